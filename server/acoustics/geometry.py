@@ -1,0 +1,153 @@
+"""Poses and floor plans.
+
+Metres and radians; right-handed world with x east, y north, z up. An orientation is a unit quaternion (x, y, z, w) whose identity
+looks along +x with +y to the left. Points are arrays whose last axis is (x, y, z); leading axes broadcast.
+"""
+
+import heapq
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+Points = npt.NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+_TOUCH_M = 1e-9
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Position in metres and orientation; a pose that exists is finite and its quaternion has unit length.
+
+    Raises ValueError for a non-finite component or a quaternion too short to have a direction.
+    """
+
+    position: Vector3
+    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if len(self.position) != 3 or not all(math.isfinite(c) for c in self.position):
+            raise ValueError("position must be three finite numbers")
+        if len(self.orientation) != 4 or not all(math.isfinite(c) for c in self.orientation):
+            raise ValueError("orientation must be four finite numbers")
+        length = math.hypot(*self.orientation)
+        if not 1e-6 < length < 1e12:
+            raise ValueError("orientation must be a quaternion of non-zero length")
+        x, y, z = (float(c) for c in self.position)
+        qx, qy, qz, qw = (float(c) / length for c in self.orientation)
+        object.__setattr__(self, "position", (x, y, z))
+        object.__setattr__(self, "orientation", (qx, qy, qz, qw))
+
+    @classmethod
+    def from_yaw(cls, position: Vector3, yaw_rad: float) -> "Pose":
+        """Level head turned counter-clockwise by `yaw_rad`; 0 looks along +x."""
+        return cls(position, (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)))
+
+    @property
+    def yaw(self) -> float:
+        """Heading of the look direction in the horizontal plane, radians in [-pi, pi]."""
+        x, y, z, w = self.orientation
+        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """A simple polygon of walls, counter-clockwise, extruded from the floor at z = 0 to `height_m`."""
+
+    corners: tuple[tuple[float, float], ...]
+    height_m: float
+
+    @cached_property
+    def walls(self) -> npt.NDArray[np.float64]:
+        """(wall, end, 2): wall i runs from corner i to corner i + 1, the inside on its left."""
+        corners = np.asarray(self.corners, dtype=np.float64)
+        return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+
+    @cached_property
+    def area_m2(self) -> float:
+        x, y = self.walls[..., 0], self.walls[..., 1]
+        return float(np.sum(x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]) / 2)
+
+    @cached_property
+    def bend_corners(self) -> npt.NDArray[np.float64]:
+        """(corner, 2): the reflex corners, the only points where a shortest path can bend."""
+        outgoing = self.walls[:, 1] - self.walls[:, 0]
+        incoming = np.roll(outgoing, 1, axis=0)
+        turn = incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0]
+        return self.walls[turn < 0, 0]
+
+    @cached_property
+    def _bend_lengths(self) -> npt.NDArray[np.float64]:
+        """(corner, corner): shortest path between reflex corners (Dijkstra over the visibility graph)."""
+        bends = self.bend_corners
+        points = np.concatenate([bends, np.zeros((len(bends), 1))], axis=-1)
+        distance = np.linalg.norm(bends[:, None] - bends[None], axis=-1)
+        direct = np.where(self.is_visible(points[:, None], points[None]), distance, np.inf)
+        shortest = np.full_like(direct, np.inf)
+        for start in range(len(bends)):
+            queue = [(0.0, start)]
+            while queue:
+                length, at = heapq.heappop(queue)
+                if length >= shortest[start, at]:
+                    continue
+                shortest[start, at] = length
+                for to in range(len(bends)):
+                    heapq.heappush(queue, (length + float(direct[at, to]), to))
+        return shortest
+
+    def contains(self, points: Points) -> npt.NDArray[np.bool_]:
+        """(...,) True inside the room or on its surfaces."""
+        points = np.asarray(points, dtype=np.float64)
+        start, end = self.walls[:, 0], self.walls[:, 1]
+        x, y = points[..., None, 0], points[..., None, 1]
+        straddles = (start[:, 1] > y) != (end[:, 1] > y)
+        rise = np.where(start[:, 1] == end[:, 1], 1.0, end[:, 1] - start[:, 1])
+        crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
+        inside = np.sum(straddles & (x < crossing), axis=-1) % 2 == 1
+        return (inside | self._on_wall(points)) & (points[..., 2] >= 0) & (points[..., 2] <= self.height_m)
+
+    def _on_wall(self, points: Points) -> npt.NDArray[np.bool_]:
+        start, along = self.walls[:, 0], self.walls[:, 1] - self.walls[:, 0]
+        offset = points[..., None, :2] - start
+        share = np.clip(np.sum(offset * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
+        gap = np.linalg.norm(offset - share[..., None] * along, axis=-1)
+        return np.asarray(np.any(gap < _TOUCH_M, axis=-1))
+
+    def is_visible(self, a: Points, b: Points) -> npt.NDArray[np.bool_]:
+        """(...,) True where no wall stands between a and b; grazing a wall or a corner does not block.
+
+        Both points are taken to be inside. Walls run from floor to ceiling, so the test is made in plan.
+        """
+        a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+        start, end = self.walls[:, 0], self.walls[:, 1]
+        p, q = a[..., None, :2], b[..., None, :2]
+
+        def side(origin: Points, tip: Points, point: Points) -> Points:
+            edge, offset = tip - origin, point - origin
+            return np.asarray(edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0])
+
+        crosses = (side(start, end, p) * side(start, end, q) < -_TOUCH_M) & (side(p, q, start) * side(p, q, end) < -_TOUCH_M)
+        # A sight line through the inside of a wall block may pass exactly through its corners: its midpoint tells.
+        middle = (a + b) / 2
+        inside = self.contains(np.concatenate([middle[..., :2], np.zeros((*middle.shape[:-1], 1))], axis=-1))
+        return np.asarray(~np.any(crosses, axis=-1) & inside)
+
+    def path_length_m(self, a: Points, b: Points) -> npt.NDArray[np.float64]:
+        """(...,) length of the shortest path from a to b that goes through no wall; the straight distance where they see each other."""
+        a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+        straight = np.linalg.norm(a - b, axis=-1)
+        bends = np.concatenate([self.bend_corners, np.zeros((len(self.bend_corners), 1))], axis=-1)
+        if not len(bends):
+            return np.asarray(straight)
+
+        def reach(points: Points) -> Points:
+            plan = np.linalg.norm(points[..., None, :2] - bends[:, :2], axis=-1)
+            return np.where(self.is_visible(points[..., None, :], bends), plan, np.inf)
+
+        via = reach(a)[..., :, None] + self._bend_lengths + reach(b)[..., None, :]
+        bent = np.hypot(np.min(via, axis=(-2, -1)), a[..., 2] - b[..., 2])
+        return np.asarray(np.where(self.is_visible(a, b), straight, bent))

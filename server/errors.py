@@ -1,0 +1,31 @@
+"""Errors that cross a boundary of the package: to an operator at start-up, or to a client in a problem body."""
+
+from pathlib import Path
+
+
+class NafirError(Exception):
+    """Base of every error Nafir raises on purpose."""
+
+
+class BundleError(NafirError):
+    """A scene bundle that cannot be used; names the file and the field at fault."""
+
+    def __init__(self, path: Path, field: str, problem: str) -> None:
+        super().__init__(f"{path}: {field}: {problem}")
+        self.path = path
+        self.field = field
+        self.problem = problem
+
+
+class RequestError(NafirError):
+    """A request that cannot be answered as asked.
+
+    `code` is stable and machine-readable, `field` names the offending input where there is one, and `status` is the HTTP status
+    (a WebSocket client gets the code instead).
+    """
+
+    def __init__(self, code: str, message: str, *, field: str | None = None, status: int = 422) -> None:
+        super().__init__(message)
+        self.code = code
+        self.field = field
+        self.status = status

@@ -1,0 +1,82 @@
+"""Poses and floor plans, against hand-drawn answers and laws of distance."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from server.acoustics.geometry import FloorPlan, Pose
+
+APARTMENT = FloorPlan(
+    ((0, 0), (4, 0), (4, 2), (4.2, 2), (4.2, 0), (8, 0), (8, 5), (4.2, 5), (4.2, 3), (4, 3), (4, 5), (0, 5)), 2.8
+)
+point = st.tuples(st.floats(0.1, 7.9), st.floats(0.1, 4.9), st.floats(0.1, 2.7)).filter(
+    lambda p: bool(APARTMENT.contains(np.array(p)))
+)
+
+
+@given(st.floats(-3.1, 3.1))
+def test_yaw_survives_the_quaternion(yaw: float) -> None:
+    assert math.isclose(Pose.from_yaw((0, 0, 0), yaw).yaw, yaw, abs_tol=1e-9)
+
+
+@pytest.mark.parametrize("orientation", [(0, 0, 0, 0), (math.nan, 0, 0, 1), (1e-9, 0, 0, 0)])
+def test_orientation_without_a_direction_is_rejected(orientation: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="orientation"):
+        Pose((0, 0, 0), orientation)  # type: ignore[arg-type]
+
+
+def test_non_finite_position_is_rejected() -> None:
+    with pytest.raises(ValueError, match="position"):
+        Pose((math.inf, 0, 0))
+
+
+def test_long_quaternion_is_normalised() -> None:
+    assert math.isclose(Pose((0, 0, 0), (0, 0, 5, 5)).yaw, math.pi / 2)
+
+
+def test_rooms_and_doorway_are_inside_walls_are_not() -> None:
+    z = 1.5
+    inside = np.array([(1, 1, z), (7, 4, z), (4.1, 2.5, z), (0, 0, z), (4.0, 2.5, z)])
+    outside = np.array([(4.1, 1, z), (4.1, 4, z), (-0.01, 1, z), (9, 2, z), (1, 1, 2.9), (1, 1, -0.1)])
+    assert APARTMENT.contains(inside).all()
+    assert not APARTMENT.contains(outside).any()
+
+
+def test_area_is_the_rectangle_less_the_wall() -> None:
+    assert math.isclose(APARTMENT.area_m2, 8 * 5 - 0.2 * 4)
+
+
+def test_sight_passes_the_doorway_and_not_the_wall() -> None:
+    a = np.array((2, 2.5, 1.5))
+    assert APARTMENT.is_visible(a, np.array((6, 2.5, 1.5)))
+    assert not APARTMENT.is_visible(np.array((2, 1, 1.5)), np.array((6, 1, 1.5)))
+
+
+def test_path_round_one_corner_is_two_straight_legs() -> None:
+    a, b = np.array((3.0, 1.0, 1.5)), np.array((4.1, 2.05, 1.5))
+    expected = math.hypot(1, 1) + math.hypot(0.1, 0.05)
+    assert not APARTMENT.is_visible(a, b)
+    assert math.isclose(APARTMENT.path_length_m(a, b), expected)
+
+
+def test_path_round_two_corners_goes_through_the_doorway() -> None:
+    a, b = np.array((3.0, 1.0, 1.5)), np.array((5.2, 1.0, 1.5))
+    assert math.isclose(APARTMENT.path_length_m(a, b), math.sqrt(2) + 0.2 + math.sqrt(2))
+
+
+@given(point, point)
+def test_path_is_symmetric_and_no_shorter_than_the_straight_line(a: tuple[float, ...], b: tuple[float, ...]) -> None:
+    there, back = APARTMENT.path_length_m(np.array(a), np.array(b)), APARTMENT.path_length_m(np.array(b), np.array(a))
+    assert math.isclose(there, back, rel_tol=1e-12)
+    assert there >= math.dist(a, b) - 1e-9
+    assert math.isfinite(there)
+
+
+@given(point, point, point)
+def test_path_obeys_the_triangle_inequality_in_plan(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> None:
+    level = [np.array((p[0], p[1], 1.5)) for p in (a, b, c)]
+    length = APARTMENT.path_length_m
+    assert length(level[0], level[2]) <= length(level[0], level[1]) + length(level[1], level[2]) + 1e-6
