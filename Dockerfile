@@ -1,0 +1,32 @@
+# Nafir's server: no torch, no training side. Runs as a numeric user on a read-only file system:
+#   docker build -t nafir . && docker run --read-only -p 8000:8000 nafir
+ARG BASE=python:3.11-slim
+
+FROM ${BASE} AS builder
+WORKDIR /source
+# An environment without pip: the outer pip installs into it, and the image carries no installer.
+RUN python -m venv --without-pip /opt/nafir
+# Dependencies come before the code, so that a change of code reuses their layer.
+COPY pyproject.toml ./
+RUN python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" > requirements.txt \
+    && python -m pip --python /opt/nafir/bin/python install --no-cache-dir --requirement requirements.txt
+COPY LICENSE ./
+COPY server server
+# Without `training` beside it the package is the server alone, so its other command goes.
+RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-deps . \
+    && rm /opt/nafir/bin/nafir-train
+
+FROM ${BASE}
+LABEL org.opencontainers.image.title="Nafir" \
+      org.opencontainers.image.description="A real-time neural acoustic field renderer" \
+      org.opencontainers.image.licenses="MIT"
+COPY --from=builder /opt/nafir /opt/nafir
+ENV PATH=/opt/nafir/bin:$PATH \
+    PYTHONDONTWRITEBYTECODE=1 \
+    PYTHONUNBUFFERED=1
+USER 10001:10001
+EXPOSE 8000
+HEALTHCHECK --interval=15s --timeout=5s --start-period=60s --retries=3 \
+    CMD ["python", "-c", "import http.client, sys; c = http.client.HTTPConnection('127.0.0.1', 8000, timeout=4); c.request('GET', '/readyz'); sys.exit(c.getresponse().status != 200)"]
+ENTRYPOINT ["nafir"]
+CMD ["serve", "--host", "0.0.0.0", "--port", "8000"]

@@ -1,0 +1,158 @@
+#!/usr/bin/env bash
+# Builds the container image and tries it as an operator would, where no Docker engine runs.
+#
+#   sudo apt-get install buildah podman runc mmdebstrap curl
+#   sudo make container-test
+#
+# The Dockerfile is built unmodified by buildah with `--isolation chroot`. Its base image is made here by mmdebstrap:
+# Debian with Python 3.11, tagged with the Dockerfile's name for it in an image store of this script's own, which is
+# deleted at the end. podman and runc then run the image with a read-only root; the script waits for /readyz, GETs an
+# impulse response and checks that it is a stereo wav with sound in it.
+#
+# Environment, all optional:
+#   PORT=8000            port on the host's loopback
+#   SCENE=apartment      scene to ask for
+#   QUERY=...            query of the impulse-response request
+#   CONTEXT=.            folder with the Dockerfile
+#   STATE=FOLDER         keep the image store and the base system here and use them again next time
+#   BASE_IMAGE=python:3.11-slim   DEBIAN_SUITE=bookworm   DEBIAN_MIRROR=URL
+#   PULL_BASE=1          take BASE_IMAGE from its registry, not from mmdebstrap
+#   BUILD_MOUNTS="/a /b" host folders that pip needs during the build (local wheels, say), mounted read-only
+#   CA_BUNDLE=FILE       certificates for the build; the host's own by default
+set -euo pipefail
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+context=${CONTEXT:-$root}
+base=${BASE_IMAGE:-python:3.11-slim}
+image=nafir:container-test
+container=nafir-container-test
+port=${PORT:-8000}
+scene=${SCENE:-apartment}
+query=${QUERY:-listener=1,2,1.5&emitter=6,3,1.5&yaw_deg=90}
+url=http://127.0.0.1:$port
+
+say() { printf '\n== %s\n' "$*"; }
+fail() { printf 'container test failed: %s\n' "$*" >&2; exit 1; }
+
+for program in buildah podman runc curl python3; do
+    command -v "$program" >/dev/null || fail "$program is not installed"
+done
+[ "$(id -u)" -eq 0 ] || fail "run it as root: the base system and the image store are made as root"
+
+! curl --silent --output /dev/null "$url" || fail "port $port is taken"
+
+keep=${STATE:+yes}
+state=${STATE:-$(mktemp -d)}
+mkdir -p "$state"
+state=$(cd "$state" && pwd)
+store=(--root "$state/images" --runroot "$state/run")
+run_podman() { podman "${store[@]}" --runtime "$(command -v runc)" --cgroup-manager cgroupfs "$@"; }
+
+tear_down() {
+    run_podman rm --force --ignore "$container" >/dev/null 2>&1 || true
+    if [ -z "$keep" ]; then
+        run_podman rmi --all --force >/dev/null 2>&1 || true
+        rm -rf "$state"
+    fi
+}
+trap tear_down EXIT
+
+if [ -n "${PULL_BASE:-}" ]; then
+    say "pulling $base"
+    buildah "${store[@]}" pull "$base"
+elif ! run_podman image exists "localhost/$base"; then
+    say "making $base"
+    if [ ! -f "$state/base.tar" ]; then
+        command -v mmdebstrap >/dev/null || fail "mmdebstrap is not installed"
+        mmdebstrap --quiet --variant=minbase \
+            --include=ca-certificates,python-is-python3,python3,python3-pip,python3-venv \
+            "${DEBIAN_SUITE:-bookworm}" "$state/base.tar.part" ${DEBIAN_MIRROR:+"$DEBIAN_MIRROR"}
+        mv "$state/base.tar.part" "$state/base.tar"
+    fi
+    run_podman import --quiet "$state/base.tar" "localhost/$base"
+fi
+
+mounts=()
+mount_file() { [ ! -f "$1" ] || mounts+=(--volume "$1:$2:ro"); }
+mount_file "${CA_BUNDLE:-/etc/ssl/certs/ca-certificates.crt}" /etc/ssl/certs/ca-certificates.crt
+mount_file /etc/pip.conf /etc/pip.conf
+mount_file "${PIP_CONFIG_FILE:-${XDG_CONFIG_HOME:-$HOME/.config}/pip/pip.conf}" /root/.config/pip/pip.conf
+for folder in ${BUILD_MOUNTS:-}; do
+    mounts+=(--volume "$folder:$folder:ro")
+done
+
+say "building $image"
+started=$SECONDS
+# Docker's image format: the OCI one has no HEALTHCHECK.
+buildah "${store[@]}" bud --isolation chroot --format docker --pull-never --layers "${mounts[@]}" \
+    --build-arg "BASE=$base" --tag "$image" "$context"
+echo "built in $((SECONDS - started)) s"
+run_podman images --filter "reference=$image"
+
+say "looking into it"
+run_podman image inspect "$image" --format 'user {{.User}}, exposes {{.Config.ExposedPorts}}, command {{.Config.Entrypoint}} {{.Config.Cmd}}'
+case $(run_podman image inspect "$image" --format '{{.User}}') in
+    "" | 0 | 0:* | root | root:*) fail "the image runs as root" ;;
+esac
+[ "$(run_podman image inspect "$image" --format '{{if .HealthCheck}}yes{{end}}')" = yes ] || fail "the image has no health check"
+
+say "running it read-only"
+started=$SECONDS
+# The health check is run below: podman would have systemd time it.
+run_podman run --detach --name "$container" --no-healthcheck --network host --read-only --read-only-tmpfs=false \
+    --cap-drop all --security-opt no-new-privileges \
+    --ulimit nofile=1024:1024 --ulimit nproc=4096:4096 \
+    "$image" serve --host 127.0.0.1 --port "$port" >/dev/null
+until curl --silent --fail --output /dev/null "$url/readyz"; do
+    [ "$(run_podman inspect "$container" --format '{{.State.Running}}')" = true ] ||
+        { run_podman logs "$container"; fail "the server stopped"; }
+    ((SECONDS - started < 120)) || { run_podman logs "$container"; fail "not ready after 120 s"; }
+    sleep 0.5
+done
+echo "ready in $((SECONDS - started)) s"
+
+run_podman exec "$container" python -c '
+import importlib.util, os
+assert os.getuid() != 0, "runs as root"
+for module in ("torch", "training", "pip"):
+    assert importlib.util.find_spec(module) is None, f"{module} is in the image"
+try:
+    open("/opt/nafir/probe", "w")
+except OSError:
+    print("uid", os.getuid(), "- read-only root, no torch, no training side")
+else:
+    raise SystemExit("the root file system is writable")
+'
+mapfile -t check < <(run_podman image inspect "$image" --format '{{json .HealthCheck.Test}}' |
+    python3 -c 'import json, sys; print(*json.load(sys.stdin)[1:], sep="\n")')
+run_podman exec "$container" "${check[@]}" || fail "the health check fails on a ready server"
+echo "health check passes"
+
+say "asking for an impulse response"
+curl --silent --show-error --fail --output "$state/ir.wav" "$url/v1/scenes/$scene/impulse-response?$query"
+python3 - "$state/ir.wav" <<'PYTHON'
+import struct
+import sys
+
+data = open(sys.argv[1], "rb").read()
+assert data[:4] == b"RIFF" and data[8:12] == b"WAVE", f"not a wav: {data[:16]!r}"
+chunks, at = {}, 12
+while at + 8 <= len(data):
+    size = struct.unpack_from("<I", data, at + 4)[0]
+    chunks[data[at : at + 4]] = data[at + 8 : at + 8 + size]
+    at += 8 + size + size % 2
+code, channels, rate, _, _, bits = struct.unpack_from("<HHIIHH", chunks[b"fmt "])
+assert (channels, bits) == (2, 32), f"{channels} channels, {bits} bits"
+samples = struct.unpack(f"<{len(chunks[b'data']) // 4}f", chunks[b"data"])
+peak = max(map(abs, samples))
+assert 0 < peak < 1e3, f"peak {peak}"
+print(f"{len(data)} bytes: {len(samples) // channels} frames x {channels} at {rate} Hz, format {code}, peak {peak:.4f}")
+PYTHON
+
+say "stopping it"
+started=$SECONDS
+run_podman stop --time 10 "$container" >/dev/null
+code=$(run_podman inspect "$container" --format '{{.State.ExitCode}}')
+echo "stopped in $((SECONDS - started)) s with exit code $code"
+[ "$code" -eq 0 ] || { run_podman logs "$container"; fail "exit code $code on SIGTERM"; }
+say "container test passed"
