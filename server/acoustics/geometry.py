@@ -108,14 +108,16 @@ class FloorPlan:
         rise = np.where(start[:, 1] == end[:, 1], 1.0, end[:, 1] - start[:, 1])
         crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
         inside = np.sum(straddles & (x < crossing), axis=-1) % 2 == 1
-        return (inside | self._on_wall(points)) & (points[..., 2] >= 0) & (points[..., 2] <= self.height_m)
+        touches = self.wall_distance_m(points) < _TOUCH_M
+        return (inside | touches) & (points[..., 2] >= 0) & (points[..., 2] <= self.height_m)
 
-    def _on_wall(self, points: Points) -> npt.NDArray[np.bool_]:
+    def wall_distance_m(self, points: Points) -> npt.NDArray[np.float64]:
+        """(...,) distance in plan to the nearest wall, inside or out."""
+        points = np.asarray(points, dtype=np.float64)
         start, along = self.walls[:, 0], self.walls[:, 1] - self.walls[:, 0]
         offset = points[..., None, :2] - start
         share = np.clip(np.sum(offset * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
-        gap = np.linalg.norm(offset - share[..., None] * along, axis=-1)
-        return np.asarray(np.any(gap < _TOUCH_M, axis=-1))
+        return np.asarray(np.min(np.linalg.norm(offset - share[..., None] * along, axis=-1), axis=-1))
 
     def is_visible(self, a: Points, b: Points) -> npt.NDArray[np.bool_]:
         """(...,) True where no wall stands between a and b; grazing a wall or a corner does not block.

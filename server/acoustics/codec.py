@@ -1,0 +1,106 @@
+"""Impulse responses to log-magnitude and instantaneous frequency, and back.
+
+Axes: (..., frequency, frame) for spectrograms, (..., sample) for signals. The transform is `scipy.signal.ShortTimeFFT` with a
+periodic Hann window; frame 0 is the first that touches the signal.
+
+Instantaneous frequency is the phase advance from one frame to the next *less* that of the bin's centre frequency, wrapped to
+[-pi, pi): without the subtraction every fourth bin would sit on the branch cut (hop = n_fft / 4). Frame 0 holds the absolute phase.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfft
+from scipy.signal import ShortTimeFFT
+from scipy.signal.windows import hann
+
+Array = npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Codec:
+    """`samples` is the length of the signals coded; `log_floor` keeps silence finite: magnitudes are stored as log(|S| + log_floor)."""
+
+    sample_rate: int
+    n_fft: int
+    hop: int
+    samples: int
+    log_floor: float
+
+    @property
+    def bins(self) -> int:
+        return self.n_fft // 2 + 1
+
+    @property
+    def frames(self) -> int:
+        return int(self._transform.p_max(self.samples) - self._transform.p_min)
+
+    @cached_property
+    def _transform(self) -> ShortTimeFFT:
+        return ShortTimeFFT(hann(self.n_fft, sym=False), self.hop, self.sample_rate, phase_shift=None)
+
+    @cached_property
+    def frame_times_s(self) -> npt.NDArray[np.float64]:
+        """(frame,) centre of each window; the first is negative."""
+        first = int(self._transform.p_min)
+        return np.arange(first, first + self.frames) * self.hop / self.sample_rate
+
+    @cached_property
+    def nominal_advance(self) -> npt.NDArray[np.float64]:
+        """(frequency, 1) radians by which a bin-centred tone advances per frame."""
+        return (2 * np.pi * self.hop / self.n_fft * np.arange(self.bins))[:, None]
+
+    @cached_property
+    def window_energy(self) -> float:
+        """Mean of |S|**2 for white noise of unit variance."""
+        return float(np.sum(self._transform.win**2))
+
+    def transform(self, signal: Array) -> npt.NDArray[np.complex128]:
+        """(..., sample) to complex (..., frequency, frame)."""
+        return np.asarray(self._transform.stft(signal, p1=self._transform.p_max(self.samples)))
+
+    def log_magnitude(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.float64]:
+        return np.log(np.abs(spectrogram) + self.log_floor)
+
+    def magnitude(self, log_magnitude: Array) -> Array:
+        return np.maximum(np.exp(log_magnitude) - self.log_floor, 0)
+
+    def encode(self, signal: Array) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """(..., sample) to log-magnitude and instantaneous frequency, each (..., frequency, frame)."""
+        spectrogram = self.transform(signal)
+        return self.log_magnitude(spectrogram), self.instantaneous_frequency(np.angle(spectrogram))
+
+    def decode(self, log_magnitude: Array, instantaneous_frequency: Array) -> npt.NDArray[np.floating]:
+        """Inverse of `encode`; (..., frequency, frame) to (..., sample)."""
+        phase = self.integrate(instantaneous_frequency)
+        return self.synthesise(self.magnitude(log_magnitude) * np.exp(1j * phase))
+
+    def instantaneous_frequency(self, phase: Array) -> npt.NDArray[np.float64]:
+        """Demodulated, wrapped phase advance per frame of (..., frequency, frame) phases."""
+        advance = np.diff(phase, axis=-1) - self.nominal_advance
+        wrapped = (advance + np.pi) % (2 * np.pi) - np.pi
+        return np.concatenate([phase[..., :1], wrapped], axis=-1)
+
+    def integrate(self, instantaneous_frequency: Array) -> Array:
+        """Phase from its advances: the inverse of `instantaneous_frequency`, up to whole turns."""
+        frames = np.arange(instantaneous_frequency.shape[-1])
+        # Whole turns are dropped before they can eat the mantissa of a float32.
+        nominal = (self.nominal_advance * frames) % (2 * np.pi)
+        return np.cumsum(instantaneous_frequency, axis=-1) + nominal.astype(instantaneous_frequency.dtype)
+
+    def synthesise(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.floating]:
+        """Complex (..., frequency, frame) to (..., sample).
+
+        Equals `ShortTimeFFT.istft`, with all frames transformed at once; the precision is that of the input.
+        """
+        slices = irfft(np.swapaxes(spectrogram, -1, -2), self.n_fft, axis=-1)
+        slices *= self._transform.dual_win.real.astype(slices.dtype)
+        shifts = self.n_fft // self.hop
+        parts = slices.reshape(*slices.shape[:-1], shifts, self.hop)
+        total = np.zeros((*slices.shape[:-2], self.frames + shifts - 1, self.hop), dtype=slices.dtype)
+        for shift in range(shifts):
+            total[..., shift : shift + self.frames, :] += parts[..., shift, :]
+        start = self.n_fft // 2 - int(self._transform.p_min) * self.hop
+        return np.asarray(total.reshape(*total.shape[:-2], -1)[..., start : start + self.samples])

@@ -1,0 +1,65 @@
+"""What a scene is made of: walls, openings and materials, as written in scene files and bundles."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from server.acoustics.geometry import FloorPlan
+
+OCTAVE_BANDS_HZ = (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0)
+
+Share = Annotated[float, Field(ge=0, le=1)]
+PerBand = Annotated[tuple[Share, ...], Field(min_length=len(OCTAVE_BANDS_HZ), max_length=len(OCTAVE_BANDS_HZ))]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+PlanPoint = tuple[Finite, Finite]
+Point = tuple[Finite, Finite, Finite]
+
+
+class Strict(BaseModel):
+    """Unknown keys are mistakes, and nothing changes after it was read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Material(Strict):
+    """Energy shares per octave band, 125 Hz to 8 kHz: absorbed, and scattered of what is reflected."""
+
+    absorption: PerBand
+    scattering: PerBand
+
+
+class Materials(Strict):
+    walls: Material
+    floor: Material
+    ceiling: Material
+
+
+class Opening(Strict):
+    """A passage between rooms, as the line in plan that one steps over."""
+
+    name: str
+    start: PlanPoint
+    end: PlanPoint
+
+    @property
+    def centre(self) -> PlanPoint:
+        return (self.start[0] + self.end[0]) / 2, (self.start[1] + self.end[1]) / 2
+
+
+class Geometry(Strict):
+    """A floor polygon, counter-clockwise and not crossing itself, extruded to `height_m`."""
+
+    height_m: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    corners: Annotated[tuple[PlanPoint, ...], Field(min_length=3)]
+    openings: tuple[Opening, ...] = ()
+    materials: Materials
+
+    @model_validator(mode="after")
+    def _turns_counter_clockwise(self) -> "Geometry":
+        if self.floor_plan.area_m2 <= 0:
+            raise ValueError("corners must run counter-clockwise")
+        return self
+
+    @property
+    def floor_plan(self) -> FloorPlan:
+        return FloorPlan(self.corners, self.height_m)
