@@ -1,0 +1,165 @@
+"""Baselines that a field has to beat: the nearest training pair, and linear interpolation between training pairs.
+
+Axes: one pair's impulse responses are `(yaw, channel, sample)`; every baseline answers with the yaws of the training
+data, so none has to interpolate orientation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import oaconvolve
+from scipy.spatial import Delaunay
+
+_Floats = npt.NDArray[np.float64]
+_Responses = npt.NDArray[np.float32]
+
+_KERNEL_REACH = 32  # samples on either side
+_KERNEL_BETA = 8.0
+
+
+class PairResponses(Protocol):
+    """An array or an open HDF5 dataset: indexed by pair it gives `(yaw, channel, sample)`."""
+
+    def __getitem__(self, pair: int, /) -> npt.NDArray[np.floating]: ...
+
+
+@dataclass(frozen=True)
+class TrainingPairs:
+    """The pairs of a dataset and which of them a baseline may look at.
+
+    pair_listener, pair_emitter: (pair,) probe of each; listener_positions, emitter_positions: (probe, 3), metres;
+    training: (pair,), False where held out.
+    """
+
+    responses: PairResponses
+    pair_listener: npt.NDArray[np.integer]
+    pair_emitter: npt.NDArray[np.integer]
+    listener_positions: _Floats
+    emitter_positions: _Floats
+    training: npt.NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        if not np.any(self.training):
+            raise ValueError("no pair is left for training")
+
+    def response(self, pair: int) -> _Responses:
+        return np.asarray(self.responses[pair], dtype=np.float32)
+
+    def weighted(self, pairs: Sequence[int], weights: Sequence[float]) -> _Responses:
+        return np.asarray(
+            sum(np.float32(weight) * self.response(pair) for pair, weight in zip(pairs, weights, strict=True)),
+            dtype=np.float32,
+        )
+
+
+def nearest_pair(pairs: TrainingPairs, pair: int) -> int:
+    """The training pair closest to `pair` in (listener, emitter) space, six coordinates in metres; first of equals."""
+    candidates = np.flatnonzero(pairs.training)
+    squared = _squared_distances(pairs.listener_positions, pairs.pair_listener, candidates, pair)
+    squared += _squared_distances(pairs.emitter_positions, pairs.pair_emitter, candidates, pair)
+    return int(candidates[np.argmin(squared)])
+
+
+def linear_weights(pairs: TrainingPairs, pair: int) -> tuple[list[int], list[float]]:
+    """Training pairs of the emitter of `pair` whose listeners surround its listener, and their weights, which sum to 1.
+
+    Barycentric in the Delaunay triangulation of those listeners, within the line, plane or space they span. Outside
+    their hull: the nearest of them. Where the emitter has no training pair: the nearest pair.
+    """
+    candidates = np.flatnonzero(pairs.training & (pairs.pair_emitter == pairs.pair_emitter[pair]))
+    if len(candidates) == 0:
+        return [nearest_pair(pairs, pair)], [1.0]
+    points = pairs.listener_positions[pairs.pair_listener[candidates]]
+    target = pairs.listener_positions[pairs.pair_listener[pair]]
+    inside = _barycentric(points, target)
+    if inside is None:
+        return [int(candidates[np.argmin(np.square(points - target).sum(axis=-1))])], [1.0]
+    corners, weights = inside
+    return [int(candidates[corner]) for corner in corners], [float(weight) for weight in weights]
+
+
+def nearest(pairs: TrainingPairs, pair: int) -> _Responses:
+    return pairs.response(nearest_pair(pairs, pair))
+
+
+def linear(pairs: TrainingPairs, pair: int) -> _Responses:
+    """Weighted sum of the waveforms, as in Luo et al. (NeurIPS 2022): early sound combs, levels sag between probes."""
+    return pairs.weighted(*linear_weights(pairs, pair))
+
+
+def linear_aligned(
+    pairs: TrainingPairs, pair: int, delays_s: npt.NDArray[np.floating], sample_rate: float
+) -> _Responses:
+    """Linear interpolation of waveforms whose direct sounds are moved on top of each other first.
+
+    delays_s: (pair,), propagation delay of every pair, the target included (known from geometry). Stronger than
+    `linear` near the direct sound.
+    """
+    neighbours, weights = linear_weights(pairs, pair)
+    shifts = [(float(delays_s[pair]) - float(delays_s[neighbour])) * sample_rate for neighbour in neighbours]
+    total: _Responses | None = None
+    for neighbour, weight, shift in zip(neighbours, weights, shifts, strict=True):
+        part = np.float32(weight) * _shifted(pairs.response(neighbour), shift)
+        total = part if total is None else total + part
+    assert total is not None  # weights are never empty
+    return total
+
+
+def _shifted(responses: _Responses, shift_samples: float) -> _Responses:
+    """Later by a fraction of samples; what leaves the response on either side is lost.
+
+    The windowed sinc is short: an unwindowed one would ring at -90 dB all over the response and end its decay.
+    """
+    samples = responses.shape[-1]
+    whole = round(shift_samples)
+    taps = np.arange(-_KERNEL_REACH, _KERNEL_REACH + 1)
+    kernel = np.sinc(taps - (shift_samples - whole)) * np.kaiser(len(taps), _KERNEL_BETA)
+    filtered = oaconvolve(responses, kernel.astype(np.float32)[np.newaxis, np.newaxis], mode="same", axes=-1)
+    shifted = np.zeros_like(responses)
+    if whole >= 0:
+        shifted[..., whole:] = filtered[..., : max(samples - whole, 0)]
+    else:
+        shifted[..., :whole] = filtered[..., -whole:]
+    return shifted
+
+
+def _squared_distances(
+    positions: _Floats, probe_of_pair: npt.NDArray[np.integer], candidates: npt.NDArray[np.integer], pair: int
+) -> _Floats:
+    offsets = positions[probe_of_pair[candidates]] - positions[probe_of_pair[pair]]
+    return np.asarray(np.square(offsets).sum(axis=-1))
+
+
+def _barycentric(points: _Floats, target: _Floats) -> tuple[npt.NDArray[np.integer], _Floats] | None:
+    """Corners (indices into points) of the simplex that holds `target`, and weights; None outside the hull."""
+    centre = points.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(points - centre, full_matrices=False)
+    span = axes[sizes > 1e-6 * max(float(sizes[0]), 1e-9)]
+    residual = (target - centre) - span.T @ (span @ (target - centre))
+    if len(span) == 0 or np.abs(residual).max() > 1e-6:  # one point, or a target off the plane of all probes
+        return None
+    flat, at = (points - centre) @ span.T, span @ (target - centre)
+    if len(span) == 1:
+        return _between(flat[:, 0], float(at[0]))
+    triangulation = Delaunay(flat)
+    simplex = int(triangulation.find_simplex(at[np.newaxis], tol=1e-9)[0])
+    if simplex < 0:
+        return None
+    transform = triangulation.transform[simplex]
+    leading = transform[:-1] @ (at - transform[-1])
+    weights = np.clip(np.append(leading, 1.0 - leading.sum()), 0.0, None)
+    held = weights > 1e-9
+    return triangulation.simplices[simplex][held], weights[held] / weights[held].sum()
+
+
+def _between(coordinates: _Floats, at: float) -> tuple[npt.NDArray[np.integer], _Floats] | None:
+    order = np.argsort(coordinates)
+    upper = int(np.searchsorted(coordinates[order], at))
+    if upper == 0 or upper == len(order):
+        return (order[:1], np.ones(1)) if at == coordinates[order[0]] else None
+    low, high = order[upper - 1], order[upper]
+    share = (at - coordinates[low]) / (coordinates[high] - coordinates[low])
+    return np.array([low, high]), np.array([1.0 - share, share])
