@@ -205,7 +205,7 @@ def test_newest_ir_wins_and_flags_tell_which_block_exchanged():
 def test_exchange_does_not_splatter(block_size, blocks_between):
     """Energy above 4 kHz of a 997 Hz tone, while every exchange is to an entirely unrelated room: the worst case.
 
-    Measured with an exchange in every block: -96 dB at 128 samples, -111 dB at 256, -126 dB at 512; without any, -140 dB.
+    Measured with an exchange in every block: -96 dB at 128 samples, -111 dB at 256, -126 dB at 512; with none, -140 dB.
     """
     ir_samples = 2_400
     blocks = 2 * SAMPLE_RATE // block_size
@@ -254,7 +254,7 @@ def test_others_are_bit_equal_after_a_source_has_come_and_gone():
 
 
 def test_a_source_that_rang_out_and_sounds_again_remembers_nothing():
-    """Guards the shortcut for silence: stale spectra must not be heard when the source is fed again, at any distance."""
+    """Guards the shortcut for silence: no stale spectrum may be heard when the source is fed again, however late."""
     size, samples = 64, 300
     ir = decaying_ir(22, samples)
     for pause in range(14):

@@ -1,4 +1,4 @@
-"""The fade rises from 0 to 1 and, reversed, is its own complement, so that what is the same on both sides stays the same."""
+"""The fade rises from 0 to 1 and, reversed, is its own complement: what both sides share passes unchanged."""
 
 import numpy as np
 import pytest
