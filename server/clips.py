@@ -1,0 +1,124 @@
+"""Dry recordings that emitters play: the bundled ones and files of the user's.
+
+A clip is decoded once, to mono float32 (n,) at the rate of the scene, and checked there, so that whatever plays it may
+trust it: at least one sample, every one finite.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+import numpy.typing as npt
+import soundfile
+import soxr
+
+from server.errors import NafirError, RequestError
+
+FloatArray = npt.NDArray[np.float32]
+
+_BUNDLED = Path(__file__).parent / "clips_data"
+_LOUDEST = 1e6
+"""Full scale is 1. Integers written as float reach 2^31, and nobody wants to hear them so."""
+
+
+class DecodeError(NafirError):
+    """A file that cannot be played; `reason` says why."""
+
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(f"{name}: {reason}")
+        self.name = name
+        self.reason = reason
+
+
+class UnknownClipError(RequestError):
+    """No clip of that name."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__("unknown_clip", f"there is no clip {name!r}", field="clip", status=404)
+        self.name = name
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What to show of a clip. `credit` is empty for the user's own files."""
+
+    name: str
+    title: str
+    duration_s: float
+    credit: str
+
+
+def decode(path: Path, sample_rate: int) -> FloatArray:
+    """Read an audio file (wav, flac, ogg, and whatever else libsndfile reads) as mono (n,) at `sample_rate`, read-only.
+
+    Channels are averaged. Raises DecodeError.
+    """
+    try:
+        content = BytesIO(path.read_bytes())  # without a name, so that the content alone decides what it is
+        samples, file_rate = soundfile.read(content, dtype="float32", always_2d=True)
+    except OSError as exc:
+        raise DecodeError(path.name, exc.strerror or str(exc)) from exc
+    except soundfile.LibsndfileError as exc:
+        raise DecodeError(path.name, f"not an audio file that can be read ({exc.error_string.rstrip('.')})") from exc
+    if samples.shape[0] == 0:
+        raise DecodeError(path.name, "it holds no samples")
+    # Before averaging and resampling, which would spread one bad sample over many.
+    is_bad = ~np.isfinite(samples).all(axis=1)
+    if is_bad.any():
+        raise DecodeError(path.name, f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
+    if (peak := np.abs(samples).max()) > _LOUDEST:
+        raise DecodeError(path.name, f"its peak of {peak:.3g} is not audio, where full scale is 1")
+    mono: FloatArray = samples.mean(axis=1, dtype=np.float32)
+    if file_rate != sample_rate:
+        mono = soxr.resample(mono, file_rate, sample_rate, quality="VHQ")
+        if mono.size == 0:
+            raise DecodeError(path.name, f"too short to be heard at {sample_rate} Hz")
+    mono.flags.writeable = False
+    return mono
+
+
+class ClipLibrary:
+    """Clips by name at one sample rate: the bundled ones, and `files`, which win where a name is taken.
+
+    Safe to use from any thread. Clips are decoded when first asked for and kept.
+    """
+
+    def __init__(self, sample_rate: int, files: Mapping[str, Path] | None = None) -> None:
+        self.sample_rate = sample_rate
+        with (_BUNDLED / "clips.toml").open("rb") as stream:
+            self._labels: dict[str, dict[str, str]] = tomllib.load(stream)
+        self._paths = {name: _BUNDLED / f"{name}.ogg" for name in self._labels}
+        for name, path in (files or {}).items():
+            self._paths[name] = path
+            self._labels[name] = {"title": name, "credit": ""}
+        self._decoded: dict[str, FloatArray] = {}
+        self._lock = Lock()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """In alphabetical order."""
+        return tuple(sorted(self._paths))
+
+    def load(self, name: str) -> FloatArray:
+        """Samples (n,) of a clip, read-only. Raises UnknownClipError and DecodeError."""
+        path = self._path(name)
+        with self._lock:
+            if name not in self._decoded:
+                self._decoded[name] = decode(path, self.sample_rate)
+            return self._decoded[name]
+
+    def describe(self, name: str) -> Clip:
+        """Raises UnknownClipError and DecodeError."""
+        self._path(name)
+        labels = self._labels[name]
+        return Clip(name, labels["title"], self.load(name).size / self.sample_rate, labels["credit"])
+
+    def _path(self, name: str) -> Path:
+        try:
+            return self._paths[name]
+        except KeyError:
+            raise UnknownClipError(name) from None
