@@ -89,6 +89,7 @@ class Convolver:
         self._silent_blocks = np.zeros(sources, np.int64)
         self._irs: list[PartitionedIr | None] = [None] * sources
         self._next_irs: list[PartitionedIr | None] = [None] * sources
+        self._has_run = np.zeros(sources, np.bool)  # with an IR
         self._exchanged: tuple[int, ...] = ()
         self._mix = np.zeros((2, bins, channels), np.complex64)  # 0: with the new IRs, 1: what the old ones add to that
         self._products = np.zeros((2, bins, channels), np.complex64)
@@ -101,7 +102,7 @@ class Convolver:
         return partition_ir(ir, self.block_size)
 
     def set_ir(self, source: int, ir: npt.NDArray[np.floating] | PartitionedIr) -> None:
-        """Give a source its IR: the first at once, a later one by a crossfade over the next block.
+        """Give a source its IR: at once before its first block, and by a crossfade over the next block from then on.
 
         A fade completes within its block, so none is ever restarted; of several IRs that arrive before it, only the
         newest is heard. Raises ValueError as `prepare`.
@@ -110,7 +111,7 @@ class Convolver:
         same_layout = (filters.channels, filters.block_size) == (self.channels, self.block_size)
         if not same_layout or filters.samples > self.ir_samples:
             raise ValueError("the IR was prepared for another convolver")
-        if self._irs[source] is None:
+        if not self._has_run[source]:
             self._irs[source] = filters
         else:
             self._next_irs[source] = filters
@@ -121,6 +122,7 @@ class Convolver:
         Rows of sources without an IR are ignored. Input must be finite: gate live audio where it enters.
         """
         running = [source for source, ir in enumerate(self._irs) if ir is not None]
+        self._has_run[running] = True
         sounding = self._advance(blocks, running)
         exchanging = tuple(source for source in running if self._next_irs[source] is not None)
         self._mix.fill(0)
@@ -188,9 +190,11 @@ class Convolver:
         """Forget a source, IR and signal. Silence it first (`is_quiet`) unless a click is welcome."""
         self._irs[source] = None
         self._next_irs[source] = None
-        self._spectra[source] = 0
-        self._input[source] = 0
         self._silent_blocks[source] = 0
+        if self._has_run[source]:
+            self._has_run[source] = False
+            self._spectra[source] = 0
+            self._input[source] = 0
 
     def reset(self) -> None:
         """Forget everything, as if just constructed."""

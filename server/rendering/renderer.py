@@ -154,7 +154,7 @@ class Renderer:
         self._emitter(emitter_id).next_gain = gain
 
     def set_ir(self, emitter_id: str, ir: npt.NDArray[np.floating] | PartitionedIr, token: int | None = None) -> None:
-        """Hand in an IR for the next block: the first starts the emitter, a later one is crossfaded to over that block.
+        """Hand in an IR for the next block, which starts the emitter or, if it sounds already, crossfades to that IR.
 
         Of several handed in before it, the newest counts. Raises UnknownEmitterError, and ValueError as `prepare`.
         """

@@ -165,7 +165,8 @@ def test_any_sequence_of_exchanges_is_a_sequence_of_crossfades(seed, changes):
             handed_in = [ir for at, to, ir in schedule if (at, to) == (block, source)]
             span = slice(block * size, (block + 1) * size)
             if current is None:
-                current = handed_in.pop(0)
+                current = handed_in.pop()
+                handed_in.clear()
             old = convolve(dry[source], current)[:, span]
             if handed_in:
                 current = handed_in[-1]
