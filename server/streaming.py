@@ -1,0 +1,238 @@
+"""The asyncio driver of a WebSocket stream: moves bytes between the socket, the session and the audio thread.
+
+One `Connection` per client, living on the event loop. A reader passes what the client says to the audio thread; a
+sender passes on what the audio thread made. Nothing here grows without bound: messages to the audio thread are refused
+beyond `MAX_WAITING_MESSAGES`, audio beyond the window is never made, and a client that reads so slowly that its answers
+pile up is cut off.
+"""
+
+import asyncio
+import dataclasses
+import logging
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from anyio import CapacityLimiter
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from server.audio_thread import AudioThread, Outgoing, Stream, StreamFailed, TimedBlock
+from server.catalogue import describe_scene
+from server.clips import ClipLibrary, DecodeError
+from server.errors import RequestError
+from server.field.field import AcousticField
+from server.protocol import (
+    AddEmitter,
+    ClientMessage,
+    Error,
+    FloatArray,
+    Hello,
+    Ping,
+    Pong,
+    ServerMessage,
+    Welcome,
+    parse_client_message,
+)
+from server.session import Session
+from server.settings import Settings
+
+NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
+MAX_WAITING_ANSWERS = 256
+
+_logger = logging.getLogger(__name__)
+
+
+def load_clip(clips: ClipLibrary, name: str) -> FloatArray:
+    """Samples (n,) of a clip. Raises RequestError unknown_clip, or undecodable_clip with the decoder's reason."""
+    try:
+        return clips.load(name)
+    except DecodeError as exc:
+        raise RequestError("undecodable_clip", str(exc), field="clip") from exc
+
+
+class ClosingError(Exception):
+    """The connection ends with this code, after an error message where there is one."""
+
+    def __init__(self, close_code: int, error: Error) -> None:
+        super().__init__(error.message)
+        self.close_code = close_code
+        self.error = error
+
+
+@dataclass
+class StreamHost:
+    """What all connections share: loaded scenes, their clips, the audio thread, and how many streams there are."""
+
+    fields: Mapping[str, AcousticField]
+    clips: Mapping[str, ClipLibrary]
+    """By scene, since every scene has its sample rate."""
+    audio: AudioThread
+    settings: Settings
+    http_limiter: CapacityLimiter
+    """How many HTTP requests compute at once."""
+    is_ready: bool = False
+    streams: int = 0
+
+
+class Connection:
+    """One client from its hello to its goodbye."""
+
+    def __init__(self, websocket: WebSocket, host: StreamHost, *, time_s: Callable[[], float] = time.monotonic) -> None:
+        self._websocket = websocket
+        self._host = host
+        self._time_s = time_s
+        self._outgoing: deque[Outgoing] = deque()
+        self._has_outgoing = asyncio.Event()
+
+    async def run(self) -> None:
+        """Serve the client until either side ends it."""
+        await self._websocket.accept()
+        try:
+            await self._serve()
+        except ClosingError as closing:
+            await self._send_message(closing.error)
+            await self._websocket.close(closing.close_code, closing.error.code)
+        except WebSocketDisconnect:
+            return
+
+    async def _serve(self) -> None:
+        host = self._host
+        if not host.is_ready:
+            raise ClosingError(TRY_AGAIN_LATER, Error(code="not_ready", message="the server is still warming up"))
+        if host.streams >= host.settings.max_streams:
+            raise ClosingError(TRY_AGAIN_LATER, Error(code="server_busy", message="the server has no free stream"))
+        host.streams += 1
+        try:
+            hello = await self._receive_hello()
+            stream = await self._open(hello)
+            await self._pump(stream, hello)
+        finally:
+            host.streams -= 1
+
+    async def _receive_hello(self) -> Hello:
+        try:
+            async with asyncio.timeout(self._host.settings.hello_timeout_s):
+                message = self._parse(await self._receive())
+        except TimeoutError as exc:
+            raise ClosingError(POLICY_VIOLATION, Error(code="hello_expected", message="no hello came")) from exc
+        except RequestError as refusal:
+            raise ClosingError(POLICY_VIOLATION, Error.from_refusal(refusal)) from refusal
+        if not isinstance(message, Hello):
+            error = Error(code="hello_expected", message=f"the first message is a hello, not {message.type}")
+            raise ClosingError(POLICY_VIOLATION, error)
+        return message
+
+    async def _open(self, hello: Hello) -> Stream:
+        settings = self._host.settings
+        field = self._host.fields.get(hello.scene)
+        window = settings.window_blocks + hello.buffer_blocks
+        try:
+            if field is None:
+                raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
+            session = await asyncio.to_thread(
+                Session,
+                hello,
+                field,
+                lambda name: load_clip(self._host.clips[hello.scene], name),
+                max_emitters=settings.max_emitters,
+                window=window,
+            )
+        except RequestError as refusal:
+            raise ClosingError(POLICY_VIOLATION, Error.from_refusal(refusal)) from refusal
+        await self._send_message(
+            Welcome(
+                session=uuid.uuid4().hex,
+                scene=describe_scene(field),
+                sample_rate=field.sample_rate,
+                block_size=hello.block_size,
+                channels=field.channels,
+                encoding=hello.encoding,
+                buffer_blocks=hello.buffer_blocks,
+                window=window,
+                ir_samples=field.ir_samples,
+                level=field.level.name,
+            )
+        )
+        return Stream(
+            session,
+            field,
+            block_s=hello.block_size / field.sample_rate,
+            lead=hello.buffer_blocks,
+            deliver=self._enqueue,
+        )
+
+    async def _pump(self, stream: Stream, hello: Hello) -> None:
+        self._host.audio.open(stream)
+        sender = asyncio.create_task(self._send_outgoing(stream, hello))
+        try:
+            while True:
+                await self._take_in(await self._receive(), stream, hello)
+        finally:
+            self._host.audio.close(stream)
+            sender.cancel()
+            await asyncio.wait([sender])
+
+    async def _take_in(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
+        try:
+            message = self._parse(data)
+            if isinstance(message, Ping):
+                self._enqueue([Pong(id=message.id)])
+                return
+            if isinstance(message, AddEmitter):
+                # Decoded once, here and off the loop, so that the audio thread finds it ready.
+                await asyncio.to_thread(load_clip, self._host.clips[hello.scene], message.clip)
+            if not stream.offer(message):
+                raise RequestError("too_many_messages", "too many messages in one block: this one was not heeded")
+        except RequestError as refusal:
+            self._enqueue([Error.from_refusal(refusal)])
+
+    async def _receive(self) -> str | bytes:
+        event = await self._websocket.receive()
+        if event["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(event.get("code", NORMAL))
+        text: str | None = event.get("text")
+        return event["bytes"] if text is None else text
+
+    def _parse(self, data: str | bytes) -> ClientMessage:
+        limit = self._host.settings.max_message_bytes
+        if len(data) > limit:
+            raise RequestError("message_too_large", f"a message has at most {limit} bytes, not {len(data)}", status=413)
+        return parse_client_message(data)
+
+    def _enqueue(self, outgoing: list[Outgoing]) -> None:
+        self._outgoing += outgoing
+        self._has_outgoing.set()
+
+    async def _send_outgoing(self, stream: Stream, hello: Hello) -> None:
+        """Send until cancelled; close the socket, which ends the reader too, where the stream cannot go on."""
+        try:
+            while True:
+                await self._has_outgoing.wait()
+                self._has_outgoing.clear()
+                while self._outgoing:
+                    if len(self._outgoing) > stream.session.window.size + MAX_WAITING_ANSWERS:
+                        await self._websocket.close(POLICY_VIOLATION, "client reads too slowly")
+                        return
+                    match self._outgoing.popleft():
+                        case TimedBlock() as timed:
+                            await self._send_block(timed, stream, hello)
+                        case StreamFailed():
+                            await self._send_message(Error(code="internal_error", message="the stream failed"))
+                            await self._websocket.close(INTERNAL_ERROR, "internal_error")
+                            return
+                        case message:
+                            await self._send_message(message)
+        except WebSocketDisconnect:
+            return  # the reader sees it too, and ends the connection
+
+    async def _send_block(self, timed: TimedBlock, stream: Stream, hello: Hello) -> None:
+        block = timed.block
+        if self._time_s() > timed.deadline_s:
+            stream.blocks_late += 1
+            block = dataclasses.replace(block, is_late=True)
+        await self._websocket.send_bytes(block.serialize(hello.encoding))
+
+    async def _send_message(self, message: ServerMessage) -> None:
+        await self._websocket.send_text(message.serialize())
