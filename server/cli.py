@@ -1,0 +1,218 @@
+"""The `nafir` command: serve scenes, write impulse responses, render paths.
+
+Errors a person can act on end the process with one line and exit code 2, as wrong usage does.
+"""
+
+import io
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from server.errors import NafirError, RequestError
+
+if TYPE_CHECKING:
+    from server.field.field import AcousticField
+    from server.render import RenderedEmitter
+
+app = typer.Typer(
+    name="nafir",
+    help="Hear how a place sounds while you move through it.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Say what was done as JSON, for programs.")]
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        app()
+    except NafirError as exc:
+        Console(stderr=True, soft_wrap=True).print(f"[bold red]error:[/] {escape(str(exc))}", highlight=False)
+        sys.exit(2)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on; 0 picks one. [default: 8000]")] = None,
+    bundle: Annotated[list[Path] | None, typer.Option(help="Scene bundle to serve as well; repeatable.")] = None,
+    clip: Annotated[list[Path] | None, typer.Option(help="Audio file to offer as a clip; repeatable.")] = None,
+) -> None:
+    """Serve scenes over HTTP and WebSocket, and a page to walk through them.
+
+    Every setting can also come from the environment: NAFIR_HOST, NAFIR_PORT, NAFIR_BUNDLES, ...
+    """
+    import uvicorn
+    from pydantic import ValidationError
+
+    from server.app import create_app
+    from server.catalogue import load_fields
+    from server.settings import Settings
+
+    given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip}
+    try:
+        settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        raise NafirError(f"setting {'.'.join(str(part) for part in first['loc'])}: {first['msg']}") from exc
+    fields = load_fields(settings.bundles)
+    if not fields:
+        raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
+    if settings.port:
+        Console().print(
+            f"[bold]Nafir[/] serves {', '.join(fields)} at [link]http://{settings.host}:{settings.port}[/]",
+            highlight=False,
+        )
+    uvicorn.run(
+        create_app(settings, fields=fields),
+        host=settings.host,
+        port=settings.port,
+        loop="auto",  # uvloop wherever it exists
+        ws="websockets-sansio",
+        ws_max_size=settings.max_frame_bytes,
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=5,
+    )
+
+
+@app.command()
+def ir(
+    scene: Scene,
+    listener: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
+    emitter: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .wav, .npy or .json.")],
+    yaw_deg: Annotated[
+        float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
+    ] = 0.0,
+    as_json: AsJson = False,
+) -> None:
+    """Write the binaural impulse response between two places."""
+    from server.field.field import AcousticField
+    from server.impulse_response import ImpulseResponse, IrQuery, parse_format, parse_position
+    from server.scene.bundle import Bundle, find_bundle
+
+    name = parse_format(output.suffix.removeprefix("."))
+    if not math.isfinite(yaw_deg):
+        raise RequestError("malformed_pose", "yaw-deg is not finite", field="yaw_deg")
+    query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
+    field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    started_s = time.perf_counter()
+    response = ImpulseResponse.compute(field, query)
+    duration_ms = (time.perf_counter() - started_s) * 1000
+    _write(output, response.encode(name))
+    _report(
+        as_json,
+        f"{output}: {response.samples.shape[1] / response.sample_rate:.2f} s at {response.sample_rate} Hz, "
+        f"computed in {duration_ms:.1f} ms",
+        {
+            "output": str(output),
+            "scene": response.scene,
+            "level": response.level,
+            "sample_rate": response.sample_rate,
+            "samples": response.samples.shape[1],
+            "duration_ms": round(duration_ms, 3),
+        },
+    )
+
+
+@app.command()
+def render(
+    scene: Scene,
+    emitter: Annotated[
+        list[str], typer.Option(help="Clip name or audio file, and where it plays; repeatable.", metavar="CLIP@X,Y,Z")
+    ],
+    path: Annotated[Path, typer.Option(help="CSV: sample or time_s, x, y, z, and qx, qy, qz, qw or yaw_deg.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32, stereo.")],
+    block_size: Annotated[int, typer.Option(help="Poses take effect at multiples of it, samples.", min=16)] = 256,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
+    duration_s: Annotated[
+        float | None, typer.Option(help="Length to render; by default until all has rung out.", min=0.0)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Render to a file what a listener hears who walks along a path."""
+    import scipy.io.wavfile
+
+    from server.field.field import AcousticField
+    from server.render import read_path
+    from server.render import render as render_path
+    from server.scene.bundle import Bundle, find_bundle
+
+    if output.suffix != ".wav":
+        raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
+    field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    emitters = [_read_emitter(text, field, loop=loop) for text in emitter]
+    points = read_path(path, field.sample_rate)
+    for number, point in enumerate(points, start=1):
+        field.bundle.require_inside(point.pose.position, f"path point {number}")
+    length = None if duration_s is None else round(duration_s * field.sample_rate)
+    started_s = time.perf_counter()
+    with Progress(transient=True, disable=as_json, console=Console(stderr=True)) as progress:
+        task = progress.add_task("rendering", total=1.0)
+        samples = render_path(
+            field,
+            emitters,
+            points,
+            block_size=block_size,
+            length=length,
+            progress=lambda done: progress.update(task, completed=done),
+        )
+    elapsed_s = time.perf_counter() - started_s
+    rendered_s = samples.shape[1] / field.sample_rate
+    content = io.BytesIO()
+    scipy.io.wavfile.write(content, field.sample_rate, samples.T)
+    _write(output, content.getvalue())
+    _report(
+        as_json,
+        f"{output}: {rendered_s:.2f} s at {field.sample_rate} Hz, rendered in {elapsed_s:.2f} s",
+        {
+            "output": str(output),
+            "scene": field.bundle.id,
+            "sample_rate": field.sample_rate,
+            "samples": samples.shape[1],
+            "rendered_s": rendered_s,
+            "elapsed_s": round(elapsed_s, 3),
+        },
+    )
+
+
+def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "RenderedEmitter":
+    """`CLIP@x,y,z`, where CLIP names a bundled clip, or else an audio file."""
+    from server.clips import ClipLibrary, decode
+    from server.impulse_response import parse_position
+    from server.render import RenderedEmitter
+
+    clip, at, place = text.rpartition("@")
+    if not at:
+        raise RequestError("malformed_pose", f"emitter: {text!r} is not CLIP@x,y,z", field="emitter")
+    position = parse_position(place, "emitter")
+    field.bundle.require_inside(position, "emitter")
+    clips = ClipLibrary(field.sample_rate)
+    samples = clips.load(clip) if clip in clips.names else decode(Path(clip), field.sample_rate)
+    return RenderedEmitter(samples, position, loop=loop)
+
+
+def _write(output: Path, content: bytes) -> None:
+    try:
+        output.write_bytes(content)
+    except OSError as exc:
+        raise NafirError(f"{output}: {exc.strerror}") from exc
+
+
+def _report(as_json: bool, sentence: str, document: dict[str, object]) -> None:
+    if as_json:
+        typer.echo(json.dumps(document))
+    else:
+        Console(soft_wrap=True).print(escape(sentence), highlight=False)

@@ -1,0 +1,110 @@
+"""Single impulse responses (IRs): one way to compute and write them, for the command line and for HTTP alike.
+
+Metres; angles in degrees, since these are human edges. Samples are (channel, sample) float32, channel 0 the left ear.
+"""
+
+import hashlib
+import io
+import json
+import math
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+import scipy.io.wavfile
+
+from server.acoustics.geometry import Vector3
+from server.errors import RequestError
+from server.field.field import AcousticField
+
+IrFormat = Literal["wav", "npy", "json"]
+IR_FORMATS: tuple[IrFormat, ...] = get_args(IrFormat)
+MEDIA_TYPES: dict[IrFormat, str] = {"wav": "audio/wav", "npy": "application/octet-stream", "json": "application/json"}
+
+
+def parse_position(text: str, field: str) -> Vector3:
+    """Three finite numbers between commas, metres. Raises RequestError malformed_pose naming `field`."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError as exc:
+        raise RequestError("malformed_pose", f"{field}: {text!r} is not three numbers x,y,z", field=field) from exc
+    if not all(math.isfinite(coordinate) for coordinate in (x, y, z)):
+        raise RequestError("malformed_pose", f"{field}: {text!r} is not finite", field=field)
+    return (x, y, z)
+
+
+def parse_format(name: str) -> IrFormat:
+    """Raises RequestError unknown_format."""
+    for known in IR_FORMATS:
+        if name == known:
+            return known
+    raise RequestError("unknown_format", f"{name!r} is none of {', '.join(IR_FORMATS)}", field="format")
+
+
+@dataclass(frozen=True)
+class IrQuery:
+    """Which IR; `yaw_deg` is the head's, counter-clockwise, 0 looks along +x."""
+
+    listener: Vector3
+    emitter: Vector3
+    yaw_deg: float = 0.0
+
+    def require_inside(self, field: AcousticField) -> None:
+        """Raises RequestError position_out_of_bounds."""
+        field.bundle.require_inside(self.listener, "listener")
+        field.bundle.require_inside(self.emitter, "emitter")
+
+    def etag(self, field: AcousticField, name: str) -> str:
+        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and the decoding code."""
+        return entity_tag(field, "impulse-response", asdict(self), name)
+
+
+def entity_tag(field: AcousticField, kind: str, parameters: dict[str, object], name: str) -> str:
+    """Tag of whatever is computed from a field's bundle, its level and `parameters`, written in format `name`."""
+    canonical = json.dumps(
+        [version("nafir"), field.bundle.digest, field.level.name, kind, parameters, name], sort_keys=True
+    )
+    return f'"{hashlib.sha256(canonical.encode()).hexdigest()[:32]}"'
+
+
+@dataclass(frozen=True)
+class ImpulseResponse:
+    """A computed IR: `samples` (2, n) at `sample_rate`, sample 0 the moment of emission."""
+
+    scene: str
+    level: str
+    query: IrQuery
+    sample_rate: int
+    samples: npt.NDArray[np.float32]
+
+    @classmethod
+    def compute(cls, field: AcousticField, query: IrQuery) -> "ImpulseResponse":
+        """Milliseconds of work: keep it off the event loop. Raises RequestError position_out_of_bounds."""
+        query.require_inside(field)
+        samples = field.impulse_responses([query.listener], [query.emitter], [math.radians(query.yaw_deg)])[0]
+        return cls(field.bundle.id, field.level.name, query, field.sample_rate, samples)
+
+    def encode(self, name: IrFormat) -> bytes:
+        """The same samples in any format, and the same bytes for the same IR."""
+        buffer = io.BytesIO()
+        match name:
+            case "wav":
+                # SciPy's writer: libsndfile stamps the time of day into float WAV files (PEAK chunk).
+                scipy.io.wavfile.write(buffer, self.sample_rate, self.samples.T)
+            case "npy":
+                np.save(buffer, self.samples, allow_pickle=False)
+            case "json":
+                buffer.write(json.dumps(self._document()).encode())
+        return buffer.getvalue()
+
+    def _document(self) -> dict[str, object]:
+        return {
+            "scene": self.scene,
+            "level": self.level,
+            **asdict(self.query),
+            "sample_rate": self.sample_rate,
+            "channels": ["left", "right"],
+            "samples": self.samples.tolist(),
+        }

@@ -1,0 +1,58 @@
+"""Errors of the HTTP interface: problem documents (RFC 9457) with the `code` and `field` of the WebSocket's errors."""
+
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from server.errors import RequestError
+
+_POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "height_m"})
+_CODES = {404: "not_found", 405: "method_not_allowed"}
+
+
+def problem(status: int, code: str, detail: str, field: str | None = None) -> JSONResponse:
+    """`code` is for programs and does not change; `detail` is for people; `field` is the parameter at fault."""
+    return JSONResponse(
+        {
+            "type": "about:blank",
+            "title": HTTPStatus(status).phrase,
+            "status": status,
+            "detail": detail,
+            "code": code,
+            "field": field,
+        },
+        status_code=status,
+        media_type="application/problem+json",
+    )
+
+
+def install_problems(app: FastAPI) -> None:
+    """Answer every error with a problem document."""
+
+    async def refused(_: Request, exc: Exception) -> JSONResponse:
+        assert isinstance(exc, RequestError)
+        return problem(exc.status, exc.code, str(exc), exc.field)
+
+    async def invalid(_: Request, exc: Exception) -> JSONResponse:
+        assert isinstance(exc, RequestValidationError)
+        first = exc.errors()[0]
+        field = str(first["loc"][-1])
+        code = "malformed_pose" if field in _POSE_PARAMETERS else "malformed_request"
+        return problem(422, code, f"{field}: {first['msg']}", field)
+
+    async def http(_: Request, exc: Exception) -> JSONResponse:
+        assert isinstance(exc, HTTPException)
+        response = problem(exc.status_code, _CODES.get(exc.status_code, "http_error"), str(exc.detail))
+        response.headers.update(exc.headers or {})
+        return response
+
+    async def crashed(_: Request, __: Exception) -> JSONResponse:
+        return problem(500, "internal_error", "the server failed to answer; its log says why")
+
+    app.add_exception_handler(RequestError, refused)
+    app.add_exception_handler(RequestValidationError, invalid)
+    app.add_exception_handler(HTTPException, http)
+    app.add_exception_handler(Exception, crashed)

@@ -1,0 +1,152 @@
+"""HTTP and WebSocket endpoints: they parse, hand over, and answer. Angles in degrees, positions in metres."""
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Query, Request, Response, WebSocket
+from pydantic import FiniteFloat
+
+from server.catalogue import describe_scene, playable_clips
+from server.errors import RequestError
+from server.field.field import AcousticField
+from server.impulse_response import (
+    MEDIA_TYPES,
+    ImpulseResponse,
+    IrQuery,
+    entity_tag,
+    parse_format,
+    parse_position,
+)
+from server.streaming import Connection, StreamHost
+
+CACHE_CONTROL = "public, max-age=3600"
+"""Entity tags outlive it: after an hour an unchanged answer costs a 304."""
+
+api = APIRouter(prefix="/v1")
+health = APIRouter()
+
+PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"])]
+
+
+@health.get("/livez")
+async def livez() -> dict[str, str]:
+    """The process answers."""
+    return {"status": "live"}
+
+
+@health.get("/readyz")
+async def readyz(request: Request) -> dict[str, str]:
+    """Streams may be opened: everything is loaded and warmed up."""
+    if not _host(request).is_ready:
+        raise RequestError("not_ready", "the server is still warming up", status=503)
+    return {"status": "ready"}
+
+
+@api.get("/scenes")
+async def scenes(request: Request) -> dict[str, Any]:
+    return {"scenes": [describe_scene(field).model_dump() for field in _host(request).fields.values()]}
+
+
+@api.get("/scenes/{scene}")
+async def one_scene(request: Request, scene: str) -> dict[str, Any]:
+    return describe_scene(_field(request, scene)).model_dump()
+
+
+@api.get("/scenes/{scene}/impulse-response", response_class=Response)
+async def impulse_response(
+    request: Request,
+    scene: str,
+    listener: PositionText,
+    emitter: PositionText,
+    yaw_deg: Annotated[FiniteFloat, Query(description="of the head, counter-clockwise, 0 looks along +x")] = 0.0,
+    format: Annotated[str, Query(description="wav, npy or json")] = "wav",  # noqa: A002  the parameter's name
+) -> Response:
+    """The impulse response between two places, as `nafir ir` writes it."""
+    field = _field(request, scene)
+    name = parse_format(format)
+    query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
+    query.require_inside(field)
+    return await _cached(
+        request,
+        query.etag(field, name),
+        MEDIA_TYPES[name],
+        lambda: ImpulseResponse.compute(field, query).encode(name),
+    )
+
+
+@api.get("/scenes/{scene}/loudness", response_class=Response)
+async def loudness(
+    request: Request,
+    scene: str,
+    emitter: PositionText,
+    height_m: Annotated[FiniteFloat, Query(description="of the listener's ears")] = 1.5,
+    spacing_m: Annotated[FiniteFloat, Query(ge=0.1, le=2, description="between map points")] = 0.25,
+    format: Annotated[str, Query(description="png or json")] = "png",  # noqa: A002  the parameter's name
+) -> Response:
+    """How loud an emitter is at every place of the scene."""
+    field = _field(request, scene)
+    if format not in {"png", "json"}:
+        raise RequestError("unknown_format", f"{format!r} is none of png, json", field="format")
+    position = parse_position(emitter, "emitter")
+    field.bundle.require_inside(position, "emitter")
+    bounds = field.bundle.manifest.bounds
+    if not bounds.minimum[2] <= height_m <= bounds.maximum[2]:
+        raise RequestError("position_out_of_bounds", f"height_m {height_m:g} is outside the scene", field="height_m")
+
+    def draw() -> bytes:
+        from server.field.loudness import loudness_map
+
+        levels = loudness_map(field, position, height_m, spacing_m)
+        return levels.to_png() if format == "png" else levels.to_json().encode()
+
+    parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
+    media_type = "image/png" if format == "png" else "application/json"
+    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw)
+
+
+@api.get("/clips")
+async def clips(request: Request) -> dict[str, Any]:
+    """Recordings an emitter can play."""
+    host = _host(request)
+    named = {}
+    for library in set(host.clips.values()):
+        for clip in await anyio.to_thread.run_sync(playable_clips, library):
+            named[clip.name] = clip
+    return {"clips": [named[name] for name in sorted(named)]}
+
+
+@api.websocket("/stream")
+async def stream(websocket: WebSocket) -> None:
+    await Connection(websocket, _host(websocket)).run()
+
+
+def _host(connection: Request | WebSocket) -> StreamHost:
+    host = connection.state.host
+    assert isinstance(host, StreamHost)
+    return host
+
+
+def _field(request: Request, scene: str) -> AcousticField:
+    try:
+        return _host(request).fields[scene]
+    except KeyError:
+        raise RequestError("unknown_scene", f"there is no scene {scene!r}", field="scene", status=404) from None
+
+
+async def _cached(request: Request, etag: str, media_type: str, compute: Callable[[], bytes]) -> Response:
+    """Answer 304 where the client has it already, and else compute in a worker thread."""
+    headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
+    if _has_tag(request.headers.get("if-none-match", ""), etag):
+        return Response(status_code=304, headers=headers)
+    host = _host(request)
+    if host.http_limiter.statistics().tasks_waiting >= host.settings.max_waiting_requests:
+        raise RequestError("server_busy", "too many requests wait for a worker", status=503)
+    body = await anyio.to_thread.run_sync(compute, limiter=host.http_limiter)
+    return Response(body, media_type=media_type, headers=headers)
+
+
+def _has_tag(if_none_match: str, etag: str) -> bool:
+    """Weak comparison, as RFC 9110 asks of If-None-Match."""
+    tags = {tag.strip().removeprefix("W/") for tag in if_none_match.split(",")}
+    return etag in tags or "*" in tags

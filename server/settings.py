@@ -1,0 +1,43 @@
+"""What an operator can set: by argument, or by an environment variable that begins with NAFIR_."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+
+def _split_paths(value: Any) -> Any:
+    return tuple(part for part in value.split(os.pathsep) if part) if isinstance(value, str) else value
+
+
+Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_split_paths)]
+"""In the environment, separated as in PATH."""
+
+
+class Settings(BaseSettings):
+    """Built once, at the edge, and handed down."""
+
+    model_config = SettingsConfigDict(env_prefix="NAFIR_", frozen=True)
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    bundles: Paths = ()
+    """Scene bundles to serve beside those that come with the package."""
+    clips: Paths = ()
+    """Audio files to offer as clips, named by their stem, beside those that come with the package."""
+
+    ir_workers: Annotated[int, Field(ge=1)] = max(1, (os.cpu_count() or 1) - 1)
+    """Threads that compute impulse responses. One core is left to the audio thread."""
+    max_streams: Annotated[int, Field(ge=1)] = 64
+    max_emitters: Annotated[int, Field(ge=1, le=64)] = 16
+    """Of one stream."""
+    window_blocks: Annotated[int, Field(ge=1)] = 32
+    """Blocks that may be unacknowledged, beyond those a client asks to have in hand."""
+    max_message_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
+    """A longer WebSocket message is refused; one longer than `max_frame_bytes` closes the connection."""
+    max_frame_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
+    hello_timeout_s: Annotated[float, Field(gt=0)] = 10.0
+    max_waiting_requests: Annotated[int, Field(ge=1)] = 32
+    """HTTP requests that may wait for a worker; one more is answered 503."""
