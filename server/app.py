@@ -43,7 +43,7 @@ def create_app(settings: Settings, *, fields: Mapping[str, AcousticField] | None
                 clips=open_clips(loaded, settings.clips),
                 audio=audio,
                 settings=settings,
-                http_limiter=anyio.CapacityLimiter(settings.ir_workers),
+                http_limiter=anyio.CapacityLimiter(settings.ir_workers + 1),  # a map must not hold up an IR
             )
             audio.start()
             warming = asyncio.create_task(_become_ready(host))

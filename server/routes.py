@@ -1,5 +1,6 @@
 """HTTP and WebSocket endpoints: they parse, hand over, and answer. Angles in degrees, positions in metres."""
 
+import json
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ from pydantic import FiniteFloat
 from server.catalogue import describe_scene, playable_clips
 from server.errors import RequestError
 from server.field.field import AcousticField
+from server.field.loudness import loudness_map
 from server.impulse_response import (
     MEDIA_TYPES,
     ImpulseResponse,
@@ -20,6 +22,8 @@ from server.impulse_response import (
 )
 from server.streaming import Connection, StreamHost
 
+MAX_MAP_POINTS = 2_000
+"""A point costs milliseconds."""
 CACHE_CONTROL = "public, max-age=3600"
 """Entity tags outlive it: after an hour an unchanged answer costs a 304."""
 
@@ -94,11 +98,12 @@ async def loudness(
     if not bounds.minimum[2] <= height_m <= bounds.maximum[2]:
         raise RequestError("position_out_of_bounds", f"height_m {height_m:g} is outside the scene", field="height_m")
 
-    def draw() -> bytes:
-        from server.field.loudness import loudness_map
+    if field.bundle.floor_plan.area_m2 > MAX_MAP_POINTS * spacing_m**2:
+        raise RequestError("map_too_fine", f"more than {MAX_MAP_POINTS} points: widen spacing_m", field="spacing_m")
 
-        levels = loudness_map(field, position, height_m, spacing_m)
-        return levels.to_png() if format == "png" else levels.to_json().encode()
+    def draw() -> bytes:
+        levels = loudness_map(field, position, listener_height_m=height_m, spacing_m=spacing_m)
+        return levels.to_png() if format == "png" else json.dumps(levels.to_json()).encode()
 
     parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
     media_type = "image/png" if format == "png" else "application/json"
@@ -140,9 +145,11 @@ async def _cached(request: Request, etag: str, media_type: str, compute: Callabl
     if _has_tag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
     host = _host(request)
-    if host.http_limiter.statistics().tasks_waiting >= host.settings.max_waiting_requests:
-        raise RequestError("server_busy", "too many requests wait for a worker", status=503)
-    body = await anyio.to_thread.run_sync(compute, limiter=host.http_limiter)
+    if (body := host.answers.get(etag)) is None:
+        if host.http_limiter.statistics().tasks_waiting >= host.settings.max_waiting_requests:
+            raise RequestError("server_busy", "too many requests wait for a worker", status=503)
+        body = await anyio.to_thread.run_sync(compute, limiter=host.http_limiter)
+        host.answers.put(etag, body)
     return Response(body, media_type=media_type, headers=headers)
 
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from anyio import CapacityLimiter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from server.answers import AnswerCache
 from server.audio_thread import AudioThread, Outgoing, Stream, StreamFailed, TimedBlock
 from server.catalogue import describe_scene
 from server.clips import ClipLibrary, DecodeError
@@ -72,6 +73,7 @@ class StreamHost:
     settings: Settings
     http_limiter: CapacityLimiter
     """How many HTTP requests compute at once."""
+    answers: AnswerCache = dataclasses.field(default_factory=AnswerCache)
     is_ready: bool = False
     streams: int = 0
 

@@ -1,4 +1,4 @@
-"""A small scene whose field is arithmetic, not a network: exact, instant, and with the properties the server relies on."""
+"""A small scene whose field is arithmetic, not a network: exact and instant."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ PLAIN = Material(absorption=(0.2,) * 7, scattering=(0.1,) * 7)
 
 
 class ArithmeticField:
-    """IRs that depend on every coordinate: exponentially decaying noise, louder nearby, and louder in the ear it is beside."""
+    """IRs that depend on every coordinate: decaying noise, louder nearby, and louder in the ear on that side."""
 
     channels = 2
 

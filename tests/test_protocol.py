@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from server.acoustics.geometry import Pose
+from server.catalogue import describe_scene
 from server.errors import RequestError
 from server.protocol import (
     Acknowledge,
@@ -52,18 +53,6 @@ CLIENT_MESSAGES = [
 ]
 
 SERVER_MESSAGES = [
-    Welcome(
-        session="5e",
-        scene={"id": "flat"},
-        sample_rate=24_000,
-        block_size=256,
-        channels=2,
-        encoding="f32",
-        buffer_blocks=8,
-        window=40,
-        ir_samples=16_800,
-        level="standard",
-    ),
     EmitterAdded(id="talker", sample_clock=512),
     EmitterRemoved(id="talker"),
     Status(
@@ -90,6 +79,22 @@ def test_client_messages_survive_the_wire(message):
 @pytest.mark.parametrize("message", SERVER_MESSAGES, ids=lambda m: m.type)
 def test_server_messages_survive_the_wire(message):
     assert parse_server_message(message.serialize()) == message
+
+
+def test_a_welcome_with_its_scene_survives_the_wire(field):
+    welcome = Welcome(
+        session="5e",
+        scene=describe_scene(field),
+        sample_rate=24_000,
+        block_size=256,
+        channels=2,
+        encoding="f32",
+        buffer_blocks=8,
+        window=40,
+        ir_samples=4_000,
+        level="standard",
+    )
+    assert parse_server_message(welcome.serialize()) == welcome
 
 
 def test_hello_as_a_person_would_type_it():

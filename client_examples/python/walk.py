@@ -1,0 +1,209 @@
+"""Walk through a scene and keep what was heard.
+
+    pip install numpy soundfile websockets
+    python walk.py --url ws://127.0.0.1:8000/v1/stream -o heard.wav
+
+Connects to a Nafir server, puts a clip where the scene suggests, walks from the scene's starting place through its
+openings towards the clip while looking around, and writes two files: the sound as it arrived, and the path as it was
+heard: every pose with the sample from which on it was audible. Given to `nafir render`, that path makes the same sound
+again.
+"""
+
+import argparse
+import asyncio
+import csv
+import json
+import math
+import statistics
+import struct
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import soundfile
+from websockets.asyncio.client import ClientConnection, connect
+
+POSE = struct.Struct("<BBHI7f")  # kind 2, two paddings, pose id, position, orientation
+BLOCK = struct.Struct("<BBHIQII")  # kind 1, flags, channels, sequence, sample clock, pose id, frames
+POSES_PER_SECOND = 30
+BLOCK_SIZE = 256
+
+
+def as_float32(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    """What the wire carries, so that the path file says exactly what the server was told."""
+    return tuple(float(np.float32(number)) for number in numbers)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Metres, and a unit quaternion (x, y, z, w); the identity looks along +x."""
+
+    position: tuple[float, ...]
+    orientation: tuple[float, ...]
+
+    @classmethod
+    def looking(cls, position: tuple[float, float, float], yaw: float) -> "Pose":
+        return cls(as_float32(position), as_float32((0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))))
+
+    def to_bytes(self, pose_id: int) -> bytes:
+        return POSE.pack(2, 0, 0, pose_id, *self.position, *self.orientation)
+
+
+class Walk:
+    """A walk along straight lines between waypoints at constant speed, over in `duration_s`."""
+
+    def __init__(self, waypoints: list[tuple[float, float, float]], duration_s: float) -> None:
+        self.duration_s = duration_s
+        self._points = np.array(waypoints)
+        self._steps = np.linalg.norm(np.diff(self._points, axis=0), axis=1)
+
+    @classmethod
+    def through(cls, scene: dict, duration_s: float) -> "Walk":
+        """From the scene's starting place by every opening to a metre before its emitter."""
+        start, goal = scene["listener"]["position"], np.array(scene["emitter"]["position"])
+        doors = [
+            [(opening["start"][axis] + opening["end"][axis]) / 2 for axis in (0, 1)] + [start[2]]
+            for opening in scene["openings"]
+        ]
+        last = np.array(doors[-1] if doors else start)
+        stop = goal + (last - goal) / max(1.0, float(np.linalg.norm(last - goal)))
+        return cls([tuple(point) for point in (start, *doors, stop.tolist())], duration_s)
+
+    def pose_at(self, time_s: float) -> Pose:
+        """Looks where it goes, and 40 degrees to either side of it, once every four seconds."""
+        walked = np.clip(time_s / self.duration_s, 0, 1) * self._steps.sum()
+        ends = np.cumsum(self._steps)
+        leg = min(int(np.searchsorted(ends, walked)), len(ends) - 1)
+        here, there = self._points[leg], self._points[leg + 1]
+        share = 1 - (ends[leg] - walked) / max(self._steps[leg], 1e-9)
+        heading = math.atan2(there[1] - here[1], there[0] - here[0])
+        glance = math.radians(40) * math.sin(2 * math.pi * time_s / 4)
+        return Pose.looking(tuple(here + share * (there - here)), heading + glance)
+
+
+@dataclass
+class Recording:
+    """Blocks by sample clock, from the moment the clip began."""
+
+    sample_rate: int
+    start: int | None = None
+    blocks: list[tuple[int, np.ndarray]] = field(default_factory=list)
+    heard: list[tuple[int, int]] = field(default_factory=list)
+    """Sample and pose id, one for each change."""
+    late: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        return (self.blocks[-1][0] + BLOCK_SIZE) / self.sample_rate if self.blocks else 0.0
+
+    def add(self, data: bytes) -> tuple[int, int]:
+        """Keep a block; its sequence number and pose id."""
+        _, flags, channels, sequence, clock, pose_id, frames = BLOCK.unpack_from(data)
+        if self.start is not None:
+            sample = clock - self.start
+            if not self.heard or self.heard[-1][1] != pose_id:
+                self.heard.append((sample, pose_id))
+            self.blocks.append((sample, np.frombuffer(data, "<f4", offset=BLOCK.size).reshape(frames, channels)))
+            self.late += bool(flags & 2)
+        return sequence, pose_id
+
+    def samples(self) -> np.ndarray:
+        """(frame, channel), with silence where the server skipped."""
+        last, block = self.blocks[-1]
+        samples = np.zeros((last + len(block), block.shape[1]), np.float32)
+        for sample, block in self.blocks:
+            samples[sample : sample + len(block)] = block
+        return samples
+
+
+async def send_poses(socket: ClientConnection, walk: Walk, poses: dict[int, Pose], sent_s: dict[int, float]) -> None:
+    started_s = time.monotonic()
+    for step in range(1, round(walk.duration_s * POSES_PER_SECOND) + 1):
+        time_s, pose_id = step / POSES_PER_SECOND, step + 1
+        await asyncio.sleep(started_s + time_s - time.monotonic())
+        poses[pose_id] = walk.pose_at(time_s)
+        sent_s[pose_id] = time.monotonic()
+        await socket.send(poses[pose_id].to_bytes(pose_id))
+
+
+async def listen(arguments: argparse.Namespace) -> None:
+    # Compression off: audio does not shrink, and trying takes time.
+    async with connect(arguments.url, compression=None, max_size=None) as socket:
+        hello = {"type": "hello", "protocol": 1, "scene": arguments.scene, "block_size": BLOCK_SIZE, "encoding": "f32"}
+        await socket.send(json.dumps(hello))
+        welcome = json.loads(await socket.recv())
+        if welcome["type"] == "error":
+            raise SystemExit(f"{welcome['code']}: {welcome['message']}")
+        scene = welcome["scene"]
+        walk = Walk.through(scene, arguments.seconds)
+        recording = Recording(welcome["sample_rate"])
+        # Before the clip, so that it begins with this pose and not with the scene's own.
+        poses = {1: walk.pose_at(0)}
+        await socket.send(poses[1].to_bytes(1))
+        emitter = {"id": "clip", "clip": arguments.clip, "position": scene["emitter"]["position"]}
+        await socket.send(json.dumps({"type": "add_emitter", **emitter}))
+
+        sent_s: dict[int, float] = {}
+        arrived_s: dict[int, float] = {}
+        walking = None
+        while recording.duration_s < arguments.seconds:
+            message = await socket.recv()
+            if isinstance(message, bytes):
+                sequence, pose_id = recording.add(message)
+                arrived_s.setdefault(pose_id, time.monotonic())
+                if sequence % 4 == 3:
+                    await socket.send(json.dumps({"type": "acknowledge", "sequence": sequence}))
+                continue
+            event = json.loads(message)
+            if event["type"] == "emitter_added":
+                recording.start = event["sample_clock"]
+                walking = asyncio.create_task(send_poses(socket, walk, poses, sent_s))
+            elif event["type"] == "error":
+                raise SystemExit(f"{event['code']}: {event['message']}")
+        if walking is not None:
+            walking.cancel()
+
+    write(arguments, recording, poses)
+    x, y, z = scene["emitter"]["position"]
+    delays_ms = [1000 * (arrived_s[pose] - sent_s[pose]) for pose in arrived_s.keys() & sent_s.keys()]
+    if delays_ms:
+        print(
+            f"{len(recording.heard)} poses heard, each received {statistics.median(delays_ms):.0f} ms after it was sent"
+        )
+    print(f"{recording.late} blocks late")
+    print(
+        f"Render it again:\n  nafir render {arguments.scene} --emitter {arguments.clip}@{x:g},{y:g},{z:g} --loop "
+        f"--path {arguments.path} --duration-s {recording.duration_s:.6f} -o again.wav"
+    )
+
+
+def write(arguments: argparse.Namespace, recording: Recording, poses: dict[int, Pose]) -> None:
+    soundfile.write(arguments.output, recording.samples(), recording.sample_rate, subtype="FLOAT")
+    with arguments.path.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["sample", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        for sample, pose_id in recording.heard:
+            pose = poses[pose_id]
+            writer.writerow([sample, *pose.position, *pose.orientation])
+    print(f"{arguments.output}: {recording.duration_s:.2f} s; {arguments.path}: {len(recording.heard)} poses")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Walk through a scene and keep what was heard.")
+    parser.add_argument("--url", default="ws://127.0.0.1:8000/v1/stream")
+    parser.add_argument("--scene", default="apartment")
+    parser.add_argument("--clip", default="woman-reading", help="one of GET /v1/clips")
+    parser.add_argument("--seconds", type=float, default=12.0, help="how long the walk takes")
+    parser.add_argument("-o", "--output", type=Path, default=Path("heard.wav"))
+    parser.add_argument("--path", type=Path, help="CSV of the path as heard (default: path.csv beside the output)")
+    arguments = parser.parse_args()
+    arguments.path = arguments.path or arguments.output.with_name("path.csv")
+    try:
+        asyncio.run(listen(arguments))
+    except OSError as exc:
+        raise SystemExit(f"{arguments.url}: {exc}") from exc
+
+
+if __name__ == "__main__":
+    main()

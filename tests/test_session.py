@@ -1,0 +1,295 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from numpy.testing import assert_allclose
+
+from server.acoustics.geometry import Pose
+from server.errors import RequestError
+from server.protocol import (
+    Acknowledge,
+    AddEmitter,
+    EmitterAdded,
+    EmitterRemoved,
+    Error,
+    Hello,
+    ListenerPose,
+    ListenerStart,
+    MoveEmitter,
+    Ping,
+    RemoveEmitter,
+)
+from server.session import Session, compute_irs
+
+CLIP = np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
+HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
+
+
+def load_clip(name):
+    if name != "noise":
+        raise RequestError("unknown_clip", "no such clip", field="clip", status=404)
+    return CLIP
+
+
+@pytest.fixture
+def session(field):
+    return Session(Hello(protocol=1, scene="flat"), field, load_clip, window=1_000)
+
+
+def add(session, identifier="talker", **changes):
+    return session.receive(AddEmitter(**{"id": identifier, "clip": "noise", "position": THERE, **changes}))
+
+
+def answer(session, field):
+    """Compute what the session wants, at once, and hand it in."""
+    request = session.take_request()
+    return [] if request is None else session.accept(compute_irs(field, request, session.prepare))
+
+
+def codes(events):
+    return [event.code for event in events if isinstance(event, Error)]
+
+
+def test_sound_is_the_clip_convolved_with_the_fields_ir(session, field):
+    session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
+    add(session, loop=False, gain_db=-6.0)
+    assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
+    heard = np.concatenate([session.render_block().samples for _ in range(40)], axis=1)
+    ir = field.impulse_responses([HERE], [THERE], [0.5])[0]
+    expected = [np.convolve(CLIP * 10 ** (-6 / 20), ear)[: heard.shape[1]] for ear in ir.astype(float)]
+    padded = [np.pad(ear, (0, heard.shape[1] - len(ear))) for ear in expected]
+    assert_allclose(heard, padded, atol=1e-5)
+
+
+def test_sound_never_waits_for_the_field(session):
+    add(session)
+    assert session.take_request() is not None
+    blocks = [session.render_block() for _ in range(20)]
+    assert [block.sample_clock for block in blocks] == [256 * k for k in range(20)]
+    assert not np.any([block.samples for block in blocks])
+
+
+def test_poses_that_arrive_during_a_computation_become_one_request(session, field):
+    add(session)
+    first = session.take_request()
+    for pose_id in range(1, 100):
+        session.receive(ListenerPose(pose_id=pose_id, position=(2.0 + pose_id / 100, 2.0, 1.5)))
+    assert session.take_request() is None
+    session.accept(compute_irs(field, first, session.prepare))
+    second = session.take_request()
+    assert (second.pose_id, second.listener.position) == (99, (2.99, 2.0, 1.5))
+
+
+def test_a_block_carries_the_pose_whose_irs_it_fades_to(session, field):
+    add(session)
+    answer(session, field)
+    assert session.render_block().pose_id == 0
+    session.receive(ListenerPose(pose_id=7, position=HERE))
+    request = session.take_request()
+    assert session.render_block().pose_id == 0
+    session.accept(compute_irs(field, request, session.prepare))
+    exchange, after = session.render_block(), session.render_block()
+    assert (exchange.pose_id, exchange.is_exchange) == (7, True)
+    assert (after.pose_id, after.is_exchange) == (7, False)
+    assert session.ir_exchanges == 1
+
+
+def test_only_what_moved_is_computed_again(session, field):
+    add(session, "a")
+    add(session, "b")
+    answer(session, field)
+    session.receive(MoveEmitter(id="b", position=HERE, pose_id=1))
+    assert [position for _, position in session.take_request().emitters] == [HERE]
+
+
+def test_a_pose_of_one_emitter_counts_for_the_whole(session, field):
+    add(session, "a")
+    add(session, "b")
+    answer(session, field)
+    session.render_block()
+    session.receive(MoveEmitter(id="b", position=HERE, pose_id=5))
+    answer(session, field)
+    assert session.render_block().pose_id == 5
+
+
+def test_without_emitters_every_pose_is_in_effect_at_once(session):
+    session.receive(ListenerPose(pose_id=3, position=HERE))
+    assert session.take_request() is None
+    assert session.render_block().pose_id == 3
+
+
+def test_an_answer_for_an_emitter_that_left_is_ignored_even_if_its_id_is_taken_again(session, field):
+    add(session)
+    request = session.take_request()
+    assert session.receive(RemoveEmitter(id="talker")) == [EmitterRemoved(id="talker")]
+    add(session, position=HERE)
+    assert session.accept(compute_irs(field, request, session.prepare)) == []
+    assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
+
+
+def test_after_a_failure_sound_goes_on_and_the_next_pose_asks_for_everything_outstanding(session, field):
+    add(session, "a")
+    add(session, "b")
+    answer(session, field)
+    session.render_block()
+    session.receive(ListenerPose(pose_id=1, position=HERE))
+    assert codes(session.give_up(session.take_request())) == ["field_failure"]
+    assert session.take_request() is None
+    block = session.render_block()
+    assert block.pose_id == 0
+    assert np.any(block.samples)
+    session.receive(MoveEmitter(id="a", position=HERE, pose_id=2))
+    assert len(session.take_request().emitters) == 2
+
+
+def test_a_full_window_drops_blocks_but_not_time(field):
+    def run(acknowledged):
+        session = Session(Hello(protocol=1, scene="flat"), field, load_clip, window=4)
+        add(session)
+        answer(session, field)
+        blocks = []
+        for _ in range(10):
+            block = session.render_block()
+            if block is not None:
+                blocks.append(block)
+                if acknowledged:
+                    session.receive(Acknowledge(sequence=block.sequence))
+        session.receive(Acknowledge(sequence=blocks[-1].sequence))
+        return session, session.render_block()
+
+    patient, expected = run(acknowledged=True)
+    silent, resumed = run(acknowledged=False)
+    assert (silent.blocks_dropped, patient.blocks_dropped) == (6, 0)
+    assert (resumed.sequence, resumed.sample_clock) == (4, 10 * 256)
+    np.testing.assert_array_equal(resumed.samples, expected.samples)
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        (ListenerPose(pose_id=9, position=(99.0, 2.0, 1.5)), "position_out_of_bounds"),
+        (ListenerPose(pose_id=0, position=HERE), "stale_pose"),
+        (MoveEmitter(id="talker", position=(2.0, 2.0, -1.0), pose_id=9), "position_out_of_bounds"),
+        (MoveEmitter(id="nobody", position=HERE, pose_id=9), "unknown_emitter"),
+        (RemoveEmitter(id="nobody"), "unknown_emitter"),
+        (AddEmitter(id="talker", clip="noise", position=HERE), "duplicate_emitter"),
+        (AddEmitter(id="new", clip="nothing", position=HERE), "unknown_clip"),
+        (AddEmitter(id="new", clip="noise", position=(0.0, 0.0, 9.0)), "position_out_of_bounds"),
+        (Acknowledge(sequence=4_000), "unknown_sequence"),
+        (Hello(protocol=1, scene="flat"), "unexpected_hello"),
+        (Ping(id=1), "unexpected_ping"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.type,
+)
+def test_a_bad_message_changes_nothing_and_the_stream_goes_on(session, field, message, code):
+    add(session)
+    answer(session, field)
+    session.render_block()
+    assert codes(session.receive(message)) == [code]
+    assert session.take_request() is None
+    block = session.render_block()
+    assert np.any(block.samples)
+    assert not block.is_exchange
+    # The pose id of a refused pose is not used up.
+    assert session.receive(ListenerPose(pose_id=9, position=HERE)) == []
+
+
+def test_emitters_are_limited(field):
+    session = Session(Hello(protocol=1, scene="flat"), field, load_clip, max_emitters=2)
+    assert codes(add(session, "a") + add(session, "b") + add(session, "c")) == ["too_many_emitters"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"protocol": 2}, "unsupported_protocol"),
+        ({"sample_rate": 44_100}, "unsupported_sample_rate"),
+        ({"listener": ListenerStart(position=(-5.0, 0.0, 0.0))}, "position_out_of_bounds"),
+    ],
+)
+def test_a_hello_that_cannot_be_served_is_refused(field, changes, code):
+    with pytest.raises(RequestError) as refusal:
+        Session(Hello(**{"protocol": 1, "scene": "flat", **changes}), field, load_clip)
+    assert refusal.value.code == code
+
+
+def test_a_listener_starts_where_the_scene_says_unless_hello_says_otherwise(field):
+    for hello, expected in [
+        (Hello(protocol=1, scene="flat"), Pose.from_yaw((2.0, 2.5, 1.5), math.pi / 2)),
+        (Hello(protocol=1, scene="flat", listener=ListenerStart(position=HERE, yaw=1.0)), Pose.from_yaw(HERE, 1.0)),
+    ]:
+        session = Session(hello, field, load_clip)
+        add(session)
+        assert session.take_request().listener == expected
+
+
+def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
+    field.impulse_responses = lambda listeners, *_: np.full((len(listeners), 2, field.ir_samples), np.nan, np.float32)
+    add(session)
+    with pytest.raises(ValueError):
+        compute_irs(field, session.take_request(), session.prepare)
+
+
+def test_laws_hold_whatever_a_client_says_in_whatever_order(field):
+    class AnyOrder(RuleBasedStateMachine):
+        @initialize()
+        def begin(self):
+            self.session = Session(Hello(protocol=1, scene="flat", block_size=128), field, load_clip, window=6)
+            self.pose_id = 0
+            self.request = None
+            self.blocks = []
+
+        @rule(identifier=st.sampled_from("abc"))
+        def add(self, identifier):
+            add(self.session, identifier)
+
+        @rule(identifier=st.sampled_from("abc"))
+        def remove(self, identifier):
+            self.session.receive(RemoveEmitter(id=identifier))
+
+        @rule(x=st.floats(0.0, 9.0), yaw=st.floats(-4, 4))
+        def turn(self, x, yaw):
+            if not self.session.receive(ListenerPose(pose_id=self.pose_id + 1, position=(x, 2.0, 1.5), yaw=yaw)):
+                self.pose_id += 1
+
+        @rule(identifier=st.sampled_from("abc"))
+        def move(self, identifier):
+            if not self.session.receive(MoveEmitter(id=identifier, position=HERE, pose_id=self.pose_id + 1)):
+                self.pose_id += 1
+
+        @rule()
+        def ask(self):
+            self.request = self.session.take_request() or self.request
+
+        @rule(succeeds=st.booleans())
+        def answer(self, succeeds):
+            if self.request is None:
+                return
+            request, self.request = self.request, None
+            if succeeds:
+                self.session.accept(compute_irs(field, request, self.session.prepare))
+            else:
+                self.session.give_up(request)
+
+        @rule(sequence=st.integers(0, 20))
+        def acknowledge(self, sequence):
+            self.session.receive(Acknowledge(sequence=sequence))
+
+        @rule()
+        def render(self):
+            block = self.session.render_block()
+            if block is not None:
+                self.blocks.append(block)
+
+        @invariant()
+        def blocks_are_finite_and_in_order(self):
+            assert all(np.isfinite(block.samples).all() for block in self.blocks[-1:])
+            assert [block.sequence for block in self.blocks] == list(range(len(self.blocks)))
+            assert all(a.sample_clock < b.sample_clock for a, b in zip(self.blocks, self.blocks[1:], strict=False))
+            assert all(a.pose_id <= b.pose_id for a, b in zip(self.blocks, self.blocks[1:], strict=False))
+            assert all(block.pose_id <= self.pose_id for block in self.blocks)
+
+    run_state_machine_as_test(AnyOrder, settings=settings(max_examples=60, stateful_step_count=40, deadline=None))
