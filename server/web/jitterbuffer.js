@@ -1,0 +1,204 @@
+// Adaptive playout buffer between a bursty network and the sound card. Plain arithmetic without I/O, so the worklet drives it
+// and tests can too. Positions count samples since the first one pushed; both ears share every index.
+//
+// Samples are played bit for bit. Clock drift and changing jitter are absorbed by splices: one quantum crossfades to the same
+// signal a few milliseconds later (to shorten the buffer) or earlier (to lengthen it), at the lag where the two match best.
+
+const QUANTUM = 128; // of the Web Audio API
+const RESERVE = 64; // kept back so that a buffer running dry ends in a fade and not in a click
+const WINDOW_S = 1; // over which the lowest fill is judged
+const AGAIN_S = 0.3; // after a splice that did not suffice
+const HEADROOM_S = 0.05; // lowest fill aimed for on a quiet network
+const RIPPLE_S = 0.015; // of the fill between the arrival of one block and the next
+const MAX_HEADROOM_S = 0.25;
+const SLACK_S = 0.012; // above the headroom before the buffer is shortened
+const GROWTH_S = 0.015; // more headroom after each dropout
+const SHORTEST_LAG = 48;
+const LONGEST_LAG = 288;
+
+const raisedCosine = (length) => Float32Array.from({ length }, (_, i) => 0.5 - 0.5 * Math.cos((Math.PI * (i + 0.5)) / length));
+const CROSSFADE = raisedCosine(QUANTUM);
+const FADE = raisedCosine(RESERVE);
+
+export class JitterBuffer {
+  constructor({ sampleRate, capacityS = 4 }) {
+    this.sampleRate = sampleRate;
+    this.capacity = Math.round(sampleRate * capacityS);
+    this.left = new Float32Array(this.capacity);
+    this.right = new Float32Array(this.capacity);
+    this.counters = { underruns: 0, splices: 0, gaps: 0, overflows: 0, late: 0, blocks: 0 };
+    this.reset();
+  }
+
+  /** Forgets the audio and starts filling again; counters stay. */
+  reset() {
+    this.read = 0;
+    this.written = 0;
+    this.playing = false;
+    this.started = false;
+    this.headroomS = HEADROOM_S;
+    this.nextClock = null;
+    this.marks = []; // {at, poseId, fill}: where a newer pose becomes audible
+    this.newestPose = -1;
+    this.#openWindow();
+  }
+
+  #openWindow(seconds = WINDOW_S) {
+    this.lowest = Infinity;
+    this.windowLeft = Math.round(seconds * this.sampleRate);
+  }
+
+  /** Samples waiting to be played. */
+  get fill() {
+    return this.written - this.read;
+  }
+
+  /** Fill aimed for on the whole, in samples, and with which playing starts: headroom and what rises and falls above it. */
+  get target() {
+    return Math.round((this.headroomS + RIPPLE_S) * this.sampleRate);
+  }
+
+  push({ left, right, sampleClock, poseId, late }) {
+    const frames = left.length;
+    this.counters.blocks += 1;
+    if (late) this.counters.late += 1;
+    const joined = this.nextClock === null || sampleClock === this.nextClock;
+    this.nextClock = sampleClock + frames;
+    if (this.fill + frames > this.capacity / 2) {
+      // The sound card stopped taking samples (a sleeping tab); what is oldest is worth least.
+      this.counters.overflows += 1;
+      this.read = this.written + frames - this.target;
+    }
+    if (!joined) this.counters.gaps += 1;
+    const soften = !joined && this.fill >= RESERVE;
+    for (let i = 0; soften && i < RESERVE; i++) {
+      const at = (this.written - RESERVE + i) % this.capacity;
+      this.left[at] *= 1 - FADE[i];
+      this.right[at] *= 1 - FADE[i];
+    }
+    for (let i = 0; i < frames; i++) {
+      const at = (this.written + i) % this.capacity;
+      const gain = !joined && i < RESERVE ? FADE[i] : 1;
+      this.left[at] = gain * left[i];
+      this.right[at] = gain * right[i];
+    }
+    if (poseId > this.newestPose) {
+      this.newestPose = poseId;
+      this.marks.push({ at: this.written, poseId, fill: Math.max(0, this.fill) });
+    }
+    this.written += frames;
+  }
+
+  /**
+   * Fills both outputs (QUANTUM samples each) and returns the poses that became audible in them, as
+   * [{poseId, offset, fill}] with `offset` in samples from the start of the outputs.
+   */
+  pull(left, right) {
+    const frames = left.length;
+    if (!this.playing && this.fill >= this.target) {
+      this.playing = true;
+      this.started = true;
+      this.#openWindow();
+      this.#copy(left, right, frames);
+      this.#ramp(left, right, FADE, 0, false);
+      return this.#heard(frames);
+    }
+    if (!this.playing) {
+      left.fill(0);
+      right.fill(0);
+      return [];
+    }
+    if (this.fill < frames + RESERVE) return this.#runDry(left, right, frames);
+    this.lowest = Math.min(this.lowest, this.fill);
+    this.windowLeft -= frames;
+    const lag = this.windowLeft <= 0 ? this.#correction() : 0;
+    if (lag !== 0 && frames === QUANTUM) this.#splice(left, right, lag);
+    else this.#copy(left, right, frames);
+    return this.#heard(frames);
+  }
+
+  #copy(left, right, frames) {
+    for (let i = 0; i < frames; i++) {
+      const at = (this.read + i) % this.capacity;
+      left[i] = this.left[at];
+      right[i] = this.right[at];
+    }
+    this.read += frames;
+  }
+
+  #ramp(left, right, shape, start, falling) {
+    for (let i = 0; i < shape.length && start + i < left.length; i++) {
+      const gain = falling ? 1 - shape[i] : shape[i];
+      left[start + i] *= gain;
+      right[start + i] *= gain;
+    }
+  }
+
+  #runDry(left, right, frames) {
+    const rest = Math.min(this.fill, frames);
+    left.fill(0);
+    right.fill(0);
+    this.#copy(left.subarray(0, rest), right.subarray(0, rest), rest);
+    const start = Math.max(0, rest - RESERVE);
+    this.#ramp(left.subarray(0, rest), right.subarray(0, rest), FADE.subarray(0, rest - start), start, true);
+    left.fill(0, rest);
+    right.fill(0, rest);
+    this.playing = false;
+    this.counters.underruns += 1;
+    this.headroomS = Math.min(MAX_HEADROOM_S, this.headroomS + GROWTH_S);
+    return this.#heard(rest);
+  }
+
+  /** Samples to skip (positive) or repeat (negative) now that a window has ended; 0 leaves the buffer alone. */
+  #correction() {
+    const headroom = this.headroomS * this.sampleRate;
+    const excess = this.lowest - headroom;
+    this.#openWindow();
+    // Headroom won by a dropout is given back slowly.
+    this.headroomS = Math.max(HEADROOM_S, this.headroomS - 0.0005);
+    const slack = SLACK_S * this.sampleRate;
+    if (excess > 8 * slack) return Math.round(excess);
+    if (excess > slack) return this.#bestLag(1, excess - slack / 2);
+    if (excess < -headroom / 2) return this.#bestLag(-1, headroom);
+    return 0;
+  }
+
+  #bestLag(sign, limit) {
+    let best = 0;
+    let least = Infinity;
+    for (let lag = SHORTEST_LAG; lag <= Math.min(LONGEST_LAG, limit); lag++) {
+      const shift = sign * lag;
+      if (shift > 0 && this.fill < QUANTUM + shift + RESERVE) break;
+      if (shift < 0 && this.read + shift < 0) break;
+      let difference = 0;
+      for (let i = 0; i < QUANTUM; i += 2) {
+        const here = (this.read + i) % this.capacity;
+        const there = (this.read + i + shift) % this.capacity;
+        difference += (this.left[here] - this.left[there]) ** 2 + (this.right[here] - this.right[there]) ** 2;
+      }
+      if (difference < least) [least, best] = [difference, shift];
+    }
+    return best;
+  }
+
+  #splice(left, right, lag) {
+    for (let i = 0; i < QUANTUM; i++) {
+      const here = (this.read + i) % this.capacity;
+      const there = (this.read + i + lag) % this.capacity;
+      left[i] = this.left[here] + CROSSFADE[i] * (this.left[there] - this.left[here]);
+      right[i] = this.right[here] + CROSSFADE[i] * (this.right[there] - this.right[here]);
+    }
+    this.read += QUANTUM + lag;
+    this.counters.splices += 1;
+    this.#openWindow(AGAIN_S);
+  }
+
+  #heard(frames) {
+    const heard = [];
+    while (this.marks.length > 0 && this.marks[0].at < this.read) {
+      const { at, poseId, fill } = this.marks.shift();
+      heard.push({ poseId, offset: Math.min(frames, Math.max(0, at - (this.read - frames))), fill });
+    }
+    return heard;
+  }
+}

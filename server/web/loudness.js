@@ -1,0 +1,173 @@
+// Loudness maps as a person reads them: levels on a grid become filled bands of a few decibels, like depths on a chart.
+// A grid is {levels (rows of numbers, NaN outside), origin [x, y], spacingM}, row 0 being the southernmost.
+
+import { contains, crosses, edges } from "./geometry.js";
+
+export const BAND_DB = 3;
+const BANDS = 10;
+const FINE_M = 0.05;
+const NEARBY = [[0, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]];
+
+export function parseGrid({ levels_db: rows, origin, spacing_m: spacingM }) {
+  return { levels: rows.map((row) => row.map((level) => level ?? NaN)), origin, spacingM };
+}
+
+/** Energy sum of several emitters' grids over the same points. */
+export function combine(grids) {
+  const [first, ...rest] = grids;
+  const power = (grid, row, column) => 10 ** (grid.levels[row][column] / 10);
+  const sum = (level, row, column) =>
+    10 * Math.log10(rest.reduce((total, grid) => total + power(grid, row, column), 10 ** (level / 10)));
+  return { ...first, levels: first.levels.map((levels, row) => levels.map((level, column) => sum(level, row, column))) };
+}
+
+/** Scale that fits a grid: the loudest few points may saturate, since a level near a source has no bound. */
+export function scaleOf(grid) {
+  const levels = grid.levels.flat().filter(Number.isFinite).sort((a, b) => a - b);
+  if (levels.length === 0) return null;
+  const loud = levels[Math.floor(0.985 * (levels.length - 1))];
+  const top = BAND_DB * Math.ceil(loud / BAND_DB);
+  const bottom = Math.max(top - BANDS * BAND_DB, BAND_DB * Math.floor(levels[0] / BAND_DB));
+  return { bottom, top };
+}
+
+const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+
+/** Quadratic B-spline: smooth enough for contours, narrow enough to keep the shadow of a wall. */
+function spline(t) {
+  const x = Math.abs(t);
+  if (x < 0.5) return 0.75 - x * x;
+  return x < 1.5 ? 0.5 * (1.5 - x) ** 2 : 0;
+}
+
+/** Weighted least squares of a plane, evaluated where x = y = 0. A plain mean would bend contours along every wall. */
+class PlaneFit {
+  #s = new Float64Array(9); // w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz
+
+  add(w, x, y, z) {
+    [w, w * x, w * y, w * x * x, w * x * y, w * y * y, w * z, w * x * z, w * y * z].forEach((term, index) => {
+      this.#s[index] += term;
+    });
+  }
+
+  /** NaN without any point near; the mean where the points do not span a plane. */
+  value() {
+    const [w, x, y, xx, xy, yy, z, xz, yz] = this.#s;
+    if (w < 1e-4) return NaN;
+    const determinant = w * (xx * yy - xy * xy) - x * (x * yy - xy * y) + y * (x * xy - xx * y);
+    if (determinant < 1e-3 * w ** 3) return z / w;
+    return (z * (xx * yy - xy * xy) - x * (xz * yy - xy * yz) + y * (xz * xy - xx * yz)) / determinant;
+  }
+}
+
+/** Levels of a grid at any point of a floor plan. Points see only grid points that no wall hides from them. */
+export class LoudnessField {
+  constructor(grid, corners) {
+    this.grid = grid;
+    this.corners = corners;
+    this.walls = edges(corners);
+    const xs = corners.map(([x]) => x);
+    const ys = corners.map(([, y]) => y);
+    this.minimum = [Math.min(...xs), Math.min(...ys)];
+    this.columns = Math.round((Math.max(...xs) - this.minimum[0]) / FINE_M) + 1;
+    this.rows = Math.round((Math.max(...ys) - this.minimum[1]) / FINE_M) + 1;
+    this.fine = new Float32Array(this.rows * this.columns);
+    for (let row = 0; row < this.rows; row++) {
+      for (let column = 0; column < this.columns; column++) {
+        const point = [this.minimum[0] + column * FINE_M, this.minimum[1] + row * FINE_M];
+        this.fine[row * this.columns + column] = this.#weighted(point);
+      }
+    }
+    // Points within walls and close to them, where no grid point reaches, continue their neighbours.
+    for (let pass = 0; pass < 12; pass++) this.#spread();
+  }
+
+  #weighted(point) {
+    const eye = this.#stepInside(point);
+    if (!eye) return NaN;
+    const { levels, origin, spacingM } = this.grid;
+    const x = (point[0] - origin[0]) / spacingM;
+    const y = (point[1] - origin[1]) / spacingM;
+    // The grid ends short of the walls: continue its slope for two cells and then stay level.
+    const [u, v] = [clamp(x, 0, levels[0].length - 1), clamp(y, 0, levels.length - 1)];
+    const [atX, atY] = [clamp(x, u - 2, u + 2), clamp(y, v - 2, v + 2)];
+    const fit = new PlaneFit();
+    for (let row = Math.max(0, Math.ceil(v - 1.5)); row <= Math.min(levels.length - 1, v + 1.5); row++) {
+      for (let column = Math.max(0, Math.ceil(u - 1.5)); column <= Math.min(levels[0].length - 1, u + 1.5); column++) {
+        const level = levels[row][column];
+        if (!Number.isFinite(level)) continue;
+        const there = [origin[0] + column * spacingM, origin[1] + row * spacingM];
+        if (this.walls.some(([a, b]) => crosses(eye, there, a, b))) continue;
+        fit.add(spline(u - column) * spline(v - row), column - atX, row - atY, level);
+      }
+    }
+    return fit.value();
+  }
+
+  /** The point, or one a step away where it lies on a wall; null within a wall. */
+  #stepInside([x, y]) {
+    for (const [dx, dy] of NEARBY) {
+      const eye = [x + 0.3 * FINE_M * dx, y + 0.3 * FINE_M * dy];
+      if (contains(this.corners, eye)) return eye;
+    }
+    return null;
+  }
+
+  #spread() {
+    const before = this.fine.slice();
+    for (let row = 0; row < this.rows; row++) {
+      for (let column = 0; column < this.columns; column++) {
+        const at = row * this.columns + column;
+        if (Number.isFinite(before[at])) continue;
+        let sum = 0;
+        let count = 0;
+        for (const [dr, dc] of [[0, 1], [0, -1], [1, 0], [-1, 0]]) {
+          const [r, c] = [row + dr, column + dc];
+          if (r < 0 || c < 0 || r >= this.rows || c >= this.columns) continue;
+          const level = before[r * this.columns + c];
+          if (Number.isFinite(level)) [sum, count] = [sum + level, count + 1];
+        }
+        if (count > 0) this.fine[at] = sum / count;
+      }
+    }
+  }
+
+  /** Level in dB at [x, y]; NaN outside the floor. */
+  at([x, y]) {
+    const u = Math.min(this.columns - 1.001, Math.max(0, (x - this.minimum[0]) / FINE_M));
+    const v = Math.min(this.rows - 1.001, Math.max(0, (y - this.minimum[1]) / FINE_M));
+    const [column, row] = [Math.floor(u), Math.floor(v)];
+    const [s, t] = [u - column, v - row];
+    const at = row * this.columns + column;
+    const below = this.fine[at] * (1 - s) + this.fine[at + 1] * s;
+    const above = this.fine[at + this.columns] * (1 - s) + this.fine[at + this.columns + 1] * s;
+    return below * (1 - t) + above * t;
+  }
+
+  /** The map as a canvas of `pixelsPerMetre`, row 0 north; `ramp(fraction)` gives [r, g, b] for 0 (quiet) to 1 (loud). */
+  paint({ bottom, top }, ramp, pixelsPerMetre) {
+    const width = Math.round((this.columns - 1) * FINE_M * pixelsPerMetre);
+    const height = Math.round((this.rows - 1) * FINE_M * pixelsPerMetre);
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [width, height];
+    const context = canvas.getContext("2d");
+    const image = context.createImageData(width, height);
+    const bands = Math.round((top - bottom) / BAND_DB);
+    const colours = Array.from({ length: bands }, (_, band) => ramp(bands > 1 ? band / (bands - 1) : 1));
+    for (let row = 0, offset = 0; row < height; row++) {
+      const y = this.minimum[1] + (height - row - 0.5) / pixelsPerMetre;
+      for (let column = 0; column < width; column++, offset += 4) {
+        const level = this.at([this.minimum[0] + (column + 0.5) / pixelsPerMetre, y]);
+        if (Number.isNaN(level)) continue;
+        const band = Math.min(bands - 1, Math.max(0, Math.floor((level - bottom) / BAND_DB)));
+        const [r, g, b] = colours[band];
+        image.data[offset] = r;
+        image.data[offset + 1] = g;
+        image.data[offset + 2] = b;
+        image.data[offset + 3] = 255;
+      }
+    }
+    context.putImageData(image, 0, 0);
+    return canvas;
+  }
+}

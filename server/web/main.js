@@ -1,0 +1,296 @@
+// Joins the parts: scene and loudness over HTTP, poses and audio through the stream worker, the plan, the panel and the keyboard.
+
+import { FloorPlan } from "./floorplan.js";
+import { PoseLedger } from "./latency.js";
+import { Legend } from "./legend.js";
+import { LoudnessField, combine, parseGrid, scaleOf } from "./loudness.js";
+import { Notices } from "./notices.js";
+import { exposeHook } from "./hook.js";
+import { onThemeChange } from "./palette.js";
+import { Panel } from "./panel.js";
+import { Paper } from "./paper.js";
+import { Player } from "./player.js";
+import { fetchClips, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
+import { Sources } from "./sources.js";
+import { Walking } from "./walking.js";
+import { World } from "./world.js";
+
+const RETRY_MS = 2000;
+const MAP_SPACING_M = 0.25;
+
+const find = (id) => document.getElementById(id);
+const epochNow = () => performance.timeOrigin + performance.now();
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+const placeKey = ({ position }) => position.map((value) => value.toFixed(3)).join();
+
+class Page {
+  constructor() {
+    this.notices = new Notices(find("notices"));
+    this.panel = new Panel(document);
+    this.legend = new Legend(find("legend"));
+    this.player = new Player();
+    this.ledger = new PoseLedger();
+    this.worker = new Worker(new URL("stream_worker.js", import.meta.url), { type: "module" });
+    this.connection = "idle";
+    this.playing = false;
+    this.steady = false;
+    this.grids = new Map(); // emitter id -> {key, grid}
+    this.mapping = null; // AbortController of the map under way
+    this.field = null;
+    this.hovered = null;
+  }
+
+  async open() {
+    this.#setConnection("connecting", "Loading");
+    const scenes = await this.#untilAnswered(fetchScenes);
+    const wanted = new URLSearchParams(location.search).get("scene");
+    const chosen = scenes.find(({ id }) => id === wanted) ?? scenes[0];
+    if (!chosen) {
+      this.notices.show("scene", "The server has no scene to play.", { lasting: true });
+      return;
+    }
+    if (wanted && chosen.id !== wanted) this.notices.show("scene", `There is no scene called “${wanted}”; this is ${chosen.name}.`);
+    const [scene, clips] = await Promise.all([
+      this.#untilAnswered(() => fetchScene(chosen.id)),
+      this.#untilAnswered(fetchClips),
+    ]);
+    this.#setUp(scene, clips);
+    this.#offer(scenes, scene);
+    this.#setConnection("idle", "Ready");
+  }
+
+  async #untilAnswered(ask) {
+    for (;;) {
+      try {
+        const answer = await ask();
+        this.notices.clear("unreachable");
+        return answer;
+      } catch (error) {
+        this.#setConnection("waiting", "Waiting for the server");
+        this.notices.show("unreachable", `${error.message} Trying again.`, { lasting: true });
+        await pause(RETRY_MS);
+      }
+    }
+  }
+
+  #offer(scenes, scene) {
+    const xs = scene.corners.map(([x]) => x);
+    const ys = scene.corners.map(([, y]) => y);
+    const size = [xs, ys].map((values) => +(Math.max(...values) - Math.min(...values)).toFixed(1));
+    find("scene-name").textContent = scene.name;
+    find("scene-size").textContent = `${size[0]} × ${size[1]} × ${scene.height_m} m`;
+    document.documentElement.style.setProperty("--aspect", (size[0] / size[1]).toFixed(3));
+    document.title = `${scene.name} · Nafir`;
+    if (scenes.length < 2) return;
+    const choice = find("scene-choice");
+    choice.replaceChildren(...scenes.map(({ id, name }) => new Option(name, id, false, id === scene.id)));
+    choice.hidden = false;
+    find("scene-name").hidden = true;
+    choice.onchange = () => location.assign(`?scene=${encodeURIComponent(choice.value)}`);
+  }
+
+  #setUp(scene, clips) {
+    this.scene = scene;
+    this.clips = clips;
+    this.world = new World(scene);
+    if (clips.length > 0) this.world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });
+    else this.notices.show("clips", "The server has no clip to play.", { lasting: true });
+    this.paper = new Paper(find("paper"), scene.corners);
+    this.plan = new FloorPlan({ svg: find("marks"), paper: this.paper, world: this.world });
+    this.sources = new Sources({ world: this.world, clips, list: find("sources"), add: find("add-source") });
+    new Walking(this.world, { focusedEmitter: () => this.plan.focusedEmitter, dropped: () => this.map() });
+    this.#listenToWorld();
+    this.#listenToSound();
+    this.#listenToControls();
+    this.map();
+    find("play").disabled = false;
+  }
+
+  #listenToWorld() {
+    const { world, plan } = this;
+    let known = new Map();
+    world.addEventListener("listener", () => {
+      this.#tell("listener", this.#listenerNow());
+      this.#pointNeedle();
+    });
+    world.addEventListener("emitter", ({ detail }) => {
+      this.#tell("emitter", this.#emitterNow(detail));
+      if (this.grids.get(detail.id)?.key !== placeKey(detail)) this.paper.stale = true;
+    });
+    world.addEventListener("emitters", () => {
+      for (const id of known.keys()) if (!world.emitters.has(id)) this.#tell("remove", { id });
+      for (const [id, emitter] of world.emitters) if (!known.has(id)) this.#tell("emitter", this.#emitterNow(emitter));
+      known = new Map(world.emitters);
+      this.map();
+    });
+    known = new Map(world.emitters);
+    plan.addEventListener("dropped", () => this.map());
+    plan.addEventListener("hover", ({ detail }) => {
+      this.hovered = detail;
+      this.#pointNeedle();
+    });
+  }
+
+  #listenToSound() {
+    this.player.addEventListener("report", ({ detail }) => {
+      if (!this.playing) return;
+      this.steady = detail.playing;
+      this.plan.glow(...this.panel.report(detail, this.ledger.summary()));
+    });
+    this.player.addEventListener("heard", ({ detail }) => this.ledger.heard(detail, this.steady));
+    this.player.addEventListener("interrupted", () => this.pause());
+    const handlers = {
+      state: (detail) => this.#streamState(detail),
+      posed: (detail) => this.ledger.posed(detail),
+      status: (detail) => this.panel.status(detail),
+      refused: ({ code, message }) => this.notices.show(code, message),
+    };
+    this.worker.onmessage = ({ data: { type, detail } }) => handlers[type](detail);
+    this.worker.onerror = (event) => this.notices.show("stream", event.message || "The stream could not be started.");
+  }
+
+  #listenToControls() {
+    find("play").addEventListener("click", () => (this.playing ? this.pause() : this.play()));
+    find("volume").addEventListener("input", ({ target }) => this.#setVolume(target.valueAsNumber));
+    this.#setVolume(find("volume").valueAsNumber);
+    onThemeChange(() => {
+      this.paper.recolour();
+      this.panel.recolour();
+      if (this.scale) this.legend.show(this.scale);
+    });
+  }
+
+  #setVolume(percent) {
+    find("volume").style.setProperty("--value", `${percent}%`);
+    this.player.volume = (percent / 100) ** 2; // closer to how loudness is heard than a straight line
+  }
+
+  #listenerNow() {
+    const { position, yaw } = this.world.listener;
+    return { position: [...position], yaw, at: epochNow() };
+  }
+
+  #emitterNow({ id, clip, position }) {
+    return { id, clip, position: [...position], at: epochNow() };
+  }
+
+  #tell(type, detail, transfer = []) {
+    this.worker.postMessage({ type, detail }, transfer);
+  }
+
+  async play() {
+    if (this.playing) return;
+    this.#setPlaying(true);
+    this.#setConnection("connecting", "Connecting");
+    let port;
+    try {
+      port = await this.player.start(this.scene.sample_rate);
+    } catch (error) {
+      this.#setPlaying(false);
+      this.#setConnection("refused", "No sound");
+      this.notices.show("audio", `Sound could not be started: ${error.message}`, { lasting: true });
+      return;
+    }
+    if (!this.playing) return;
+    this.notices.clear("audio");
+    const hello = { scene: this.scene.id, sampleRate: this.scene.sample_rate };
+    const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
+    this.#tell("open", { url: streamUrl(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
+  }
+
+  async pause() {
+    if (!this.playing) return;
+    this.#setPlaying(false);
+    await this.player.pause();
+    if (this.playing) return;
+    this.#tell("close");
+    this.panel.rest();
+    this.plan.glow(0, 0);
+    this.#setConnection("idle", "Paused");
+  }
+
+  #setPlaying(playing) {
+    this.playing = playing;
+    this.steady = false;
+    find("play").setAttribute("aria-pressed", playing);
+    find("play-text").textContent = playing ? "Pause" : "Play";
+    document.body.classList.toggle("playing", playing);
+  }
+
+  #setConnection(state, text) {
+    this.connection = state;
+    find("connection").dataset.state = state;
+    find("connection-text").textContent = text;
+  }
+
+  #streamState(detail) {
+    if (!this.playing) return;
+    const { state, attempt, retryMs, reason } = detail;
+    if (state === "connecting" && attempt === 0) this.#setConnection("connecting", "Connecting");
+    else if (state === "live") {
+      this.#setConnection("live", "Live");
+      this.notices.clear("connection");
+    } else if (state === "waiting") {
+      this.steady = false;
+      this.#setConnection("waiting", "Reconnecting");
+      if (retryMs >= 1000) this.notices.show("connection", `The connection was lost. ${reason ?? ""} Trying again.`.replace("  ", " "));
+    } else if (state === "refused") {
+      this.notices.show("connection", reason, { lasting: true });
+      this.#setPlaying(false);
+      this.player.pause();
+      this.panel.rest();
+      this.#setConnection("refused", "Refused");
+    }
+  }
+
+  /** Fetches the maps that no longer fit their emitters and shows the sum of all. */
+  async map() {
+    this.mapping?.abort();
+    const emitters = [...this.world.emitters.values()];
+    if (emitters.length === 0) return;
+    const mapping = new AbortController();
+    this.mapping = mapping;
+    this.paper.stale = true;
+    this.legend.note = "mapping";
+    try {
+      const grids = [];
+      for (const emitter of emitters) grids.push(await this.#grid(emitter, mapping.signal));
+      if (mapping.signal.aborted) return;
+      const grid = combine(grids);
+      this.field = new LoudnessField(grid, this.scene.corners);
+      // One scale for the whole visit, so that two maps can be compared by eye.
+      this.scale ??= scaleOf(grid);
+      this.paper.show(this.field, this.scale);
+      this.legend.show(this.scale);
+      const whose = emitters.length > 1 ? "of all sources together" : `of source ${emitters[0].id}`;
+      this.legend.note = `${whose}; 0 dB is 1 m in the open`;
+      this.#pointNeedle();
+    } catch (error) {
+      if (error.name === "AbortError") return;
+      this.legend.note = "not available";
+      this.notices.show("loudness", `No loudness map: ${error.message}`);
+    }
+  }
+
+  async #grid({ id, position }, signal) {
+    const key = placeKey({ position });
+    const known = this.grids.get(id);
+    if (known?.key === key) return known.grid;
+    const heightM = this.world.listener.position[2];
+    const grid = parseGrid(await fetchLoudness(this.scene.id, { position, heightM, spacingM: MAP_SPACING_M, signal }));
+    this.grids.set(id, { key, grid });
+    return grid;
+  }
+
+  #pointNeedle() {
+    if (!this.field) return;
+    const hovered = this.hovered && this.field.at(this.hovered);
+    if (Number.isFinite(hovered)) this.legend.point(hovered, "here");
+    else this.legend.point(this.field.at(this.world.listener.position), "at you");
+  }
+}
+
+const page = new Page();
+const becomeReady = exposeHook(page);
+await page.open();
+becomeReady();

@@ -1,0 +1,124 @@
+// The measurements beside the plan: ear levels, pose-to-sound latency and its parts, buffer health, and what the server says.
+
+import { Sparkline } from "./sparkline.js";
+
+const FLOOR_DB = -60;
+const DRAW_MS = 100; // figures and the strip chart; the meters run with every report
+const decibels = (amplitude) => (amplitude > 0 ? 20 * Math.log10(amplitude) : -Infinity);
+const fraction = (level) => Math.min(1, Math.max(0, 1 - level / FLOOR_DB));
+const milliseconds = (value) => `${Math.round(value)} ms`;
+
+class Meter {
+  #bar;
+  #peak;
+  #output;
+  #held = FLOOR_DB;
+  #shown = FLOOR_DB;
+
+  constructor(root) {
+    this.#bar = root.querySelector("i");
+    this.#peak = root.querySelector("b");
+    this.#output = root.querySelector("output");
+  }
+
+  /** Rises at once and falls gently, as a programme meter does; returns the bar's length, 0 to 1. */
+  show(rms, peak) {
+    const level = Math.max(FLOOR_DB, decibels(rms));
+    this.#shown = Math.max(level, this.#shown - 1.2);
+    this.#held = Math.max(Math.max(FLOOR_DB, decibels(peak)), this.#held - 0.5);
+    this.#bar.style.transform = `scaleX(${fraction(this.#shown).toFixed(4)})`;
+    this.#peak.style.left = `${(100 * fraction(this.#held)).toFixed(2)}%`;
+    return fraction(this.#shown);
+  }
+
+  print() {
+    this.#output.textContent = this.#shown <= FLOOR_DB ? "–" : `−${Math.abs(Math.round(this.#shown))}`;
+  }
+
+  rest() {
+    this.#held = this.#shown = FLOOR_DB;
+    this.show(0, 0);
+    this.print();
+  }
+}
+
+export class Panel {
+  #find;
+  #left;
+  #right;
+  #spark;
+  #drawn = 0;
+  #dropouts = 0;
+  #fillMs = null;
+  #server = { late: 0, dropped: 0 };
+
+  constructor(document) {
+    this.#find = (id) => document.getElementById(id);
+    this.#left = new Meter(this.#find("meter-left"));
+    this.#right = new Meter(this.#find("meter-right"));
+    this.#spark = new Sparkline(this.#find("spark"));
+    new ResizeObserver(() => this.#spark.draw()).observe(this.#find("spark"));
+  }
+
+  recolour() {
+    this.#spark.draw();
+  }
+
+  /** Takes a worklet report; returns the meters' lengths for both ears. */
+  report(report, latency) {
+    const at = performance.now();
+    const fillMs = 1000 * report.fillS;
+    this.#fillMs = this.#fillMs === null ? fillMs : this.#fillMs + 0.1 * (fillMs - this.#fillMs);
+    const dropout = report.counters.underruns > this.#dropouts;
+    this.#dropouts = report.counters.underruns;
+    this.#spark.add({ at, value: fillMs, target: 1000 * report.targetS, dropout });
+    const lengths = [this.#left.show(report.rms[0], report.peak[0]), this.#right.show(report.rms[1], report.peak[1])];
+    if (at - this.#drawn >= DRAW_MS) {
+      this.#drawn = at;
+      this.#print(report, latency);
+    }
+    return lengths;
+  }
+
+  #print({ targetS, counters, started }, latency) {
+    this.#left.print();
+    this.#right.print();
+    this.#spark.draw();
+    this.#find("buffer").textContent = Math.round(this.#fillMs);
+    this.#find("buffer-note").textContent = started ? `aims for ${Math.round(1000 * targetS)} ms` : "filling";
+    this.#find("dropouts").textContent = counters.underruns;
+    this.#find("late").textContent = Math.max(counters.late, this.#server.late);
+    this.#find("skipped").textContent = Math.max(counters.gaps, this.#server.dropped);
+    for (const id of ["dropouts", "late", "skipped"]) {
+      this.#find(id).classList.toggle("alarm", this.#find(id).textContent !== "0");
+    }
+    if (latency) this.#printLatency(latency);
+  }
+
+  #printLatency({ totalMs, worstMs, serverMs, bufferMs, outputMs }) {
+    this.#find("latency").textContent = Math.round(totalMs);
+    this.#find("latency-note").textContent = `95% within ${Math.round(worstMs)} ms`;
+    this.#find("part-server").textContent = milliseconds(serverMs);
+    this.#find("part-buffer").textContent = milliseconds(bufferMs);
+    this.#find("part-device").textContent = milliseconds(outputMs);
+    const stack = this.#find("stack");
+    for (const [name, value] of [["server", serverMs], ["buffered", bufferMs], ["device", outputMs]]) {
+      stack.querySelector(`.${name}`).style.flexGrow = Math.max(0, value).toFixed(1);
+    }
+  }
+
+  /** Takes the server's once-a-second status message. */
+  status({ blocks_late: late, blocks_dropped: dropped, ir_ms: ir }) {
+    this.#server = { late, dropped };
+    if (ir) this.#find("field-cost").textContent = `${ir.p50.toFixed(1)} ms`;
+  }
+
+  rest() {
+    this.#left.rest();
+    this.#right.rest();
+    this.#fillMs = null;
+    this.#spark.clear();
+    this.#find("buffer").textContent = "–";
+    this.#find("buffer-note").textContent = "";
+  }
+}

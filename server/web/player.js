@@ -1,0 +1,96 @@
+// The sound card end: an AudioContext at the stream's sample rate, the worklet and a volume control.
+// Events: "report" and "heard" as sent by the worklet; "heard" gains `at`, the epoch millisecond when it leaves the sound card,
+// and `outputS`, how long that takes from the worklet; "interrupted" when the system takes the sound away (a call, another tab).
+
+export class Player extends EventTarget {
+  #context = null;
+  #node = null;
+  #gain = null;
+  #volume = 1;
+  #captures = new Map();
+  #nextCapture = 0;
+  #ready = null;
+  #started = false;
+  #wanted = false; // whether sound should be running, so that a pause overtaken by a start does nothing
+
+  /** Call from a user gesture: browsers start audio only then. Resolves with a port that takes audio blocks. */
+  async start(sampleRate) {
+    if (!this.#context) {
+      this.#context = new AudioContext({ sampleRate, latencyHint: "interactive" });
+      this.#ready = this.#build();
+    }
+    this.#wanted = true;
+    const resumed = this.#context.resume();
+    await this.#ready;
+    await resumed;
+    const { port1, port2 } = new MessageChannel();
+    this.#node.port.postMessage({ type: "connect", port: port1 }, [port1]);
+    this.#started = true;
+    this.#fade(this.#volume);
+    return port2;
+  }
+
+  async #build() {
+    this.#context.onstatechange = () => {
+      if (this.#wanted && this.#started && this.#context.state !== "running") this.dispatchEvent(new Event("interrupted"));
+    };
+    if (!this.#context.audioWorklet) throw new Error("This browser plays live audio only over https or from localhost.");
+    await this.#context.audioWorklet.addModule(new URL("worklet.js", import.meta.url));
+    this.#node = new AudioWorkletNode(this.#context, "nafir-player", { numberOfInputs: 0, outputChannelCount: [2] });
+    this.#gain = new GainNode(this.#context, { gain: 0 });
+    this.#node.connect(this.#gain).connect(this.#context.destination);
+    this.#node.port.onmessage = ({ data }) => this.#receive(data);
+  }
+
+  #receive(data) {
+    if (data.type === "captured") {
+      this.#captures.get(data.id)(data);
+      this.#captures.delete(data.id);
+      return;
+    }
+    this.dispatchEvent(new CustomEvent(data.type, { detail: data.type === "heard" ? this.#timed(data) : data }));
+  }
+
+  #timed(heard) {
+    const at = this.#audibleAt(heard.time);
+    return { ...heard, at, outputS: Math.max(0, at - performance.timeOrigin - performance.now()) / 1000 };
+  }
+
+  /** Epoch milliseconds at which the sample of context time `time` reaches the output device. */
+  #audibleAt(time) {
+    const output = this.#context.getOutputTimestamp?.();
+    if (output?.contextTime > 0 && output.performanceTime > 0) {
+      return performance.timeOrigin + output.performanceTime + 1000 * (time - output.contextTime);
+    }
+    const latencyS = this.#context.outputLatency || this.#context.baseLatency;
+    return performance.timeOrigin + performance.now() + 1000 * (time - this.#context.currentTime + latencyS);
+  }
+
+  #fade(target) {
+    this.#gain.gain.setTargetAtTime(target, this.#context.currentTime, 0.015);
+  }
+
+  /** Fades out and lets the sound card sleep. */
+  async pause() {
+    if (!this.#gain) return;
+    this.#wanted = this.#started = false;
+    this.#fade(0);
+    await new Promise((resolve) => setTimeout(resolve, 80));
+    if (!this.#wanted) await this.#context.suspend();
+  }
+
+  set volume(value) {
+    this.#volume = value;
+    if (this.#gain && this.#context.state === "running") this.#fade(value);
+  }
+
+  /** The last `seconds` that were played, before the volume control: {sampleRate, left, right}. */
+  capture(seconds) {
+    if (!this.#node) return Promise.reject(new Error("nothing has been played yet"));
+    const id = this.#nextCapture++;
+    return new Promise((resolve) => {
+      this.#captures.set(id, ({ left, right }) => resolve({ sampleRate: this.#context.sampleRate, left, right }));
+      this.#node.port.postMessage({ type: "capture", id, seconds });
+    });
+  }
+}

@@ -1,0 +1,44 @@
+// HTTP side of the server: scenes, clips and loudness maps. Problem bodies become RequestError.
+
+const endpoint = (path) => new URL(`v1/${path}`, document.baseURI);
+
+export class RequestError extends Error {
+  constructor(message, { code = "unreachable", status = 0 } = {}) {
+    super(message);
+    this.code = code;
+    this.status = status;
+  }
+}
+
+async function getJson(url, options) {
+  let response;
+  try {
+    response = await fetch(url, options);
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new RequestError("The server cannot be reached.");
+  }
+  if (response.ok) return response.json();
+  const problem = await response.json().catch(() => ({}));
+  throw new RequestError(problem.detail || problem.title || `The server answered ${response.status}.`, {
+    code: problem.code,
+    status: response.status,
+  });
+}
+
+export const fetchScenes = async () => (await getJson(endpoint("scenes"))).scenes;
+export const fetchScene = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}`));
+export const fetchClips = async () => (await getJson(endpoint("clips"))).clips;
+
+export function fetchLoudness(scene, { position, heightM, spacingM, signal }) {
+  const url = endpoint(`scenes/${encodeURIComponent(scene)}/loudness`);
+  const query = { emitter: position.map((value) => value.toFixed(3)).join(","), height_m: heightM, spacing_m: spacingM, format: "json" };
+  for (const [key, value] of Object.entries(query)) url.searchParams.set(key, value);
+  return getJson(url, { signal });
+}
+
+export function streamUrl() {
+  const url = endpoint("stream");
+  url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
+  return url.href;
+}

@@ -1,0 +1,99 @@
+// The list of emitters beside the plan: what each one plays, where it is as seen from the listener, and how to add or remove one.
+
+import { isVisible } from "./geometry.js";
+import { MOST_EMITTERS } from "./world.js";
+
+const AHEAD = Math.PI / 12;
+
+function describe({ distanceM, bearing }, visible) {
+  const degrees = Math.round((Math.abs(bearing) * 180) / Math.PI);
+  let direction = `${degrees}° ${bearing > 0 ? "left" : "right"}`;
+  if (Math.abs(bearing) < AHEAD) direction = "ahead";
+  else if (Math.abs(bearing) > Math.PI - AHEAD) direction = "behind";
+  return `${distanceM.toFixed(1)} m, ${direction}${visible ? "" : ", out of sight"}`;
+}
+
+export class Sources {
+  #world;
+  #clips;
+  #list;
+  #add;
+  #rows = new Map(); // id -> {row, select, remove, place}
+
+  constructor({ world, clips, list, add }) {
+    this.#world = world;
+    this.#clips = clips;
+    this.#list = list;
+    this.#add = add;
+    add.onclick = () => world.addEmitter({ clip: this.nextClip() });
+    world.addEventListener("emitters", () => this.#sync());
+    world.addEventListener("emitter", () => this.#describe());
+    world.addEventListener("listener", () => this.#describe());
+    list.replaceChildren();
+    this.#sync();
+  }
+
+  /** The first clip that nobody plays yet. */
+  nextClip() {
+    const played = new Set([...this.#world.emitters.values()].map(({ clip }) => clip));
+    return (this.#clips.find(({ name }) => !played.has(name)) ?? this.#clips[0]).name;
+  }
+
+  #build(emitter) {
+    const row = document.createElement("li");
+    row.dataset.source = emitter.id;
+    const badge = document.createElement("span");
+    badge.className = "badge";
+    badge.textContent = emitter.id;
+    const select = document.createElement("select");
+    select.setAttribute("aria-label", `What source ${emitter.id} plays`);
+    for (const { name, title } of this.#clips) select.add(new Option(title || name, name));
+    select.value = emitter.clip;
+    let byPointer = false;
+    select.addEventListener("pointerdown", () => (byPointer = true));
+    select.addEventListener("keydown", () => (byPointer = false));
+    select.addEventListener("change", () => {
+      this.#world.setClip(emitter.id, select.value);
+      if (byPointer) select.blur(); // gives the keys back to walking
+    });
+    const remove = document.createElement("button");
+    remove.type = "button";
+    remove.className = "remove";
+    remove.textContent = "×";
+    remove.setAttribute("aria-label", `Remove source ${emitter.id}`);
+    remove.addEventListener("click", () => this.#world.removeEmitter(emitter.id));
+    const place = document.createElement("span");
+    place.className = "place quiet";
+    row.append(badge, select, remove, place);
+    this.#list.append(row);
+    return { row, select, remove, place };
+  }
+
+  #sync() {
+    const { emitters } = this.#world;
+    for (const [id, { row }] of this.#rows) {
+      if (emitters.has(id)) continue;
+      row.remove();
+      this.#rows.delete(id);
+    }
+    for (const emitter of emitters.values()) {
+      if (!this.#rows.has(emitter.id)) this.#rows.set(emitter.id, this.#build(emitter));
+    }
+    for (const { remove } of this.#rows.values()) remove.hidden = emitters.size < 2;
+    this.#add.disabled = this.#clips.length === 0;
+    this.#add.hidden = emitters.size >= MOST_EMITTERS;
+    this.#describe();
+  }
+
+  #describe() {
+    const { listener, emitters, scene } = this.#world;
+    for (const [id, { place, select }] of this.#rows) {
+      const emitter = emitters.get(id);
+      if (!emitter) continue;
+      const visible = isVisible(scene.corners, listener.position, emitter.position);
+      place.textContent = describe(this.#world.bearing(emitter), visible);
+      select.value = emitter.clip;
+      select.title = this.#clips.find(({ name }) => name === emitter.clip)?.credit ?? "";
+    }
+  }
+}

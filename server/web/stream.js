@@ -1,0 +1,182 @@
+// A live stream that keeps itself connected: it holds what the listener should hear (poses, emitters) and brings the server to it,
+// at first and again after every reconnect. Runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
+
+import { FLAG_LATE, message, parseBlock, serializePose } from "./wire.js";
+
+const POSE_INTERVAL_MS = 12; // at most about 80 poses a second, the newest wins
+const ACKNOWLEDGE_EVERY = 4; // blocks
+const RETRY_MS = [250, 500, 1000, 2000, 4000];
+const REST_MS = 1000; // a listener at rest is sent again this often, which keeps the measured latency current
+const SILENCE_MS = 4000; // a server that paces audio is never silent for this long
+const REFUSED = 1008; // bad hello: asking again would not help
+
+export const now = () => performance.timeOrigin + performance.now();
+
+export class Stream {
+  #url;
+  #hello;
+  #listeners;
+  #socket = null;
+  #welcomed = false;
+  #attempt = 0;
+  #retry = 0;
+  #watchdog = 0;
+  #heardAt = 0;
+  #poseId = 0;
+  #lastError = null;
+  #listener; // {position, yaw, at}
+  #emitters = new Map(); // id -> {clip, position, at}
+  #dirty = new Set(); // "listener" and emitter ids that moved since they were last sent
+  #sentAt = 0;
+  #sending = 0;
+  #heartbeat = 0;
+
+  /**
+   * `hello` is {scene, sampleRate}; `listeners` are callbacks: block(block), state({state, ...}), posed({poseId, at}),
+   * status(message), refused({code, message, field}).
+   */
+  constructor({ url, hello, listener, emitters, listeners }) {
+    this.#url = url;
+    this.#hello = hello;
+    this.#listeners = listeners;
+    this.#listener = listener;
+    for (const emitter of emitters) this.#emitters.set(emitter.id, emitter);
+    this.#connect();
+  }
+
+  setListener(listener) {
+    this.#listener = listener;
+    this.#dirty.add("listener");
+    this.#schedule();
+  }
+
+  setEmitter({ id, clip, position, at }) {
+    const known = this.#emitters.get(id);
+    this.#emitters.set(id, { id, clip, position, at });
+    if (!this.#welcomed) return;
+    if (!known || known.clip !== clip) {
+      if (known) this.#send(message.removeEmitter(id));
+      this.#send(message.addEmitter({ id, clip, position }));
+    } else {
+      this.#dirty.add(`emitter ${id}`);
+      this.#schedule();
+    }
+  }
+
+  removeEmitter(id) {
+    if (!this.#emitters.delete(id)) return;
+    this.#dirty.delete(`emitter ${id}`);
+    if (this.#welcomed) this.#send(message.removeEmitter(id));
+  }
+
+  close() {
+    clearTimeout(this.#retry);
+    clearTimeout(this.#sending);
+    this.#detach();
+    this.#listeners.state({ state: "closed" });
+  }
+
+  #detach() {
+    clearInterval(this.#watchdog);
+    clearInterval(this.#heartbeat);
+    const socket = this.#socket;
+    this.#socket = null;
+    this.#welcomed = false;
+    if (!socket) return;
+    socket.onopen = socket.onmessage = socket.onclose = null;
+    socket.close(1000);
+  }
+
+  #connect() {
+    this.#listeners.state({ state: "connecting", attempt: this.#attempt });
+    const socket = new WebSocket(this.#url);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      const { position, yaw, at } = this.#listener;
+      socket.send(message.hello({ ...this.#hello, listener: { position, yaw } }));
+      this.#poseId = 0; // the hello's listener is pose 0
+      this.#listeners.posed({ poseId: 0, at: Math.max(at, now()) });
+    };
+    socket.onmessage = ({ data }) => (typeof data === "string" ? this.#receive(JSON.parse(data)) : this.#receiveBlock(data));
+    socket.onclose = ({ code, reason }) => this.#lost(code, reason);
+    this.#socket = socket;
+    this.#heardAt = now();
+    this.#watchdog = setInterval(() => {
+      if (now() - this.#heardAt < SILENCE_MS) return;
+      this.#lost(0, "");
+    }, 1000);
+  }
+
+  #lost(code, reason) {
+    this.#detach();
+    if (code === REFUSED) {
+      this.#listeners.state({ state: "refused", reason: this.#lastError ?? (reason || "The server refused the stream.") });
+      return;
+    }
+    const wait = RETRY_MS[Math.min(this.#attempt, RETRY_MS.length - 1)];
+    this.#attempt += 1;
+    this.#listeners.state({ state: "waiting", code, reason, retryMs: wait });
+    this.#retry = setTimeout(() => this.#connect(), wait);
+  }
+
+  #receive(received) {
+    this.#heardAt = now();
+    if (received.type === "welcome") this.#welcome(received);
+    else if (received.type === "status") this.#listeners.status(received);
+    else if (received.type === "error") {
+      this.#lastError = received.message;
+      this.#listeners.refused(received);
+    }
+  }
+
+  #welcome(welcome) {
+    this.#welcomed = true;
+    this.#attempt = 0;
+    this.#lastError = null;
+    this.#dirty.clear();
+    this.#listeners.state({ state: "live", welcome });
+    for (const emitter of this.#emitters.values()) this.#send(message.addEmitter(emitter));
+    // Whatever moved while the hello was under way is in here.
+    this.setListener({ ...this.#listener, at: now() });
+    clearInterval(this.#heartbeat);
+    this.#heartbeat = setInterval(() => {
+      if (now() - this.#sentAt >= REST_MS) this.setListener({ ...this.#listener, at: now() });
+    }, REST_MS);
+  }
+
+  #receiveBlock(buffer) {
+    this.#heardAt = now();
+    const block = parseBlock(buffer);
+    if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence));
+    this.#listeners.block({ ...block, late: (block.flags & FLAG_LATE) !== 0 });
+  }
+
+  #schedule() {
+    if (!this.#welcomed || this.#sending) return;
+    const wait = Math.max(0, this.#sentAt + POSE_INTERVAL_MS - now());
+    this.#sending = setTimeout(() => {
+      this.#sending = 0;
+      this.#sendPoses();
+    }, wait);
+  }
+
+  #sendPoses() {
+    if (!this.#welcomed) return;
+    this.#sentAt = now();
+    for (const { id, position, at } of this.#emitters.values()) {
+      if (!this.#dirty.has(`emitter ${id}`)) continue;
+      this.#send(message.moveEmitter({ id, position, poseId: ++this.#poseId }));
+      this.#listeners.posed({ poseId: this.#poseId, at });
+    }
+    if (this.#dirty.has("listener")) {
+      const { position, yaw, at } = this.#listener;
+      this.#send(serializePose({ poseId: ++this.#poseId, position, yaw }));
+      this.#listeners.posed({ poseId: this.#poseId, at });
+    }
+    this.#dirty.clear();
+  }
+
+  #send(data) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(data);
+  }
+}

@@ -1,0 +1,42 @@
+// Worker entry: carries commands from the page to a Stream, its events back, and audio blocks straight to the worklet's port.
+
+import { Stream } from "./stream.js";
+
+let stream = null;
+let playerPort = null;
+
+function open({ url, hello, listener, emitters, port }) {
+  stream?.close();
+  playerPort = port;
+  const tell = (type) => (detail) => self.postMessage({ type, detail });
+  stream = new Stream({
+    url,
+    hello,
+    listener,
+    emitters,
+    listeners: {
+      block: (block) => playerPort.postMessage(block, [block.left.buffer, block.right.buffer]),
+      state(detail) {
+        // A new stream counts its samples and poses from zero.
+        if (detail.state === "live") playerPort.postMessage("restart");
+        self.postMessage({ type: "state", detail });
+      },
+      posed: tell("posed"),
+      status: tell("status"),
+      refused: tell("refused"),
+    },
+  });
+}
+
+const commands = {
+  open,
+  listener: (detail) => stream?.setListener(detail),
+  emitter: (detail) => stream?.setEmitter(detail),
+  remove: ({ id }) => stream?.removeEmitter(id),
+  close() {
+    stream?.close();
+    stream = null;
+  },
+};
+
+self.onmessage = ({ data: { type, detail } }) => commands[type](detail);

@@ -1,0 +1,98 @@
+// Keyboard: W and S or the up and down arrows walk, A and D sidestep, the left and right arrows or Q and E turn. With a source
+// focused the arrows and WASD move the source along the plan instead.
+
+const WALK_M_S = 1.3;
+const SOURCE_M_S = 1.3;
+const TURN_RAD_S = 1.9;
+const HURRY = 2.2; // with shift
+
+const KEYS = {
+  KeyW: "forward", ArrowUp: "forward", KeyS: "back", ArrowDown: "back", KeyA: "left", KeyD: "right",
+  ArrowLeft: "turnLeft", KeyQ: "turnLeft", ArrowRight: "turnRight", KeyE: "turnRight",
+};
+
+export class Walking {
+  #world;
+  #focusedEmitter;
+  #dropped;
+  #held = new Map(); // code -> action
+  #hurry = false;
+  #last = 0;
+  #frame = 0;
+  #movedEmitter = null;
+
+  /** `focusedEmitter()` names the emitter with the keyboard focus or null; `dropped(id)` tells that one came to rest. */
+  constructor(world, { focusedEmitter, dropped }) {
+    this.#world = world;
+    this.#focusedEmitter = focusedEmitter;
+    this.#dropped = dropped;
+    window.addEventListener("keydown", (event) => this.#down(event));
+    window.addEventListener("keyup", (event) => this.#up(event));
+    window.addEventListener("blur", () => this.#release());
+  }
+
+  #down(event) {
+    this.#hurry = event.shiftKey;
+    const action = KEYS[event.code];
+    if (!action || event.ctrlKey || event.altKey || event.metaKey || takesKey(event)) return;
+    event.preventDefault();
+    this.#held.set(event.code, action);
+    if (!this.#frame) {
+      this.#last = performance.now();
+      this.#frame = requestAnimationFrame((time) => this.#step(time));
+    }
+  }
+
+  #up(event) {
+    this.#hurry = event.shiftKey;
+    this.#held.delete(event.code);
+  }
+
+  #release() {
+    this.#held.clear();
+  }
+
+  #step(time) {
+    const seconds = Math.min(0.1, Math.max(0, (time - this.#last) / 1000));
+    this.#last = time;
+    const active = new Set(this.#held.values());
+    const axis = (plus, minus) => (active.has(plus) ? 1 : 0) - (active.has(minus) ? 1 : 0);
+    const pace = seconds * (this.#hurry ? HURRY : 1);
+    const emitter = this.#focusedEmitter();
+    if (active.size > 0 && emitter) this.#moveEmitter(emitter, axis, pace);
+    else if (active.size > 0) this.#walk(axis, pace);
+    if (this.#held.size > 0) {
+      this.#frame = requestAnimationFrame((next) => this.#step(next));
+    } else {
+      this.#frame = 0;
+      if (this.#movedEmitter) this.#dropped(this.#movedEmitter);
+      this.#movedEmitter = null;
+    }
+  }
+
+  #walk(axis, pace) {
+    const { position, yaw } = this.#world.listener;
+    const heading = yaw + axis("turnLeft", "turnRight") * TURN_RAD_S * pace;
+    const ahead = axis("forward", "back") * WALK_M_S * pace;
+    const aside = axis("left", "right") * WALK_M_S * pace;
+    const x = position[0] + ahead * Math.cos(heading) - aside * Math.sin(heading);
+    const y = position[1] + ahead * Math.sin(heading) + aside * Math.cos(heading);
+    this.#world.moveListener(ahead || aside ? [x, y] : null, heading);
+  }
+
+  #moveEmitter(id, axis, pace) {
+    const [x, y] = this.#world.emitters.get(id).position;
+    const east = axis("right", "left") + axis("turnRight", "turnLeft");
+    const north = axis("forward", "back");
+    this.#world.moveEmitter(id, [x + SOURCE_M_S * pace * Math.sign(east), y + SOURCE_M_S * pace * north]);
+    this.#movedEmitter = id;
+  }
+}
+
+/** Whether the focused control has a use of its own for this key. */
+function takesKey({ target, code }) {
+  if (!(target instanceof Element)) return false;
+  if (target.closest("select, textarea, [contenteditable]")) return true;
+  const input = target.closest("input");
+  return input !== null && (input.type !== "range" || code.startsWith("Arrow"));
+}

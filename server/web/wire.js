@@ -1,0 +1,60 @@
+// Wire format of /v1/stream, protocol version 1: parsers and serialisers side by side.
+// Units are metres and radians; everything binary is little endian.
+
+export const PROTOCOL = 1;
+
+const AUDIO_BLOCK = 1;
+const LISTENER_POSE = 2;
+const BLOCK_HEADER_BYTES = 24;
+const POSE_BYTES = 36;
+
+export const FLAG_EXCHANGE = 1; // an IR exchange fades in this block
+export const FLAG_LATE = 2;
+
+/** Compact listener pose; `position` is [x, y, z] and `yaw` turns counter-clockwise from +x. */
+export function serializePose({ poseId, position, yaw }) {
+  const buffer = new ArrayBuffer(POSE_BYTES);
+  const view = new DataView(buffer);
+  view.setUint8(0, LISTENER_POSE);
+  view.setUint32(4, poseId, true);
+  const floats = [...position, 0, 0, Math.sin(yaw / 2), Math.cos(yaw / 2)];
+  floats.forEach((value, index) => view.setFloat32(8 + 4 * index, value, true));
+  return buffer;
+}
+
+/** Audio block as {flags, sequence, sampleClock, poseId, frames, left, right}; the ears are Float32Array(frames). */
+export function parseBlock(buffer) {
+  const view = new DataView(buffer);
+  if (buffer.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) {
+    throw new TypeError("not an audio block");
+  }
+  const channels = view.getUint16(2, true);
+  const frames = view.getUint32(20, true);
+  if (channels !== 2 || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * channels * 4) {
+    throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${channels} channels`);
+  }
+  const left = new Float32Array(frames);
+  const right = new Float32Array(frames);
+  for (let frame = 0, offset = BLOCK_HEADER_BYTES; frame < frames; frame++, offset += 8) {
+    left[frame] = view.getFloat32(offset, true);
+    right[frame] = view.getFloat32(offset + 4, true);
+  }
+  return {
+    flags: view.getUint8(1),
+    sequence: view.getUint32(4, true),
+    sampleClock: Number(view.getBigUint64(8, true)),
+    poseId: view.getUint32(16, true),
+    frames,
+    left,
+    right,
+  };
+}
+
+export const message = {
+  hello: ({ scene, sampleRate, listener }) =>
+    JSON.stringify({ type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", listener }),
+  addEmitter: ({ id, clip, position }) => JSON.stringify({ type: "add_emitter", id, clip, position }),
+  moveEmitter: ({ id, position, poseId }) => JSON.stringify({ type: "move_emitter", id, position, pose_id: poseId }),
+  removeEmitter: (id) => JSON.stringify({ type: "remove_emitter", id }),
+  acknowledge: (sequence) => JSON.stringify({ type: "acknowledge", sequence }),
+};

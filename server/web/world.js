@@ -1,0 +1,83 @@
+// What is in the scene: one listener and a few emitters, always in places where they may stand.
+// Events: "listener", "emitter" (detail: the emitter) and "emitters" (one came or went).
+
+import { Floor, distance, wrapAngle } from "./geometry.js";
+
+export const MOST_EMITTERS = 2;
+
+export class World extends EventTarget {
+  constructor(scene) {
+    super();
+    this.scene = scene;
+    const { minimum, maximum } = scene.bounds;
+    this.floor = new Floor({ corners: scene.corners, minimum: minimum.slice(0, 2), maximum: maximum.slice(0, 2) });
+    this.listener = { position: [...scene.listener.position], yaw: scene.listener.yaw ?? 0 };
+    this.emitters = new Map();
+  }
+
+  #emit(type, detail) {
+    this.dispatchEvent(new CustomEvent(type, { detail }));
+  }
+
+  /** Moves and turns the listener; `point` is [x, y] or [x, y, z], either argument may be left out. */
+  moveListener(point, yaw) {
+    const { position } = this.listener;
+    if (point) this.#place(position, point);
+    if (yaw !== undefined) this.listener.yaw = wrapAngle(yaw);
+    this.#emit("listener", this.listener);
+  }
+
+  moveEmitter(id, point) {
+    const emitter = this.emitters.get(id);
+    this.#place(emitter.position, point);
+    this.#emit("emitter", emitter);
+  }
+
+  #place(position, point) {
+    const { minimum, maximum } = this.scene.bounds;
+    [position[0], position[1]] = this.floor.slide([position[0], position[1]], [point[0], point[1]]);
+    if (point.length > 2) position[2] = Math.min(maximum[2], Math.max(minimum[2], point[2]));
+  }
+
+  setClip(id, clip) {
+    const emitter = this.emitters.get(id);
+    emitter.clip = clip;
+    this.#emit("emitter", emitter);
+  }
+
+  /** Adds an emitter named by the first free letter, by default at the scene's place for it or else where there is most room. */
+  addEmitter({ clip, position }) {
+    const id = ["A", "B", "C", "D"].find((letter) => !this.emitters.has(letter));
+    const height = this.scene.emitter.position[2];
+    const emitter = { id, clip, position: position ? [...position] : [...this.#roomiest(), height] };
+    this.emitters.set(id, emitter);
+    this.#emit("emitters");
+    return emitter;
+  }
+
+  removeEmitter(id) {
+    this.emitters.delete(id);
+    this.#emit("emitters");
+  }
+
+  #roomiest() {
+    const { minimum, maximum, corners } = this.floor;
+    const open = new Floor({ corners, minimum, maximum, clearance: 0.7 });
+    const taken = [this.listener.position, ...[...this.emitters.values()].map(({ position }) => position)];
+    const spread = ([x, y]) => Math.min(...taken.map((position) => distance(position, [x, y])));
+    let best = null;
+    for (let x = minimum[0]; x <= maximum[0]; x += 0.2) {
+      for (let y = minimum[1]; y <= maximum[1]; y += 0.2) {
+        if (open.allows([x, y]) && (!best || spread([x, y]) > spread(best))) best = [x, y];
+      }
+    }
+    return best ?? [this.listener.position[0], this.listener.position[1]];
+  }
+
+  /** Emitter as heard: distance in metres and bearing in radians, positive to the left of the nose. */
+  bearing({ position }) {
+    const [x, y] = this.listener.position;
+    const angle = Math.atan2(position[1] - y, position[0] - x) - this.listener.yaw;
+    return { distanceM: distance(position, [x, y]), bearing: wrapAngle(angle) };
+  }
+}
