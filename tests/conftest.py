@@ -1,64 +1,132 @@
-"""A small scene whose field is arithmetic, not a network: exact and instant."""
+"""A small scene whose field is arithmetic written as an ONNX graph: no training, and what it should say is known.
 
+Sound decays, is louder nearby (1 / distance), and louder in the ear on its side.
+"""
+
+import io
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
-from server.scene.bundle import Bundle
-from server.scene.geometry import Geometry, Material, Materials
+from server.field.field import AcousticField
+from server.scene.bundle import Bundle, write_bundle
+from server.scene.geometry import Geometry, Material, Materials, Opening
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
 
+CODEC = CodecParameters(
+    sample_rate=24_000, n_fft=256, hop=64, samples=4_000, lead_samples=64, known_frames=4, log_floor=1e-3
+)
 PLAIN = Material(absorption=(0.2,) * 7, scattering=(0.1,) * 7)
+MANIFEST = Manifest(
+    id="flat",
+    name="A flat",
+    geometry=Geometry(
+        height_m=2.8,
+        corners=((0, 0), (8, 0), (8, 5), (0, 5)),
+        openings=(Opening(name="middle", start=(4.0, 1.0), end=(4.0, 4.0)),),
+        materials=Materials(walls=PLAIN, floor=PLAIN, ceiling=PLAIN),
+    ),
+    bounds=Bounds(minimum=(0.3, 0.3, 0.5), maximum=(7.7, 4.7, 2.3)),
+    speed_of_sound=343.0,
+    start=Start(listener=(2.0, 2.5, 1.5), listener_yaw_deg=90.0, emitter=(6.0, 3.0, 1.5)),
+    codec=CODEC,
+    fields={"arithmetic": FieldFile(file="arithmetic.onnx", architecture="arithmetic", rank=1)},
+    levels=(QualityLevel(name="standard", field="arithmetic"),),
+    files={"arithmetic.onnx": "0" * 64, "arrays.npz": "0" * 64},
+)
 
 
-class ArithmeticField:
-    """IRs that depend on every coordinate: decaying noise, louder nearby, and louder in the ear on that side."""
-
-    channels = 2
-
-    def __init__(self, bundle: Bundle) -> None:
-        self.bundle = bundle
-        self.level = bundle.manifest.levels[0]
-        self.sample_rate = bundle.manifest.codec.sample_rate
-        self.ir_samples = bundle.manifest.codec.samples
-        decay = np.exp(-np.arange(self.ir_samples) / (0.05 * self.sample_rate))
-        self._tail = np.random.default_rng(7).standard_normal((2, self.ir_samples)) * decay * 0.1
-        self.calls: list[int] = []
-
-    def impulse_responses(self, listeners, emitters, yaws):
-        listeners, emitters, yaws = (np.asarray(value, np.float64) for value in (listeners, emitters, yaws))
-        self.calls.append(len(yaws))
-        offset = emitters - listeners
-        distance = np.maximum(np.linalg.norm(offset, axis=-1), 0.2)
-        bearing = np.arctan2(offset[:, 1], offset[:, 0]) - yaws
-        ears = np.stack([1 + 0.8 * np.sin(bearing), 1 - 0.8 * np.sin(bearing)], axis=-1) / distance[:, None]
-        return (ears[..., None] * self._tail).astype(np.float32)
-
-
-def make_manifest(identifier: str = "flat") -> Manifest:
-    return Manifest(
-        id=identifier,
-        name="A flat",
-        geometry=Geometry(
-            height_m=2.8,
-            corners=((0, 0), (8, 0), (8, 5), (0, 5)),
-            materials=Materials(walls=PLAIN, floor=PLAIN, ceiling=PLAIN),
-        ),
-        bounds=Bounds(minimum=(0.3, 0.3, 0.5), maximum=(7.7, 4.7, 2.3)),
-        speed_of_sound=343.0,
-        start=Start(listener=(2.0, 2.5, 1.5), listener_yaw_deg=90.0, emitter=(6.0, 3.0, 1.5)),
-        codec=CodecParameters(
-            sample_rate=24_000, n_fft=512, hop=128, samples=4_000, lead_samples=64, known_frames=4, log_floor=1e-3
-        ),
-        fields={"arithmetic": FieldFile(file="arithmetic.onnx", architecture="arithmetic", rank=1)},
-        levels=(QualityLevel(name="standard", field="arithmetic"),),
-        files={"arithmetic.onnx": "0" * 64, "arrays.npz": "0" * 64},
+def arithmetic_graph() -> bytes:
+    bins, frames, known = CODEC.codec.bins, CODEC.codec.frames, CODEC.known_frames
+    decay = np.linspace(-1.0, -8.0, frames, dtype=np.float32)[None, None, None] * np.ones((1, 1, bins, 1), np.float32)
+    constants = {
+        "decay": decay,
+        "zero": np.float32(0),
+        "one": np.float32(1),
+        "reach": np.float32(0.2),
+        "side_strength": np.float32(0.8),
+        "axis": np.array([1]),
+        "column": np.array([-1, 1]),
+        "cube": np.array([-1, 1, 1, 1]),
+        "ears": np.array([-1, 2, 1, 1]),
+        "no_phase": np.zeros((1, 2, bins, known), np.float32),
+        "no_coherence": np.zeros((1, 2, bins, frames), np.float32),
+        "x": np.array([0]),
+        "y": np.array([1]),
+    }
+    steps = [
+        ("Sub", ["emitter", "listener"], "offset"),
+        ("ReduceL2", ["offset", "axis"], "range"),
+        ("Add", ["range", "reach"], "distance"),
+        ("Log", ["distance"], "log_distance"),
+        ("Reshape", ["log_distance", "cube"], "attenuation"),
+        ("Gather", ["offset", "x"], "east"),
+        ("Gather", ["offset", "y"], "north"),
+        ("Reshape", ["yaw", "column"], "heading"),
+        ("Sin", ["heading"], "sine"),
+        ("Cos", ["heading"], "cosine"),
+        ("Mul", ["north", "cosine"], "north_part"),
+        ("Mul", ["east", "sine"], "east_part"),
+        ("Sub", ["north_part", "east_part"], "leftward"),
+        ("Div", ["leftward", "distance"], "side"),
+        ("Mul", ["side", "side_strength"], "left_excess"),
+        ("Neg", ["left_excess"], "right_excess"),
+        ("Concat", ["left_excess", "right_excess"], "excess"),
+        ("Add", ["excess", "one"], "ear_gain"),
+        ("Log", ["ear_gain"], "log_ear_gain"),
+        ("Reshape", ["log_ear_gain", "ears"], "ear_level"),
+        ("Sub", ["ear_level", "attenuation"], "level"),
+        ("Add", ["level", "decay"], "log_magnitude"),
+        ("Mul", ["attenuation", "zero"], "nothing"),
+        ("Add", ["nothing", "no_phase"], "instantaneous_frequency"),
+        ("Add", ["nothing", "no_phase"], "phase_certainty"),
+        ("Add", ["nothing", "no_coherence"], "interaural_coherence"),
+    ]
+    attributes = {"Gather": {"axis": 1}, "Concat": {"axis": 1}, "ReduceL2": {"keepdims": 1}}
+    nodes = [helper.make_node(kind, inputs, [output], **attributes.get(kind, {})) for kind, inputs, output in steps]
+    shapes = {
+        "log_magnitude": [bins, frames],
+        "instantaneous_frequency": [bins, known],
+        "phase_certainty": [bins, known],
+        "interaural_coherence": [bins, frames],
+    }
+    graph = helper.make_graph(
+        nodes,
+        "arithmetic",
+        [
+            helper.make_tensor_value_info("listener", TensorProto.FLOAT, ["B", 3]),
+            helper.make_tensor_value_info("emitter", TensorProto.FLOAT, ["B", 3]),
+            helper.make_tensor_value_info("yaw", TensorProto.FLOAT, ["B"]),
+        ],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["B", 2, *shape]) for name, shape in shapes.items()],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
     )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory) -> Bundle:
+    noise = io.BytesIO()
+    np.savez(noise, frozen_noise=np.random.default_rng(7).standard_normal((2, CODEC.samples), dtype=np.float32))
+    files = {"arithmetic.onnx": arithmetic_graph(), "arrays.npz": noise.getvalue()}
+    return write_bundle(tmp_path_factory.mktemp("scenes") / "flat", MANIFEST, files)
 
 
 @pytest.fixture
-def field() -> ArithmeticField:
-    manifest = make_manifest()
-    noise = np.zeros((2, manifest.codec.samples), np.float32)
-    return ArithmeticField(Bundle(Path("flat"), manifest, "d1" * 32, {}, noise))
+def field(bundle) -> AcousticField:
+    return AcousticField.load(bundle)
+
+
+@pytest.fixture
+def bundle_copy(bundle, tmp_path) -> Path:
+    """The bundle's folder, to damage."""
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for path in bundle.folder.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder
