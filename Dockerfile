@@ -23,10 +23,13 @@ LABEL org.opencontainers.image.title="Nafir" \
 COPY --from=builder /opt/nafir /opt/nafir
 ENV PATH=/opt/nafir/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
-    PYTHONUNBUFFERED=1
+    PYTHONUNBUFFERED=1 \
+    NAFIR_HOST=0.0.0.0 \
+    NAFIR_PORT=8000
 USER 10001:10001
 EXPOSE 8000
+# The slim image has no curl. http.client, unlike urllib, takes no notice of a proxy in the environment.
 HEALTHCHECK --interval=15s --timeout=5s --start-period=60s --retries=3 \
-    CMD ["python", "-c", "import http.client, sys; c = http.client.HTTPConnection('127.0.0.1', 8000, timeout=4); c.request('GET', '/readyz'); sys.exit(c.getresponse().status != 200)"]
+    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['NAFIR_PORT']), timeout=4); c.request('GET', '/readyz'); sys.exit(c.getresponse().status != 200)"]
 ENTRYPOINT ["nafir"]
-CMD ["serve", "--host", "0.0.0.0", "--port", "8000"]
+CMD ["serve"]

@@ -6,8 +6,8 @@
 #
 # The Dockerfile is built unmodified by buildah with `--isolation chroot`. Its base image is made here by mmdebstrap:
 # Debian with Python 3.11, tagged with the Dockerfile's name for it in an image store of this script's own, which is
-# deleted at the end. podman and runc then run the image with a read-only root; the script waits for /readyz, GETs an
-# impulse response and checks that it is a stereo wav with sound in it.
+# deleted at the end. podman and runc then run the image with a read-only root; the script waits for /readyz, looks
+# at the page, GETs an impulse response and checks that it is a stereo wav with sound in it.
 #
 # Environment, all optional:
 #   PORT=8000            port on the host's loopback
@@ -102,7 +102,7 @@ started=$SECONDS
 run_podman run --detach --name "$container" --no-healthcheck --network host --read-only --read-only-tmpfs=false \
     --cap-drop all --security-opt no-new-privileges \
     --ulimit nofile=1024:1024 --ulimit nproc=4096:4096 \
-    "$image" serve --host 127.0.0.1 --port "$port" >/dev/null
+    --env NAFIR_HOST=127.0.0.1 --env "NAFIR_PORT=$port" "$image" >/dev/null
 until curl --silent --fail --output /dev/null "$url/readyz"; do
     [ "$(run_podman inspect "$container" --format '{{.State.Running}}')" = true ] ||
         { run_podman logs "$container"; fail "the server stopped"; }
@@ -128,7 +128,8 @@ mapfile -t check < <(run_podman image inspect "$image" --format '{{json .HealthC
 run_podman exec "$container" "${check[@]}" || fail "the health check fails on a ready server"
 echo "health check passes"
 
-say "asking for an impulse response"
+say "asking for the page and an impulse response"
+curl --silent --show-error --fail "$url/" | grep --ignore-case --quiet '<!doctype html' || fail "no page at /"
 curl --silent --show-error --fail --output "$state/ir.wav" "$url/v1/scenes/$scene/impulse-response?$query"
 python3 - "$state/ir.wav" <<'PYTHON'
 import struct
