@@ -7,7 +7,8 @@
 # The Dockerfile is built unmodified by buildah with `--isolation chroot`. Its base image is made here by mmdebstrap:
 # Debian with Python 3.11, tagged with the Dockerfile's name for it in an image store of this script's own, which is
 # deleted at the end. podman and runc then run the image with a read-only root; the script waits for /readyz, looks
-# at the page, GETs an impulse response and checks that it is a stereo wav with sound in it.
+# at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks through the scene
+# over WebSocket.
 #
 # Environment, all optional:
 #   PORT=8000            port on the host's loopback
@@ -129,7 +130,8 @@ run_podman exec "$container" "${check[@]}" || fail "the health check fails on a 
 echo "health check passes"
 
 say "asking for the page and an impulse response"
-curl --silent --show-error --fail "$url/" | grep --ignore-case --quiet '<!doctype html' || fail "no page at /"
+page=$(curl --silent --show-error --fail "$url/")
+[[ ${page,,} == *"<!doctype html"* ]] || fail "no page at /"
 curl --silent --show-error --fail --output "$state/ir.wav" "$url/v1/scenes/$scene/impulse-response?$query"
 python3 - "$state/ir.wav" <<'PYTHON'
 import struct
@@ -149,6 +151,11 @@ peak = max(map(abs, samples))
 assert 0 < peak < 1e3, f"peak {peak}"
 print(f"{len(data)} bytes: {len(samples) // channels} frames x {channels} at {rate} Hz, format {code}, peak {peak:.4f}")
 PYTHON
+
+say "walking through the scene for three seconds"
+# From inside, where what the client imports is installed; /dev/shm is the only place to write.
+run_podman exec --interactive "$container" python - --url "ws://127.0.0.1:$port/v1/stream" --scene "$scene" \
+    --seconds 3 -o /dev/shm/heard.wav <"$root/client_examples/python/walk.py"
 
 say "stopping it"
 started=$SECONDS
