@@ -1,10 +1,11 @@
 """Impulse responses to log-magnitude and instantaneous frequency, and back.
 
-Axes: (..., frequency, frame) for spectrograms, (..., sample) for signals. The transform is `scipy.signal.ShortTimeFFT` with a
-periodic Hann window; frame 0 is the first that touches the signal.
+Axes: (..., frequency, frame) for spectrograms, (..., sample) for signals. The transform is `scipy.signal.ShortTimeFFT`
+with a periodic Hann window; frame 0 is the first that touches the signal.
 
-Instantaneous frequency is the phase advance from one frame to the next *less* that of the bin's centre frequency, wrapped to
-[-pi, pi): without the subtraction every fourth bin would sit on the branch cut (hop = n_fft / 4). Frame 0 holds the absolute phase.
+Instantaneous frequency is the phase advance from one frame to the next *less* that of the bin's centre frequency,
+wrapped to [-pi, pi): without the subtraction every fourth bin would sit on the branch cut (hop = n_fft / 4). Frame 0
+holds the absolute phase.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,8 @@ Array = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Codec:
-    """`samples` is the length of the signals coded; `log_floor` keeps silence finite: magnitudes are stored as log(|S| + log_floor)."""
+    """`samples` is the length of the signals coded; `log_floor` keeps silence finite: magnitudes are stored as
+    log(|S| + log_floor)."""
 
     sample_rate: int
     n_fft: int
@@ -45,12 +47,12 @@ class Codec:
     def frame_times_s(self) -> npt.NDArray[np.float64]:
         """(frame,) centre of each window; the first is negative."""
         first = int(self._transform.p_min)
-        return np.arange(first, first + self.frames) * self.hop / self.sample_rate
+        return np.arange(first, first + self.frames, dtype=np.float64) * self.hop / self.sample_rate
 
     @cached_property
     def nominal_advance(self) -> npt.NDArray[np.float64]:
         """(frequency, 1) radians by which a bin-centred tone advances per frame."""
-        return (2 * np.pi * self.hop / self.n_fft * np.arange(self.bins))[:, None]
+        return np.asarray(2 * np.pi * self.hop / self.n_fft * np.arange(self.bins, dtype=np.float64)[:, None])
 
     @cached_property
     def window_energy(self) -> float:
@@ -62,7 +64,7 @@ class Codec:
         return np.asarray(self._transform.stft(signal, p1=self._transform.p_max(self.samples)))
 
     def log_magnitude(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.float64]:
-        return np.log(np.abs(spectrogram) + self.log_floor)
+        return np.asarray(np.log(np.abs(spectrogram).astype(np.float64) + self.log_floor))
 
     def magnitude(self, log_magnitude: Array) -> Array:
         return np.maximum(np.exp(log_magnitude) - self.log_floor, 0)

@@ -1,7 +1,8 @@
 """Poses and floor plans.
 
-Metres and radians; right-handed world with x east, y north, z up. An orientation is a unit quaternion (x, y, z, w) whose identity
-looks along +x with +y to the left. Points are arrays whose last axis is (x, y, z); leading axes broadcast.
+Metres and radians; right-handed world with x east, y north, z up. An orientation is a unit quaternion (x, y, z, w)
+whose identity looks along +x with +y to the left. Points are arrays whose last axis is (x, y, z); leading axes
+broadcast.
 """
 
 import heapq
@@ -78,10 +79,10 @@ class FloorPlan:
         outgoing = self.walls[:, 1] - self.walls[:, 0]
         incoming = np.roll(outgoing, 1, axis=0)
         turn = incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0]
-        return self.walls[turn < 0, 0]
+        return np.asarray(self.walls[turn < 0, 0])
 
     @cached_property
-    def _bend_lengths(self) -> npt.NDArray[np.float64]:
+    def bend_lengths_m(self) -> npt.NDArray[np.float64]:
         """(corner, corner): shortest path between reflex corners (Dijkstra over the visibility graph)."""
         bends = self.bend_corners
         points = np.concatenate([bends, np.zeros((len(bends), 1))], axis=-1)
@@ -109,7 +110,7 @@ class FloorPlan:
         crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
         inside = np.sum(straddles & (x < crossing), axis=-1) % 2 == 1
         touches = self.wall_distance_m(points) < _TOUCH_M
-        return (inside | touches) & (points[..., 2] >= 0) & (points[..., 2] <= self.height_m)
+        return np.asarray((inside | touches) & (points[..., 2] >= 0) & (points[..., 2] <= self.height_m))
 
     def wall_distance_m(self, points: Points) -> npt.NDArray[np.float64]:
         """(...,) distance in plan to the nearest wall, inside or out."""
@@ -132,14 +133,17 @@ class FloorPlan:
             edge, offset = tip - origin, point - origin
             return np.asarray(edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0])
 
-        crosses = (side(start, end, p) * side(start, end, q) < -_TOUCH_M) & (side(p, q, start) * side(p, q, end) < -_TOUCH_M)
+        crosses = (side(start, end, p) * side(start, end, q) < -_TOUCH_M) & (
+            side(p, q, start) * side(p, q, end) < -_TOUCH_M
+        )
         # A sight line through the inside of a wall block may pass exactly through its corners: its midpoint tells.
         middle = (a + b) / 2
         inside = self.contains(np.concatenate([middle[..., :2], np.zeros((*middle.shape[:-1], 1))], axis=-1))
         return np.asarray(~np.any(crosses, axis=-1) & inside)
 
     def path_length_m(self, a: Points, b: Points) -> npt.NDArray[np.float64]:
-        """(...,) length of the shortest path from a to b that goes through no wall; the straight distance where they see each other."""
+        """(...,) length of the shortest path from a to b that goes through no wall; the straight distance where they
+        see each other."""
         a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
         straight = np.linalg.norm(a - b, axis=-1)
         bends = np.concatenate([self.bend_corners, np.zeros((len(self.bend_corners), 1))], axis=-1)
@@ -150,6 +154,6 @@ class FloorPlan:
             plan = np.linalg.norm(points[..., None, :2] - bends[:, :2], axis=-1)
             return np.where(self.is_visible(points[..., None, :], bends), plan, np.inf)
 
-        via = reach(a)[..., :, None] + self._bend_lengths + reach(b)[..., None, :]
+        via = reach(a)[..., :, None] + self.bend_lengths_m + reach(b)[..., None, :]
         bent = np.hypot(np.min(via, axis=(-2, -1)), a[..., 2] - b[..., 2])
         return np.asarray(np.where(self.is_visible(a, b), straight, bent))

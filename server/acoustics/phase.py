@@ -1,15 +1,18 @@
-"""Phase for a predicted binaural spectrogram: what is known is used, the rest is noise with the right correlation between the ears.
+"""Phase for a predicted binaural spectrogram: what is known is used, the rest is noise with the right correlation
+between the ears.
 
-A field knows the phase of the direct sound and of some early reflections, and cannot know that of late reverberation. It says how
-much it knows: `certainty` is the length of the mean phasor, 1 where the phase is determined and 0 where it is anybody's guess.
-A bin is then the known phasor plus frozen noise carrying the remaining energy:
+A field knows the phase of the direct sound and of some early reflections, and cannot know that of late reverberation.
+It says how much it knows: `certainty` is the length of the mean phasor, 1 where the phase is determined and 0 where it
+is anybody's guess. A bin is then the known phasor plus frozen noise carrying the remaining energy:
 
     S = M (R exp(i phi) + sqrt(1 - R**2) N)
 
-The noise is the transform of one white signal per scene, the same for every pose, so that responses of neighbouring poses crossfade
-without combing. Its right ear is mixed so that the whole has the predicted complex interaural coherence.
+The noise is the transform of one white signal per scene, the same for every pose, so that responses of neighbouring
+poses crossfade without combing. Its right ear is mixed so that the whole has the predicted complex interaural
+coherence.
 
-Axes: (..., ear, frequency, frame), ear 0 = left; coherence (..., frequency, frame), E[S_left conj(S_right)] over the magnitudes.
+Axes: (..., ear, frequency, frame), ear 0 = left; coherence (..., frequency, frame), E[S_left conj(S_right)] over the
+magnitudes.
 """
 
 from dataclasses import dataclass
@@ -38,9 +41,7 @@ class FrozenNoise:
         return cls((codec.transform(signal.astype(np.float64)) * scale).astype(np.complex64))
 
 
-def compose(
-    magnitude: Real, known_phase: Real, certainty: Real, coherence: Complex, noise: FrozenNoise
-) -> Complex:
+def compose(magnitude: Real, known_phase: Real, certainty: Real, coherence: Complex, noise: FrozenNoise) -> Complex:
     """(..., 2, frequency, frame) complex spectrogram.
 
     `known_phase` and `certainty` cover the first frames only, as many as they have; all later ones are pure noise.
@@ -60,9 +61,10 @@ def compose(
 
 
 def _correlated(noise: Complex, coherence: Complex) -> Complex:
-    """(..., 2, frequency, frame) noise of unit power whose ears have the given coherence, limited to what is possible."""
+    """(..., 2, frequency, frame) noise of unit power whose ears have the given coherence, limited to what is
+    possible."""
     strength = np.abs(coherence)
-    coherence = coherence / np.maximum(strength, 1)
+    coherence = (coherence / np.maximum(strength, 1)).astype(np.complex64)
     left = np.broadcast_to(noise[0], coherence.shape)
     right = np.conj(coherence) * noise[0] + np.sqrt(np.maximum(1 - np.abs(coherence) ** 2, 0)) * noise[1]
     return np.stack([left, right], axis=-3).astype(np.complex64)

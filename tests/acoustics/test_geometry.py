@@ -76,7 +76,9 @@ def test_path_is_symmetric_and_no_shorter_than_the_straight_line(a: tuple[float,
 
 
 @given(point, point, point)
-def test_path_obeys_the_triangle_inequality_in_plan(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> None:
+def test_path_obeys_the_triangle_inequality_in_plan(
+    a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]
+) -> None:
     level = [np.array((p[0], p[1], 1.5)) for p in (a, b, c)]
     length = APARTMENT.path_length_m
     assert length(level[0], level[2]) <= length(level[0], level[1]) + length(level[1], level[2]) + 1e-6

@@ -34,7 +34,9 @@ def test_power_is_that_of_the_magnitude_whatever_the_certainty(noise: FrozenNois
     phase = np.zeros((2, *SHAPE), dtype=np.float32)
     # A known part that leaves room for noise of any correlation.
     coherence = _flat(certainty**2 + 0.1)
-    power = np.mean(np.abs(compose(magnitude, phase, np.full_like(phase, certainty), coherence, noise)) ** 2, axis=(-2, -1))
+    power = np.mean(
+        np.abs(compose(magnitude, phase, np.full_like(phase, certainty), coherence, noise)) ** 2, axis=(-2, -1)
+    )
     assert_allclose(power, 0.09, rtol=0.05)
 
 

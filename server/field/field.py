@@ -1,0 +1,169 @@
+"""A trained acoustic field: poses in, binaural impulse responses out.
+
+Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians, seconds.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import onnxruntime
+
+from server.acoustics.phase import FrozenNoise, compose
+from server.errors import BundleError
+from server.scene.bundle import Bundle
+from server.scene.manifest import QualityLevel
+
+Float32 = npt.NDArray[np.float32]
+
+_INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
+_OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
+_GATE_S = 0.0015
+_CHUNK = 32
+
+
+@dataclass(frozen=True)
+class Spectrograms:
+    """What the network says: `log_magnitude` (B, 2, frequency, frame); `instantaneous_frequency` and `certainty` of
+    the first frames (B, 2, frequency, known frame); `coherence` (B, frequency, frame), complex, between the ears."""
+
+    log_magnitude: Float32
+    instantaneous_frequency: Float32
+    certainty: Float32
+    coherence: npt.NDArray[np.complex64]
+
+
+class AcousticField:
+    """One scene's field at one quality level. Thread-safe: every call works on its own arrays."""
+
+    channels = 2
+
+    def __init__(self, bundle: Bundle, level: QualityLevel, session: onnxruntime.InferenceSession) -> None:
+        self.bundle = bundle
+        self.level = level
+        self._session = session
+        parameters = bundle.manifest.codec
+        self._codec = parameters.codec
+        self._lead = parameters.lead_samples
+        self._noise = FrozenNoise.from_signal(self._codec, bundle.frozen_noise)
+        self._gate = self._onset_gate()
+
+    @classmethod
+    def load(cls, bundle: Bundle, *, level: str | None = None, threads: int = 1) -> "AcousticField":
+        """The named quality level, by default the first. Raises BundleError for a graph that does not fit the
+        manifest."""
+        manifest = bundle.manifest
+        chosen = next((entry for entry in manifest.levels if level in (None, entry.name)), None)
+        if chosen is None:
+            raise BundleError(bundle.folder, "levels", f"there is no quality level {level!r}")
+        name = manifest.fields[chosen.field].file
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        try:
+            session = onnxruntime.InferenceSession(bundle.models[name], options, providers=["CPUExecutionProvider"])
+        except Exception as exc:  # ONNX Runtime's own exceptions share no base class but this one.
+            raise BundleError(bundle.folder / name, "graph", f"cannot be loaded: {exc}") from exc
+        inputs = {entry.name: entry.shape[1:] for entry in session.get_inputs()}
+        if inputs != _INPUTS:
+            raise BundleError(bundle.folder / name, "inputs", f"are {inputs}, expected {_INPUTS} after the batch axis")
+        outputs = tuple(entry.name for entry in session.get_outputs())
+        if not set(_OUTPUTS) <= set(outputs):
+            raise BundleError(bundle.folder / name, "outputs", f"are {outputs}, expected {_OUTPUTS}")
+        field = cls(bundle, chosen, session)
+        field._check_outputs(name)
+        return field
+
+    @property
+    def sample_rate(self) -> int:
+        return self._codec.sample_rate
+
+    @property
+    def ir_samples(self) -> int:
+        return self._codec.samples
+
+    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+        """Network outputs for B poses; positions (B, 3), yaws (B,)."""
+        log_magnitude, frequency, certainty, coherence = self._session.run(
+            _OUTPUTS,
+            {
+                "listener": np.asarray(listeners, dtype=np.float32),
+                "emitter": np.asarray(emitters, dtype=np.float32),
+                "yaw": np.asarray(yaws, dtype=np.float32),
+            },
+        )
+        known = self.bundle.manifest.codec.known_frames
+        return Spectrograms(
+            log_magnitude,
+            frequency[..., :known],
+            certainty[..., :known],
+            coherence[:, 0] + 1j * coherence[:, 1],
+        )
+
+    def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
+        """(B, 2, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
+        listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
+        for start in range(0, len(yaws), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            responses[part] = self._decode(listeners[part], emitters[part], yaws[part])
+        return responses
+
+    def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """(B,) time at which sound can first arrive, round corners where it must."""
+        length = self.bundle.floor_plan.path_length_m(np.asarray(emitters), np.asarray(listeners))
+        return np.asarray(length / self.bundle.manifest.speed_of_sound)
+
+    def _decode(
+        self, listeners: npt.NDArray[np.float64], emitters: npt.NDArray[np.float64], yaws: npt.NDArray[np.float64]
+    ) -> Float32:
+        predicted = self.spectrograms(listeners, emitters, yaws)
+        onset = self.onset_s(listeners, emitters) * self.sample_rate
+        start = np.floor(onset).astype(int)
+        spectrogram = compose(
+            self._codec.magnitude(predicted.log_magnitude),
+            self._codec.integrate(predicted.instantaneous_frequency),
+            predicted.certainty,
+            predicted.coherence,
+            self._noise,
+        )
+        shift = np.exp(-2j * np.pi * np.arange(self._codec.bins) / self._codec.n_fft * (onset - start)[:, None])
+        spectrogram *= shift[:, None, :, None].astype(np.complex64)
+        aligned = self._codec.synthesise(spectrogram)
+        aligned[..., : len(self._gate)] *= self._gate
+        responses = np.zeros_like(aligned)
+        for row, first in enumerate(start - self._lead):
+            source, target = max(0, -first), max(0, first)
+            length = aligned.shape[-1] - max(source, target)
+            if length > 0:
+                responses[row, :, target : target + length] = aligned[row, :, source : source + length]
+        return responses
+
+    def _onset_gate(self) -> Float32:
+        """Silence until just before sound can arrive at the nearer ear: windows smear energy to where it cannot be."""
+        opens = max(0, self._lead - round(_GATE_S * self.sample_rate))
+        rise = (1 - np.cos(np.pi * np.arange(self._lead - opens) / max(1, 2 * (self._lead - opens)))) ** 0.5
+        return np.concatenate([np.zeros(opens), rise]).astype(np.float32)
+
+    def _check_outputs(self, name: str) -> None:
+        """Runs the graph once, in the middle of the bounds."""
+        bounds = self.bundle.manifest.bounds
+        middle = (np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2
+        try:
+            predicted = self.spectrograms(middle, middle, np.zeros(1))
+        except (ValueError, RuntimeError) as exc:
+            raise BundleError(self.bundle.folder / name, "outputs", f"cannot be computed: {exc}") from exc
+        bins, frames, known = self._codec.bins, self._codec.frames, self.bundle.manifest.codec.known_frames
+        expected = {
+            "log_magnitude": (1, 2, bins, frames),
+            "instantaneous_frequency": (1, 2, bins, known),
+            "certainty": (1, 2, bins, known),
+            "coherence": (1, bins, frames),
+        }
+        for output, shape in expected.items():
+            found = getattr(predicted, output)
+            if found.shape != shape or not np.isfinite(found).all():
+                raise BundleError(
+                    self.bundle.folder / name, output, f"has shape {found.shape}, expected {shape} and finite"
+                )

@@ -1,0 +1,95 @@
+"""How loud an emitter is everywhere in a scene: a map of listener positions, for people to look at.
+
+Level is that of both ears together, averaged over head orientations, in dB relative to the emitter's free field at one
+metre.
+"""
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from server.acoustics.decibels import power_to_db
+from server.acoustics.geometry import Vector3
+from server.field.field import AcousticField
+
+_YAWS = 4
+_CHUNK = 64
+_PIXELS_PER_METRE = 80
+_RANGE_DB = 30.0
+# Perceptually even, dark to bright, legible under dark and light drawings (a subset of the CAM02-UCS path of
+# "viridis").
+_COLOURS = np.array(
+    [(46, 30, 92), (58, 82, 139), (44, 113, 142), (33, 144, 141), (66, 190, 113), (163, 218, 55), (250, 230, 60)],
+    dtype=float,
+)
+
+
+@dataclass(frozen=True)
+class LoudnessMap:
+    """`levels_db` (row, column), NaN outside the room; row 0 is the southernmost. `origin` is the centre of cell (0,
+    0), metres."""
+
+    levels_db: npt.NDArray[np.float64]
+    origin: tuple[float, float]
+    spacing_m: float
+    height_m: float
+
+    def to_json(self) -> dict[str, object]:
+        rows = [[None if np.isnan(level) else round(float(level), 2) for level in row] for row in self.levels_db]
+        return {
+            "levels_db": rows,
+            "origin": list(self.origin),
+            "spacing_m": self.spacing_m,
+            "height_m": self.height_m,
+            "loudest_db": round(float(np.nanmax(self.levels_db)), 2),
+            "quietest_db": round(float(np.nanmin(self.levels_db)), 2),
+        }
+
+    def to_png(self) -> bytes:
+        """North up, transparent outside the room; the brightest colour is the loudest, 30 dB above the darkest."""
+        loudest = np.nanmax(self.levels_db)
+        share = np.clip(1 - (loudest - np.nan_to_num(self.levels_db, nan=loudest)) / _RANGE_DB, 0, 1)
+        steps = np.linspace(0, 1, len(_COLOURS))
+        colour = np.stack([np.interp(share, steps, _COLOURS[:, channel]) for channel in range(3)], axis=-1)
+        alpha = np.where(np.isnan(self.levels_db), 0, 255)[..., None]
+        image = Image.fromarray(np.concatenate([colour, alpha], axis=-1).astype(np.uint8)[::-1], "RGBA")
+        scale = self.spacing_m * _PIXELS_PER_METRE
+        size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+        buffer = io.BytesIO()
+        image.resize(size, Image.Resampling.BICUBIC).save(buffer, "PNG")
+        return buffer.getvalue()
+
+
+def loudness_map(
+    field: AcousticField, emitter: Vector3, *, listener_height_m: float, spacing_m: float = 0.25
+) -> LoudnessMap:
+    """Asks the field for every cell inside the floor plan; about 2 ms per cell."""
+    bundle = field.bundle
+    low, high = np.asarray(bundle.manifest.bounds.minimum[:2]), np.asarray(bundle.manifest.bounds.maximum[:2])
+    columns, rows = np.maximum(1, np.round((high - low) / spacing_m).astype(int))
+    x = low[0] + (np.arange(columns) + 0.5) * (high[0] - low[0]) / columns
+    y = low[1] + (np.arange(rows) + 0.5) * (high[1] - low[1]) / rows
+    cells = np.stack([*np.meshgrid(x, y), np.full((rows, columns), listener_height_m)], axis=-1)
+    inside = bundle.floor_plan.contains(cells)
+    levels = np.full((rows, columns), np.nan)
+    levels[inside] = power_to_db(_mean_power(field, cells[inside], emitter))
+    return LoudnessMap(levels, (float(x[0]), float(y[0])), spacing_m, listener_height_m)
+
+
+def _mean_power(field: AcousticField, listeners: npt.NDArray[np.float64], emitter: Vector3) -> npt.NDArray[np.float64]:
+    """(listener,) energy per ear, averaged over ears and head orientations, straight from the predicted magnitudes."""
+    codec = field.bundle.manifest.codec.codec
+    yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
+    positions, heads = np.repeat(listeners, _YAWS, axis=0), np.tile(yaws, len(listeners))
+    power = np.empty(len(heads))
+    # Bins between DC and Nyquist stand for two.
+    weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
+    for start in range(0, len(heads), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        emitters = np.broadcast_to(emitter, positions[part].shape)
+        magnitude = codec.magnitude(field.spectrograms(positions[part], emitters, heads[part]).log_magnitude)
+        power[part] = np.einsum("bcft,f->b", magnitude**2, weight) / 2
+    return np.asarray(power.reshape(-1, _YAWS).mean(axis=1))

@@ -1,0 +1,113 @@
+"""`scene.json`: what a scene bundle says of itself."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from server.acoustics.codec import Codec
+from server.scene.geometry import Finite, Geometry, Point, Strict
+
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+
+
+class Bounds(Strict):
+    """The box of positions the field was trained for, metres."""
+
+    minimum: Point
+    maximum: Point
+
+    @model_validator(mode="after")
+    def _is_a_box(self) -> "Bounds":
+        if any(low >= high for low, high in zip(self.minimum, self.maximum, strict=True)):
+            raise ValueError("minimum must lie below maximum on every axis")
+        return self
+
+
+class Start(Strict):
+    """Where a visitor finds listener and emitter."""
+
+    listener: Point
+    listener_yaw_deg: Finite = 0.0
+    emitter: Point
+
+
+class CodecParameters(Strict):
+    """How the field's spectrograms are to be read.
+
+    `samples` is the length of a response after alignment: sample `lead_samples` is the moment sound can first arrive.
+    `known_frames` is the number of frames whose phase the field predicts.
+    """
+
+    sample_rate: Annotated[int, Field(ge=8000, le=96000)]
+    n_fft: Annotated[int, Field(ge=64, le=4096)]
+    hop: Annotated[int, Field(ge=16)]
+    samples: Annotated[int, Field(ge=256, le=960_000)]
+    lead_samples: Annotated[int, Field(ge=0)]
+    known_frames: Annotated[int, Field(ge=0)]
+    log_floor: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+    @model_validator(mode="after")
+    def _overlaps_four_times(self) -> "CodecParameters":
+        if self.n_fft != 4 * self.hop:
+            raise ValueError("hop must be a quarter of n_fft")
+        return self
+
+    @property
+    def codec(self) -> Codec:
+        return Codec(self.sample_rate, self.n_fft, self.hop, self.samples, self.log_floor)
+
+
+class FieldFile(Strict):
+    """One trained network: an ONNX file, and the rank of its output basis."""
+
+    file: FileName
+    architecture: str
+    rank: Annotated[int, Field(ge=1)]
+
+
+class Accuracy(Strict):
+    """Median errors over `pairs` held-out pairs, each heard at `yaws` head orientations, by metric, and the
+    repeatability floor."""
+
+    pairs: int
+    yaws: int
+    errors: dict[str, Finite]
+    floor: dict[str, Finite]
+
+
+class QualityLevel(Strict):
+    """A point on the accuracy-cost frontier; `accuracy` is absent until it was measured."""
+
+    name: str
+    field: str
+    accuracy: Accuracy | None = None
+
+
+class Manifest(Strict):
+    """All of `scene.json`; `files` maps every other file of the bundle to its SHA-256."""
+
+    format_version: Literal[1] = 1
+    id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
+    name: str
+    description: str = ""
+    geometry: Geometry
+    bounds: Bounds
+    speed_of_sound: Annotated[float, Field(gt=100, lt=1000)]
+    start: Start
+    channels: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+    codec: CodecParameters
+    fields: Annotated[dict[str, FieldFile], Field(min_length=1)]
+    levels: Annotated[tuple[QualityLevel, ...], Field(min_length=1)]
+    files: dict[FileName, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
+
+    @model_validator(mode="after")
+    def _refers_to_what_exists(self) -> "Manifest":
+        for name, field in self.fields.items():
+            if field.file not in self.files:
+                raise ValueError(f"fields.{name}.file: {field.file} is not listed in files")
+        for level in self.levels:
+            if level.field not in self.fields:
+                raise ValueError(f"levels.{level.name}.field: there is no field {level.field}")
+        if "arrays.npz" not in self.files:
+            raise ValueError("files: arrays.npz is not listed")
+        return self
