@@ -18,6 +18,7 @@ _Responses = npt.NDArray[np.float32]
 
 _KERNEL_REACH = 32  # samples on either side
 _KERNEL_BETA = 8.0
+_WEIGHT_TOLERANCE = 1e-9
 
 
 class PairResponses(Protocol):
@@ -136,23 +137,36 @@ def _squared_distances(
 def _barycentric(points: _Floats, target: _Floats) -> tuple[npt.NDArray[np.integer], _Floats] | None:
     """Corners (indices into points) of the simplex that holds `target`, and weights; None outside the hull."""
     centre = points.mean(axis=0)
-    _, sizes, axes = np.linalg.svd(points - centre, full_matrices=False)
-    span = axes[sizes > 1e-6 * max(float(sizes[0]), 1e-9)]
+    spread, axes = np.linalg.eigh(np.cov((points - centre).T, bias=True))
+    span = axes.T[spread > 1e-12 * max(float(spread[-1]), 1e-6)]
     residual = (target - centre) - span.T @ (span @ (target - centre))
     if len(span) == 0 or np.abs(residual).max() > 1e-6:  # one point, or a target off the plane of all probes
         return None
     flat, at = (points - centre) @ span.T, span @ (target - centre)
     if len(span) == 1:
         return _between(flat[:, 0], float(at[0]))
-    triangulation = Delaunay(flat)
-    simplex = int(triangulation.find_simplex(at[np.newaxis], tol=1e-9)[0])
-    if simplex < 0:
+    simplices = Delaunay(flat).simplices
+    corners = flat[simplices]  # (simplex, corner, axis)
+    # Ratios of volumes: Delaunay.find_simplex calls LAPACK for every simplex, hundreds of times slower on busy cores.
+    volumes = _volumes(corners)
+    replaced = np.repeat(corners[np.newaxis], corners.shape[1], axis=0)
+    for corner in range(corners.shape[1]):
+        replaced[corner, :, corner] = at
+    with np.errstate(divide="ignore", invalid="ignore"):  # slivers of no volume hold nothing
+        weights = np.where(volumes != 0.0, _volumes(replaced) / volumes, -np.inf)
+    holding = int(np.argmax(weights.min(axis=0)))
+    held = weights[:, holding] > _WEIGHT_TOLERANCE
+    if weights[:, holding].min() < -_WEIGHT_TOLERANCE:
         return None
-    transform = triangulation.transform[simplex]
-    leading = transform[:-1] @ (at - transform[-1])
-    weights = np.clip(np.append(leading, 1.0 - leading.sum()), 0.0, None)
-    held = weights > 1e-9
-    return triangulation.simplices[simplex][held], weights[held] / weights[held].sum()
+    return simplices[holding][held], weights[held, holding] / weights[held, holding].sum()
+
+
+def _volumes(corners: _Floats) -> _Floats:
+    """Signed areas of triangles `(..., 3, 2)` or volumes of tetrahedra `(..., 4, 3)`, times a constant."""
+    edges = corners[..., 1:, :] - corners[..., :1, :]
+    if edges.shape[-1] == 2:
+        return np.asarray(edges[..., 0, 0] * edges[..., 1, 1] - edges[..., 0, 1] * edges[..., 1, 0])
+    return np.asarray((edges[..., 0, :] * np.cross(edges[..., 1, :], edges[..., 2, :])).sum(axis=-1))
 
 
 def _between(coordinates: _Floats, at: float) -> tuple[npt.NDArray[np.integer], _Floats] | None:

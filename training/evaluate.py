@@ -5,6 +5,7 @@ Axes: one held-out pair's impulse responses are `(yaw, channel, sample)`. Errors
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -87,6 +88,7 @@ def evaluate(
     log_magnitude: Callable[[Responses], npt.NDArray[np.floating]],
     informational: Mapping[str, PairSource] | None = None,
     decay_db: float = 30.0,
+    threads: int = 2,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
     """Measures every held-out pair at every yaw in every column.
@@ -94,35 +96,43 @@ def evaluate(
     `visible` (pair,): whether the emitter is in sight; without sight there is no direct sound, and metrics that need
     one are missing. The direct sound is sought within 3 ms of where the reference has it. `repeats` is a second
     independent simulation of the references. `log_magnitude` maps `(yaw, 2, sample)` to the codec's spectrogram.
-    `track` may wrap the loop in a progress bar.
+    The sources are called from several `threads`; `track` may wrap the loop over pairs in a progress bar.
     """
+    if len(visible) == 0:
+        raise ValueError("no pair is held out")
     if not baselines:
         raise ValueError("a field is judged against baselines: give at least one")
     sources = {FIELD: field, **baselines, **(informational or {}), FLOOR: repeats}
     if len(sources) != 2 + len(baselines) + len(informational or {}):
         raise ValueError("two columns have the same name")
-    collected: dict[str, dict[str, list[_Errors]]] = {
-        column: {metric.name: [] for metric in METRICS} for column in sources
-    }
-    for pair in track(range(len(visible))):
-        reference = references(pair)
+
+    def pair_errors(pair: int) -> dict[str, dict[str, _Errors]]:
+        reference = np.asarray(references(pair), dtype=np.float32)  # stored as float16, which is slow to compute with
         reference_parameters = measure(reference, sample_rate, decay_db=decay_db)
         onset = np.round(np.nan_to_num(reference_parameters.onset_s, nan=0.0) * sample_rate).astype(np.int64)
         reference_spectrogram = log_magnitude(reference)
+        errors: dict[str, dict[str, _Errors]] = {}
         for column, source in sources.items():
-            estimate = source(pair)
+            estimate = np.asarray(source(pair), dtype=np.float32)
             if estimate.shape != reference.shape:
                 raise ValueError(f"{column}: responses of {estimate.shape} where the reference has {reference.shape}")
             parameters = measure(estimate, sample_rate, decay_db=decay_db, onset=onset)
-            errors = parameter_errors(reference_parameters, parameters)
-            errors[SPECTRAL_LOSS.name] = spectral_loss(reference_spectrogram, log_magnitude(estimate))
+            errors[column] = parameter_errors(reference_parameters, parameters)
+            errors[column][SPECTRAL_LOSS.name] = spectral_loss(reference_spectrogram, log_magnitude(estimate))
             for metric in METRICS:
-                hidden = metric.needs_direct_sound and not visible[pair]
-                values = np.full_like(errors[metric.name], np.nan) if hidden else errors[metric.name]
-                collected[column][metric.name].append(values)
+                if metric.needs_direct_sound and not visible[pair]:
+                    errors[column][metric.name] = np.full_like(errors[column][metric.name], np.nan)
+        return errors
+
+    pool = ThreadPoolExecutor(threads)
+    try:
+        pairs = range(len(visible))
+        by_pair = [errors for _, errors in zip(track(pairs), pool.map(pair_errors, pairs), strict=True)]
+    finally:
+        pool.shutdown(cancel_futures=True)
     errors_by_column = {
-        column: {name: np.stack(values) for name, values in by_metric.items()}
-        for column, by_metric in collected.items()
+        column: {metric.name: np.stack([errors[column][metric.name] for errors in by_pair]) for metric in METRICS}
+        for column in sources
     }
     return Evaluation(
         pairs=len(visible),

@@ -168,6 +168,8 @@ def test_what_cannot_be_compared_is_refused() -> None:
         evaluated(reference, baselines={"field": reference})
     with pytest.raises(ValueError, match="at least one"):
         evaluated(reference, baselines={})
+    with pytest.raises(ValueError, match="held out"):
+        evaluated(reference, visible=VISIBLE[:0])
 
 
 def test_figure_is_a_picture(tmp_path: Path) -> None:
