@@ -6,8 +6,10 @@
 
 const QUANTUM = 128; // of the Web Audio API
 const RESERVE = 64; // kept back so that a buffer running dry ends in a fade and not in a click
-const WINDOW_S = 1; // over which the lowest fill is judged
+const WINDOW_S = 1; // over which the lowest fill is taken
+const MEMORY = 15; // windows without a dip before the buffer is shortened: jitter that comes rarely still comes
 const AGAIN_S = 0.3; // after a splice that did not suffice
+const JUMP_S = 0.15; // above the headroom, as after a burst: half of it is skipped at once
 const HEADROOM_S = 0.05; // lowest fill aimed for on a quiet network
 const RIPPLE_S = 0.015; // of the fill between the arrival of one block and the next
 const MAX_HEADROOM_S = 0.25;
@@ -40,6 +42,7 @@ export class JitterBuffer {
     this.nextClock = null;
     this.marks = []; // {at, poseId, fill}: where a newer pose becomes audible
     this.newestPose = -1;
+    this.dips = []; // lowest fill of each of the last windows
     this.#openWindow();
   }
 
@@ -98,6 +101,7 @@ export class JitterBuffer {
     if (!this.playing && this.fill >= this.target) {
       this.playing = true;
       this.started = true;
+      this.read = this.written - this.target; // what came in one burst with it would only be delay
       this.#openWindow();
       this.#copy(left, right, frames);
       this.#ramp(left, right, FADE, 0, false);
@@ -145,6 +149,7 @@ export class JitterBuffer {
     right.fill(0, rest);
     this.playing = false;
     this.counters.underruns += 1;
+    this.#remember(0);
     this.headroomS = Math.min(MAX_HEADROOM_S, this.headroomS + GROWTH_S);
     return this.#heard(rest);
   }
@@ -152,15 +157,21 @@ export class JitterBuffer {
   /** Samples to skip (positive) or repeat (negative) now that a window has ended; 0 leaves the buffer alone. */
   #correction() {
     const headroom = this.headroomS * this.sampleRate;
-    const excess = this.lowest - headroom;
+    const { lowest } = this;
+    this.#remember(lowest);
     this.#openWindow();
     // Headroom won by a dropout is given back slowly.
-    this.headroomS = Math.max(HEADROOM_S, this.headroomS - 0.0005);
+    this.headroomS = Math.max(HEADROOM_S, this.headroomS - 0.0002);
+    if (lowest < headroom / 2) return this.#bestLag(-1, headroom);
+    if (lowest > headroom + JUMP_S * this.sampleRate) return Math.round((lowest - headroom) / 2);
     const slack = SLACK_S * this.sampleRate;
-    if (excess > 8 * slack) return Math.round(excess);
-    if (excess > slack) return this.#bestLag(1, excess - slack / 2);
-    if (excess < -headroom / 2) return this.#bestLag(-1, headroom);
-    return 0;
+    const excess = Math.min(...this.dips) - headroom;
+    return this.dips.length === MEMORY && excess > slack ? this.#bestLag(1, excess - slack / 2) : 0;
+  }
+
+  #remember(dip) {
+    this.dips.push(dip);
+    if (this.dips.length > MEMORY) this.dips.shift();
   }
 
   #bestLag(sign, limit) {
@@ -190,6 +201,7 @@ export class JitterBuffer {
     }
     this.read += QUANTUM + lag;
     this.counters.splices += 1;
+    this.dips = this.dips.map((dip) => dip - lag);
     this.#openWindow(AGAIN_S);
   }
 

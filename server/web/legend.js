@@ -1,6 +1,5 @@
 // Legend of the loudness map: one swatch per band, labels in decibels, and a needle at the level where the listener (or the mouse) is.
 
-import { BAND_DB } from "./loudness.js";
 import { loudnessRamp } from "./palette.js";
 
 const format = (level) => `${level < 0 ? "−" : ""}${Math.abs(Math.round(level))}`;
@@ -27,8 +26,8 @@ export class Legend {
   show(scale) {
     this.#scale = scale;
     this.#root.hidden = false;
-    const { bottom, top } = scale;
-    const bands = Math.round((top - bottom) / BAND_DB);
+    const { bottom, top, band: width } = scale;
+    const bands = Math.round((top - bottom) / width);
     const ramp = loudnessRamp();
     this.#swatches.replaceChildren(
       ...Array.from({ length: bands }, (_, band) => {
@@ -38,8 +37,8 @@ export class Legend {
       }),
     );
     this.#ticks.replaceChildren();
-    for (let level = bottom; level <= top; level += BAND_DB) {
-      if (level % (2 * BAND_DB) !== 0) continue;
+    for (let level = bottom; level <= top; level += width) {
+      if (level % (2 * width) !== 0) continue;
       const tick = document.createElement("span");
       tick.style.left = `${(100 * (level - bottom)) / (top - bottom)}%`;
       tick.textContent = format(level);

@@ -3,8 +3,11 @@
 
 import { contains, crosses, edges } from "./geometry.js";
 
-export const BAND_DB = 3;
-const BANDS = 10;
+const BAND_WIDTHS_DB = [1, 2, 3, 5];
+const MOST_BANDS = 10;
+const WIDTH = 1.25;
+const REACH = 1.5 * WIDTH; // of the spline, in grid steps
+const RIDGE = 1e-3;
 const FINE_M = 0.05;
 const NEARBY = [[0, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]];
 
@@ -21,21 +24,25 @@ export function combine(grids) {
   return { ...first, levels: first.levels.map((levels, row) => levels.map((level, column) => sum(level, row, column))) };
 }
 
-/** Scale that fits a grid: the loudest few points may saturate, since a level near a source has no bound. */
+/**
+ * Scale that fits a grid, {bottom, top, band} in decibels. The loudest few points may saturate, since a level near a source has no
+ * bound, and so may the quietest where the range would not fit the widest bands.
+ */
 export function scaleOf(grid) {
   const levels = grid.levels.flat().filter(Number.isFinite).sort((a, b) => a - b);
   if (levels.length === 0) return null;
   const loud = levels[Math.floor(0.985 * (levels.length - 1))];
-  const top = BAND_DB * Math.ceil(loud / BAND_DB);
-  const bottom = Math.max(top - BANDS * BAND_DB, BAND_DB * Math.floor(levels[0] / BAND_DB));
-  return { bottom, top };
+  const band = BAND_WIDTHS_DB.find((width) => (loud - levels[0]) / width <= MOST_BANDS - 1) ?? BAND_WIDTHS_DB.at(-1);
+  const top = band * Math.ceil(loud / band);
+  const bottom = Math.max(top - MOST_BANDS * band, Math.min(top - 2 * band, band * Math.floor(levels[0] / band)));
+  return { bottom, top, band };
 }
 
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 
-/** Quadratic B-spline: smooth enough for contours, narrow enough to keep the shadow of a wall. */
+/** Quadratic B-spline, a little wider than the grid: smooth enough for contours, narrow enough to keep the shadow of a wall. */
 function spline(t) {
-  const x = Math.abs(t);
+  const x = Math.abs(t) / WIDTH;
   if (x < 0.5) return 0.75 - x * x;
   return x < 1.5 ? 0.5 * (1.5 - x) ** 2 : 0;
 }
@@ -50,12 +57,12 @@ class PlaneFit {
     });
   }
 
-  /** NaN without any point near; the mean where the points do not span a plane. */
+  /** NaN without any point near. The ridge keeps the plane level in a direction that the points say nothing about. */
   value() {
-    const [w, x, y, xx, xy, yy, z, xz, yz] = this.#s;
+    const [w, x, y, xx0, xy, yy0, z, xz, yz] = this.#s;
     if (w < 1e-4) return NaN;
+    const [xx, yy] = [xx0 + RIDGE * w, yy0 + RIDGE * w];
     const determinant = w * (xx * yy - xy * xy) - x * (x * yy - xy * y) + y * (x * xy - xx * y);
-    if (determinant < 1e-3 * w ** 3) return z / w;
     return (z * (xx * yy - xy * xy) - x * (xz * yy - xy * yz) + y * (xz * xy - xx * yz)) / determinant;
   }
 }
@@ -88,12 +95,12 @@ export class LoudnessField {
     const { levels, origin, spacingM } = this.grid;
     const x = (point[0] - origin[0]) / spacingM;
     const y = (point[1] - origin[1]) / spacingM;
-    // The grid ends short of the walls: continue its slope for two cells and then stay level.
+    // The grid ends short of the walls: continue its slope for a cell and then stay level.
     const [u, v] = [clamp(x, 0, levels[0].length - 1), clamp(y, 0, levels.length - 1)];
-    const [atX, atY] = [clamp(x, u - 2, u + 2), clamp(y, v - 2, v + 2)];
+    const [atX, atY] = [clamp(x, u - 1, u + 1), clamp(y, v - 1, v + 1)];
     const fit = new PlaneFit();
-    for (let row = Math.max(0, Math.ceil(v - 1.5)); row <= Math.min(levels.length - 1, v + 1.5); row++) {
-      for (let column = Math.max(0, Math.ceil(u - 1.5)); column <= Math.min(levels[0].length - 1, u + 1.5); column++) {
+    for (let row = Math.max(0, Math.ceil(v - REACH)); row <= Math.min(levels.length - 1, v + REACH); row++) {
+      for (let column = Math.max(0, Math.ceil(u - REACH)); column <= Math.min(levels[0].length - 1, u + REACH); column++) {
         const level = levels[row][column];
         if (!Number.isFinite(level)) continue;
         const there = [origin[0] + column * spacingM, origin[1] + row * spacingM];
@@ -145,21 +152,21 @@ export class LoudnessField {
   }
 
   /** The map as a canvas of `pixelsPerMetre`, row 0 north; `ramp(fraction)` gives [r, g, b] for 0 (quiet) to 1 (loud). */
-  paint({ bottom, top }, ramp, pixelsPerMetre) {
-    const width = Math.round((this.columns - 1) * FINE_M * pixelsPerMetre);
-    const height = Math.round((this.rows - 1) * FINE_M * pixelsPerMetre);
+  paint({ bottom, top, band: width }, ramp, pixelsPerMetre) {
+    const columns = Math.round((this.columns - 1) * FINE_M * pixelsPerMetre);
+    const rows = Math.round((this.rows - 1) * FINE_M * pixelsPerMetre);
     const canvas = document.createElement("canvas");
-    [canvas.width, canvas.height] = [width, height];
+    [canvas.width, canvas.height] = [columns, rows];
     const context = canvas.getContext("2d");
-    const image = context.createImageData(width, height);
-    const bands = Math.round((top - bottom) / BAND_DB);
-    const colours = Array.from({ length: bands }, (_, band) => ramp(bands > 1 ? band / (bands - 1) : 1));
-    for (let row = 0, offset = 0; row < height; row++) {
-      const y = this.minimum[1] + (height - row - 0.5) / pixelsPerMetre;
-      for (let column = 0; column < width; column++, offset += 4) {
+    const image = context.createImageData(columns, rows);
+    const bands = Math.round((top - bottom) / width);
+    const colours = Array.from({ length: bands }, (_, band) => ramp(band / (bands - 1)));
+    for (let row = 0, offset = 0; row < rows; row++) {
+      const y = this.minimum[1] + (rows - row - 0.5) / pixelsPerMetre;
+      for (let column = 0; column < columns; column++, offset += 4) {
         const level = this.at([this.minimum[0] + (column + 0.5) / pixelsPerMetre, y]);
         if (Number.isNaN(level)) continue;
-        const band = Math.min(bands - 1, Math.max(0, Math.floor((level - bottom) / BAND_DB)));
+        const band = Math.min(bands - 1, Math.max(0, Math.floor((level - bottom) / width)));
         const [r, g, b] = colours[band];
         image.data[offset] = r;
         image.data[offset + 1] = g;

@@ -104,6 +104,7 @@ class Page {
     this.#listenToControls();
     this.map();
     find("play").disabled = false;
+    document.body.classList.add("ready");
   }
 
   #listenToWorld() {

@@ -110,7 +110,7 @@ export class Panel {
   /** Takes the server's once-a-second status message. */
   status({ blocks_late: late, blocks_dropped: dropped, ir_ms: ir }) {
     this.#server = { late, dropped };
-    if (ir) this.#find("field-cost").textContent = `${ir.p50.toFixed(1)} ms`;
+    if (ir?.p50 != null) this.#find("field-cost").textContent = `${ir.p50.toFixed(1)} ms`;
   }
 
   rest() {

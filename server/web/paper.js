@@ -62,7 +62,7 @@ export class Paper {
     this.draw();
   }
 
-  /** Shows a LoudnessField on `scale` {bottom, top}, fading over from the one before. */
+  /** Shows a LoudnessField on `scale` {bottom, top, band}, fading over from the one before. */
   show(field, scale) {
     this.#before = this.#map;
     this.#field = field;

@@ -93,7 +93,8 @@ export class Sources {
       const visible = isVisible(scene.corners, listener.position, emitter.position);
       place.textContent = describe(this.#world.bearing(emitter), visible);
       select.value = emitter.clip;
-      select.title = this.#clips.find(({ name }) => name === emitter.clip)?.credit ?? "";
+      const clip = this.#clips.find(({ name }) => name === emitter.clip);
+      select.title = [clip?.title, clip?.credit].filter(Boolean).join(". ");
     }
   }
 }
