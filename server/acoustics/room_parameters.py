@@ -294,10 +294,12 @@ def _itd_s(responses: npt.NDArray[np.generic], direct_at: _Integers, sample_rate
     # A raised cosine from pass to stop over an octave: a brick wall would ring for longer than the window.
     lowpass = 0.5 + 0.5 * np.cos(np.pi * np.clip(frequencies / _LOWPASS_HZ - 1.0, 0.0, 1.0))
     values = np.full(len(ears), np.nan)
-    for row, first in enumerate(peaks.min(axis=-1)):
-        if first < 0:
+    for row, arrivals in enumerate(peaks):
+        if arrivals.min() < 0:
             continue
-        start = max(int(first) - lead, 0)
+        # The louder ear is the nearer one, and its direct sound is the surer of the two.
+        nearer = int(np.argmax(np.abs(ears[row, [0, 1], arrivals])))
+        start = max(int(arrivals[nearer]) - lead, 0)
         left, right = scipy.fft.rfft(ears[row, :, start : start + length].astype(np.float64), size, axis=-1) * lowpass
         spectrum = np.conj(left) * right
         if not np.abs(spectrum).max() > 0.0:
