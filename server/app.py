@@ -8,11 +8,11 @@ from contextlib import asynccontextmanager
 from importlib.metadata import version
 from pathlib import Path
 
-import anyio
 import numpy as np
 from fastapi import FastAPI
 from starlette.staticfiles import StaticFiles
 
+from server.answers import Answers
 from server.audio_thread import AudioThread
 from server.catalogue import load_fields, open_clips, playable_clips
 from server.field.field import AcousticField
@@ -43,7 +43,8 @@ def create_app(settings: Settings, *, fields: Mapping[str, AcousticField] | None
                 clips=open_clips(loaded, settings.clips),
                 audio=audio,
                 settings=settings,
-                http_limiter=anyio.CapacityLimiter(settings.ir_workers + 1),  # a map must not hold up an IR
+                # One more than there are IR workers: a map must not hold up an IR.
+                answers=Answers(workers=settings.ir_workers + 1, waiting=settings.max_waiting_requests),
             )
             audio.start()
             warming = asyncio.create_task(_become_ready(host))

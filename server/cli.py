@@ -21,6 +21,7 @@ from server.errors import NafirError, RequestError
 if TYPE_CHECKING:
     from server.field.field import AcousticField
     from server.render import RenderedEmitter
+    from server.settings import Settings
 
 app = typer.Typer(
     name="nafir",
@@ -75,16 +76,20 @@ def serve(
             f"[bold]Nafir[/] serves {', '.join(fields)} at [link]http://{settings.host}:{settings.port}[/]",
             highlight=False,
         )
-    uvicorn.run(
-        create_app(settings, fields=fields),
-        host=settings.host,
-        port=settings.port,
-        loop="auto",  # uvloop wherever it exists
-        ws="websockets-sansio",
-        ws_max_size=settings.max_frame_bytes,
-        ws_per_message_deflate=False,
-        timeout_graceful_shutdown=5,
-    )
+    uvicorn.run(create_app(settings, fields=fields), **server_options(settings))
+
+
+def server_options(settings: "Settings") -> dict[str, Any]:
+    """How uvicorn has to run the application."""
+    return {
+        "host": settings.host,
+        "port": settings.port,
+        "loop": "auto",  # uvloop wherever it exists
+        "ws": "websockets-sansio",
+        "ws_max_size": settings.max_frame_bytes,
+        "ws_per_message_deflate": False,
+        "timeout_graceful_shutdown": 5,
+    }
 
 
 @app.command()

@@ -144,12 +144,7 @@ async def _cached(request: Request, etag: str, media_type: str, compute: Callabl
     headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
     if _has_tag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    host = _host(request)
-    if (body := host.answers.get(etag)) is None:
-        if host.http_limiter.statistics().tasks_waiting >= host.settings.max_waiting_requests:
-            raise RequestError("server_busy", "too many requests wait for a worker", status=503)
-        body = await anyio.to_thread.run_sync(compute, limiter=host.http_limiter)
-        host.answers.put(etag, body)
+    body = await _host(request).answers.get(etag, compute)
     return Response(body, media_type=media_type, headers=headers)
 
 

@@ -15,10 +15,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from anyio import CapacityLimiter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from server.answers import AnswerCache
+from server.answers import Answers
 from server.audio_thread import AudioThread, Outgoing, Stream, StreamFailed, TimedBlock
 from server.catalogue import describe_scene
 from server.clips import ClipLibrary, DecodeError
@@ -71,9 +70,7 @@ class StreamHost:
     """By scene, since every scene has its sample rate."""
     audio: AudioThread
     settings: Settings
-    http_limiter: CapacityLimiter
-    """How many HTTP requests compute at once."""
-    answers: AnswerCache = dataclasses.field(default_factory=AnswerCache)
+    answers: Answers
     is_ready: bool = False
     streams: int = 0
 

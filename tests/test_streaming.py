@@ -6,13 +6,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 
-import anyio
 import numpy as np
 import pytest
 import soundfile
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
+from server.answers import Answers
 from server.app import create_app
 from server.audio_thread import AudioThread
 from server.catalogue import open_clips
@@ -298,7 +298,7 @@ async def hosting(field, **settings):
             clips=open_clips({"flat": field}, ()),
             audio=audio,
             settings=Settings(**settings),
-            http_limiter=anyio.CapacityLimiter(1),
+            answers=Answers(workers=1, waiting=1),
             is_ready=True,
         )
         audio.start()

@@ -1,0 +1,45 @@
+"""A real server on a free port of the loopback interface."""
+
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import pytest
+import uvicorn
+
+from server.app import create_app
+from server.cli import server_options
+from server.field.field import AcousticField
+from server.settings import Settings
+
+
+@pytest.fixture
+def served(bundle) -> Iterator[str]:
+    """HOST:PORT of a server of the arithmetic scene, ready, with the options of `nafir serve`."""
+    settings = Settings(port=0)
+    app = create_app(settings, fields={bundle.id: AcousticField.load(bundle)})
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        while not server.started:
+            time.sleep(0.02)
+        address = "{}:{}".format(*server.servers[0].sockets[0].getsockname())
+        _wait_until_ready(address)
+        yield address
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def _wait_until_ready(address: str) -> None:
+    for _ in range(200):
+        try:
+            with urllib.request.urlopen(f"http://{address}/readyz", timeout=5):
+                return
+        except urllib.error.HTTPError as answer:
+            answer.close()
+            time.sleep(0.05)
+    raise AssertionError("the server never became ready")

@@ -1,0 +1,59 @@
+"""Over a real socket: what only a real server shows."""
+
+import json
+import socket
+import time
+
+import pytest
+from websockets.exceptions import ConnectionClosedError
+from websockets.sync.client import connect
+
+from server.protocol import Acknowledge, AudioBlock, Hello
+
+HELLO = Hello(protocol=1, scene="flat").serialize()
+
+
+def blocks_for(client, duration_s):
+    """Blocks that arrive meanwhile, acknowledged."""
+    blocks, end_s = [], time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        message = client.recv(timeout=5)
+        if isinstance(message, bytes):
+            blocks.append(AudioBlock.parse(message, "f32"))
+            client.send(Acknowledge(sequence=blocks[-1].sequence).serialize())
+    return blocks
+
+
+def test_a_message_far_too_long_closes_its_own_connection_only(served):
+    url = f"ws://{served}/v1/stream"
+    with connect(url) as good, connect(url) as bad:
+        good.send(HELLO)
+        bad.send(HELLO)
+        bad.send("x" * (2 * 1024 * 1024))
+        with pytest.raises(ConnectionClosedError) as closed:
+            _ = [bad.recv(timeout=5) for _ in range(10_000)]
+        assert closed.value.rcvd.code == 1009
+        blocks = blocks_for(good, 0.5)
+        assert [block.sequence for block in blocks] == list(range(len(blocks)))
+        assert len(blocks) > 30
+
+
+def test_audio_is_not_compressed_on_the_way(served):
+    with connect(f"ws://{served}/v1/stream") as client:
+        assert "permessage-deflate" not in str(client.response.headers.get("Sec-WebSocket-Extensions", ""))
+
+
+def test_sound_arrives_at_the_pace_of_time(served):
+    with connect(f"ws://{served}/v1/stream") as client:
+        client.send(HELLO)
+        assert json.loads(client.recv())["type"] == "welcome"
+        count = len(blocks_for(client, 2.0))
+        assert count == pytest.approx(2.0 * 24_000 / 256 + 8, abs=6)
+
+
+def test_a_client_that_vanishes_leaves_no_stream_behind(served):
+    for _ in range(70):  # more than the server has streams
+        with connect(f"ws://{served}/v1/stream") as client:
+            client.send(HELLO)
+            assert json.loads(client.recv(timeout=5))["type"] == "welcome"
+            client.socket.shutdown(socket.SHUT_RDWR)

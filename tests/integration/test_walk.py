@@ -1,0 +1,63 @@
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import soundfile
+
+from server.acoustics.decibels import amplitude_to_db
+from server.clips import ClipLibrary
+from server.field.field import AcousticField
+from server.render import RenderedEmitter, read_path, render
+
+WALK = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "walk.py"
+
+
+def walk(address, *options):
+    command = [sys.executable, str(WALK), "--url", f"ws://{address}/v1/stream", *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_what_a_walker_heard_is_what_an_offline_render_of_his_path_says(served, bundle, tmp_path):
+    heard = tmp_path / "heard.wav"
+    done = walk(served, "--scene", "flat", "--clip", "woman-reading", "--seconds", "3", "-o", str(heard))
+    assert done.returncode == 0, done.stderr
+    live, rate = soundfile.read(heard, dtype="float32")
+    assert rate == 24_000
+    assert 3.0 <= len(live) / rate < 3.5
+    assert np.sqrt(np.mean(live**2)) > 1e-3
+
+    path = read_path(tmp_path / "path.csv", rate)
+    assert path[0].sample == 0
+    assert len(path) > 30  # of some 90 poses, even on a busy machine
+    emitter = RenderedEmitter(ClipLibrary(rate).load("woman-reading"), bundle.manifest.start.emitter, loop=True)
+    offline = render(AcousticField.load(bundle), [emitter], path, length=len(live))
+    difference = np.sqrt(np.mean((live - offline.T) ** 2)) / np.sqrt(np.mean(live**2))
+    assert amplitude_to_db(difference) < -90
+
+
+def test_the_command_that_a_walk_prints_renders_it_again(served, bundle, tmp_path):
+    heard, again = tmp_path / "heard.wav", tmp_path / "again.wav"
+    done = walk(served, "--scene", "flat", "--clip", "trumpet", "--seconds", "1", "-o", str(heard))
+    command = re.search(r"nafir (render .*)", done.stdout)[1].split()
+    command[command.index("flat")] = str(bundle.folder)
+    command[command.index("again.wav")] = str(again)
+    run = [sys.executable, "-c", "from server.cli import main; main()", *command]
+    subprocess.run(run, check=True, capture_output=True, timeout=60)
+    live, _ = soundfile.read(heard, dtype="float32")
+    offline, _ = soundfile.read(again, dtype="float32")
+    np.testing.assert_allclose(offline, live, atol=10 ** (-90 / 20) * np.abs(live).max())
+
+
+def test_a_walk_where_there_is_no_such_scene_says_so(served, tmp_path):
+    done = walk(served, "--scene", "moon", "-o", str(tmp_path / "heard.wav"))
+    assert done.returncode == 1
+    assert done.stderr.strip() == "unknown_scene: there is no scene 'moon'"
+
+
+def test_a_walk_without_a_server_says_so(tmp_path):
+    done = walk("127.0.0.1:1", "-o", str(tmp_path / "heard.wav"))
+    assert done.returncode == 1
+    assert done.stderr.startswith("ws://127.0.0.1:1/v1/stream: ")
+    assert "Traceback" not in done.stderr

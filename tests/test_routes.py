@@ -1,0 +1,235 @@
+import io
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+import soundfile
+from PIL import Image
+from starlette.testclient import TestClient
+
+from server.app import create_app
+from server.impulse_response import ImpulseResponse, IrQuery
+from server.settings import Settings
+
+IR = "/v1/scenes/flat/impulse-response"
+PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
+
+
+def wait_until_ready(client):
+    for _ in range(200):
+        if client.get("/readyz").status_code == 200:
+            return
+        time.sleep(0.05)
+    raise AssertionError("never ready")
+
+
+@pytest.fixture
+def client(field):
+    settings = Settings(ir_workers=1, max_waiting_requests=1)
+    with TestClient(create_app(settings, fields={"flat": field}), raise_server_exceptions=False) as client:
+        wait_until_ready(client)
+        yield client
+
+
+def check_problem(response, status, code, field=None):
+    assert response.status_code == status
+    assert response.headers["content-type"] == "application/problem+json"
+    body = response.json()
+    assert {name: body[name] for name in ("status", "code", "field")} == {
+        "status": status,
+        "code": code,
+        "field": field,
+    }
+    assert body["title"]
+    assert body["detail"]
+
+
+def test_health(client):
+    assert client.get("/livez").json() == {"status": "live"}
+    assert client.get("/readyz").json() == {"status": "ready"}
+
+
+def test_ready_only_after_the_field_has_been_used(field):
+    compute, may_go_on = field.impulse_responses, threading.Event()
+
+    def held_up(*arguments):
+        may_go_on.wait(5)
+        return compute(*arguments)
+
+    field.impulse_responses = held_up
+    with TestClient(create_app(Settings(), fields={"flat": field})) as client:
+        assert client.get("/livez").status_code == 200
+        check_problem(client.get("/readyz"), 503, "not_ready")
+        may_go_on.set()
+        wait_until_ready(client)
+
+
+def test_a_failing_warm_up_leaves_the_server_live_and_not_ready(field, caplog):
+    def broken(*_):
+        raise RuntimeError("the field broke")
+
+    field.impulse_responses = broken
+    with TestClient(create_app(Settings(), fields={"flat": field})) as client:
+        for _ in range(100):
+            if "warm-up failed" in caplog.text:
+                break
+            time.sleep(0.05)
+        assert client.get("/livez").status_code == 200
+        check_problem(client.get("/readyz"), 503, "not_ready")
+
+
+def test_scenes(client):
+    (scene,) = client.get("/v1/scenes").json()["scenes"]
+    assert scene == client.get("/v1/scenes/flat").json()
+    assert (scene["id"], scene["sample_rate"], scene["height_m"]) == ("flat", 24_000, 2.8)
+    assert scene["bounds"] == {"minimum": [0.3, 0.3, 0.5], "maximum": [7.7, 4.7, 2.3]}
+    assert scene["listener"] == {"position": [2.0, 2.5, 1.5], "yaw": pytest.approx(np.pi / 2)}
+
+
+def test_clips(client):
+    clips = client.get("/v1/clips").json()["clips"]
+    assert "woman-reading" in {clip["name"] for clip in clips}
+    assert all(clip["duration_s"] > 0 and clip["title"] for clip in clips)
+
+
+def test_a_clip_that_cannot_be_decoded_is_left_out_and_the_log_says_why(field, tmp_path, caplog):
+    (tmp_path / "noise.flac").write_bytes(b"not audio")
+    with TestClient(create_app(Settings(clips=(tmp_path / "noise.flac",)), fields={"flat": field})) as client:
+        names = {clip["name"] for clip in client.get("/v1/clips").json()["clips"]}
+    assert "noise" not in names
+    assert "noise.flac" in caplog.text
+
+
+def test_an_impulse_response_is_what_the_command_line_would_write(client, field):
+    query = IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5), 90.0)
+    expected = ImpulseResponse.compute(field, query)
+    for name, media_type in [("wav", "audio/wav"), ("npy", "application/octet-stream"), ("json", "application/json")]:
+        response = client.get(IR, params={**PLACES, "yaw_deg": 90, "format": name})
+        assert response.headers["content-type"] == media_type
+        assert response.content == expected.encode(name)
+    samples, rate = soundfile.read(
+        io.BytesIO(client.get(IR, params={**PLACES, "yaw_deg": 90}).content), dtype="float32"
+    )
+    assert rate == 24_000
+    np.testing.assert_array_equal(samples.T, expected.samples)
+
+
+def test_what_a_client_has_is_not_sent_again(client, field):
+    first = client.get(IR, params=PLACES)
+    assert first.headers["cache-control"].startswith("public, max-age=")
+    tag = first.headers["etag"]
+    # A 304 costs no computation.
+    field.impulse_responses = None
+    for header in (tag, f"W/{tag}", f'"other", {tag}', "*"):
+        again = client.get(IR, params=PLACES, headers={"If-None-Match": header})
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+        assert again.headers["cache-control"] == first.headers["cache-control"]
+    assert client.get(IR, params=PLACES, headers={"If-None-Match": '"other"'}).content == first.content
+
+
+def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_another(client):
+    def tag(**changes):
+        return client.get(IR, params={**PLACES, **changes}).headers["etag"]
+
+    assert tag() == tag(listener="1.0, 2.0,1.50", yaw_deg="0.0", format="wav")
+    assert len({tag(), tag(yaw_deg=1), tag(format="npy"), tag(listener="1,2,1.6")}) == 4
+
+
+@pytest.mark.parametrize(
+    ("path", "params", "status", "code", "at_fault"),
+    [
+        ("/v1/scenes/moon", {}, 404, "unknown_scene", "scene"),
+        ("/v1/scenes/moon/impulse-response", PLACES, 404, "unknown_scene", "scene"),
+        ("/v1/scenes/moon/loudness", PLACES, 404, "unknown_scene", "scene"),
+        (IR, {"listener": "1,2,1.5"}, 422, "malformed_pose", "emitter"),
+        (IR, {**PLACES, "listener": "1,2"}, 422, "malformed_pose", "listener"),
+        (IR, {**PLACES, "listener": "1,2,three"}, 422, "malformed_pose", "listener"),
+        (IR, {**PLACES, "emitter": "nan,2,1"}, 422, "malformed_pose", "emitter"),
+        (IR, {**PLACES, "emitter": "1,2,inf"}, 422, "malformed_pose", "emitter"),
+        (IR, {**PLACES, "yaw_deg": "nan"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "yaw_deg": "north"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "listener": "1,2,99"}, 422, "position_out_of_bounds", "listener"),
+        (IR, {**PLACES, "emitter": "-1,2,1"}, 422, "position_out_of_bounds", "emitter"),
+        (IR, {**PLACES, "format": "mp3"}, 422, "unknown_format", "format"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3"}, 422, "malformed_pose", "emitter"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,9"}, 422, "position_out_of_bounds", "emitter"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "height_m": 9}, 422, "position_out_of_bounds", "height_m"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "spacing_m": 0.01}, 422, "malformed_request", "spacing_m"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "spacing_m": 0.1}, 422, "map_too_fine", "spacing_m"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "format": "gif"}, 422, "unknown_format", "format"),
+        ("/v1/nothing", {}, 404, "not_found", None),
+        ("/nothing", {}, 404, "not_found", None),
+    ],
+)
+def test_bad_requests_are_answered_with_a_problem(client, path, params, status, code, at_fault):
+    check_problem(client.get(path, params=params), status, code, at_fault)
+    # And the server goes on.
+    assert client.get(IR, params=PLACES).status_code == 200
+
+
+def test_a_wrong_method_is_a_problem_too(client):
+    response = client.post("/v1/scenes")
+    check_problem(response, 405, "method_not_allowed")
+    assert "GET" in response.headers["allow"]
+
+
+def test_a_crash_is_a_problem_that_tells_nothing_of_the_inside(client, field):
+    def broken(*_):
+        raise RuntimeError("secret")
+
+    field.impulse_responses = broken
+    response = client.get(IR, params=PLACES)
+    check_problem(response, 500, "internal_error")
+    assert "secret" not in response.text
+
+
+def test_the_loudness_map_is_a_picture_or_numbers_and_loudest_at_the_emitter(client):
+    params = {"emitter": "6,3,1.5", "spacing_m": 0.5}
+    picture = client.get("/v1/scenes/flat/loudness", params=params)
+    assert picture.headers["content-type"] == "image/png"
+    assert Image.open(io.BytesIO(picture.content)).format == "PNG"
+    numbers = client.get("/v1/scenes/flat/loudness", params={**params, "format": "json"})
+    assert numbers.headers["etag"] != picture.headers["etag"]
+    levels = np.array(json.loads(numbers.content)["levels_db"], float)
+    row, column = np.unravel_index(np.nanargmax(levels), levels.shape)
+    x, y = json.loads(numbers.content)["origin"]
+    assert abs(x + column * 0.5 - 6) <= 0.5
+    assert abs(y + row * 0.5 - 3) <= 0.5
+
+
+def test_too_many_waiting_requests_are_turned_away_and_health_is_answered_meanwhile(client, field):
+    compute, may_go_on = field.impulse_responses, threading.Event()
+
+    def held_up(*arguments):
+        may_go_on.wait(10)
+        return compute(*arguments)
+
+    field.impulse_responses = held_up
+    statuses = []
+
+    def ask(height):
+        statuses.append(client.get(IR, params={**PLACES, "listener": f"1,2,{height}"}).status_code)
+
+    # Two are computed at once and one may wait; the rest is turned away.
+    askers = [threading.Thread(target=ask, args=(1 + number / 10,)) for number in range(6)]
+    for asker in askers:
+        asker.start()
+    try:
+        for _ in range(100):
+            if len(statuses) == 3:
+                break
+            time.sleep(0.02)
+        assert statuses == [503] * 3
+        assert client.get("/livez").status_code == 200
+    finally:
+        may_go_on.set()
+        for asker in askers:
+            asker.join()
+    assert sorted(statuses) == [200] * 3 + [503] * 3
+
+
+def test_the_interface_describes_itself(client):
+    paths = client.get("/openapi.json").json()["paths"]
+    assert IR.replace("flat", "{scene}") in paths
