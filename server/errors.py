@@ -20,8 +20,8 @@ class BundleError(NafirError):
 class RequestError(NafirError):
     """A request that cannot be answered as asked.
 
-    `code` is stable and machine-readable, `field` names the offending input where there is one, and `status` is the HTTP status
-    (a WebSocket client gets the code instead).
+    `code` is stable and machine-readable, `field` names the offending input where there is one, and `status` is the
+    HTTP status (a WebSocket client gets the code instead).
     """
 
     def __init__(self, code: str, message: str, *, field: str | None = None, status: int = 422) -> None:
