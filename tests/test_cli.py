@@ -1,0 +1,207 @@
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+import soundfile
+
+from server.cli import main
+from server.clips import ClipLibrary
+from server.impulse_response import ImpulseResponse, IrQuery
+
+NAFIR = [sys.executable, "-c", "from server.cli import main; main()"]
+PLACES = ("--listener", "1,2,1.5", "--emitter", "6,3,1.5")
+
+
+@pytest.fixture
+def nafir(monkeypatch, capsys):
+    """Runs the command here: exit code, output, error output."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["nafir", *(str(argument) for argument in arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        captured = capsys.readouterr()
+        return ended.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+def check_error(result, *words):
+    code, _, errors = result
+    assert code == 2
+    assert errors.startswith("error: ")
+    assert errors.count("\n") == 1
+    for word in words:
+        assert word in errors
+
+
+@pytest.mark.parametrize("suffix", ["wav", "npy", "json"])
+def test_ir_writes_what_http_answers(nafir, bundle, field, tmp_path, suffix):
+    output = tmp_path / f"ir.{suffix}"
+    code, said, _ = nafir("ir", bundle.folder, *PLACES, "--yaw-deg", "90", "-o", output)
+    assert code == 0
+    assert str(output) in said
+    query = IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5), 90.0)
+    assert output.read_bytes() == ImpulseResponse.compute(field, query).encode(suffix)
+
+
+def test_ir_tells_programs_what_it_did(nafir, bundle, tmp_path):
+    output = tmp_path / "ir.wav"
+    _, said, _ = nafir("ir", bundle.folder, *PLACES, "-o", output, "--json")
+    document = json.loads(said)
+    assert (document["scene"], document["sample_rate"], document["samples"]) == ("flat", 24_000, 4_000)
+    assert document["output"] == str(output)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("--listener", "1,2", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener"),
+        (("--listener", "1,2,99", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener"),
+        (("--listener", "1,2,1.5", "--emitter", "nan,3,1.5", "-o", "ir.wav"), "emitter"),
+        ((*PLACES, "--yaw-deg", "inf", "-o", "ir.wav"), "yaw-deg"),
+        ((*PLACES, "-o", "ir.mp3"), "mp3"),
+        ((*PLACES, "-o", "no/such/folder/ir.wav"), "No such file"),
+    ],
+)
+def test_ir_says_what_is_wrong_in_one_line(nafir, bundle, tmp_path, monkeypatch, arguments, word):
+    monkeypatch.chdir(tmp_path)
+    check_error(nafir("ir", bundle.folder, *arguments), word)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_scene_is_named(nafir, tmp_path):
+    check_error(nafir("ir", "moon", *PLACES, "-o", tmp_path / "ir.wav"), "'moon'")
+
+
+def test_render_of_a_still_listener_is_the_clip_convolved(nafir, bundle, field, tmp_path):
+    path, output = tmp_path / "path.csv", tmp_path / "out.wav"
+    path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
+    code, _, _ = nafir("render", bundle.folder, "--emitter", "trumpet@6,3,1.5", "--path", path, "-o", output)
+    assert code == 0
+    heard, rate = soundfile.read(output, dtype="float32")
+    assert rate == 24_000
+    clip = ClipLibrary(24_000).load("trumpet").astype(float)
+    ir = field.impulse_responses([(2.0, 2.0, 1.5)], [(6.0, 3.0, 1.5)], [0.0])[0]
+    size = 2 ** int(np.ceil(np.log2(clip.size + ir.shape[1])))
+    expected = np.fft.irfft(np.fft.rfft(clip, size) * np.fft.rfft(ir, size), size)[:, : len(heard)].T
+    np.testing.assert_allclose(heard, expected[: len(heard)], atol=1e-5)
+
+
+def test_render_plays_files_together_for_as_long_as_asked(nafir, bundle, tmp_path):
+    path, output, tone = tmp_path / "path.csv", tmp_path / "out.wav", tmp_path / "tone@home.wav"
+    soundfile.write(tone, np.sin(np.arange(2_400) * 0.2) / 4, 24_000)
+    path.write_text("sample,x,y,z,qx,qy,qz,qw\n0,2,2,1.5,0,0,0,1\n4096,3,2,1.5,0,0,1,1\n")
+    emitters = ("--emitter", f"{tone}@6,3,1.5", "--emitter", "man-reading@1,1,1")
+    options = (*emitters, "--loop", "--duration-s", "1.5", "--path", path, "-o", output, "--json")
+    code, said, _ = nafir("render", bundle.folder, *options)
+    assert code == 0
+    assert json.loads(said)["rendered_s"] == 1.5
+    heard, _ = soundfile.read(output)
+    assert heard.shape == (36_000, 2)
+    assert np.abs(heard[-1_000:]).max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("emitter", "path", "output", "words"),
+    [
+        ("trumpet", "0,2,2,1.5,0", "out.wav", ["CLIP@x,y,z"]),
+        ("trumpet@1,2", "0,2,2,1.5,0", "out.wav", ["emitter"]),
+        ("trumpet@1,2,77", "0,2,2,1.5,0", "out.wav", ["emitter"]),
+        ("kazoo.wav@1,2,1", "0,2,2,1.5,0", "out.wav", ["kazoo.wav"]),
+        ("broken.wav@1,2,1", "0,2,2,1.5,0", "out.wav", ["broken.wav"]),
+        ("trumpet@1,2,1", "0,2,2,x,0", "out.wav", ["path.csv", "line 2"]),
+        ("trumpet@1,2,1", "0,2,2,99,0", "out.wav", ["path point 1"]),
+        ("trumpet@1,2,1", "0,2,2,1.5,0", "out.flac", ["out.flac"]),
+    ],
+)
+def test_render_says_what_is_wrong_in_one_line(nafir, bundle, tmp_path, monkeypatch, emitter, path, output, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.wav").write_bytes(b"RIFF and then nothing")
+    (tmp_path / "path.csv").write_text(f"sample,x,y,z,yaw_deg\n{path}\n")
+    check_error(nafir("render", bundle.folder, "--emitter", emitter, "--path", "path.csv", "-o", output), *words)
+    assert not (tmp_path / output).exists()
+
+
+def damage_manifest(folder):
+    document = json.loads((folder / "scene.json").read_text())
+    document["codec"]["hop"] = "wide"
+    (folder / "scene.json").write_text(json.dumps(document))
+
+
+DAMAGES = {
+    "no manifest": (lambda folder: (folder / "scene.json").unlink(), ["scene.json"]),
+    "not json": (lambda folder: (folder / "scene.json").write_text("{"), ["scene.json"]),
+    "a wrong field": (damage_manifest, ["scene.json", "codec.hop"]),
+    "a changed file": (lambda folder: (folder / "arithmetic.onnx").write_bytes(b"0"), ["arithmetic.onnx", "sha256"]),
+    "a missing file": (lambda folder: (folder / "arrays.npz").unlink(), ["arrays.npz"]),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_bundle_ends_serve_with_one_line_and_code_2(nafir, bundle_copy, damage):
+    do_damage, words = DAMAGES[damage]
+    do_damage(bundle_copy)
+    check_error(nafir("serve", "--bundle", bundle_copy, "--port", 0), *words)
+
+
+def test_a_damaged_bundle_leaves_no_traceback(bundle_copy):
+    damage_manifest(bundle_copy)
+    done = subprocess.run(
+        [*NAFIR, "serve", "--bundle", str(bundle_copy)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert "Traceback" not in done.stdout + done.stderr
+    assert "codec.hop" in done.stderr
+
+
+def test_an_impossible_setting_is_named(nafir, monkeypatch):
+    monkeypatch.setenv("NAFIR_IR_WORKERS", "none")
+    check_error(nafir("serve"), "ir_workers")
+
+
+def test_wrong_usage_is_code_2_too(nafir):
+    assert nafir("ir")[0] == 2
+    assert nafir("levitate")[0] == 2
+
+
+def test_help_names_the_commands(nafir):
+    code, said, _ = nafir("--help")
+    assert code == 0
+    assert all(command in said for command in ("serve", "ir", "render"))
+
+
+def test_serve_serves_until_it_is_told_to_stop(bundle):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = {**os.environ, "NAFIR_BUNDLES": str(bundle.folder)}
+    server = subprocess.Popen(
+        [*NAFIR, "serve", "--port", str(port)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=environment,
+        text=True,
+    )
+    try:
+        for _ in range(300):
+            with contextlib.suppress(urllib.error.URLError):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=5).close()
+                break
+            time.sleep(0.1)
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/v1/scenes", timeout=5) as answer:
+            assert "flat" in {scene["id"] for scene in json.load(answer)["scenes"]}
+    finally:
+        server.send_signal(signal.SIGTERM)
+        said, _ = server.communicate(timeout=30)
+    assert f"http://127.0.0.1:{port}" in said
+    assert "Traceback" not in said

@@ -1,0 +1,35 @@
+import os
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from server.settings import Settings
+
+
+@pytest.fixture(autouse=True)
+def _plain_environment(monkeypatch):
+    for name in os.environ:
+        if name.startswith("NAFIR_"):
+            monkeypatch.delenv(name)
+
+
+def test_defaults_serve_this_machine_only():
+    settings = Settings()
+    assert (settings.host, settings.port, settings.bundles) == ("127.0.0.1", 8000, ())
+    assert settings.ir_workers >= 1
+
+
+def test_the_environment_is_heeded_and_arguments_win(monkeypatch):
+    monkeypatch.setenv("NAFIR_PORT", "9000")
+    monkeypatch.setenv("NAFIR_MAX_STREAMS", "3")
+    monkeypatch.setenv("NAFIR_BUNDLES", os.pathsep.join(["one", "two"]))
+    settings = Settings(port=9001)
+    assert (settings.port, settings.max_streams, settings.bundles) == (9001, 3, (Path("one"), Path("two")))
+
+
+@pytest.mark.parametrize(("name", "value"), [("PORT", "70000"), ("IR_WORKERS", "0"), ("HELLO_TIMEOUT_S", "soon")])
+def test_impossible_settings_are_refused(monkeypatch, name, value):
+    monkeypatch.setenv(f"NAFIR_{name}", value)
+    with pytest.raises(ValidationError, match=name.lower()):
+        Settings()
