@@ -1,0 +1,96 @@
+"""Simulation of all pairs of probes of a scene: resumable emitter by emitter, the same for the same seed."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.progress import Progress
+
+from training.dataset import Dataset, DatasetError
+from training.hrtf import KEMAR, Hrtf
+from training.synthesis import BinauralSynthesis
+from training.tracing import RoomTracer, sphere_directions
+
+
+def simulate(scene_path: Path, folder: Path, *, seed: int, workers: int, progress: Progress) -> Dataset:
+    """Fills the dataset folder, going on where an earlier run stopped.
+
+    Raises SceneFileError for a bad scene file, and DatasetError for a folder that holds another scene or if a worker
+    process dies.
+    """
+    dataset = Dataset.create(folder, scene_path, seed)
+    remaining = dataset.remaining()
+    task = progress.add_task("simulating", total=len(dataset.probes), completed=len(dataset.probes) - len(remaining))
+    context = multiprocessing.get_context("spawn")
+    bystanders = set(multiprocessing.active_children())
+    leash, held = context.Pipe(duplex=False)
+    with leash, held, ProcessPoolExecutor(workers, context, _live_on_leash, (leash,)) as pool:
+        try:
+            running = {pool.submit(_simulate_emitter, dataset, emitter): emitter for emitter in remaining}
+            for future in as_completed(running):
+                dataset.write(running.pop(future), *future.result())
+                progress.advance(task)
+        except BaseException as exc:
+            # Neither an interrupt nor a full disk waits for emitters under way.
+            for worker in set(multiprocessing.active_children()) - bystanders:
+                worker.terminate()
+            if isinstance(exc, BrokenProcessPool):
+                raise DatasetError(f"{folder}: a worker process died; run simulate again to go on") from exc
+            raise
+    return dataset
+
+
+def _live_on_leash(leash: Connection) -> None:
+    """Prepares a worker: interrupts are for the parent to handle, and a worker must not outlive it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_die_when_released, args=(leash,), daemon=True).start()
+
+
+def _die_when_released(leash: Connection) -> None:
+    leash.poll(None)  # nothing is ever sent: it returns when the parent, sole holder of the other end, has died
+    os._exit(1)
+
+
+def _simulate_emitter(
+    dataset: Dataset, emitter: int
+) -> tuple[npt.NDArray[np.float16], dict[int, npt.NDArray[np.float16]]]:
+    """First takes of all listeners, and independent second takes of the held-out ones."""
+    listeners = np.flatnonzero(np.arange(len(dataset.probes)) != emitter)
+    repeated = np.flatnonzero(dataset.held_out[emitter])
+    first = np.zeros((len(dataset.probes), len(dataset.yaws), 2, dataset.samples), dtype=np.float16)
+    first[listeners] = _responses(dataset, emitter, listeners, take=0)
+    second = _responses(dataset, emitter, repeated, take=1)
+    return first, dict(zip(map(int, repeated), second, strict=True))
+
+
+def _responses(dataset: Dataset, emitter: int, listeners: npt.NDArray[np.int64], take: int) -> npt.NDArray[np.float16]:
+    """(listener, yaw, ear, sample)"""
+    if not len(listeners):
+        return np.zeros((0, len(dataset.yaws), 2, dataset.samples), dtype=np.float16)
+    settings = dataset.scene.simulation
+    directions = sphere_directions(settings.arrival_directions)
+    tracer = RoomTracer(
+        dataset.scene.geometry,
+        dataset.probes[listeners],
+        duration_s=settings.duration_s,
+        image_order=settings.image_order,
+        arrival_directions=directions,
+    )
+    synthesis = BinauralSynthesis(Hrtf.read(KEMAR, dataset.sample_rate), directions, dataset.yaws, dataset.samples)
+    rng = np.random.default_rng([dataset.seed, 2, emitter, take])
+    arrivals = tracer.trace(dataset.probes[emitter], rays=settings.rays, seed=int(rng.integers(2**31)))
+    return np.stack(
+        [
+            synthesis.render(arrival, dataset.probes[listener], dataset.onset_s[emitter, listener], rng).astype(
+                np.float16
+            )
+            for arrival, listener in zip(arrivals, listeners, strict=True)
+        ]
+    )
