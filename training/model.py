@@ -1,0 +1,209 @@
+"""The factorised field: pose -> K coefficients -> learned time-frequency basis (a branch-trunk network).
+
+The contract is that of every field: `listener` (B, 3), `emitter` (B, 3), `yaw` (B,) in; `log_magnitude` (B, 2,
+frequency, frame), `instantaneous_frequency` and `phase_certainty` (B, 2, frequency, known frame),
+`interaural_coherence` (B, 2, frequency, frame; real and imaginary) out. Everything between (geometry, encodings, grid,
+normalisation) lives in the graph.
+
+Inside, four heads share the coefficients: log-magnitude of the fine frames and of the late cells, mean phasors of the
+known frames, and mean interaural phasors of all cells (see `training.cells`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from server.acoustics.geometry import FloorPlan
+from training.cells import Cells
+from training.propagation import Propagation
+
+_NEAREST_M = 0.25
+_AZIMUTH_HARMONICS = 5
+_YAW_HARMONICS = 3
+_POSITION_OCTAVES = 3
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """The network's whole configuration."""
+
+    rank: int = 128
+    width: int = 256
+    depth: int = 4
+    grid_spacing_m: float = 0.5
+    grid_features: int = 32
+
+
+class FeatureGrid(nn.Module):
+    """Learned features on a grid in plan, read by a Gaussian Nadaraya-Watson kernel with a learned bandwidth per node.
+
+    Listener and emitter read the same grid: what is near a place is the same for both. The kernel is a softmax, so
+    that it cannot underflow to 0/0 far from every node.
+    """
+
+    def __init__(self, plan: FloorPlan, spacing_m: float, features: int) -> None:
+        super().__init__()
+        low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
+        steps = [np.linspace(a, b, max(2, round((b - a) / spacing_m) + 1)) for a, b in zip(low, high, strict=True)]
+        nodes = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.register_buffer("_nodes", torch.tensor(nodes, dtype=torch.float32), persistent=False)
+        self._log_precision = nn.Parameter(torch.full((len(nodes),), float(-2 * np.log(spacing_m / 2) - np.log(2))))
+        self._features = nn.Parameter(torch.randn(len(nodes), features) * 0.1)
+
+    def forward(self, position: Tensor) -> Tensor:
+        squared = torch.sum((position[:, None, :2] - self._nodes) ** 2, dim=-1)
+        return torch.softmax(-squared * torch.exp(self._log_precision), dim=-1) @ self._features
+
+
+class PoseEncoder(nn.Module):
+    """Listener, emitter and yaw to the features the trunk sees; `size` of them."""
+
+    def __init__(self, plan: FloorPlan, shape: FieldShape) -> None:
+        super().__init__()
+        self._propagation = Propagation(plan)
+        self._grid = FeatureGrid(plan, shape.grid_spacing_m, shape.grid_features)
+        low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
+        box = np.array([(*low, 0.0), (*high, plan.height_m)], dtype=np.float32)
+        self.register_buffer("_centre", torch.tensor(box.mean(axis=0)), persistent=False)
+        self.register_buffer("_half_size", torch.tensor((box[1] - box[0]) / 2), persistent=False)
+        poses = torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1)
+        self.size = self(*poses).shape[-1]
+
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
+        path = self._propagation(listener, emitter)
+        cos, sin = torch.cos(yaw), torch.sin(yaw)
+        towards = _turned(path.from_listener, cos, sin)
+        distance = torch.clamp(path.length, min=_NEAREST_M)
+        rise = (emitter[:, 2] - listener[:, 2]) / distance
+        visible = path.visible[:, None]
+        azimuth = _harmonics(towards, _AZIMUTH_HARMONICS)
+        scalars = torch.stack([torch.log(distance), 1 / (1 + distance), rise], dim=-1)
+        return torch.cat(
+            [
+                self._grid(listener),
+                self._grid(emitter),
+                self._octaves(listener),
+                self._octaves(emitter),
+                azimuth,
+                azimuth * visible,
+                scalars,
+                scalars * visible,
+                visible,
+                path.from_listener,
+                path.from_emitter,
+                _harmonics(torch.stack([cos, sin], dim=-1), _YAW_HARMONICS),
+            ],
+            dim=-1,
+        )
+
+    def _octaves(self, position: Tensor) -> Tensor:
+        scaled = (position - self._centre) / self._half_size
+        waves = [scaled]
+        for octave in range(_POSITION_OCTAVES):
+            angle = scaled * (np.pi / 2 * 2**octave)
+            waves += [torch.sin(angle), torch.cos(angle)]
+        return torch.cat(waves, dim=-1)
+
+
+def _turned(direction: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """World direction in plan as the head sees it."""
+    x, y = direction[:, 0], direction[:, 1]
+    return torch.stack([x * cos + y * sin, y * cos - x * sin], dim=-1)
+
+
+def _harmonics(unit: Tensor, count: int) -> Tensor:
+    """cos and sin of the first multiples of a direction's angle, by recurrence (no trigonometry, no branch cut)."""
+    real, imaginary = [unit[:, 0]], [unit[:, 1]]
+    for _ in range(count - 1):
+        a, b = real[-1], imaginary[-1]
+        real.append(a * unit[:, 0] - b * unit[:, 1])
+        imaginary.append(a * unit[:, 1] + b * unit[:, 0])
+    return torch.stack(real + imaginary, dim=-1)
+
+
+class Heads(nn.Module):
+    """Slices of the basis: where each head's numbers lie in the flat output."""
+
+    def __init__(self, cells: Cells) -> None:
+        super().__init__()
+        codec = cells.codec
+        self.shapes = {
+            "fine": (2, codec.bins, cells.fine_frames),
+            "late": (2, cells.bands.cells, cells.late_frames.cells),
+            "phasor": (2, 2, codec.bins, cells.known_frames),
+            "interaural": (2, cells.bands.cells, cells.all_frames.cells),
+        }
+        sizes = [int(np.prod(shape)) for shape in self.shapes.values()]
+        bounds = np.concatenate([[0], np.cumsum(sizes)])
+        self.slices = {
+            name: slice(int(a), int(b)) for name, a, b in zip(self.shapes, bounds[:-1], bounds[1:], strict=True)
+        }
+        self.size = int(bounds[-1])
+
+
+class FactorisedField(nn.Module):
+    """Flat predictions (B, heads.size), in units of each output's spread about its mean over the training set."""
+
+    def __init__(self, plan: FloorPlan, cells: Cells, shape: FieldShape) -> None:
+        super().__init__()
+        self.heads = Heads(cells)
+        self.encoder = PoseEncoder(plan, shape)
+        self._inputs = nn.Linear(self.encoder.size, shape.width)
+        self._hidden = nn.ModuleList(nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1))
+        self._coefficients = nn.Linear(shape.width, shape.rank)
+        self.basis = nn.Parameter(torch.randn(shape.rank, self.heads.size) / np.sqrt(shape.rank))
+        self.register_buffer("mean", torch.zeros(self.heads.size))
+        self.register_buffer("spread", torch.ones(self.heads.size))
+        self.register_buffer("level_correction", torch.zeros(self.heads.size))
+
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
+        hidden = nn.functional.gelu(self._inputs(self.encoder(listener, emitter, yaw)))
+        for layer in self._hidden:
+            hidden = hidden + nn.functional.gelu(layer(hidden))
+        return self._coefficients(hidden) @ self.basis
+
+    def in_physical_units(self, flat: Tensor) -> Tensor:
+        return flat * self.spread + self.mean
+
+
+class ExportedField(nn.Module):
+    """The contract's outputs from a trained field: cells spread to frames and bins, phasors turned into phase and
+    certainty."""
+
+    def __init__(self, field: FactorisedField, cells: Cells) -> None:
+        super().__init__()
+        self._field = field
+        self._cells = cells
+        for name, matrix in (
+            ("bands", cells.bands.spread().T),
+            ("late_frames", cells.late_frames.spread()),
+            ("all_frames", cells.all_frames.spread()),
+        ):
+            self.register_buffer(f"_{name}", torch.tensor(np.ascontiguousarray(matrix)), persistent=False)
+        nominal = torch.tensor(cells.codec.nominal_advance, dtype=torch.float32)
+        self.register_buffer("_nominal_advance", nominal, persistent=False)
+        self._silence = float(np.log(cells.codec.log_floor))
+
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        field, heads = self._field, self._field.heads
+        flat = field.in_physical_units(field(listener, emitter, yaw)) + field.level_correction
+
+        def head(name: str) -> Tensor:
+            return flat[:, heads.slices[name]].reshape(-1, *heads.shapes[name])
+
+        late = self._bands @ head("late") @ self._late_frames
+        log_magnitude = torch.clamp(torch.cat([head("fine"), late], dim=-1), min=self._silence)
+        phasor = head("phasor")
+        frequency, certainty = self._phase(phasor[:, 0], phasor[:, 1])
+        coherence = self._bands @ head("interaural") @ self._all_frames
+        return log_magnitude, frequency, certainty, coherence
+
+    def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
+        """Instantaneous frequency and certainty of mean phasors (B, ear, frequency, frame)."""
+        certainty = torch.sqrt(real**2 + imaginary**2 + 1e-12)
+        phase = torch.atan2(imaginary, real)
+        advance = phase[..., 1:] - phase[..., :-1] - self._nominal_advance
+        wrapped = advance - 2 * np.pi * torch.floor((advance + np.pi) / (2 * np.pi))
+        return torch.cat([phase[..., :1], wrapped], dim=-1), torch.clamp(certainty, max=1.0)
