@@ -37,6 +37,8 @@ class Page {
     this.grids = new Map(); // emitter id -> {key, grid}
     this.mapping = null; // AbortController of the map under way
     this.field = null;
+    this.scale = null;
+    this.scaled = 0; // number of emitters the scale was made for
     this.hovered = null;
   }
 
@@ -259,8 +261,8 @@ class Page {
       if (mapping.signal.aborted) return;
       const grid = combine(grids);
       this.field = new LoudnessField(grid, this.scene.corners);
-      // One scale for the whole visit, so that two maps can be compared by eye.
-      this.scale ??= scaleOf(grid);
+      // One scale as long as no source comes or goes, so that two maps can be compared by eye.
+      if (this.scaled !== emitters.length) [this.scale, this.scaled] = [scaleOf(grid), emitters.length];
       this.paper.show(this.field, this.scale);
       this.legend.show(this.scale);
       const whose = emitters.length > 1 ? "of all sources together" : `of source ${emitters[0].id}`;
