@@ -7,8 +7,8 @@ pile up is cut off.
 """
 
 import asyncio
+import contextlib
 import dataclasses
-import logging
 import time
 import uuid
 from collections import deque
@@ -40,8 +40,6 @@ from server.settings import Settings
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
 MAX_WAITING_ANSWERS = 256
-
-_logger = logging.getLogger(__name__)
 
 
 def load_clip(clips: ClipLibrary, name: str) -> FloatArray:
@@ -87,14 +85,13 @@ class Connection:
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
-        await self._websocket.accept()
-        try:
-            await self._serve()
-        except ClosingError as closing:
-            await self._send_message(closing.error)
-            await self._websocket.close(closing.close_code, closing.error.code)
-        except WebSocketDisconnect:
-            return
+        with contextlib.suppress(WebSocketDisconnect):
+            await self._websocket.accept()
+            try:
+                await self._serve()
+            except ClosingError as closing:
+                await self._send_message(closing.error)
+                await self._websocket.close(closing.close_code, closing.error.code)
 
     async def _serve(self) -> None:
         host = self._host
@@ -163,15 +160,25 @@ class Connection:
         )
 
     async def _pump(self, stream: Stream, hello: Hello) -> None:
+        """Read and send until either ends, or fails."""
         self._host.audio.open(stream)
-        sender = asyncio.create_task(self._send_outgoing(stream, hello))
+        tasks = [
+            asyncio.create_task(self._read_incoming(stream, hello)),
+            asyncio.create_task(self._send_outgoing(stream, hello)),
+        ]
         try:
-            while True:
-                await self._take_in(await self._receive(), stream, hello)
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._host.audio.close(stream)
-            sender.cancel()
-            await asyncio.wait([sender])
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        for task in done:
+            task.result()
+
+    async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
+        while True:
+            await self._take_in(await self._receive(), stream, hello)
 
     async def _take_in(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
         try:
@@ -205,26 +212,23 @@ class Connection:
         self._has_outgoing.set()
 
     async def _send_outgoing(self, stream: Stream, hello: Hello) -> None:
-        """Send until cancelled; close the socket, which ends the reader too, where the stream cannot go on."""
-        try:
-            while True:
-                await self._has_outgoing.wait()
-                self._has_outgoing.clear()
-                while self._outgoing:
-                    if len(self._outgoing) > stream.session.window.size + MAX_WAITING_ANSWERS:
-                        await self._websocket.close(POLICY_VIOLATION, "client reads too slowly")
+        """Send until cancelled, or until the stream cannot go on and the socket was closed for it."""
+        while True:
+            await self._has_outgoing.wait()
+            self._has_outgoing.clear()
+            while self._outgoing:
+                if len(self._outgoing) > stream.session.window.size + MAX_WAITING_ANSWERS:
+                    await self._websocket.close(POLICY_VIOLATION, "client reads too slowly")
+                    return
+                match self._outgoing.popleft():
+                    case TimedBlock() as timed:
+                        await self._send_block(timed, stream, hello)
+                    case StreamFailed():
+                        await self._send_message(Error(code="internal_error", message="the stream failed"))
+                        await self._websocket.close(INTERNAL_ERROR, "internal_error")
                         return
-                    match self._outgoing.popleft():
-                        case TimedBlock() as timed:
-                            await self._send_block(timed, stream, hello)
-                        case StreamFailed():
-                            await self._send_message(Error(code="internal_error", message="the stream failed"))
-                            await self._websocket.close(INTERNAL_ERROR, "internal_error")
-                            return
-                        case message:
-                            await self._send_message(message)
-        except WebSocketDisconnect:
-            return  # the reader sees it too, and ends the connection
+                    case message:
+                        await self._send_message(message)
 
     async def _send_block(self, timed: TimedBlock, stream: Stream, hello: Hello) -> None:
         block = timed.block

@@ -111,6 +111,7 @@ def test_hello_as_a_person_would_type_it():
         ("", "malformed_message", None),
         ("{", "malformed_message", None),
         ("[" * 5000, "malformed_message", None),
+        ('{"type": "remove_emitter", "id": "\\ud800"}', "malformed_message", None),
         ("null", "malformed_message", None),
         ('"hello"', "malformed_message", None),
         ("{}", "unknown_message", "type"),

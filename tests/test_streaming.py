@@ -360,6 +360,38 @@ def test_before_the_server_is_warm_a_client_is_told_to_come_back(field):
     assert socket.close_code == 1013
 
 
+def test_a_client_may_leave_at_any_moment(field):
+    class Gone(Socket):
+        """Whose client left after the given number of sends."""
+
+        def __init__(self, sends):
+            super().__init__()
+            self.sends = sends
+
+        def _leave(self):
+            self.sends -= 1
+            if self.sends < 0:
+                raise WebSocketDisconnect(1006)
+
+        async def send_text(self, text):
+            self._leave()
+            await super().send_text(text)
+
+        async def send_bytes(self, data):
+            self._leave()
+            await super().send_bytes(data)
+
+    async def scenario(first, sends):
+        socket = Gone(sends)
+        async with hosting(field) as host:
+            socket.say(first)
+            await asyncio.wait_for(Connection(socket, host).run(), 5)
+            return host.streams
+
+    for first, sends in [(Ping(id=1), 0), (HELLO, 0), (HELLO, 1), (HELLO, 5)]:
+        assert asyncio.run(scenario(first, sends)) == 0
+
+
 def test_a_stream_that_fails_is_closed_with_an_internal_error(field):
     async def scenario():
         socket = Socket()
