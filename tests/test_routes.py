@@ -217,7 +217,7 @@ def test_too_many_waiting_requests_are_turned_away_and_health_is_answered_meanwh
     for asker in askers:
         asker.start()
     try:
-        for _ in range(100):
+        for _ in range(500):
             if len(statuses) == 3:
                 break
             time.sleep(0.02)

@@ -47,8 +47,12 @@ def test_sound_arrives_at_the_pace_of_time(served):
     with connect(f"ws://{served}/v1/stream") as client:
         client.send(HELLO)
         assert json.loads(client.recv())["type"] == "welcome"
+        started_s = time.monotonic()
         count = len(blocks_for(client, 2.0))
-        assert count == pytest.approx(2.0 * 24_000 / 256 + 8, abs=6)
+        heard_s = count * 256 / 24_000
+        # Never further ahead than the eight blocks asked for, whatever the machine does; behind only by what it stalls.
+        assert heard_s <= time.monotonic() - started_s + 10 * 256 / 24_000
+        assert heard_s > 1.5
 
 
 def test_a_client_that_vanishes_leaves_no_stream_behind(served):
