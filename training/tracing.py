@@ -80,8 +80,8 @@ class RoomTracer:
             hist_bin_size=HISTOGRAM_BIN_S,
         )
         room.add_microphone_array(receivers.T)
-        # The engine underneath the public class: its `compute_rir` cannot do without an image source, and knows no
-        # direction of arrival for omnidirectional receivers.
+        # The engine underneath the public class: where every path is blocked, its `compute_rir` draws the direct one
+        # through the wall, and it knows no direction of arrival for omnidirectional receivers.
         self._engine = room.room_engine
         for microphone in self._engine.microphones:
             microphone.set_directions(arrival_directions.astype(np.float32))

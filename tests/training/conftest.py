@@ -1,0 +1,72 @@
+"""The smallest scene, simulated, trained and exported once for all tests."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from rich.progress import Progress
+
+from server.scene.bundle import Bundle
+from training.dataset import Dataset
+from training.export import export
+from training.hrtf import KEMAR, Hrtf
+from training.model import FieldShape
+from training.scene_file import SceneFile
+from training.simulate import simulate
+from training.train import Configuration, train
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation
+
+TINY = Path(__file__).parents[1] / "data" / "tiny.toml"
+CONFIGURATION = Configuration(
+    epochs=20, batch=16, shape=FieldShape(rank=16, width=32, depth=2, grid_spacing_m=1.0, grid_features=4)
+)
+
+
+@pytest.fixture(scope="session")
+def tiny_scene() -> Path:
+    return TINY
+
+
+@pytest.fixture(scope="session")
+def apartment() -> SceneFile:
+    return SceneFile.read(Path(__file__).parents[2] / "training" / "scenes" / "apartment.toml")
+
+
+@pytest.fixture(scope="session")
+def kemar() -> Hrtf:
+    return Hrtf.read(KEMAR, 24_000)
+
+
+@pytest.fixture(scope="session")
+def configuration() -> Configuration:
+    return CONFIGURATION
+
+
+@pytest.fixture(scope="session")
+def one_thread() -> Iterator[None]:
+    """Sums in parallel are not repeatable."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("tiny") / "data"
+    return simulate(TINY, folder, seed=5, workers=1, progress=Progress(disable=True))
+
+
+@pytest.fixture(scope="session")
+def run(dataset, one_thread, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("tiny") / "run"
+    train(dataset, folder, CONFIGURATION, Progress(disable=True))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_bundle(dataset, run, tmp_path_factory) -> Bundle:
+    return export(dataset, run, tmp_path_factory.mktemp("tiny") / "bundle")

@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+import torch
+
+from server.acoustics.codec import Codec
+from server.acoustics.geometry import FloorPlan
+from training.cells import Cells
+from training.model import ExportedField, FactorisedField, FeatureGrid, FieldShape, Heads, PoseEncoder
+
+PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
+CELLS = Cells(Codec(16_000, 256, 64, 4_000, 1e-5))
+SHAPE = FieldShape(rank=8, width=16, depth=2, grid_features=4)
+
+
+@pytest.fixture
+def field():
+    torch.manual_seed(0)
+    return FactorisedField(PLAN, CELLS, SHAPE).eval()
+
+
+def poses(count, seed=0):
+    rng = np.random.default_rng(seed)
+    ends = (rng.uniform((0.3, 0.3, 1), (1.7, 4.7, 2), (count, 3)) for _ in range(2))
+    return [torch.from_numpy(array.astype(np.float32)) for array in (*ends, rng.uniform(-3, 3, count))]
+
+
+def test_heads_tile_the_output():
+    heads = Heads(CELLS)
+    owner = np.zeros(heads.size, dtype=int)
+    for name, part in heads.slices.items():
+        owner[part] += 1
+        assert part.stop - part.start == np.prod(heads.shapes[name])
+    np.testing.assert_array_equal(owner, 1)
+
+
+@pytest.mark.parametrize("distance_m", [0, 1e3, 1e6])
+def test_the_grid_reads_a_mean_of_its_features_however_far_away(distance_m):
+    grid = FeatureGrid(PLAN, 0.5, 4)
+    read = grid(torch.tensor([[distance_m, -distance_m, 1.0], [-distance_m, 2.0, 1.0]]))
+    assert (read <= grid._features.amax(dim=0) + 1e-6).all()
+    assert (read >= grid._features.amin(dim=0) - 1e-6).all()
+
+
+def test_the_grid_reads_mostly_its_nearest_node():
+    grid = FeatureGrid(PLAN, 0.5, 4)
+    with torch.no_grad():
+        grid._features.copy_(grid._nodes.sum(dim=1, keepdim=True).expand(-1, 4))
+    inner = torch.tensor([[2.2, 2.6, 0.0], [1.0, 1.5, 0.0]])
+    # A plane in plan is read off as that plane.
+    torch.testing.assert_close(grid(inner)[:, 0], torch.tensor([4.8, 2.5]), atol=0.05, rtol=0)
+
+
+def test_turning_by_a_full_turn_changes_nothing(field):
+    listener, emitter, yaw = poses(20)
+    torch.testing.assert_close(field(listener, emitter, yaw + 2 * np.pi), field(listener, emitter, yaw), atol=1e-4, rtol=0)
+
+
+def test_the_head_meets_the_azimuth_it_turned_to():
+    """Looking at the emitter, the encoder sees azimuth zero whatever the compass says."""
+    encoder = PoseEncoder(PLAN, SHAPE)
+    listener = torch.tensor([[1.0, 1.0, 1.5]]).repeat(3, 1)
+    angle = torch.tensor([0.0, 0.5, 1.2])
+    emitter = listener + torch.stack([0.8 * torch.cos(angle), 0.8 * torch.sin(angle), torch.zeros(3)], dim=-1)
+    features = encoder(listener, emitter, angle)
+    start = 2 * SHAPE.grid_features + 2 * encoder._octaves(listener).shape[-1]
+    azimuth = features[:, start : start + 10]
+    torch.testing.assert_close(azimuth, torch.tensor([[1.0] * 5 + [0.0] * 5]).repeat(3, 1), atol=2e-3, rtol=0)
+
+
+def test_neighbours_have_similar_outputs(field):
+    listener, emitter, yaw = poses(50)
+    near = field(listener + 1e-4, emitter, yaw)
+    assert (near - field(listener, emitter, yaw)).abs().max() < 0.05
+
+
+def test_phase_is_coded_as_the_codec_does(field):
+    exported = ExportedField(field, CELLS)
+    rng = np.random.default_rng(0)
+    phase = rng.uniform(-np.pi, np.pi, (3, 2, CELLS.codec.bins, CELLS.known_frames))
+    length = rng.uniform(0.1, 1.5, phase.shape)
+    parts = (torch.from_numpy(part.astype(np.float32)) for part in (length * np.cos(phase), length * np.sin(phase)))
+    frequency, certainty = exported._phase(*parts)
+    turn = np.exp(1j * frequency.numpy()) / np.exp(1j * CELLS.codec.instantaneous_frequency(phase))
+    np.testing.assert_allclose(turn, 1, atol=1e-4)
+    assert frequency[..., 1:].abs().max() <= np.pi + 1e-4
+    again = CELLS.codec.integrate(frequency.numpy())
+    np.testing.assert_allclose(np.exp(1j * again), np.exp(1j * phase), atol=2e-4)
+    np.testing.assert_allclose(certainty, np.minimum(length, 1), atol=1e-5)
+
+
+def test_a_flat_prediction_comes_out_where_it_belongs(field):
+    """With constant heads, every output of the contract is that constant, in frames and bins of the codec."""
+    heads = field.heads
+    with torch.no_grad():
+        field.basis.zero_()
+        field.mean[heads.slices["fine"]] = -2.0
+        field.mean[heads.slices["late"]] = -3.0
+        phasor = field.mean[heads.slices["phasor"]].reshape(heads.shapes["phasor"])
+        phasor[0], phasor[1] = 0.6, 0.0
+        interaural = field.mean[heads.slices["interaural"]].reshape(heads.shapes["interaural"])
+        interaural[0], interaural[1] = 0.3, -0.4
+    outputs = ExportedField(field, CELLS)(*poses(2))
+    log_magnitude, frequency, certainty, coherence = (output.detach().numpy() for output in outputs)
+    codec = CELLS.codec
+    assert log_magnitude.shape == (2, 2, codec.bins, codec.frames)
+    np.testing.assert_allclose(log_magnitude[..., : CELLS.fine_frames], -2, atol=1e-5)
+    np.testing.assert_allclose(log_magnitude[..., CELLS.fine_frames :], -3, atol=1e-5)
+    assert frequency.shape == certainty.shape == (2, 2, codec.bins, CELLS.known_frames)
+    np.testing.assert_allclose(np.exp(1j * codec.integrate(frequency)), 1, atol=1e-3)
+    np.testing.assert_allclose(certainty, 0.6, atol=1e-5)
+    assert coherence.shape == (2, 2, codec.bins, codec.frames)
+    np.testing.assert_allclose(coherence[:, 0], 0.3, atol=1e-5)
+    np.testing.assert_allclose(coherence[:, 1], -0.4, atol=1e-5)
+
+
+def test_predictions_stay_above_silence(field):
+    with torch.no_grad():
+        field.mean.fill_(-100.0)
+    log_magnitude, *_ = ExportedField(field, CELLS)(*poses(2))
+    assert (log_magnitude >= np.log(CELLS.codec.log_floor) - 1e-5).all()

@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+import torch
+
+from server.acoustics.geometry import FloorPlan
+from training.propagation import Propagation
+
+PLANS = {
+    "apartment": FloorPlan(
+        ((0, 0), (4, 0), (4, 2), (4.2, 2), (4.2, 0), (8, 0), (8, 5), (4.2, 5), (4.2, 3), (4, 3), (4, 5), (0, 5)), 2.8
+    ),
+    "L": FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0),
+    # Round two bends, with slanted walls.
+    "horseshoe": FloorPlan(((0, 0), (9, 0.5), (8.5, 5), (6, 5), (5.5, 2), (3, 1.8), (2.5, 5.2), (0, 5)), 3.0),
+    "shoebox": FloorPlan(((0, 0), (4, 0), (4, 3), (0, 3)), 2.5),
+}
+PAIRS = 3000
+
+
+def random_pairs(plan):
+    rng = np.random.default_rng(0)
+    low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
+    points = rng.uniform((*low, 0.1), (*high, plan.height_m - 0.1), (4 * PAIRS, 3)).astype(np.float32)
+    points = points[plan.contains(points) & (plan.wall_distance_m(points) > 0.01)]
+    return points[: len(points) // 2], points[len(points) // 2 : len(points) // 2 * 2]
+
+
+@pytest.fixture(params=PLANS)
+def case(request):
+    """A plan, emitters and listeners in it, and their paths by way of torch."""
+    plan = PLANS[request.param]
+    listeners, emitters = random_pairs(plan)
+    path = Propagation(plan)(torch.from_numpy(listeners), torch.from_numpy(emitters))
+    return plan, listeners, emitters, path
+
+
+def test_lengths_are_those_of_the_floor_plan(case):
+    plan, listeners, emitters, path = case
+    assert len(listeners) > PAIRS / 2
+    np.testing.assert_allclose(path.length.numpy(), plan.path_length_m(emitters, listeners), atol=2e-4)
+
+
+def test_sight_is_that_of_the_floor_plan(case):
+    plan, listeners, emitters, path = case
+    expected = plan.is_visible(listeners, emitters)
+    # Single precision may differ where a corner is grazed.
+    assert np.mean((path.visible.numpy() > 0.5) != expected) < 1e-3
+    assert expected.all() == (plan is PLANS["shoebox"])
+
+
+def test_directions_are_unit_vectors(case):
+    *_, path = case
+    for direction in (path.from_listener, path.from_emitter):
+        assert ((direction.norm(dim=-1) - 1).abs() < 0.02).all()
+
+
+def test_in_sight_they_point_at_each_other(case):
+    _, listeners, emitters, path = case
+    seen = path.visible.numpy() > 0.5
+    offset = (emitters - listeners)[seen, :2]
+    straight = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
+    far = np.linalg.norm(offset, axis=-1) > 0.1
+    np.testing.assert_allclose(path.from_listener.numpy()[seen][far], straight[far], atol=2e-3)
+    np.testing.assert_allclose(path.from_emitter.numpy()[seen][far], -straight[far], atol=2e-3)
+
+
+def test_out_of_sight_they_set_out_on_a_shortest_path(case):
+    """A small step in the direction given makes what remains shorter by the step."""
+    plan, listeners, emitters, path = case
+    hidden = ~plan.is_visible(listeners, emitters) & (path.visible.numpy() < 0.5)
+    step_m = 0.02
+    for here, there, direction in (
+        (listeners[hidden], emitters[hidden], path.from_listener.numpy()[hidden]),
+        (emitters[hidden], listeners[hidden], path.from_emitter.numpy()[hidden]),
+    ):
+        level = there.copy()
+        level[:, 2] = here[:, 2]
+        corner_far = np.min(np.linalg.norm(here[:, None, :2] - np.array(plan.corners), axis=-1), axis=1) > 2 * step_m
+        ahead = here + step_m * np.pad(direction, ((0, 0), (0, 1)))
+        shorter = plan.path_length_m(here, level) - plan.path_length_m(ahead, level)
+        np.testing.assert_allclose(shorter[corner_far], step_m, atol=2e-4)
+
+
+def test_paths_there_and_back_are_one(case):
+    plan, listeners, emitters, path = case
+    back = Propagation(plan)(torch.from_numpy(emitters), torch.from_numpy(listeners))
+    torch.testing.assert_close(back.length, path.length, rtol=0, atol=1e-4)
+    torch.testing.assert_close(back.from_emitter, path.from_listener, rtol=0, atol=1e-3)
+
+
+def test_a_listener_at_the_emitter_is_finite(case):
+    plan, listeners, *_ = case
+    points = torch.from_numpy(listeners[:5]).requires_grad_()
+    path = Propagation(plan)(points, points)
+    for part in (path.length, path.from_listener, path.from_emitter):
+        assert part.isfinite().all()
+    path.length.sum().backward()
+    assert points.grad.isfinite().all()
