@@ -11,7 +11,7 @@ from server.field.field import AcousticField
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy
 from training.baselines import TrainingPairs, linear, linear_aligned, nearest
-from training.dataset import Dataset
+from training.dataset import Dataset, DatasetError
 from training.evaluate import FIELD, FLOOR, Evaluation, Responses, evaluate
 from training.evaluation_figure import draw_figure
 
@@ -91,9 +91,15 @@ def evaluate_bundle(
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
     """Every held-out pair at every yaw, in the time domain, as the server would render it; optionally with a figure
-    (PNG)."""
-    field = AcousticField.load(bundle)
+    (PNG).
+
+    Raises DatasetError if the dataset is of another scene than the bundle.
+    """
     codec = bundle.manifest.codec.codec
+    of_bundle = bundle.manifest.geometry, codec.sample_rate, codec.samples
+    if of_bundle != (dataset.scene.geometry, dataset.sample_rate, dataset.samples):
+        raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
+    field = AcousticField.load(bundle)
     with h5py.File(dataset.folder / "pairs.h5", "r") as file:
         held_out = HeldOut(dataset, field, file)
         evaluation = evaluate(

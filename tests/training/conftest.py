@@ -45,7 +45,7 @@ def configuration() -> Configuration:
     return CONFIGURATION
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
     """Sums in parallel are not repeatable."""
     threads = torch.get_num_threads()
@@ -61,7 +61,7 @@ def dataset(tmp_path_factory) -> Dataset:
 
 
 @pytest.fixture(scope="session")
-def run(dataset, one_thread, tmp_path_factory) -> Path:
+def run(dataset, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("tiny") / "run"
     train(dataset, folder, CONFIGURATION, Progress(disable=True))
     return folder

@@ -52,7 +52,9 @@ def test_the_grid_reads_mostly_its_nearest_node():
 
 def test_turning_by_a_full_turn_changes_nothing(field):
     listener, emitter, yaw = poses(20)
-    torch.testing.assert_close(field(listener, emitter, yaw + 2 * np.pi), field(listener, emitter, yaw), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        field(listener, emitter, yaw + 2 * np.pi), field(listener, emitter, yaw), atol=1e-4, rtol=0
+    )
 
 
 def test_the_head_meets_the_azimuth_it_turned_to():

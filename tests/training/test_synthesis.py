@@ -48,7 +48,8 @@ def test_direct_sound_arrives_after_its_way(sample_rate, distance_m):
 
 def test_direct_sound_falls_as_one_over_distance(kemar):
     near, far = (
-        rendering(kemar).render(direct((r, 0, 0)), HERE, r / 343, np.random.default_rng(0)) for r in (343 / 120, 686 / 120)
+        rendering(kemar).render(direct((r, 0, 0)), HERE, r / 343, np.random.default_rng(0))
+        for r in (343 / 120, 686 / 120)
     )
     # Whole samples apart, so that the two are copies.
     np.testing.assert_allclose(far[..., 200:], near[..., :-200] / 2, atol=1e-9)

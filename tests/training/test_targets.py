@@ -55,7 +55,7 @@ def test_phasors_are_those_of_the_click():
     found = phasor[0] + 1j * phasor[1]
     start = np.round(CODEC.frame_times_s[: CELLS.known_frames] * CODEC.sample_rate).astype(int) - CODEC.n_fft // 2
     # Where Hann's window lets the click through at all.
-    hears = (LEAD_SAMPLES > start) & (LEAD_SAMPLES < start + CODEC.n_fft)
+    hears = (start < LEAD_SAMPLES) & (start + CODEC.n_fft > LEAD_SAMPLES)
     assert hears.any()
     turn = -2j * np.pi * np.arange(CODEC.bins)[:, None] * (LEAD_SAMPLES - start) / CODEC.n_fft
     np.testing.assert_allclose(found[..., hears], np.broadcast_to(np.exp(turn), found.shape)[..., hears], atol=2e-3)

@@ -16,7 +16,9 @@ OUT_OF_SIGHT = np.array([4.6, 4.6, 1.4]), np.array([3.5, 0.5, 1.5])
 
 def shoebox(*, absorption=0.3, scattering=0.3):
     material = Material(absorption=(absorption,) * 7, scattering=(scattering,) * 7)
-    return Geometry(height_m=2.5, corners=CORNERS, materials=Materials(walls=material, floor=material, ceiling=material))
+    return Geometry(
+        height_m=2.5, corners=CORNERS, materials=Materials(walls=material, floor=material, ceiling=material)
+    )
 
 
 def trace(geometry, emitter=EMITTER, receivers=RECEIVERS, *, rays=2000, seed=0, image_order=1, duration_s=0.4):
@@ -173,9 +175,7 @@ def test_the_seed_decides_the_arrivals():
 
 
 def test_a_tracer_keeps_nothing_of_the_emitter_before():
-    tracer = RoomTracer(
-        shoebox(), RECEIVERS, duration_s=0.2, image_order=1, arrival_directions=sphere_directions(6)
-    )
+    tracer = RoomTracer(shoebox(), RECEIVERS, duration_s=0.2, image_order=1, arrival_directions=sphere_directions(6))
     first = tracer.trace(EMITTER, rays=500, seed=1)
     tracer.trace(EMITTER + 0.3, rays=500, seed=2)
     for one, same in zip(first, tracer.trace(EMITTER, rays=500, seed=1), strict=True):

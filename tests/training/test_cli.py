@@ -1,0 +1,74 @@
+import json
+import shutil
+
+import pytest
+
+from training.cli import main
+
+
+@pytest.fixture
+def nafir_train(monkeypatch, capfd):
+    """Runs the command; gives its exit code, standard output and standard error."""
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["nafir-train", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        return left.value.code, *capfd.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("simulate", "absent.toml", "-o", "{tmp}/data"), "absent.toml: cannot be read"),
+        (("simulate", "{scene}", "-o", "{data}", "--seed", "9"), "another scene or seed"),
+        (("train", "{tmp}", "-o", "{tmp}/run"), "{tmp}"),
+        (("train", "{data}", "-o", "{run}"), "another configuration"),
+        (("export", "{tmp}", "-o", "{tmp}/bundle"), "not a run folder"),
+        (("export", "{run}", "--data", "{tmp}", "-o", "{tmp}/bundle"), "{tmp}"),
+        (("evaluate", "{tmp}", "{data}"), "scene.json"),
+        (("evaluate", "{bundle}", "{tmp}"), "{tmp}"),
+    ],
+)
+def test_what_cannot_be_done_is_told_in_a_line(
+    nafir_train, dataset, run, tiny_bundle, tiny_scene, tmp_path, arguments, told
+):
+    places = {
+        "tmp": tmp_path,
+        "scene": tiny_scene,
+        "data": dataset.folder,
+        "run": run,
+        "bundle": tiny_bundle.folder,
+    }
+    code, _, err = nafir_train(*(argument.format(**places) for argument in arguments))
+    assert code == 2
+    last = err.strip().splitlines()[-1]
+    assert last.startswith("nafir-train: ")
+    assert told.format(**places) in last
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("option", [("--workers", "-1"), ("--seed", "-1")])
+def test_numbers_out_of_range_are_refused(nafir_train, tiny_scene, tmp_path, option):
+    code, _, err = nafir_train("simulate", tiny_scene, "-o", tmp_path, *option)
+    assert code == 2
+    assert option[0] in err
+
+
+def test_simulating_again_finds_nothing_left_to_do(nafir_train, dataset, tiny_scene):
+    code, out, _ = nafir_train("simulate", tiny_scene, "-o", dataset.folder, "--seed", dataset.seed)
+    assert code == 0
+    assert "26 pairs to train on and 4 held out, 4 orientations each" in out
+
+
+def test_evaluating_prints_json_and_records(nafir_train, dataset, tiny_bundle, tmp_path):
+    bundle = tmp_path / "bundle"
+    shutil.copytree(tiny_bundle.folder, bundle)
+    code, out, _ = nafir_train("evaluate", bundle, dataset.folder, "--json", "--record")
+    assert code == 0
+    printed = json.loads(out)
+    recorded = json.loads((bundle / "scene.json").read_text())["levels"][0]["accuracy"]
+    assert printed["pairs"] == recorded["pairs"] == len(dataset.pairs(held_out=True))
+    assert {row["name"] for row in printed["rows"]} >= recorded["errors"].keys()

@@ -1,0 +1,126 @@
+import multiprocessing
+import time
+
+import h5py
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from training.dataset import Dataset, DatasetError
+from training.simulate import simulate
+
+
+class Impatient(Progress):
+    """Interrupts, as Ctrl-C does, after so many emitters."""
+
+    def __init__(self, patience):
+        super().__init__(disable=True)
+        self._patience = patience
+
+    def advance(self, *arguments):
+        super().advance(*arguments)
+        self._patience -= 1
+        if self._patience == 0:
+            raise KeyboardInterrupt
+
+
+def stored(folder):
+    with h5py.File(folder / "pairs.h5", "r") as file:
+        return {name: values[()] for name, values in file.items()}
+
+
+def test_couples_are_held_out_in_both_directions(dataset):
+    np.testing.assert_array_equal(dataset.held_out, dataset.held_out.T)
+    assert not np.diag(dataset.held_out).any()
+
+
+def test_the_share_held_out_is_that_of_the_scene(dataset):
+    probes = len(dataset.probes)
+    couples = probes * (probes - 1) / 2
+    assert dataset.held_out.sum() / 2 == round(dataset.scene.simulation.held_out_share * couples)
+    trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
+    assert trained + held_out == probes * (probes - 1)
+
+
+def test_pairs_are_emitter_and_listener(dataset):
+    with h5py.File(dataset.folder / "pairs.h5", "r") as file:
+        for emitter, listener in dataset.pairs(held_out=True):
+            np.testing.assert_array_equal(
+                dataset.read(np.array([[emitter, listener]]))[0], file["impulse_responses"][emitter, listener]
+            )
+
+
+def test_sound_arrives_when_it_can(dataset):
+    """In a shoebox every pair is in sight: the louder ear's direct sound comes after distance / c."""
+    for emitter, listener in dataset.pairs(held_out=False):
+        response = dataset.read(np.array([[emitter, listener]]))[0].astype(float)
+        onset = np.argmax(np.abs(response) > 0.2 * np.abs(response).max(axis=(1, 2), keepdims=True), axis=-1).min(
+            axis=-1
+        )
+        distance = np.linalg.norm(dataset.probes[emitter] - dataset.probes[listener])
+        # Sound reaches the nearer ear up to a head's radius earlier.
+        early, late = ((distance + extra_m) / 343 * dataset.sample_rate for extra_m in (-0.13, 0.06))
+        assert ((onset >= early) & (onset <= late)).all()
+
+
+def test_second_takes_share_the_direct_sound_and_not_the_noise(dataset):
+    pairs = dataset.pairs(held_out=True)
+    first, second = (dataset.read(pairs, name).astype(float) for name in ("impulse_responses", "repeats"))
+    assert not np.array_equal(first, second)
+    for (emitter, listener), one, other in zip(pairs, first, second, strict=True):
+        onset = round(dataset.onset_s[emitter, listener] * dataset.sample_rate)
+        head = slice(onset - 4, onset + 12)
+        assert np.corrcoef(one[..., head].ravel(), other[..., head].ravel())[0, 1] > 0.8
+        tail = slice(onset + 800, None)
+        assert abs(np.corrcoef(one[..., tail].ravel(), other[..., tail].ravel())[0, 1]) < 0.2
+        # Independent simulations of one room agree on its level.
+        assert np.sum(one**2) == pytest.approx(np.sum(other**2), rel=0.3)
+
+
+def test_an_interrupted_simulation_goes_on_to_the_same_data(dataset, tiny_scene, tmp_path):
+    folder = tmp_path / "data"
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        simulate(tiny_scene, folder, seed=dataset.seed, workers=2, progress=Impatient(2))
+    assert time.monotonic() - began < 30
+    assert not multiprocessing.active_children()
+    with pytest.raises(DatasetError, match="4 emitters are not simulated yet"):
+        Dataset.open(folder)
+
+    resumed = simulate(tiny_scene, folder, seed=dataset.seed, workers=1, progress=Progress(disable=True))
+    assert resumed.remaining() == []
+    whole, pieced = stored(dataset.folder), stored(folder)
+    assert whole.keys() == pieced.keys()
+    for name, values in whole.items():
+        np.testing.assert_array_equal(pieced[name], values, err_msg=name)
+
+
+def test_a_start_interrupted_halfway_can_be_repeated(tiny_scene, tmp_path):
+    (tmp_path / "scene.toml").write_text("half a fi")
+    (tmp_path / "pairs.partial").write_bytes(b"\x89HDF")
+    dataset = Dataset.create(tmp_path, tiny_scene, 0)
+    assert dataset.remaining() == list(range(len(dataset.probes)))
+
+
+def test_a_folder_keeps_to_its_scene_and_seed(dataset, tiny_scene, tmp_path):
+    with pytest.raises(DatasetError, match="another scene or seed"):
+        Dataset.create(dataset.folder, tiny_scene, dataset.seed + 1)
+    other = tmp_path / "other.toml"
+    other.write_text(tiny_scene.read_text().replace("rays = 500", "rays = 501"))
+    with pytest.raises(DatasetError, match="another scene or seed"):
+        Dataset.create(dataset.folder, other, dataset.seed)
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "format"])
+def test_what_is_no_dataset_says_so(tiny_scene, tmp_path, damage):
+    Dataset.create(tmp_path, tiny_scene, 0)
+    path = tmp_path / "pairs.h5"
+    if damage == "missing":
+        path.unlink()
+    elif damage == "format":
+        with h5py.File(path, "r+") as file:
+            file.attrs["format"] = 99
+    else:
+        path.write_bytes(b"" if damage == "empty" else path.read_bytes()[:500])
+    with pytest.raises(DatasetError, match=str(tmp_path)):
+        Dataset.open(tmp_path, finished=False)
