@@ -10,7 +10,7 @@ RUN python -m venv --without-pip /opt/nafir
 COPY pyproject.toml ./
 RUN python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" > requirements.txt \
     && python -m pip --python /opt/nafir/bin/python install --no-cache-dir --requirement requirements.txt
-COPY LICENSE ./
+COPY LICENSE README.md ./
 COPY server server
 # Without `training` beside it the package is the server alone, so its other command goes.
 RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-deps . \

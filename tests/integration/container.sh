@@ -65,7 +65,7 @@ elif ! run_podman image exists "localhost/$base"; then
     say "making $base"
     if [ ! -f "$state/base.tar" ]; then
         command -v mmdebstrap >/dev/null || fail "mmdebstrap is not installed"
-        mmdebstrap --quiet --variant=minbase \
+        mmdebstrap --quiet --format=tar --variant=minbase \
             --include=ca-certificates,python-is-python3,python3,python3-pip,python3-venv \
             "${DEBIAN_SUITE:-bookworm}" "$state/base.tar.part" ${DEBIAN_MIRROR:+"$DEBIAN_MIRROR"}
         mv "$state/base.tar.part" "$state/base.tar"
