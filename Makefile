@@ -39,7 +39,7 @@ bundle: $(VENV)/installed-training ## simulate, train, export and evaluate a sce
 	$(BIN)/nafir-train simulate training/scenes/$(SCENE).toml -o $(RUNS)/data
 	$(BIN)/nafir-train train $(RUNS)/data -o $(RUNS)/run
 	$(BIN)/nafir-train export $(RUNS)/run -o $(RUNS)/bundle
-	$(BIN)/nafir-train evaluate $(RUNS)/bundle $(RUNS)/data
+	$(BIN)/nafir-train evaluate $(RUNS)/bundle $(RUNS)/data --record --figure $(RUNS)/errors.png
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh

@@ -72,9 +72,6 @@ class ListenerStart(_Directed):
     """Where the listener stands when the stream begins: pose 0."""
 
 
-# --- client to server -------------------------------------------------------------------------------------------------
-
-
 class Hello(_Message):
     """First message. `sample_rate` may be left out; given, it has to be the scene's. `buffer_blocks` is how many blocks
     ahead of real time the server runs: more survives a worse network, less is heard sooner."""
@@ -181,9 +178,6 @@ def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
     else:
         code = "malformed_message"
     return RequestError(code, f"{field}: {first['msg']}" if field else str(first["msg"]), field=field)
-
-
-# --- server to client -------------------------------------------------------------------------------------------------
 
 
 class Place(_Message):

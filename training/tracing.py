@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pyroomacoustics as pra
+from scipy.stats import poisson
 
 from server.scene.geometry import OCTAVE_BANDS_HZ, Geometry, Material
 
@@ -13,6 +14,7 @@ HISTOGRAM_BIN_S = 0.004
 # Nothing is sampled here, but pyroomacoustics derives from its rate the octave bands (at this one, exactly
 # OCTAVE_BANDS_HZ) and rounds the bins of its histograms to whole samples (at this one, exactly HISTOGRAM_BIN_S).
 _ENGINE_RATE = 24_000
+_SPEED_OF_SOUND = pra.constants.get("c")
 _RECEIVER_RADIUS_M = 0.4
 # Rays are followed down to -120 dB; pyroomacoustics' default of -70 dB per ray truncates decays at about -45 dB.
 _ENERGY_THRESHOLD = 1e-12
@@ -39,6 +41,26 @@ def sphere_directions(count: int) -> npt.NDArray[np.float64]:
     azimuth = step * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - z**2)
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
+
+
+def counted_twice(geometry: Geometry, *, image_order: int, bins: int) -> npt.NDArray[np.float64]:
+    """(band, bin) factor by which pyroomacoustics' rays bring too much energy where surfaces scatter.
+
+    At every wall its engine sends the scattered share s to the receivers and then follows the ray on with all of its
+    energy, not 1 - s of it, so that 1 + s arrives of 1. Arrivals of up to `image_order` reflections are spared: there
+    the ray itself is left to the image sources. How many reflections an arrival has had by a time is Poisson, after
+    the mean free path 4 V / S of a diffuse field (Kuttruff, Room Acoustics, ch. 5).
+    """
+    plan, materials = geometry.floor_plan, geometry.materials
+    perimeter_m = float(np.sum(np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1)))
+    areas = np.array([perimeter_m * geometry.height_m, plan.area_m2, plan.area_m2])
+    surfaces = (materials.walls, materials.floor, materials.ceiling)
+    reflected = areas[:, None] * (1 - np.array([surface.absorption for surface in surfaces]))
+    scattering = np.array([surface.scattering for surface in surfaces])
+    mean_scattering = np.sum(reflected * scattering, axis=0) / np.maximum(np.sum(reflected, axis=0), 1e-9)
+    mean_free_path_m = 4 * plan.area_m2 * geometry.height_m / float(np.sum(areas))
+    reflections = (np.arange(bins) + 0.5) * HISTOGRAM_BIN_S * _SPEED_OF_SOUND / mean_free_path_m
+    return np.asarray(1 + mean_scattering[:, None] * poisson.sf(image_order - 1, reflections))
 
 
 def _material(material: Material) -> pra.Material:
@@ -87,7 +109,7 @@ class RoomTracer:
             microphone.set_directions(arrival_directions.astype(np.float32))
         self._bands: int = room.octave_bands.n_bands
         self._air_absorption_per_m = np.asarray(room.air_absorption, dtype=np.float64)
-        self._sound_speed: float = room.c
+        self._counted_twice = counted_twice(geometry, image_order=image_order, bins=self._bins)
 
     def trace(self, emitter: npt.NDArray[np.float64], *, rays: int, seed: int) -> list[Arrivals]:
         """One entry per receiver. The same seed gives the same arrivals."""
@@ -118,8 +140,8 @@ class RoomTracer:
         self._engine.ray_tracing(directions, np.ones((rays, self._bands), np.float32), emitter.astype(np.float32))
         energy = np.stack([self._read(microphone) for microphone in self._engine.microphones])
         self._engine.reset_mics()
-        distance = (np.arange(self._bins) + 0.5) * HISTOGRAM_BIN_S * self._sound_speed
-        return np.asarray(energy * np.exp(-self._air_absorption_per_m[:, None] * distance))
+        distance = (np.arange(self._bins) + 0.5) * HISTOGRAM_BIN_S * _SPEED_OF_SOUND
+        return np.asarray(energy * np.exp(-self._air_absorption_per_m[:, None] * distance) / self._counted_twice)
 
     def _read(self, microphone: pra.libroom.Microphone) -> npt.NDArray[np.float64]:
         energy = np.zeros((len(microphone.histograms), self._bands, self._bins))

@@ -42,7 +42,7 @@ class Configuration:
     """All that decides a run's outcome besides the dataset."""
 
     seed: int = 0
-    epochs: int = 24
+    epochs: int = 14
     batch: int = 128
     learning_rate: float = 2e-3
     weight_decay: float = 1e-2

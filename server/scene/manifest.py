@@ -66,7 +66,7 @@ class FieldFile(Strict):
 
 
 class Accuracy(Strict):
-    """Median errors over `pairs` held-out pairs, each heard at `yaws` head orientations, by metric, and the
+    """Mean errors over `pairs` held-out pairs, each heard at `yaws` head orientations, by metric, and the
     repeatability floor."""
 
     pairs: int

@@ -4,7 +4,7 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.scene.geometry import OCTAVE_BANDS_HZ, Geometry, Material, Materials
-from training.tracing import HISTOGRAM_BIN_S, RoomTracer, sphere_directions
+from training.tracing import HISTOGRAM_BIN_S, RoomTracer, counted_twice, sphere_directions
 
 SIZE_M = np.array([4.0, 3.0, 2.5])
 CORNERS = ((0, 0), (4, 0), (4, 3), (0, 3))
@@ -109,6 +109,7 @@ def test_energy_is_that_of_pyroomacoustics_own_responses():
     rate, rays = 96_000, 4000
     room, responses = computed_by_pyroomacoustics(shoebox(), EMITTER, RECEIVERS, rays=rays, sample_rate=rate)
     traced = trace(shoebox(), rays=rays)
+    too_much = counted_twice(shoebox(), image_order=1, bins=100)
     impulse = np.zeros(8192)
     impulse[4096] = 1
     for start_s, end_s in ((0.0, 0.02), (0.02, 0.06), (0.06, 0.12), (0.12, 0.2)):
@@ -121,8 +122,26 @@ def test_energy_is_that_of_pyroomacoustics_own_responses():
                 expected += np.sum(room.octave_bands.analysis(response, band=band)[window] ** 2) / passes
                 arrival_s = np.linalg.norm(arrivals.image_positions - receiver, axis=1) / 343
                 heard = (arrival_s >= start_s) & (arrival_s < end_s)
-                found += np.sum(arrivals.image_amplitudes[heard, band] ** 2) + arrivals.energy[:, band, bins].sum()
+                found += (
+                    np.sum(arrivals.image_amplitudes[heard, band] ** 2)
+                    + (arrivals.energy * too_much)[:, band, bins].sum()
+                )
         assert power_to_db(found / expected) == pytest.approx(0, abs=1.5)
+
+
+@pytest.mark.parametrize("image_order", [1, 3])
+@pytest.mark.parametrize("scattering", [0.0, 0.5, 0.9])
+def test_reflected_energy_is_that_of_a_diffuse_field(scattering, image_order):
+    """16 pi / R with the room constant R (Kuttruff, Room Acoustics, ch. 5), direct sound 1 / r**2."""
+    absorption = 0.15
+    geometry = shoebox(absorption=absorption, scattering=scattering)
+    surface = 2 * (SIZE_M * np.roll(SIZE_M, 1)).sum()
+    expected = 16 * np.pi * (1 - absorption) / (surface * absorption)
+    found = 0.0
+    for arrivals in trace(geometry, rays=4000, image_order=image_order, duration_s=0.8):
+        reflected = ~np.isclose(arrivals.image_positions, EMITTER).all(axis=1)
+        found += np.sum(arrivals.image_amplitudes[reflected, 2] ** 2) + arrivals.energy[:, 2].sum()
+    assert power_to_db(found / len(RECEIVERS) / expected) == pytest.approx(0, abs=0.8)
 
 
 def test_rays_are_sorted_by_where_they_come_from():
