@@ -1,0 +1,132 @@
+"""A field's responses: what the graph of `conftest` says, as sound, and what the bundled apartment sounds like."""
+
+import io
+
+import numpy as np
+import onnx
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from server.acoustics.room_parameters import level_db
+from server.errors import BundleError
+from server.field.field import AcousticField
+from server.scene.bundle import BUNDLED, Bundle, write_bundle
+
+
+@pytest.fixture(scope="module")
+def apartment() -> AcousticField:
+    return AcousticField.load(Bundle.load(BUNDLED / "apartment"))
+
+
+def _ears(field, listener, emitter, yaw_deg):
+    return level_db(field.impulse_responses([listener], [emitter], [np.radians(yaw_deg)]))[0]
+
+
+def test_batch_of_one_equals_batch_of_many(field):
+    rng = np.random.default_rng(0)
+    listeners, emitters = rng.uniform((1, 1, 1), (7, 4, 2), (2, 40, 3))
+    yaws = rng.uniform(-3, 3, 40)
+    together = field.impulse_responses(listeners, emitters, yaws)
+    alone = [field.impulse_responses(listeners[i : i + 1], emitters[i : i + 1], yaws[i : i + 1])[0] for i in range(40)]
+    assert_allclose(together, alone, atol=1e-6)
+
+
+def test_nothing_is_heard_before_sound_can_arrive(field):
+    listener, emitter = (1.0, 1.0, 1.5), (7.0, 4.0, 1.5)
+    response = field.impulse_responses([listener], [emitter], [0.3])[0]
+    arrival = int(field.onset_s([listener], [emitter])[0] * field.sample_rate)
+    assert not response[:, : arrival - 40].any()
+    assert np.abs(response[:, arrival - 40 : arrival + 400]).max() > 0
+
+
+def test_level_follows_the_graph(field):
+    """The graph's magnitude is 1 / (distance + 0.2): 0.8 m away against 3.8 m is 12 dB, whatever the phase."""
+    near, far = (_ears(field, (2.0, 2.5, 1.5), (2.0 + distance, 2.5, 1.5), 0) for distance in (0.8, 3.8))
+    assert_allclose(near - far, 20 * np.log10(4.0), atol=0.2)
+
+
+def test_louder_ear_is_the_one_the_graph_says(field):
+    left, right = _ears(field, (4.0, 2.5, 1.5), (4.0, 4.0, 1.5), 0)
+    assert left > right + 6
+
+
+@pytest.mark.parametrize("missing", ["phase_certainty", "log_magnitude"])
+def test_graph_without_an_output_is_a_bundle_error(bundle, tmp_path, missing):
+    model = onnx.load_from_string(bundle.models["arithmetic.onnx"])
+    kept = [output for output in model.graph.output if output.name != missing]
+    del model.graph.output[:]
+    model.graph.output.extend(kept)
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    files["arithmetic.onnx"] = model.SerializeToString()
+    with pytest.raises(BundleError, match=r"arithmetic\.onnx: outputs"):
+        AcousticField.load(write_bundle(tmp_path / "short", bundle.manifest, files))
+
+
+def test_graph_of_another_codec_is_a_bundle_error(bundle, tmp_path):
+    codec = bundle.manifest.codec.model_copy(update={"samples": 6_000})
+    noise = io.BytesIO()
+    np.savez(noise, frozen_noise=np.ones((2, 6_000), np.float32))
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    longer = write_bundle(
+        tmp_path / "long",
+        bundle.manifest.model_copy(update={"codec": codec}),
+        {**files, "arrays.npz": noise.getvalue()},
+    )
+    with pytest.raises(BundleError, match=r"log_magnitude: has shape"):
+        AcousticField.load(longer)
+
+
+def test_bytes_that_are_no_graph_are_a_bundle_error(bundle, tmp_path):
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    broken = write_bundle(tmp_path / "broken", bundle.manifest, {**files, "arithmetic.onnx": b"not a graph"})
+    with pytest.raises(BundleError, match=r"arithmetic\.onnx: graph"):
+        AcousticField.load(broken)
+
+
+def test_unknown_quality_level_is_a_bundle_error(bundle):
+    with pytest.raises(BundleError, match="luxurious"):
+        AcousticField.load(bundle, level="luxurious")
+
+
+def test_apartment_is_finite_at_every_corner_and_yaw(apartment):
+    bounds = apartment.bundle.manifest.bounds
+    x, y, z = (np.linspace(low, high, 5) for low, high in zip(bounds.minimum, bounds.maximum, strict=True))
+    points = np.stack(np.meshgrid(x, y, z[::4]), axis=-1).reshape(-1, 3)
+    rng = np.random.default_rng(0)
+    for yaw in (-np.pi, 0.0, np.pi, 40.0):
+        responses = apartment.impulse_responses(points, rng.permutation(points), np.full(len(points), yaw))
+        assert np.isfinite(responses).all()
+        assert np.abs(responses).max() < 20
+
+
+def test_apartment_answers_for_listener_and_emitter_in_one_place(apartment):
+    here = (2.0, 2.5, 1.5)
+    assert np.isfinite(apartment.impulse_responses([here], [here], [0.0])).all()
+
+
+def test_apartment_is_the_same_every_time(apartment):
+    pose = ([(1.0, 2.0, 1.5)], [(6.0, 3.0, 1.5)], [0.7])
+    assert_array_equal(apartment.impulse_responses(*pose), apartment.impulse_responses(*pose))
+
+
+def test_apartment_turning_the_head_swaps_the_louder_ear(apartment):
+    listener, emitter = (2.0, 1.5, 1.5), (2.0, 2.5, 1.5)
+    ahead_east, ahead_west = _ears(apartment, listener, emitter, 0), _ears(apartment, listener, emitter, 180)
+    assert ahead_east[0] - ahead_east[1] > 2
+    assert ahead_west[1] - ahead_west[0] > 2
+
+
+def test_apartment_is_quieter_behind_the_wall(apartment):
+    emitter = (2.0, 1.0, 1.5)
+    beside = _ears(apartment, (3.4, 1.0, 1.5), emitter, 90).mean()
+    behind = _ears(apartment, (4.8, 1.0, 1.5), emitter, 90).mean()
+    assert beside - behind > 4
+
+
+def test_apartment_changes_smoothly_through_the_doorway(apartment):
+    """Steps of 5 cm change the level by less than 1.5 dB per ear: nothing pops on the way."""
+    x = np.arange(3.0, 5.2, 0.05)
+    path = np.stack([x, np.full_like(x, 2.5), np.full_like(x, 1.5)], axis=-1)
+    emitters = np.broadcast_to((1.5, 3.5, 1.5), path.shape)
+    levels = level_db(apartment.impulse_responses(path, emitters, np.zeros(len(x))))
+    assert np.abs(np.diff(levels, axis=0)).max() < 1.5

@@ -1,0 +1,59 @@
+"""The loudness map against the responses it summarises."""
+
+import io
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from PIL import Image
+
+from server.field.loudness import LoudnessMap, loudness_map
+
+
+@pytest.fixture
+def chart(field):
+    return loudness_map(field, (2.0, 2.5, 1.5), listener_height_m=1.5, spacing_m=0.5)
+
+
+def test_cells_cover_the_bounds(chart, field):
+    bounds = field.bundle.manifest.bounds
+    rows, columns = chart.levels_db.shape
+    assert (rows, columns) == (8, 14)
+    for axis, count in enumerate((columns, rows)):
+        margins = (
+            chart.origin[axis] - bounds.minimum[axis],
+            bounds.maximum[axis] - chart.origin[axis] - (count - 1) * 0.5,
+        )
+        assert_allclose(margins[0], margins[1])
+        assert 0.25 <= margins[0] < 0.5
+    assert np.isfinite(chart.levels_db).all()
+
+
+def test_levels_differ_as_those_of_the_responses_do(chart, field):
+    """Only differences compare: the graph sounds from its first frame on, before the onset the field passes."""
+    cells = np.array([(4, 4), (6, 11)])
+    x, y = chart.origin[0] + cells[:, 1] * 0.5, chart.origin[1] + cells[:, 0] * 0.5
+    listeners = np.repeat(np.stack([x, y, np.full(2, 1.5)], axis=-1), 4, axis=0)
+    yaws = np.tile(np.arange(4) * np.pi / 2, 2)
+    responses = field.impulse_responses(listeners, np.broadcast_to((2.0, 2.5, 1.5), listeners.shape), yaws)
+    levels = 10 * np.log10(np.mean(np.sum(responses.astype(np.float64) ** 2, axis=-1).reshape(2, 8), axis=-1))
+    near, far = (chart.levels_db[row, column] for row, column in cells)
+    assert_allclose(near - far, levels[0] - levels[1], atol=0.7)
+
+
+def test_loudest_cell_is_at_the_emitter(chart):
+    row, column = np.unravel_index(np.argmax(chart.levels_db), chart.levels_db.shape)
+    assert abs(chart.origin[0] + column * 0.5 - 2.0) < 0.5
+    assert abs(chart.origin[1] + row * 0.5 - 2.5) < 0.5
+
+
+def test_picture_is_north_up_and_brightest_where_loudest(chart):
+    image = np.asarray(Image.open(io.BytesIO(chart.to_png())).convert("L"), dtype=float)
+    row, column = np.unravel_index(np.argmax(image), image.shape)
+    assert abs(column / image.shape[1] - (2.0 - 0.3) / 7.4) < 0.05
+    assert abs(1 - row / image.shape[0] - (2.5 - 0.3) / 4.4) < 0.08
+
+
+def test_json_has_no_numbers_outside_the_room():
+    chart = LoudnessMap(np.array([[np.nan, -3.0]]), (0.0, 0.0), 0.5, 1.5)
+    assert chart.to_json()["levels_db"] == [[None, -3.0]]
