@@ -1,4 +1,4 @@
-# `make help` lists what can be done. Everything is installed into .venv; nothing outside this folder is touched.
+# `make help` lists what can be done. Everything is installed into .venv.
 
 PYTHON ?= python3
 HOST ?= 127.0.0.1
