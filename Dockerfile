@@ -21,11 +21,9 @@ LABEL org.opencontainers.image.title="Nafir" \
       org.opencontainers.image.description="A real-time neural acoustic field renderer" \
       org.opencontainers.image.licenses="MIT"
 COPY --from=builder /opt/nafir /opt/nafir
-# ONNX Runtime reports its use to its makers unless told not to before it is imported.
 ENV PATH=/opt/nafir/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1 \
-    ORT_DISABLE_TELEMETRY=1 \
     NAFIR_HOST=0.0.0.0 \
     NAFIR_PORT=8000
 USER 10001:10001

@@ -10,9 +10,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-# ONNX Runtime reports its use to its makers, and keeps a device id in the home folder, unless told not to.
-export ORT_DISABLE_TELEMETRY := 1
-
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle container-test clean

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import onnx
-import onnxruntime
 import torch
 from onnx import numpy_helper
 
 from server.errors import NafirError
+from server.field.runtime import open_session
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
 from training.cells import Cells
@@ -106,7 +106,7 @@ def _poses(dataset: Dataset, count: int, seed: int) -> tuple[npt.NDArray[np.floa
 
 
 def _check(model: onnx.ModelProto, module: ExportedField, dataset: Dataset, seed: int) -> None:
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    session = open_session(model.SerializeToString())
     poses = _poses(dataset, _CHECK_POSES, seed)
     found = dict(zip(OUTPUTS, session.run(list(OUTPUTS), dict(zip(INPUTS, poses, strict=True))), strict=True))
     with torch.no_grad():

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import onnxruntime
 
 from server.acoustics.phase import FrozenNoise, compose
 from server.errors import BundleError
+from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
 from server.scene.bundle import Bundle
 from server.scene.manifest import QualityLevel
 
@@ -38,7 +38,7 @@ class AcousticField:
 
     channels = 2
 
-    def __init__(self, bundle: Bundle, level: QualityLevel, session: onnxruntime.InferenceSession) -> None:
+    def __init__(self, bundle: Bundle, level: QualityLevel, session: InferenceSession) -> None:
         self.bundle = bundle
         self.level = level
         self._session = session
@@ -57,13 +57,9 @@ class AcousticField:
         if chosen is None:
             raise BundleError(bundle.folder, "levels", f"there is no quality level {level!r}")
         name = manifest.fields[chosen.field].file
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
         try:
-            session = onnxruntime.InferenceSession(bundle.models[name], options, providers=["CPUExecutionProvider"])
-        except Exception as exc:  # ONNX Runtime's own exceptions share no base class but this one.
+            session = open_session(bundle.models[name], threads=threads)
+        except ValueError as exc:
             raise BundleError(bundle.folder / name, "graph", f"cannot be loaded: {exc}") from exc
         inputs = {entry.name: entry.shape[1:] for entry in session.get_inputs()}
         if inputs != _INPUTS:
@@ -152,7 +148,7 @@ class AcousticField:
         middle = (np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2
         try:
             predicted = self.spectrograms(middle, middle, np.zeros(1))
-        except (ValueError, RuntimeError) as exc:
+        except SESSION_ERRORS as exc:
             raise BundleError(self.bundle.folder / name, "outputs", f"cannot be computed: {exc}") from exc
         bins, frames, known = self._codec.bins, self._codec.frames, self.bundle.manifest.codec.known_frames
         expected = {

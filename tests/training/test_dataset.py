@@ -54,9 +54,8 @@ def test_sound_arrives_when_it_can(dataset):
     """In a shoebox every pair is in sight: the louder ear's direct sound comes after distance / c."""
     for emitter, listener in dataset.pairs(held_out=False):
         response = dataset.read(np.array([[emitter, listener]]))[0].astype(float)
-        onset = np.argmax(np.abs(response) > 0.2 * np.abs(response).max(axis=(1, 2), keepdims=True), axis=-1).min(
-            axis=-1
-        )
+        loudest = np.abs(response).max(axis=1)
+        onset = np.argmax(loudest > 0.2 * loudest.max(axis=-1, keepdims=True), axis=-1)
         distance = np.linalg.norm(dataset.probes[emitter] - dataset.probes[listener])
         # Sound reaches the nearer ear up to a head's radius earlier.
         early, late = ((distance + extra_m) / 343 * dataset.sample_rate for extra_m in (-0.13, 0.06))

@@ -2,11 +2,11 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
+from server.field.runtime import open_session
 from training import export as export_module
 from training.export import INPUTS, MODEL_FILE, OUTPUTS, ExportError, export, halve_weights
 from training.model import ExportedField
@@ -15,7 +15,7 @@ from training.train import load_field
 
 @pytest.fixture(scope="module")
 def session(tiny_bundle):
-    return onnxruntime.InferenceSession(tiny_bundle.models[MODEL_FILE], providers=["CPUExecutionProvider"])
+    return open_session(tiny_bundle.models[MODEL_FILE])
 
 
 def poses(count, seed=1):
@@ -86,7 +86,7 @@ def test_halving_keeps_weights_within_float16():
     size = len(model.SerializeToString())
     halved = halve_weights(model)
     assert len(halved.SerializeToString()) < 0.6 * size
-    session = onnxruntime.InferenceSession(halved.SerializeToString(), providers=["CPUExecutionProvider"])
+    session = open_session(halved.SerializeToString())
     (read,) = session.run(["y"], {"x": np.eye(128, dtype=np.float32)})
     np.testing.assert_allclose(read - np.float32(1 / 3), large, rtol=2**-11, atol=1e-6)
 

@@ -1,0 +1,39 @@
+"""ONNX Runtime as Nafir uses it: on the CPU, with few threads, telling nobody.
+
+Every other module takes its sessions from here.
+"""
+
+import os
+
+# Recent builds report usage to their vendor unless told otherwise; the variable is read once, as the library is loaded.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
+from onnxruntime import InferenceSession, SessionOptions
+from onnxruntime.capi import onnxruntime_pybind11_state as _state
+
+__all__ = ["SESSION_ERRORS", "InferenceSession", "open_session"]
+
+SESSION_ERRORS: tuple[type[Exception], ...] = (
+    _state.Fail,
+    _state.InvalidArgument,
+    _state.InvalidGraph,
+    _state.InvalidProtobuf,
+    _state.NoModel,
+    _state.NotImplemented,
+    _state.RuntimeException,
+)
+"""What opening or running a session may raise; they have no base of their own."""
+
+_ERRORS_ONLY = 3
+
+
+def open_session(model: bytes, *, threads: int = 1) -> InferenceSession:
+    """A session for the bytes of an ONNX file. Raises ValueError for bytes that are no usable graph."""
+    options = SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _ERRORS_ONLY
+    try:
+        return InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except SESSION_ERRORS as exc:
+        raise ValueError(str(exc)) from exc
