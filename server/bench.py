@@ -101,7 +101,8 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
         for number in range(emitters):
             emitter = AddEmitter(id=str(number), clip="woman-reading", position=answer.scene.emitter.position)
             await socket.send(emitter.serialize())
-        blocks = late = exchanges = pose_id = 0
+        blocks = exchanges = pose_id = 0
+        late_at_s: list[float] = []
         sent_s: dict[int, float] = {}
         waits_ms: list[float] = []
         errors: list[str] = []
@@ -115,7 +116,7 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
                 continue
             block = AudioBlock.parse(message, answer.encoding)
             blocks += 1
-            late += block.is_late
+            late_at_s += [round(now_s - started_s, 1)] if block.is_late else []
             exchanges += block.is_exchange
             heard = [number for number in sent_s if number <= block.pose_id]
             waits_ms += [(now_s - sent_s.pop(number)) * 1000 for number in heard]
@@ -131,7 +132,8 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
         "emitters": emitters,
         "duration_s": round(now_s - started_s, 1),
         "blocks": blocks,
-        "blocks_late": late,
+        "blocks_late": len(late_at_s),
+        "late_at_s": late_at_s,
         "ir_exchanges": exchanges,
         "poses": pose_id,
         "pose_to_block_median_ms": statistics.median(waits_ms) if waits_ms else None,
