@@ -93,16 +93,16 @@ class Codec:
         return np.cumsum(instantaneous_frequency, axis=-1) + nominal.astype(instantaneous_frequency.dtype)
 
     def synthesise(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.floating]:
-        """Complex (..., frequency, frame) to (..., sample).
+        """Complex (..., frequency, frame) to (..., sample), of all frames or of the first few and what they reach.
 
         Equals `ShortTimeFFT.istft`, with all frames transformed at once; the precision is that of the input.
         """
         slices = irfft(np.swapaxes(spectrogram, -1, -2), self.n_fft, axis=-1)
         slices *= self._transform.dual_win.real.astype(slices.dtype)
-        shifts = self.n_fft // self.hop
+        frames, shifts = spectrogram.shape[-1], self.n_fft // self.hop
         parts = slices.reshape(*slices.shape[:-1], shifts, self.hop)
-        total = np.zeros((*slices.shape[:-2], self.frames + shifts - 1, self.hop), dtype=slices.dtype)
+        total = np.zeros((*slices.shape[:-2], frames + shifts - 1, self.hop), dtype=slices.dtype)
         for shift in range(shifts):
-            total[..., shift : shift + self.frames, :] += parts[..., shift, :]
+            total[..., shift : shift + frames, :] += parts[..., shift, :]
         start = self.n_fft // 2 - int(self._transform.p_min) * self.hop
         return np.asarray(total.reshape(*total.shape[:-2], -1)[..., start : start + self.samples])

@@ -7,15 +7,17 @@ is anybody's guess. A bin is then the known phasor plus frozen noise carrying th
 
     S = M (R exp(i phi) + sqrt(1 - R**2) N)
 
-The noise is the transform of one white signal per scene, the same for every pose, so that responses of neighbouring
-poses crossfade without combing. Its right ear is mixed so that the whole has the predicted complex interaural
-coherence.
+The noise is the transform of one white signal per scene. It stands still in time, whatever the pose: a field's frames
+count from the moment sound arrives, so their levels are delayed to the time of emission before they meet the noise, and
+only the known part moves with the emitter. Responses of neighbouring poses therefore crossfade without combing. The
+noise of the right ear is mixed so that the whole has the predicted complex interaural coherence.
 
 Axes: (..., ear, frequency, frame), ear 0 = left; coherence (..., frequency, frame), E[S_left conj(S_right)] over the
 magnitudes.
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +26,7 @@ from server.acoustics.codec import Codec
 
 Real = npt.NDArray[np.float32]
 Complex = npt.NDArray[np.complex64]
+Number = TypeVar("Number", np.float32, np.complex64)
 
 _UNDECIDED = 1e-6
 
@@ -41,30 +44,46 @@ class FrozenNoise:
         return cls((codec.transform(signal.astype(np.float64)) * scale).astype(np.complex64))
 
 
-def compose(magnitude: Real, known_phase: Real, certainty: Real, coherence: Complex, noise: FrozenNoise) -> Complex:
-    """(..., 2, frequency, frame) complex spectrogram.
+def separate(magnitude: Real, known_phase: Real, certainty: Real, coherence: Complex) -> tuple[Complex, Real, Complex]:
+    """The known part, and the magnitude and coherence of the noise that makes up the rest.
 
-    `known_phase` and `certainty` cover the first frames only, as many as they have; all later ones are pure noise.
+    `known_phase` and `certainty` cover the first frames only, as many as they have, and so does the known part.
     """
     known_frames = certainty.shape[-1]
-    spectrogram = np.empty(magnitude.shape, dtype=np.complex64)
-    spectrogram[..., known_frames:] = _correlated(noise.spectrogram[..., known_frames:], coherence[..., known_frames:])
-    known = certainty * np.exp(1j * known_phase)
+    phasors = (certainty * np.exp(1j * known_phase)).astype(np.complex64)
     unknown = np.sqrt(np.maximum(1 - certainty**2, 0))
     # The known parts bring a coherence of their own; the noise makes up the difference.
-    rest = coherence[..., :known_frames] - known[..., 0, :, :] * np.conj(known[..., 1, :, :])
+    rest = coherence[..., :known_frames] - phasors[..., 0, :, :] * np.conj(phasors[..., 1, :, :])
     share = np.maximum(unknown[..., 0, :, :] * unknown[..., 1, :, :], _UNDECIDED)
-    early_noise = _correlated(noise.spectrogram[..., :known_frames], rest / share)
-    spectrogram[..., :known_frames] = known + unknown * early_noise
+    noise_coherence = np.concatenate([rest / share, coherence[..., known_frames:]], axis=-1)
+    noise_coherence /= np.maximum(np.abs(noise_coherence), 1)
+    noise_magnitude = magnitude.copy()
+    noise_magnitude[..., :known_frames] *= unknown
+    return magnitude[..., :known_frames] * phasors, noise_magnitude, noise_coherence
+
+
+def delayed(values: npt.NDArray[Number], frames: npt.NDArray[np.float64]) -> npt.NDArray[Number]:
+    """(B, ..., frame) values later by `frames` (B,), not necessarily whole: interpolated linearly, zero before them."""
+    later = np.zeros_like(values)
+    count = values.shape[-1]
+    for row, delay in enumerate(frames):
+        whole = int(np.floor(delay))
+        share = float(delay - whole)
+        for start, weight in ((whole, 1 - share), (whole + 1, share)):
+            first, last = max(0, start), min(count, count + start)
+            if last > first:
+                later[row, ..., first:last] += (
+                    values.dtype.type(weight) * values[row, ..., first - start : last - start]
+                )
+    return later
+
+
+def correlated_noise(magnitude: Real, coherence: Complex, noise: FrozenNoise) -> Complex:
+    """(..., 2, frequency, frame) frozen noise of the given magnitudes and interaural coherence (at most 1)."""
+    left, right = noise.spectrogram
+    spectrogram = np.empty(magnitude.shape, dtype=np.complex64)
+    spectrogram[..., 0, :, :] = left
+    independent = np.sqrt(np.maximum(1 - np.abs(coherence) ** 2, 0))
+    spectrogram[..., 1, :, :] = np.conj(coherence) * left + independent * right
     spectrogram *= magnitude
     return spectrogram
-
-
-def _correlated(noise: Complex, coherence: Complex) -> Complex:
-    """(..., 2, frequency, frame) noise of unit power whose ears have the given coherence, limited to what is
-    possible."""
-    strength = np.abs(coherence)
-    coherence = (coherence / np.maximum(strength, 1)).astype(np.complex64)
-    left = np.broadcast_to(noise[0], coherence.shape)
-    right = np.conj(coherence) * noise[0] + np.sqrt(np.maximum(1 - np.abs(coherence) ** 2, 0)) * noise[1]
-    return np.stack([left, right], axis=-3).astype(np.complex64)

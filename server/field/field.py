@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.phase import FrozenNoise, compose
+from server.acoustics.phase import FrozenNoise, correlated_noise, delayed, separate
 from server.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
 from server.scene.bundle import Bundle
@@ -86,7 +86,9 @@ class AcousticField:
             {
                 "listener": np.asarray(listeners, dtype=np.float32),
                 "emitter": np.asarray(emitters, dtype=np.float32),
-                "yaw": np.asarray(yaws, dtype=np.float32),
+                # Whole turns come off in double precision: in single, large angles lose their heading, or overflow.
+                "yaw": np.remainder(np.asarray(yaws, dtype=np.float64) + np.pi, 2 * np.pi).astype(np.float32)
+                - np.float32(np.pi),
             },
         )
         known = self.bundle.manifest.codec.known_frames
@@ -115,26 +117,25 @@ class AcousticField:
         self, listeners: npt.NDArray[np.float64], emitters: npt.NDArray[np.float64], yaws: npt.NDArray[np.float64]
     ) -> Float32:
         predicted = self.spectrograms(listeners, emitters, yaws)
-        onset = self.onset_s(listeners, emitters) * self.sample_rate
-        start = np.floor(onset).astype(int)
-        spectrogram = compose(
-            self._codec.magnitude(predicted.log_magnitude),
-            self._codec.integrate(predicted.instantaneous_frequency),
+        codec = self._codec
+        aligned_s = self.onset_s(listeners, emitters) * self.sample_rate - self._lead
+        start = np.floor(aligned_s).astype(int)
+        known, magnitude, coherence = separate(
+            codec.magnitude(predicted.log_magnitude),
+            codec.integrate(predicted.instantaneous_frequency),
             predicted.certainty,
             predicted.coherence,
-            self._noise,
         )
-        shift = np.exp(-2j * np.pi * np.arange(self._codec.bins) / self._codec.n_fft * (onset - start)[:, None])
-        spectrogram *= shift[:, None, :, None].astype(np.complex64)
-        aligned = self._codec.synthesise(spectrogram)
-        aligned[..., : len(self._gate)] *= self._gate
-        responses = np.zeros_like(aligned)
-        for row, first in enumerate(start - self._lead):
-            source, target = max(0, -first), max(0, first)
-            length = aligned.shape[-1] - max(source, target)
-            if length > 0:
-                responses[row, :, target : target + length] = aligned[row, :, source : source + length]
-        return responses
+        frames = aligned_s / codec.hop
+        responses = codec.synthesise(
+            correlated_noise(delayed(magnitude, frames), delayed(coherence, frames), self._noise)
+        )
+        shift = np.exp(-2j * np.pi * np.arange(codec.bins) / codec.n_fft * (aligned_s - start)[:, None])
+        early = codec.synthesise(known * shift[:, None, :, None].astype(np.complex64))
+        for response, direct, at in zip(responses, early, start, strict=True):
+            _add(direct, response, at)
+            _apply(self._gate, response, at)
+        return responses.astype(np.float32, copy=False)
 
     def _onset_gate(self) -> Float32:
         """Silence until just before sound can arrive at the nearer ear: windows smear energy to where it cannot be."""
@@ -163,3 +164,18 @@ class AcousticField:
                 raise BundleError(
                     self.bundle.folder / name, output, f"has shape {found.shape}, expected {shape} and finite"
                 )
+
+
+def _add(part: Float32, response: Float32, at: int) -> None:
+    """Adds (ear, sample) `part` to the response from sample `at` on, as far as both reach."""
+    first, last = max(0, at), min(response.shape[-1], at + part.shape[-1])
+    if last > first:
+        response[:, first:last] += part[:, first - at : last - at]
+
+
+def _apply(gate: Float32, response: Float32, at: int) -> None:
+    """Multiplies the response by a gate that begins at sample `at`, silent before it."""
+    response[:, : max(0, at)] = 0
+    first, last = max(0, at), min(response.shape[-1], at + len(gate))
+    if last > first:
+        response[:, first:last] *= gate[first - at : last - at]

@@ -40,9 +40,10 @@ def test_nothing_is_heard_before_sound_can_arrive(field):
 
 
 def test_level_follows_the_graph(field):
-    """The graph's magnitude is 1 / (distance + 0.2): 0.8 m away against 3.8 m is 12 dB, whatever the phase."""
+    """The graph's magnitude is 1 / (distance + 0.2): 0.8 m away against 3.8 m is 12 dB, give or take the frozen noise,
+    another stretch of which the later arrival meets."""
     near, far = (_ears(field, (2.0, 2.5, 1.5), (2.0 + distance, 2.5, 1.5), 0) for distance in (0.8, 3.8))
-    assert_allclose(near - far, 20 * np.log10(4.0), atol=0.2)
+    assert_allclose(near - far, 20 * np.log10(4.0), atol=0.6)
 
 
 def test_louder_ear_is_the_one_the_graph_says(field):
@@ -130,3 +131,26 @@ def test_apartment_changes_smoothly_through_the_doorway(apartment):
     emitters = np.broadcast_to((1.5, 3.5, 1.5), path.shape)
     levels = level_db(apartment.impulse_responses(path, emitters, np.zeros(len(x))))
     assert np.abs(np.diff(levels, axis=0)).max() < 1.5
+
+
+@pytest.mark.parametrize("step", [(0.03, 0.0), (0.06, 0.0), (0.1, 0.0), (0.0, 0.06)])
+def test_apartment_tail_does_not_comb_while_walking(apartment, step):
+    """Half-way through a crossfade between responses a step apart, no band of the late part sags by more than 1 dB."""
+    emitter, here = (6.2, 3.2, 1.5), (5.0, 3.2, 1.5)
+    there = (here[0] + step[0], here[1] + step[1], here[2])
+    late = apartment.impulse_responses([here, there], [emitter] * 2, [0.3] * 2)[..., 2400:9600]
+    middle = late.mean(axis=0, keepdims=True)
+    bands = np.abs(np.fft.rfft(np.concatenate([late, middle]))[..., 1:]) ** 2
+    power = bands.reshape(3, 2, 12, -1).sum(axis=(1, 3))
+    assert np.all(10 * np.log10(power[2] / power[:2].mean(axis=0))[:11] > -1)
+
+
+def test_whole_turns_are_no_turn(field):
+    pose = ([(2.0, 2.5, 1.5)], [(4.0, 4.0, 1.5)])
+    turns = 2 * np.pi * 100_000_000
+    assert_allclose(field.impulse_responses(*pose, [0.5 + turns]), field.impulse_responses(*pose, [0.5]), atol=1e-5)
+
+
+@pytest.mark.parametrize("yaw", [1e300, -1e300])
+def test_headings_beyond_any_meaning_are_finite(field, yaw):
+    assert np.isfinite(field.impulse_responses([(2.0, 2.5, 1.5)], [(4.0, 4.0, 1.5)], [yaw])).all()
