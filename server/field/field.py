@@ -18,7 +18,7 @@ Float32 = npt.NDArray[np.float32]
 
 _INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
 _OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
-_GATE_S = 0.0015
+_GATE_S = 0.0007
 _CHUNK = 32
 
 
