@@ -67,14 +67,14 @@ def nearest_pair(pairs: TrainingPairs, pair: int) -> int:
 def linear_weights(pairs: TrainingPairs, pair: int) -> tuple[list[int], list[float]]:
     """Training pairs of the emitter of `pair` whose listeners surround its listener, and their weights, which sum to 1.
 
-    Barycentric in the Delaunay triangulation of those listeners, within the line, plane or space they span. Outside
-    their hull: the nearest of them. Where the emitter has no training pair: the nearest pair.
+    Barycentric in the Delaunay triangulation of those listeners in plan (they stand in one layer, at various heights).
+    Outside their hull: the nearest of them. Where the emitter has no training pair: the nearest pair.
     """
     candidates = np.flatnonzero(pairs.training & (pairs.pair_emitter == pairs.pair_emitter[pair]))
     if len(candidates) == 0:
         return [nearest_pair(pairs, pair)], [1.0]
-    points = pairs.listener_positions[pairs.pair_listener[candidates]]
-    target = pairs.listener_positions[pairs.pair_listener[pair]]
+    points = pairs.listener_positions[pairs.pair_listener[candidates], :2]
+    target = pairs.listener_positions[pairs.pair_listener[pair], :2]
     inside = _barycentric(points, target)
     if inside is None:
         return [int(candidates[np.argmin(np.square(points - target).sum(axis=-1))])], [1.0]
