@@ -11,9 +11,10 @@ import torch
 from onnx import numpy_helper
 
 from server.errors import NafirError
+from server.field.field import INPUTS, OUTPUTS
 from server.field.runtime import open_session
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
+from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel
 from training.cells import Cells
 from training.dataset import SPEED_OF_SOUND, Dataset
 from training.frozen_noise import even_noise
@@ -22,8 +23,6 @@ from training.targets import LEAD_SAMPLES
 from training.train import load_field
 
 MODEL_FILE = "factorised.onnx"
-INPUTS = ("listener", "emitter", "yaw")
-OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
 
 _OPSET = 18
 _HALVE_ABOVE_BYTES = 16_384
@@ -47,7 +46,7 @@ def export(dataset: Dataset, run: Path, folder: Path) -> Bundle:
     noise = even_noise(cells.codec, np.random.default_rng([configuration.seed, 6]))
     arrays = io.BytesIO()
     np.savez(arrays, frozen_noise=noise)
-    files = {MODEL_FILE: model.SerializeToString(), "arrays.npz": arrays.getvalue()}
+    files = {MODEL_FILE: model.SerializeToString(), ARRAYS_FILE: arrays.getvalue()}
     return write_bundle(folder, _manifest(dataset, cells, configuration.shape.rank, files), files)
 
 
@@ -137,7 +136,7 @@ def _manifest(dataset: Dataset, cells: Cells, rank: int, files: dict[str, bytes]
             maximum=(float(high[0]), float(high[1]), scene.probes.heights_m[1]),
         ),
         speed_of_sound=SPEED_OF_SOUND,
-        start=Start.model_validate(scene.start.model_dump()),
+        start=scene.start,
         codec=CodecParameters(
             sample_rate=codec.sample_rate,
             n_fft=codec.n_fft,

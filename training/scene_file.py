@@ -9,7 +9,8 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError, model_validator
 
 from server.errors import NafirError
-from server.scene.geometry import Finite, Geometry, Point, Strict
+from server.scene.geometry import Geometry, Strict
+from server.scene.manifest import Start
 
 _DRAWS_PER_CELL = 32
 # Two probes make one couple, and that one is held out.
@@ -20,14 +21,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 class SceneFileError(NafirError):
     """A scene file that cannot be used; names the file and the field at fault."""
-
-
-class Start(Strict):
-    """Where a visitor finds listener and emitter."""
-
-    listener: Point
-    listener_yaw_deg: Finite = 0.0
-    emitter: Point
 
 
 class Probes(Strict):

@@ -16,10 +16,13 @@ from server.scene.manifest import QualityLevel
 
 Float32 = npt.NDArray[np.float32]
 
-_INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
-_OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
+INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
+"""Inputs of a graph, and their shapes after the batch axis."""
+OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
+_OUTPUTS = OUTPUTS
 _GATE_S = 0.0007
 _CHUNK = 32
+_TENSOR = "tensor(float)"
 
 
 @dataclass(frozen=True)
@@ -62,11 +65,11 @@ class AcousticField:
         except ValueError as exc:
             raise BundleError(bundle.folder / name, "graph", f"cannot be loaded: {exc}") from exc
         inputs = {entry.name: entry.shape[1:] for entry in session.get_inputs()}
-        if inputs != _INPUTS:
-            raise BundleError(bundle.folder / name, "inputs", f"are {inputs}, expected {_INPUTS} after the batch axis")
-        outputs = tuple(entry.name for entry in session.get_outputs())
-        if not set(_OUTPUTS) <= set(outputs):
-            raise BundleError(bundle.folder / name, "outputs", f"are {outputs}, expected {_OUTPUTS}")
+        if inputs != INPUTS:
+            raise BundleError(bundle.folder / name, "inputs", f"are {inputs}, expected {INPUTS} after the batch axis")
+        outputs = {entry.name: entry.type for entry in session.get_outputs()}
+        if any(outputs.get(output) != _TENSOR for output in OUTPUTS):
+            raise BundleError(bundle.folder / name, "outputs", f"are {outputs}, expected {_TENSOR} {OUTPUTS}")
         field = cls(bundle, chosen, session)
         field._check_outputs(name)
         return field
@@ -146,20 +149,21 @@ class AcousticField:
     def _check_outputs(self, name: str) -> None:
         """Runs the graph once, in the middle of the bounds."""
         bounds = self.bundle.manifest.bounds
-        middle = (np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2
+        middle = ((np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2).astype(np.float32)
+        poses = {"listener": middle, "emitter": middle, "yaw": np.zeros(1, np.float32)}
         try:
-            predicted = self.spectrograms(middle, middle, np.zeros(1))
+            outputs = dict(zip(OUTPUTS, self._session.run(OUTPUTS, poses), strict=True))
         except SESSION_ERRORS as exc:
             raise BundleError(self.bundle.folder / name, "outputs", f"cannot be computed: {exc}") from exc
         bins, frames, known = self._codec.bins, self._codec.frames, self.bundle.manifest.codec.known_frames
         expected = {
             "log_magnitude": (1, 2, bins, frames),
             "instantaneous_frequency": (1, 2, bins, known),
-            "certainty": (1, 2, bins, known),
-            "coherence": (1, bins, frames),
+            "phase_certainty": (1, 2, bins, known),
+            "interaural_coherence": (1, 2, bins, frames),
         }
         for output, shape in expected.items():
-            found = getattr(predicted, output)
+            found = outputs[output]
             if found.shape != shape or not np.isfinite(found).all():
                 raise BundleError(
                     self.bundle.folder / name, output, f"has shape {found.shape}, expected {shape} and finite"

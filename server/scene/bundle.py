@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,11 +20,13 @@ from pydantic import ValidationError
 
 from server.acoustics.geometry import FloorPlan, Vector3
 from server.errors import BundleError, RequestError
-from server.scene.manifest import Manifest
+from server.scene.manifest import ARRAYS_FILE, Manifest
 
 MANIFEST_FILE = "scene.json"
-ARRAYS_FILE = "arrays.npz"
 BUNDLED = Path(__file__).parent / "bundles"
+
+# What `zipfile` and NumPy raise between them for bytes that are no archive, or archives that hold no array.
+_ARCHIVE_ERRORS = (OSError, EOFError, KeyError, ValueError, RuntimeError, zlib.error, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True)
@@ -115,12 +118,14 @@ def _read(path: Path) -> bytes:
 
 def _frozen_noise(path: Path, data: bytes, samples: int) -> npt.NDArray[np.float32]:
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            noise = np.asarray(arrays["frozen_noise"], dtype=np.float32)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as exc:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open("frozen_noise.npy") as member:
+            noise = np.lib.format.read_array(member, allow_pickle=False)
+    except _ARCHIVE_ERRORS as exc:
         raise BundleError(path, "frozen_noise", f"cannot be read: {exc}") from exc
+    if not np.issubdtype(noise.dtype, np.floating):
+        raise BundleError(path, "frozen_noise", f"holds {noise.dtype}, expected floating point")
     if noise.shape != (2, samples):
         raise BundleError(path, "frozen_noise", f"has shape {noise.shape}, expected {(2, samples)}")
     if not np.isfinite(noise).all():
         raise BundleError(path, "frozen_noise", "holds non-finite samples")
-    return noise
+    return noise.astype(np.float32, copy=False)

@@ -1,8 +1,9 @@
 """What a scene is made of: walls, openings and materials, as written in scene files and bundles."""
 
+import math
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from server.acoustics.geometry import FloorPlan
 
@@ -13,6 +14,10 @@ PerBand = Annotated[tuple[Share, ...], Field(min_length=len(OCTAVE_BANDS_HZ), ma
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 PlanPoint = tuple[Finite, Finite]
 Point = tuple[Finite, Finite, Finite]
+
+
+# Shorter ones are a corner written twice; geometry divides by the length of a wall.
+_SHORTEST_WALL_M = 0.001
 
 
 class Strict(BaseModel):
@@ -53,6 +58,14 @@ class Geometry(Strict):
     corners: Annotated[tuple[PlanPoint, ...], Field(min_length=3)]
     openings: tuple[Opening, ...] = ()
     materials: Materials
+
+    @field_validator("corners")
+    @classmethod
+    def _walls_have_a_length(cls, corners: tuple[PlanPoint, ...]) -> tuple[PlanPoint, ...]:
+        for index, corner in enumerate(corners):
+            if math.dist(corner, corners[index - 1]) < _SHORTEST_WALL_M:
+                raise ValueError(f"corner {index} is where the corner before it is")
+        return corners
 
     @model_validator(mode="after")
     def _turns_counter_clockwise(self) -> "Geometry":

@@ -2,10 +2,13 @@
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from server.acoustics.codec import Codec
 from server.scene.geometry import Finite, Geometry, Point, Strict
+
+ARRAYS_FILE = "arrays.npz"
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -50,6 +53,16 @@ class CodecParameters(Strict):
     def _overlaps_four_times(self) -> "CodecParameters":
         if self.n_fft != 4 * self.hop:
             raise ValueError("hop must be a quarter of n_fft")
+        return self
+
+    @model_validator(mode="after")
+    def _counts_within_a_response(self) -> "CodecParameters":
+        if self.samples < self.n_fft:
+            raise ValueError(f"samples must not be below n_fft, {self.n_fft}")
+        if self.lead_samples >= self.samples:
+            raise ValueError(f"lead_samples must be below samples, {self.samples}")
+        if self.known_frames > self.codec.frames:
+            raise ValueError(f"known_frames must not exceed the {self.codec.frames} frames of a response")
         return self
 
     @property
@@ -108,6 +121,22 @@ class Manifest(Strict):
         for level in self.levels:
             if level.field not in self.fields:
                 raise ValueError(f"levels.{level.name}.field: there is no field {level.field}")
-        if "arrays.npz" not in self.files:
-            raise ValueError("files: arrays.npz is not listed")
+        if ARRAYS_FILE not in self.files:
+            raise ValueError(f"files: {ARRAYS_FILE} is not listed")
         return self
+
+    @model_validator(mode="after")
+    def _fits_into_the_room(self) -> "Manifest":
+        plan = self.geometry.floor_plan
+        room = (*np.min(plan.corners, axis=0), 0.0), (*np.max(plan.corners, axis=0), plan.height_m)
+        if not _within(self.bounds.minimum, *room) or not _within(self.bounds.maximum, *room):
+            raise ValueError("bounds: must lie in the box around geometry.corners, up to geometry.height_m")
+        for name, position in (("listener", self.start.listener), ("emitter", self.start.emitter)):
+            in_bounds = _within(position, self.bounds.minimum, self.bounds.maximum)
+            if not in_bounds or not plan.contains(np.array(position)):
+                raise ValueError(f"start.{name}: must be within bounds and not inside a wall")
+        return self
+
+
+def _within(position: Point, low: Point, high: Point) -> bool:
+    return all(least <= at <= most for least, at, most in zip(low, position, high, strict=True))

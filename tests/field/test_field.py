@@ -6,10 +6,11 @@ import numpy as np
 import onnx
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from onnx import TensorProto, helper, numpy_helper
 
 from server.acoustics.room_parameters import level_db
 from server.errors import BundleError
-from server.field.field import AcousticField
+from server.field.field import OUTPUTS, AcousticField
 from server.scene.bundle import BUNDLED, Bundle, write_bundle
 
 
@@ -75,6 +76,41 @@ def test_graph_of_another_codec_is_a_bundle_error(bundle, tmp_path):
     )
     with pytest.raises(BundleError, match=r"log_magnitude: has shape"):
         AcousticField.load(longer)
+
+
+def _reshaped(model, output, shape):
+    """The graph with that output given another shape, and no word of shapes in what it declares."""
+    for node in model.graph.node:
+        node.output[:] = [f"{name}_before" if name == output else name for name in node.output]
+    model.graph.initializer.append(numpy_helper.from_array(np.array(shape, np.int64), "shape"))
+    model.graph.node.append(helper.make_node("Reshape", [f"{output}_before", "shape"], [output]))
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize("shape", [[-1], [1, -1], [1, 1, 2, -1]])
+def test_output_of_another_shape_is_a_bundle_error(bundle, tmp_path, output, shape):
+    model = onnx.load_from_string(bundle.models["arithmetic.onnx"])
+    _reshaped(model, output, shape)
+    for entry in model.graph.output:
+        entry.type.tensor_type.ClearField("shape")
+    with pytest.raises(BundleError, match=rf"arithmetic\.onnx: {output}: has shape"):
+        AcousticField.load(_with_graph(bundle, tmp_path, model))
+
+
+def test_output_of_another_kind_is_a_bundle_error(bundle, tmp_path):
+    model = onnx.load_from_string(bundle.models["arithmetic.onnx"])
+    model.graph.node.append(helper.make_node("SequenceConstruct", ["level"], ["log_magnitudes"]))
+    (entry,) = (entry for entry in model.graph.output if entry.name == "log_magnitude")
+    for node in model.graph.node:
+        node.output[:] = [{"log_magnitude": "plain", "log_magnitudes": "log_magnitude"}.get(o, o) for o in node.output]
+    entry.CopyFrom(helper.make_tensor_sequence_value_info("log_magnitude", TensorProto.FLOAT, None))
+    with pytest.raises(BundleError, match=r"arithmetic\.onnx: outputs"):
+        AcousticField.load(_with_graph(bundle, tmp_path, model))
+
+
+def _with_graph(bundle, tmp_path, model):
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    return write_bundle(tmp_path / "graph", bundle.manifest, {**files, "arithmetic.onnx": model.SerializeToString()})
 
 
 def test_bytes_that_are_no_graph_are_a_bundle_error(bundle, tmp_path):

@@ -1,12 +1,16 @@
 """Bundles load whole or not at all, and say what is wrong where."""
 
+import io
 import json
+import zipfile
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from server.errors import BundleError, RequestError
 from server.scene.bundle import BUNDLED, Bundle, bundled_scenes, find_bundle, write_bundle
+from server.scene.manifest import Manifest
 
 
 def _edit(folder, **changes):
@@ -64,21 +68,96 @@ def test_damaged_manifest_names_the_field(bundle_copy, changes, field):
         Bundle.load(bundle_copy)
 
 
+@pytest.mark.parametrize(
+    ("place", "value", "told"),
+    [
+        (("codec", "lead_samples"), 4_000, "codec: .*lead_samples"),
+        (("codec", "known_frames"), 1_000, "codec: .*known_frames"),
+        (("start", "listener"), [9.0, 2.5, 1.5], r"start\.listener"),
+        (("start", "listener"), [0.1, 2.5, 1.5], r"start\.listener"),
+        (("start", "emitter"), [6.0, 3.0, 2.5], r"start\.emitter"),
+        (("bounds", "maximum"), [80.0, 4.7, 2.3], "bounds"),
+        (("bounds", "maximum"), [7.7, 4.7, 2.9], "bounds"),
+        (("bounds", "minimum"), [0.3, 0.3, -0.1], "bounds"),
+        (("geometry", "corners"), [[0, 0], [8, 0], [8, 0], [8, 5], [0, 5]], r"geometry\.corners: .*corner 2"),
+        (("geometry", "corners"), [[0, 0], [8, 0], [8, 5], [0, 5], [0, 0]], r"geometry\.corners: .*corner 0"),
+    ],
+)
+def test_what_does_not_fit_together_is_named(bundle_copy, place, value, told):
+    section, field = place
+    document = json.loads((bundle_copy / "scene.json").read_text())
+    _edit(bundle_copy, **{section: {**document[section], field: value}})
+    with pytest.raises(BundleError, match=told):
+        Bundle.load(bundle_copy)
+
+
+def test_responses_shorter_than_a_window_are_refused(bundle_copy):
+    codec = json.loads((bundle_copy / "scene.json").read_text())["codec"]
+    _edit(bundle_copy, codec={**codec, "n_fft": 4096, "hop": 1024, "known_frames": 1})
+    with pytest.raises(BundleError, match="samples must not be below n_fft"):
+        Bundle.load(bundle_copy)
+
+
+def test_a_start_inside_a_wall_is_named():
+    document = json.loads((BUNDLED / "apartment" / "scene.json").read_text())
+    document["start"]["emitter"] = [4.1, 1.0, 1.5]
+    with pytest.raises(ValidationError, match=r"start\.emitter"):
+        Manifest.model_validate(document)
+
+
 def test_manifest_that_is_no_json_is_a_bundle_error(bundle_copy):
     (bundle_copy / "scene.json").write_text("{")
     with pytest.raises(BundleError, match=r"scene\.json"):
         Bundle.load(bundle_copy)
 
 
-@pytest.mark.parametrize("noise", [np.zeros((2, 7), np.float32), np.full((2, 4000), np.nan, np.float32)])
+@pytest.mark.parametrize(
+    "noise",
+    [np.zeros((2, 7), np.float32), np.full((2, 4000), np.nan, np.float32), np.ones((2, 4000), complex)],
+)
 def test_unusable_noise_is_a_bundle_error(bundle, tmp_path, noise):
-    import io
-
     buffer = io.BytesIO()
     np.savez(buffer, frozen_noise=noise)
+    _refuses_arrays(bundle, tmp_path, buffer.getvalue())
+
+
+def _npy():
+    buffer = io.BytesIO()
+    np.save(buffer, np.ones((2, 4000), np.float32))
+    return buffer.getvalue()
+
+
+def _zip(content):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("frozen_noise.npy", content)
+    return buffer.getvalue()
+
+
+def _broken_in_the_middle(archive):
+    return archive[:48] + bytes(16) + archive[64:]
+
+
+NO_ARRAYS = {
+    "nothing": b"",
+    "text": b"no archive",
+    "a bare array": _npy(),
+    "an archive of text": _zip(b"no array"),
+    "an archive of nothing": _zip(b""),
+    "half an archive": _zip(_npy())[:200],
+    "a broken stream": _broken_in_the_middle(_zip(_npy())),
+}
+
+
+@pytest.mark.parametrize("content", NO_ARRAYS.values(), ids=NO_ARRAYS)
+def test_what_is_no_archive_of_arrays_is_a_bundle_error(bundle, tmp_path, content):
+    _refuses_arrays(bundle, tmp_path, content)
+
+
+def _refuses_arrays(bundle, tmp_path, content):
     files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
     with pytest.raises(BundleError, match=r"arrays\.npz: frozen_noise"):
-        write_bundle(tmp_path / "noise", bundle.manifest, {**files, "arrays.npz": buffer.getvalue()})
+        write_bundle(tmp_path / "noise", bundle.manifest, {**files, "arrays.npz": content})
 
 
 def test_positions_inside_pass_and_others_say_why(bundle):
