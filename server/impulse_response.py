@@ -57,7 +57,8 @@ class IrQuery:
         field.bundle.require_inside(self.emitter, "emitter")
 
     def etag(self, field: AcousticField, name: str) -> str:
-        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and the decoding code."""
+        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and the package's
+        version."""
         return entity_tag(field, "impulse-response", asdict(self), name)
 
 

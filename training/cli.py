@@ -117,11 +117,16 @@ def evaluate(
 
 
 def main() -> None:
-    """Entry point of the console script: Nafir's own errors become one line and exit code 2."""
+    """Entry point of the console script: Nafir's own errors, and those of files, become one line and exit code 2."""
     try:
         app()
     except NafirError as exc:
         typer.echo(f"nafir-train: {exc}", err=True)
+        raise SystemExit(2) from exc
+    except OSError as exc:
+        # Folders that cannot be written, full disks; HDF5 words these itself and has no `strerror`.
+        place = "" if exc.filename is None else f"{exc.filename}: "
+        typer.echo(f"nafir-train: {place}{exc.strerror or exc}", err=True)
         raise SystemExit(2) from exc
     except ModuleNotFoundError as exc:
         typer.echo(

@@ -50,6 +50,35 @@ def test_what_cannot_be_done_is_told_in_a_line(
     assert "Traceback" not in err
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate", "{scene}", "-o", "{file}/x"),
+        ("train", "{data}", "-o", "{file}/x"),
+        ("export", "{run}", "-o", "{file}/x"),
+        ("evaluate", "{bundle}", "{data}", "--figure", "{file}/x.png"),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_told_in_a_line(
+    nafir_train, dataset, run, tiny_bundle, tiny_scene, tmp_path, arguments
+):
+    file = tmp_path / "file"
+    file.touch()
+    places = {
+        "file": file,
+        "scene": tiny_scene,
+        "data": dataset.folder,
+        "run": run,
+        "bundle": tiny_bundle.folder,
+    }
+    code, _, err = nafir_train(*(argument.format(**places) for argument in arguments))
+    assert code == 2
+    last = err.strip().splitlines()[-1]
+    assert last.startswith(f"nafir-train: {file}")
+    assert last.endswith("Not a directory")
+    assert "Traceback" not in err
+
+
 @pytest.mark.parametrize("option", [("--workers", "-1"), ("--seed", "-1")])
 def test_numbers_out_of_range_are_refused(nafir_train, tiny_scene, tmp_path, option):
     code, _, err = nafir_train("simulate", tiny_scene, "-o", tmp_path, *option)

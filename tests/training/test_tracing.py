@@ -4,6 +4,7 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.scene.geometry import OCTAVE_BANDS_HZ, Geometry, Material, Materials
+from training.dataset import SPEED_OF_SOUND
 from training.tracing import HISTOGRAM_BIN_S, RoomTracer, counted_twice, sphere_directions
 
 SIZE_M = np.array([4.0, 3.0, 2.5])
@@ -199,3 +200,7 @@ def test_a_tracer_keeps_nothing_of_the_emitter_before():
     tracer.trace(EMITTER + 0.3, rays=500, seed=2)
     for one, same in zip(first, tracer.trace(EMITTER, rays=500, seed=1), strict=True):
         np.testing.assert_array_equal(one.energy, same.energy)
+
+
+def test_the_engine_takes_sound_to_be_as_fast_as_everything_else_does():
+    assert pra.constants.get("c") == SPEED_OF_SOUND
