@@ -19,7 +19,6 @@ Float32 = npt.NDArray[np.float32]
 INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
 """Inputs of a graph, and their shapes after the batch axis."""
 OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
-_OUTPUTS = OUTPUTS
 _GATE_S = 0.0007
 _CHUNK = 32
 _TENSOR = "tensor(float)"
@@ -85,7 +84,7 @@ class AcousticField:
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
         """Network outputs for B poses; positions (B, 3), yaws (B,)."""
         log_magnitude, frequency, certainty, coherence = self._session.run(
-            _OUTPUTS,
+            OUTPUTS,
             {
                 "listener": np.asarray(listeners, dtype=np.float32),
                 "emitter": np.asarray(emitters, dtype=np.float32),
@@ -94,13 +93,7 @@ class AcousticField:
                 - np.float32(np.pi),
             },
         )
-        known = self.bundle.manifest.codec.known_frames
-        return Spectrograms(
-            log_magnitude,
-            frequency[..., :known],
-            certainty[..., :known],
-            coherence[:, 0] + 1j * coherence[:, 1],
-        )
+        return Spectrograms(log_magnitude, frequency, certainty, coherence[:, 0] + 1j * coherence[:, 1])
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
         """(B, 2, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
