@@ -146,7 +146,7 @@ class Acknowledge(_Message):
 
 class Ping(_Message):
     type: Literal["ping"] = "ping"
-    id: int
+    id: Annotated[int, Field(ge=0, lt=2**53)]  # what JavaScript counts exactly
 
 
 ClientMessage = Hello | AddEmitter | MoveEmitter | RemoveEmitter | ListenerPose | Acknowledge | Ping

@@ -3,7 +3,7 @@
 One `Connection` per client, living on the event loop. A reader passes what the client says to the audio thread; a
 sender passes on what the audio thread made. Nothing here grows without bound: messages to the audio thread are refused
 beyond `MAX_WAITING_MESSAGES`, audio beyond the window is never made, and a client that reads so slowly that its answers
-pile up is cut off.
+pile up is cut off, whether or not it ever reads again.
 """
 
 import asyncio
@@ -40,6 +40,8 @@ from server.settings import Settings
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
 MAX_WAITING_ANSWERS = 256
+_GOODBYE_S = 1.0
+"""Even closing waits for room in the socket, and a client that does not read makes none."""
 
 
 def load_clip(clips: ClipLibrary, name: str) -> FloatArray:
@@ -82,6 +84,8 @@ class Connection:
         self._time_s = time_s
         self._outgoing: deque[Outgoing] = deque()
         self._has_outgoing = asyncio.Event()
+        self._capacity = MAX_WAITING_ANSWERS
+        self._is_overfull = asyncio.Event()
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
@@ -90,8 +94,10 @@ class Connection:
             try:
                 await self._serve()
             except ClosingError as closing:
-                await self._send_message(closing.error)
-                await self._websocket.close(closing.close_code, closing.error.code)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(_GOODBYE_S):
+                        await self._send_message(closing.error)
+                        await self._websocket.close(closing.close_code, closing.error.code)
 
     async def _serve(self) -> None:
         host = self._host
@@ -124,6 +130,7 @@ class Connection:
         settings = self._host.settings
         field = self._host.fields.get(hello.scene)
         window = settings.window_blocks + hello.buffer_blocks
+        self._capacity = window + MAX_WAITING_ANSWERS
         try:
             if field is None:
                 raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
@@ -160,11 +167,12 @@ class Connection:
         )
 
     async def _pump(self, stream: Stream, hello: Hello) -> None:
-        """Read and send until either ends, or fails."""
+        """Read and send until either ends or fails, or too much waits to be sent."""
         self._host.audio.open(stream)
         tasks = [
             asyncio.create_task(self._read_incoming(stream, hello)),
             asyncio.create_task(self._send_outgoing(stream, hello)),
+            asyncio.create_task(self._refuse_overflow()),
         ]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -203,13 +211,23 @@ class Connection:
 
     def _parse(self, data: str | bytes) -> ClientMessage:
         limit = self._host.settings.max_message_bytes
-        if len(data) > limit:
-            raise RequestError("message_too_large", f"a message has at most {limit} bytes, not {len(data)}", status=413)
+        size = len(data.encode() if isinstance(data, str) else data)
+        if size > limit:
+            raise RequestError("message_too_large", f"a message has at most {limit} bytes, not {size}", status=413)
         return parse_client_message(data)
 
     def _enqueue(self, outgoing: list[Outgoing]) -> None:
+        """Where there is no room, what comes is lost, and the connection ends."""
+        if len(self._outgoing) + len(outgoing) > self._capacity:
+            self._is_overfull.set()
+            return
         self._outgoing += outgoing
         self._has_outgoing.set()
+
+    async def _refuse_overflow(self) -> None:
+        """Apart from the sender, which may be waiting for the very client that does not read."""
+        await self._is_overfull.wait()
+        raise ClosingError(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
 
     async def _send_outgoing(self, stream: Stream, hello: Hello) -> None:
         """Send until cancelled, or until the stream cannot go on and the socket was closed for it."""
@@ -217,9 +235,6 @@ class Connection:
             await self._has_outgoing.wait()
             self._has_outgoing.clear()
             while self._outgoing:
-                if len(self._outgoing) > stream.session.window.size + MAX_WAITING_ANSWERS:
-                    await self._websocket.close(POLICY_VIOLATION, "client reads too slowly")
-                    return
                 match self._outgoing.popleft():
                     case TimedBlock() as timed:
                         await self._send_block(timed, stream, hello)

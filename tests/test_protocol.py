@@ -49,7 +49,7 @@ CLIENT_MESSAGES = [
     ListenerPose(pose_id=4, position=(1, 2, 3), yaw=-math.pi),
     ListenerPose(pose_id=4, position=(1, 2, 3), orientation=(0, 0, 1, 0)),
     Acknowledge(sequence=7),
-    Ping(id=-1),
+    Ping(id=2**53 - 1),
 ]
 
 SERVER_MESSAGES = [
@@ -119,6 +119,8 @@ def test_hello_as_a_person_would_type_it():
         ('{"type": ["listener"]}', "unknown_message", "type"),
         ('{"type": "ping"}', "malformed_message", "id"),
         ('{"type": "ping", "id": true}', "malformed_message", "id"),
+        ('{"type": "ping", "id": -1}', "malformed_message", "id"),
+        ('{"type": "ping", "id": 9007199254740992}', "malformed_message", "id"),
         ('{"type": "ping", "id": 1, "extra": 2}', "malformed_message", "extra"),
         ('{"type": "acknowledge", "sequence": -1}', "malformed_message", "sequence"),
         ('{"type": "listener", "pose_id": 4294967296, "position": [1,2,3]}', "malformed_message", "pose_id"),

@@ -1,0 +1,203 @@
+"""The driver of one connection, against a fake socket whose client reads when the test wants it to."""
+
+import asyncio
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+
+import numpy as np
+import pytest
+from starlette.websockets import WebSocketDisconnect
+
+from server.answers import Answers
+from server.audio_thread import AudioThread
+from server.catalogue import open_clips
+from server.protocol import (
+    Acknowledge,
+    AddEmitter,
+    AudioBlock,
+    Error,
+    Hello,
+    Ping,
+    RemoveEmitter,
+    Status,
+    parse_server_message,
+)
+from server.settings import Settings
+from server.streaming import Connection, StreamHost
+
+HELLO = Hello(protocol=1, scene="flat")
+
+
+class Socket:
+    """The server's end of a WebSocket whose client may be slow: sends and closing wait until `reads` is set."""
+
+    def __init__(self):
+        self.incoming, self.sent, self.reads = asyncio.Queue(), [], asyncio.Event()
+        self.has_sent, self.close_code = asyncio.Event(), None
+        self.reads.set()
+
+    async def accept(self):
+        pass
+
+    async def receive(self):
+        return await self.incoming.get()
+
+    async def send_text(self, text):
+        await self.reads.wait()
+        self.sent.append(parse_server_message(text))
+        self.has_sent.set()
+
+    async def send_bytes(self, data):
+        await self.reads.wait()
+        self.sent.append(AudioBlock.parse(data, "f32"))
+
+    async def close(self, code, _reason):
+        await self.reads.wait()
+        self.close_code = code
+        self.incoming.put_nowait({"type": "websocket.disconnect", "code": code})
+
+    def say(self, message):
+        self.incoming.put_nowait({"type": "websocket.receive", "text": message.serialize()})
+
+
+@asynccontextmanager
+async def hosting(field, **settings):
+    with ThreadPoolExecutor(1) as workers:
+        audio = AudioThread(asyncio.get_running_loop().call_soon_threadsafe, workers)
+        host = StreamHost(
+            fields={"flat": field},
+            clips=open_clips({"flat": field}, ()),
+            audio=audio,
+            settings=Settings(**settings),
+            answers=Answers(workers=1, waiting=1),
+            is_ready=True,
+        )
+        audio.start()
+        try:
+            yield host
+        finally:
+            await asyncio.to_thread(audio.stop)
+
+
+async def stop_reading(socket, message):
+    """Say hello, read the welcome and nothing more, and give the server a thousand occasions to answer."""
+    socket.say(HELLO)
+    await asyncio.wait_for(socket.has_sent.wait(), 5)
+    socket.reads.clear()
+    for _ in range(20):
+        for _ in range(50):
+            socket.say(message)
+        await asyncio.sleep(0.015)  # a block: what the audio thread is to answer has to come slowly
+
+
+def test_blocks_that_leave_after_their_deadline_are_flagged_and_counted(field):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field) as host:
+            running = asyncio.create_task(Connection(socket, host, time_s=lambda: time.monotonic() + 1.0).run())
+            socket.say(HELLO)
+            while not any(isinstance(message, Status) for message in socket.sent):
+                for block in [message for message in socket.sent if isinstance(message, AudioBlock)][-1:]:
+                    socket.say(Acknowledge(sequence=block.sequence))
+                await asyncio.sleep(0.01)
+            await socket.close(1000, "")
+            await running
+        return socket.sent
+
+    sent = asyncio.run(scenario())
+    late = [message for message in sent if isinstance(message, AudioBlock)]
+    (status,) = [message for message in sent if isinstance(message, Status)]
+    assert all(block.is_late for block in late)
+    assert status.blocks_late == pytest.approx(len(late), abs=12)
+
+
+@pytest.mark.parametrize("message", [Ping(id=1), RemoveEmitter(id="ghost")])
+def test_a_client_that_never_reads_its_answers_is_cut_off(field, message):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field) as host:
+            running = asyncio.create_task(Connection(socket, host).run())
+            await stop_reading(socket, message)
+            await asyncio.wait_for(running, 5)
+            return host.streams
+
+    assert asyncio.run(scenario()) == 0
+
+
+def test_a_client_that_reads_too_late_learns_why_it_was_cut_off(field):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field) as host:
+            running = asyncio.create_task(Connection(socket, host).run())
+            await stop_reading(socket, Ping(id=1))
+            socket.reads.set()
+            await asyncio.wait_for(running, 5)
+        return socket
+
+    socket = asyncio.run(scenario())
+    assert socket.close_code == 1008
+    assert socket.sent[-1].code == "reads_too_slowly"
+
+
+def test_before_the_server_is_warm_a_client_is_told_to_come_back(field):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field) as host:
+            host.is_ready = False
+            await Connection(socket, host).run()
+        return socket
+
+    socket = asyncio.run(scenario())
+    assert [message.code for message in socket.sent] == ["not_ready"]
+    assert socket.close_code == 1013
+
+
+def test_a_client_may_leave_at_any_moment(field):
+    class Gone(Socket):
+        """Whose client left after the given number of sends."""
+
+        def __init__(self, sends):
+            super().__init__()
+            self.sends = sends
+
+        def _leave(self):
+            self.sends -= 1
+            if self.sends < 0:
+                raise WebSocketDisconnect(1006)
+
+        async def send_text(self, text):
+            self._leave()
+            await super().send_text(text)
+
+        async def send_bytes(self, data):
+            self._leave()
+            await super().send_bytes(data)
+
+    async def scenario(first, sends):
+        socket = Gone(sends)
+        async with hosting(field) as host:
+            socket.say(first)
+            await asyncio.wait_for(Connection(socket, host).run(), 5)
+            return host.streams
+
+    for first, sends in [(Ping(id=1), 0), (HELLO, 0), (HELLO, 1), (HELLO, 5)]:
+        assert asyncio.run(scenario(first, sends)) == 0
+
+
+def test_a_stream_that_fails_is_closed_with_an_internal_error(field):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field) as host:
+            running = asyncio.create_task(Connection(socket, host).run())
+            # Not a shape that any bundle could have: stands for a defect of our own.
+            field.impulse_responses = lambda *_: np.zeros((1, 2, 100), np.float32)
+            socket.say(HELLO)
+            socket.say(AddEmitter(id="a", clip="trumpet", position=(1.0, 2.0, 1.0)))
+            socket.say(AddEmitter(id="b", clip="trumpet", position=(1.0, 2.0, 1.0)))
+            await asyncio.wait_for(running, 5)
+        return socket
+
+    socket = asyncio.run(scenario())
+    assert socket.close_code == 1011
+    assert [message.code for message in socket.sent if isinstance(message, Error)] == ["internal_error"]
