@@ -16,7 +16,7 @@ from server.errors import NafirError
 
 if TYPE_CHECKING:
     from server.acoustics.geometry import Vector3
-    from server.protocol import ListenerPose
+    from server.protocol import AddEmitter, ListenerPose, Welcome
 
 app = typer.Typer(help="Measure what things cost on this host.", no_args_is_help=True)
 
@@ -75,7 +75,12 @@ def stream(
     as_json: AsJson = False,
 ) -> None:
     """Listen to a running server while walking in circles: late blocks, and the time from a pose to its sound."""
-    measured = asyncio.run(_listen(url, scene, emitters, duration_s, poses_per_second))
+    from websockets.exceptions import WebSocketException
+
+    try:
+        measured = asyncio.run(_listen(url, scene, emitters, duration_s, poses_per_second))
+    except (OSError, WebSocketException) as exc:
+        raise NafirError(f"{url}: {exc}") from exc
     _report(as_json, f"One stream of {url}", measured)
 
 
@@ -85,7 +90,6 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
     from server.protocol import (
         PROTOCOL,
         Acknowledge,
-        AddEmitter,
         AudioBlock,
         Error,
         Hello,
@@ -98,10 +102,9 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
         answer = parse_server_message(str(await socket.recv()))
         if not isinstance(answer, Welcome):
             raise NafirError(f"{url} does not serve {scene}: {answer.serialize()}")
-        for number in range(emitters):
-            emitter = AddEmitter(id=str(number), clip="woman-reading", position=answer.scene.emitter.position)
+        for emitter in _sounding(answer, emitters):
             await socket.send(emitter.serialize())
-        blocks = exchanges = pose_id = 0
+        blocks = blocks_skipped = exchanges = pose_id = next_clock = 0
         late_at_s: list[float] = []
         sent_s: dict[int, float] = {}
         waits_ms: list[float] = []
@@ -116,6 +119,8 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
                 continue
             block = AudioBlock.parse(message, answer.encoding)
             blocks += 1
+            blocks_skipped += (block.sample_clock - next_clock) // answer.block_size
+            next_clock = block.sample_clock + answer.block_size
             late_at_s += [round(now_s - started_s, 1)] if block.is_late else []
             exchanges += block.is_exchange
             heard = [number for number in sent_s if number <= block.pose_id]
@@ -132,6 +137,7 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
         "emitters": emitters,
         "duration_s": round(now_s - started_s, 1),
         "blocks": blocks,
+        "blocks_skipped": blocks_skipped,
         "blocks_late": len(late_at_s),
         "late_at_s": late_at_s,
         "ir_exchanges": exchanges,
@@ -140,6 +146,19 @@ async def _listen(url: str, scene: str, emitters: int, duration_s: float, poses_
         "pose_to_block_p99_ms": float(np.percentile(waits_ms, 99)) if waits_ms else None,
         "errors": errors,
     }
+
+
+def _sounding(welcome: "Welcome", count: int) -> "list[AddEmitter]":
+    """Clips in turn, and in turn where the scene's own emitter is and where a visitor starts: two differ in both."""
+    from server.clips import ClipLibrary
+    from server.protocol import AddEmitter
+
+    clips = ClipLibrary(welcome.sample_rate).names
+    places = welcome.scene.emitter.position, welcome.scene.listener.position
+    return [
+        AddEmitter(id=str(number), clip=clips[number % len(clips)], position=places[number % len(places)])
+        for number in range(count)
+    ]
 
 
 def _walking(pose_id: int, centre: "Vector3", time_s: float) -> "ListenerPose":

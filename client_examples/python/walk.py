@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, WebSocketException
 
 POSE = struct.Struct("<BBHI7f")  # kind 2, two paddings, pose id, position, orientation
 BLOCK = struct.Struct("<BBHIQII")  # kind 1, flags, channels, sequence, sample clock, pose id, frames
@@ -124,7 +125,10 @@ async def send_poses(socket: ClientConnection, walk: Walk, poses: dict[int, Pose
         await asyncio.sleep(started_s + time_s - time.monotonic())
         poses[pose_id] = walk.pose_at(time_s)
         sent_s[pose_id] = time.monotonic()
-        await socket.send(poses[pose_id].to_bytes(pose_id))
+        try:
+            await socket.send(poses[pose_id].to_bytes(pose_id))
+        except ConnectionClosed:
+            return  # whoever listens hears of it too, and says so
 
 
 async def listen(arguments: argparse.Namespace) -> None:
@@ -201,7 +205,7 @@ def main() -> None:
     arguments.path = arguments.path or arguments.output.with_name("path.csv")
     try:
         asyncio.run(listen(arguments))
-    except OSError as exc:
+    except (OSError, WebSocketException) as exc:
         raise SystemExit(f"{arguments.url}: {exc}") from exc
 
 

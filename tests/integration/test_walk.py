@@ -1,14 +1,19 @@
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
+import pytest
 import soundfile
+from websockets.sync.server import serve
 
 from server.acoustics.decibels import amplitude_to_db
+from server.catalogue import describe_scene
 from server.clips import ClipLibrary
 from server.field.field import AcousticField
+from server.protocol import EmitterAdded, Welcome
 from server.render import RenderedEmitter, read_path, render
 
 WALK = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "walk.py"
@@ -61,3 +66,46 @@ def test_a_walk_without_a_server_says_so(tmp_path):
     assert done.returncode == 1
     assert done.stderr.startswith("ws://127.0.0.1:1/v1/stream: ")
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("url", ["http://127.0.0.1/", "ws://{served}/v1/elsewhere"])
+def test_a_walk_to_the_wrong_address_says_so_in_one_line(served, tmp_path, url):
+    url = url.format(served=served)
+    done = walk(served, "--url", url, "-o", str(tmp_path / "heard.wav"))
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"{url}: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_walk_whose_server_goes_away_says_so_in_one_line(field, tmp_path):
+    welcome = Welcome(
+        session="s",
+        scene=describe_scene(field),
+        sample_rate=24_000,
+        block_size=256,
+        channels=2,
+        encoding="f32",
+        buffer_blocks=8,
+        window=40,
+        ir_samples=4_000,
+        level="standard",
+    )
+
+    def leave_midway(socket):
+        socket.recv()
+        socket.send(welcome.serialize())
+        socket.send(EmitterAdded(id="clip", sample_clock=0).serialize())
+        for _ in range(5):
+            socket.recv()  # the walk is under way
+        socket.close(1011, "internal_error")
+
+    with serve(leave_midway, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        address = "{}:{}".format(*server.socket.getsockname())
+        done = walk(address, "-o", str(tmp_path / "heard.wav"))
+        server.shutdown()
+        thread.join()
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"ws://{address}/v1/stream: received 1011")
+    assert done.stderr.count("\n") == 1
