@@ -145,7 +145,7 @@ def render(
     block_size: Annotated[int, typer.Option(help="Poses take effect at multiples of it, samples.", min=16)] = 256,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
     duration_s: Annotated[
-        float | None, typer.Option(help="Length to render; by default until all has rung out.", min=0.0)
+        float | None, typer.Option(help="Length to render; by default until all has rung out.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -153,13 +153,19 @@ def render(
     import scipy.io.wavfile
 
     from server.field.field import AcousticField
-    from server.render import read_path
+    from server.render import MAX_RENDER_S, read_path
     from server.render import render as render_path
     from server.scene.bundle import Bundle, find_bundle
 
     if output.suffix != ".wav":
         raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
     field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    if duration_s is not None and not 1 / field.sample_rate <= duration_s <= MAX_RENDER_S:
+        raise RequestError(
+            "malformed_duration",
+            f"duration-s: {duration_s:g} is not between one sample and {MAX_RENDER_S} s",
+            field="duration_s",
+        )
     emitters = [_read_emitter(text, field, loop=loop) for text in emitter]
     points = read_path(path, field.sample_rate)
     for number, point in enumerate(points, start=1):

@@ -20,6 +20,9 @@ from server.rendering.renderer import Renderer
 
 FloatArray = npt.NDArray[np.float32]
 
+MAX_RENDER_S = 2 * 3600
+"""A render is held in memory as a whole: two hours of stereo at 48 kHz are 2.8 GB."""
+
 _CLOCKS = ("sample", "time_s")
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
@@ -63,7 +66,7 @@ def read_path(path: Path, sample_rate: int) -> list[PathPoint]:
     """Read a CSV file with a header line, columns in any order.
 
     They are `sample` or `time_s`; `x`, `y`, `z` in metres; and `qx`, `qy`, `qz`, `qw` or `yaw_deg` (counter-clockwise,
-    0 looks along +x). Samples increase from line to line. Raises PathError.
+    0 looks along +x). Samples increase from line to line, up to `MAX_RENDER_S`. Raises PathError.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -90,7 +93,11 @@ def _parse(lines: list[tuple[int, list[str]]], name: str, sample_rate: int) -> I
         clock = "sample" if "sample" in values else "time_s"
         if clock == "sample" and not values["sample"].is_integer():
             raise PathError(f"{where}, column 'sample': {values['sample']:g} is not a whole number")
-        sample = round(values[clock] * (sample_rate if clock == "time_s" else 1))
+        at = values[clock] * (sample_rate if clock == "time_s" else 1)
+        if at > MAX_RENDER_S * sample_rate:
+            problem = f"{values[clock]:g} is beyond the {MAX_RENDER_S} s that a render may last"
+            raise PathError(f"{where}, column '{clock}': {problem}")
+        sample = round(max(at, -1.0))  # any negative number is refused, and -inf cannot be rounded
         if sample <= last_sample:
             problem = "must not be negative" if last_sample < 0 else "must be later than on the line before"
             raise PathError(f"{where}, column '{clock}': {problem}")

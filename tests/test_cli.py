@@ -132,6 +132,15 @@ def test_render_says_what_is_wrong_in_one_line(nafir, bundle, tmp_path, monkeypa
     assert not (tmp_path / output).exists()
 
 
+@pytest.mark.parametrize("duration_s", ["0", "-1", "1e-9", "7201", "1e308", "inf", "nan"])
+def test_render_says_how_long_it_may_be(nafir, bundle, tmp_path, duration_s):
+    path, output = tmp_path / "path.csv", tmp_path / "out.wav"
+    path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
+    places = ("--emitter", "trumpet@6,3,1.5", "--path", path)
+    check_error(nafir("render", bundle.folder, *places, "--duration-s", duration_s, "-o", output), "duration-s", "7200")
+    assert not output.exists()
+
+
 def damage_manifest(folder):
     document = json.loads((folder / "scene.json").read_text())
     document["codec"]["hop"] = "wide"

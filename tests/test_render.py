@@ -202,6 +202,19 @@ QUATERNION = "sample,x,y,z,qx,qy,qz,qw\n"
             "path.csv: line 3, column 'time_s': must be later than on the line before",
         ),
         (
+            "time_s,x,y,z,yaw_deg\n0,1,2,1.5,0\n1e9,1,2,1.5,0\n",
+            "path.csv: line 3, column 'time_s': 1e+09 is beyond the 7200 s that a render may last",
+        ),
+        (
+            "time_s,x,y,z,yaw_deg\n1e308,1,2,1.5,0\n",
+            "path.csv: line 2, column 'time_s': 1e+308 is beyond the 7200 s that a render may last",
+        ),
+        ("time_s,x,y,z,yaw_deg\n-1e308,1,2,1.5,0\n", "path.csv: line 2, column 'time_s': must not be negative"),
+        (
+            YAW + "172800001,1,2,1.5,0\n",
+            "path.csv: line 2, column 'sample': 1.728e+08 is beyond the 7200 s that a render may last",
+        ),
+        (
             QUATERNION + "0,1,2,1.5,0,0,0,0\n",
             "path.csv: line 2, columns 'qx' to 'qw': orientation must be a quaternion of non-zero length",
         ),
