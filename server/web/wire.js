@@ -8,7 +8,6 @@ const LISTENER_POSE = 2;
 const BLOCK_HEADER_BYTES = 24;
 const POSE_BYTES = 36;
 
-export const FLAG_EXCHANGE = 1; // an IR exchange fades in this block
 export const FLAG_LATE = 2;
 
 /** Compact listener pose; `position` is [x, y, z] and `yaw` turns counter-clockwise from +x. */
