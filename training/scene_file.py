@@ -39,7 +39,7 @@ class Simulation(Strict):
     yaws: Annotated[int, Field(ge=1)]
     rays: Annotated[int, Field(ge=100)]
     # At order 0 the rays would bring the direct sound a second time.
-    image_order: Annotated[int, Field(ge=1, le=6)]
+    image_order: Annotated[int, Field(ge=0, le=6)]
     arrival_directions: Annotated[int, Field(ge=6)]
     held_out_share: Annotated[float, Field(gt=0, lt=0.5)]
 

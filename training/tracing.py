@@ -47,12 +47,9 @@ def counted_twice(geometry: Geometry, *, image_order: int, bins: int) -> npt.NDA
     """(band, bin) factor by which pyroomacoustics' rays bring too much energy where surfaces scatter.
 
     At every wall its engine sends the scattered share s to the receivers and then follows the ray on with all of its
-    energy, not 1 - s of it, so that 1 + s arrives of 1. Arrivals of fewer than `image_order` reflections are spared:
-    there the ray itself is left to the image sources. How many reflections an arrival has had by a time is Poisson,
-    after the mean free path 4 V / S of a diffuse field (Kuttruff, Room Acoustics, ch. 5).
-
-    A known excess remains: reflections of exactly that order arrive as images and as rays. In the apartment this is
-    0.1 to 0.4 dB too much reflected energy at 125 Hz, and 0.1 dB or less from 2 kHz.
+    energy, not 1 - s of it, so that 1 + s arrives of 1. Arrivals of up to `image_order` reflections are spared: there
+    the ray itself is left to the image sources. How many reflections an arrival has had by a time is Poisson, after
+    the mean free path 4 V / S of a diffuse field (Kuttruff, Room Acoustics, ch. 5).
     """
     plan, materials = geometry.floor_plan, geometry.materials
     perimeter_m = float(np.sum(np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1)))
@@ -63,7 +60,7 @@ def counted_twice(geometry: Geometry, *, image_order: int, bins: int) -> npt.NDA
     mean_scattering = np.sum(reflected * scattering, axis=0) / np.maximum(np.sum(reflected, axis=0), 1e-9)
     mean_free_path_m = 4 * plan.area_m2 * geometry.height_m / float(np.sum(areas))
     reflections = (np.arange(bins) + 0.5) * HISTOGRAM_BIN_S * SPEED_OF_SOUND / mean_free_path_m
-    return np.asarray(1 + mean_scattering[:, None] * poisson.sf(image_order - 1, reflections))
+    return np.asarray(1 + mean_scattering[:, None] * poisson.sf(image_order, reflections))
 
 
 def _material(material: Material) -> pra.Material:
@@ -91,7 +88,9 @@ class RoomTracer:
         room = pra.Room.from_corners(
             corners,
             fs=_ENGINE_RATE,
-            max_order=image_order,
+            # Its rays bring reflections of this very order as its images do: they are asked for one order more, and
+            # those images are left out.
+            max_order=image_order + 1,
             materials=_material(geometry.materials.walls),
             ray_tracing=True,
             air_absorption=True,
@@ -112,6 +111,7 @@ class RoomTracer:
             microphone.set_directions(arrival_directions.astype(np.float32))
         self._bands: int = room.octave_bands.n_bands
         self._air_absorption_per_m = np.asarray(room.air_absorption, dtype=np.float64)
+        self._image_order = image_order
         self._counted_twice = counted_twice(geometry, image_order=image_order, bins=self._bins)
 
     def trace(self, emitter: npt.NDArray[np.float64], *, rays: int, seed: int) -> list[Arrivals]:
@@ -128,11 +128,12 @@ class RoomTracer:
         if count == 0:
             none = np.zeros((len(self._receivers), 0))
             return np.zeros((0, 3)), np.zeros((*none.shape, self._bands)), none.astype(bool)
-        images = np.array(self._engine.sources.T, dtype=np.float64)
-        damping = np.array(self._engine.attenuations.T, dtype=np.float64)
+        wanted = np.array(self._engine.orders) <= self._image_order
+        images = np.array(self._engine.sources.T, dtype=np.float64)[wanted]
+        damping = np.array(self._engine.attenuations.T, dtype=np.float64)[wanted]
         distance = np.linalg.norm(images - self._receivers[:, None], axis=-1)[..., None]
         amplitudes = damping / distance * np.exp(-0.5 * self._air_absorption_per_m * distance)
-        return images, amplitudes, np.array(self._engine.visible_mics, dtype=bool)
+        return images, amplitudes, np.array(self._engine.visible_mics, dtype=bool)[:, wanted]
 
     def _energy(self, emitter: npt.NDArray[np.float64], rays: int, seed: int) -> npt.NDArray[np.float64]:
         """(receiver, direction, band, bin) squared pressure."""
