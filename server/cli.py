@@ -50,7 +50,10 @@ def main() -> None:
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on; 0 picks one. [default: 8000]")] = None,
-    bundle: Annotated[list[Path] | None, typer.Option(help="Scene bundle to serve as well; repeatable.")] = None,
+    bundle: Annotated[
+        list[Path] | None,
+        typer.Option(help="Scene bundle to serve as well, in place of a bundled scene of the same id; repeatable."),
+    ] = None,
     clip: Annotated[list[Path] | None, typer.Option(help="Audio file to offer as a clip; repeatable.")] = None,
 ) -> None:
     """Serve scenes over HTTP and WebSocket, and a page to walk through them.

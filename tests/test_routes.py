@@ -233,3 +233,8 @@ def test_too_many_waiting_requests_are_turned_away_and_health_is_answered_meanwh
 def test_the_interface_describes_itself(client):
     paths = client.get("/openapi.json").json()["paths"]
     assert IR.replace("flat", "{scene}") in paths
+
+
+@pytest.mark.parametrize("path", ["/livez", "/readyz"])
+def test_load_balancers_may_probe_with_head(client, path):
+    assert client.head(path).status_code == 200

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from scipy.ndimage import distance_transform_edt
 
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import Vector3
@@ -51,16 +52,21 @@ class LoudnessMap:
 
     def to_png(self) -> bytes:
         """North up, transparent outside the room; the brightest colour is the loudest, 30 dB above the darkest."""
-        loudest = np.nanmax(self.levels_db)
-        share = np.clip(1 - (loudest - np.nan_to_num(self.levels_db, nan=loudest)) / _RANGE_DB, 0, 1)
+        outside = np.isnan(self.levels_db)
+        # Cells outside take the level of the nearest inside, or they would bleed into the room in the enlarged picture.
+        nearest = distance_transform_edt(outside, return_distances=False, return_indices=True)
+        levels = self.levels_db[tuple(nearest)].astype(np.float32)
+        scale = self.spacing_m * _PIXELS_PER_METRE
+        size = (max(1, round(levels.shape[1] * scale)), max(1, round(levels.shape[0] * scale)))
+        enlarged = np.asarray(Image.fromarray(levels[::-1]).resize(size, Image.Resampling.BILINEAR))
+        mask = Image.fromarray(np.where(outside, 0, 255).astype(np.uint8)[::-1]).resize(size, Image.Resampling.NEAREST)
+        share = np.clip(1 - (levels.max() - enlarged) / _RANGE_DB, 0, 1)
         steps = np.linspace(0, 1, len(_COLOURS))
         colour = np.stack([np.interp(share, steps, _COLOURS[:, channel]) for channel in range(3)], axis=-1)
-        alpha = np.where(np.isnan(self.levels_db), 0, 255)[..., None]
-        image = Image.fromarray(np.concatenate([colour, alpha], axis=-1).astype(np.uint8)[::-1], "RGBA")
-        scale = self.spacing_m * _PIXELS_PER_METRE
-        size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+        image = Image.fromarray(colour.astype(np.uint8), "RGB")
+        image.putalpha(mask)
         buffer = io.BytesIO()
-        image.resize(size, Image.Resampling.BICUBIC).save(buffer, "PNG")
+        image.save(buffer, "PNG")
         return buffer.getvalue()
 
 

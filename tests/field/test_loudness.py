@@ -50,8 +50,20 @@ def test_loudest_cell_is_at_the_emitter(chart):
 def test_picture_is_north_up_and_brightest_where_loudest(chart):
     image = np.asarray(Image.open(io.BytesIO(chart.to_png())).convert("L"), dtype=float)
     row, column = np.unravel_index(np.argmax(image), image.shape)
-    assert abs(column / image.shape[1] - (2.0 - 0.3) / 7.4) < 0.05
-    assert abs(1 - row / image.shape[0] - (2.5 - 0.3) / 4.4) < 0.08
+    west, south = chart.origin[0] - chart.spacing_m / 2, chart.origin[1] - chart.spacing_m / 2
+    assert abs(west + (column + 0.5) / 80 - 2.0) < 0.3
+    assert abs(south + (image.shape[0] - row - 0.5) / 80 - 2.5) < 0.3
+
+
+def test_walls_are_cut_out_sharply_and_do_not_bleed():
+    levels = np.full((4, 9), -10.0)
+    levels[:, 4] = np.nan
+    image = np.asarray(Image.open(io.BytesIO(LoudnessMap(levels, (0.0, 0.0), 0.25, 1.5).to_png())))
+    assert image.shape == (80, 180, 4)
+    assert not image[:, 80:100, 3].any()
+    assert (image[:, :80, 3] == 255).all()
+    assert (image[:, 100:, 3] == 255).all()
+    assert len(np.unique(image[image[..., 3] > 0], axis=0)) == 1
 
 
 def test_json_has_no_numbers_outside_the_room():
