@@ -73,7 +73,8 @@ def blocks(delivered):
 
 
 def add(stream):
-    assert stream.offer(AddEmitter(id="a", clip="any", position=(6.0, 3.0, 1.5)))
+    # So near that its sound arrives within the first block.
+    assert stream.offer(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
 
 
 def test_nothing_to_do_without_streams(stage):
