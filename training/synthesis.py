@@ -14,9 +14,9 @@ import numpy.typing as npt
 from scipy.signal import ShortTimeFFT
 from scipy.signal.windows import hann
 
-from server.scene.geometry import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.rendering.hrtf import Hrtf
 from training.dataset import SPEED_OF_SOUND
-from training.hrtf import Hrtf
 from training.tracing import HISTOGRAM_BIN_S, Arrivals
 
 _WINDOW_S = 0.010

@@ -7,7 +7,8 @@ import numpy.typing as npt
 import pyroomacoustics as pra
 from scipy.stats import poisson
 
-from server.scene.geometry import OCTAVE_BANDS_HZ, Geometry, Material
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.scene.geometry import Geometry, Material
 from training.dataset import SPEED_OF_SOUND
 
 HISTOGRAM_BIN_S = 0.004

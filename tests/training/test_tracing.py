@@ -2,8 +2,9 @@ import numpy as np
 import pyroomacoustics as pra
 import pytest
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import power_to_db
-from server.scene.geometry import OCTAVE_BANDS_HZ, Geometry, Material, Materials
+from server.scene.geometry import Geometry, Material, Materials
 from training.dataset import SPEED_OF_SOUND
 from training.tracing import HISTOGRAM_BIN_S, RoomTracer, counted_twice, sphere_directions
 
