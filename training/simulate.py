@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
+from server.rendering.hrtf import KEMAR, Hrtf
 from training.dataset import Dataset, DatasetError
-from training.hrtf import KEMAR, Hrtf
 from training.synthesis import BinauralSynthesis
 from training.tracing import RoomTracer, sphere_directions
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from rich.progress import Progress
 
+from server.rendering.hrtf import KEMAR, Hrtf
 from server.scene.bundle import Bundle
 from training.dataset import Dataset
 from training.export import export
-from training.hrtf import KEMAR, Hrtf
 from training.model import FieldShape
 from training.scene_file import SceneFile
 from training.simulate import simulate

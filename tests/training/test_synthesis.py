@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
-from training.hrtf import KEMAR, Hrtf
+from server.rendering.hrtf import KEMAR, Hrtf
 from training.synthesis import BinauralSynthesis, rotate_into_head
 from training.tracing import HISTOGRAM_BIN_S, Arrivals, sphere_directions
 

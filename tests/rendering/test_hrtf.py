@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
-from training.hrtf import KEMAR, Hrtf
+from server.rendering.hrtf import KEMAR, Hrtf
 
 HEAD_RADIUS_M = 0.0875
 
