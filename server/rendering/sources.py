@@ -1,0 +1,162 @@
+"""Where an emitter's dry signal comes from: a clip, or a client that makes it as it goes.
+
+Mono float32 at the scene's rate, full scale 1. A source fills one block at a time, on the thread that renders.
+"""
+
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from server.rendering.fade import raised_cosine
+
+FloatArray = npt.NDArray[np.float32]
+
+LOUDEST = 1e6
+"""Full scale is 1. Integers written as float reach 2^31, and nobody wants to hear them so."""
+FADE_SAMPLES = 64
+_TINY = np.finfo(np.float32).tiny
+
+
+class Source(Protocol):
+    """What the renderer asks for an emitter's next block."""
+
+    def process(self, out: FloatArray) -> None:
+        """Fill `out` (b,)."""
+
+    def reset(self) -> None:
+        """Begin again."""
+
+
+class ClipPlayer:
+    """Plays mono samples (n,), n >= 1, block by block: once and then silence, or round and round without a gap."""
+
+    def __init__(self, clip: FloatArray, *, loop: bool) -> None:
+        if clip.ndim != 1 or clip.size == 0:
+            raise ValueError(f"a clip is mono and not empty, got shape {clip.shape}")
+        self._clip = clip
+        self._loop = loop
+        self._position = 0
+
+    def process(self, out: FloatArray) -> None:
+        """Fill `out` (b,) with the next samples."""
+        written = 0
+        while written < out.size:
+            piece = self._clip[self._position : self._position + out.size - written]
+            if piece.size == 0:  # only once, and over
+                out[written:] = 0
+                return
+            out[written : written + piece.size] = piece
+            written += piece.size
+            self._position += piece.size
+            if self._loop and self._position == self._clip.size:
+                self._position = 0
+
+    def reset(self) -> None:
+        self._position = 0
+
+
+class LiveSource:
+    """Samples on their way from a client to the renderer: first in, first out, `capacity` of them at most.
+
+    It plays once `lead` samples wait, so that they may come unevenly. Where too few wait for a block, those fade out
+    and silence follows: one underrun. It goes on once twice as many wait as it waited for before, up to half the
+    capacity, and with the newest of them: what a stall held up would only be delay. Where too many wait, the oldest are
+    dropped, and sound crossfades over the gap.
+
+    What is no audio (not finite, or beyond `LOUDEST`) becomes silence here, once, since a single NaN would stay in
+    every filter behind; so do denormal numbers, uncounted, which only cost time.
+
+    Everything happens on the thread that renders: what a client sends reaches it with the other messages. Blocks to
+    fill have at least `FADE_SAMPLES`.
+    """
+
+    def __init__(self, *, capacity: int, lead: int) -> None:
+        if not FADE_SAMPLES < lead <= capacity:
+            raise ValueError(f"a lead of {lead} samples does not lie between {FADE_SAMPLES} and {capacity}")
+        self._ring = np.zeros(capacity, np.float32)
+        self._lead = lead
+        self._fade_in = raised_cosine(FADE_SAMPLES)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what waits, and every count."""
+        self.queued = 0
+        """Samples that wait."""
+        self.underruns = 0
+        self.samples_dropped = 0
+        self.samples_gated = 0
+        self._read = 0
+        self._is_playing = False
+        self._waits_for = self._lead
+        self._overtaken: FloatArray | None = None  # what would have come next, had it not been dropped
+
+    def push(self, samples: FloatArray) -> None:
+        """Take in what a client sent, (n,)."""
+        with np.errstate(invalid="ignore"):  # a signalling NaN
+            magnitude = np.abs(samples)
+            is_audio = magnitude <= LOUDEST
+            clean = np.where(is_audio & (magnitude >= _TINY), samples, np.float32(0))
+        self.samples_gated += samples.size - int(np.count_nonzero(is_audio))
+        capacity = self._ring.size
+        self._drop(self.queued + clean.size - capacity)
+        clean = clean[-capacity:]
+        start = (self._read + self.queued) % capacity
+        first = clean[: capacity - start]
+        self._ring[start : start + first.size] = first
+        self._ring[: clean.size - first.size] = clean[first.size :]
+        self.queued += clean.size
+
+    def process(self, out: FloatArray) -> None:
+        """Fill `out` (b,) with the next samples, or with silence where there are none."""
+        if not self._is_playing:
+            self._start(out)
+        elif self.queued >= out.size + FADE_SAMPLES:
+            # That many stay behind at least, for the fade-out should nothing follow.
+            self._take(out)
+            if self._overtaken is not None:
+                head = out[:FADE_SAMPLES]
+                head += (1 - self._fade_in) * (self._overtaken - head)
+        else:
+            self._run_dry(out)
+        self._overtaken = None
+
+    def _start(self, out: FloatArray) -> None:
+        wanted = max(self._waits_for, out.size + FADE_SAMPLES)
+        if self.queued < wanted:
+            out.fill(0)
+            return
+        if self.underruns:
+            self._drop(self.queued - wanted)
+        self._is_playing = True
+        self._take(out)
+        if self.underruns:
+            out[:FADE_SAMPLES] *= self._fade_in
+
+    def _run_dry(self, out: FloatArray) -> None:
+        rest = out[: self.queued]
+        self._take(rest)
+        rest[-FADE_SAMPLES:] *= 1 - self._fade_in
+        out[rest.size :] = 0
+        self._is_playing = False
+        self._waits_for = min(2 * self._waits_for, self._ring.size // 2)
+        self.underruns += 1
+
+    def _drop(self, count: int) -> None:
+        """Let go of the `count` oldest samples, of those waiting and then of those coming."""
+        if count <= 0:
+            return
+        self.samples_dropped += count
+        if self._is_playing and self._overtaken is None:
+            self._overtaken = self._ring.take(np.arange(self._read, self._read + FADE_SAMPLES), mode="wrap")
+        waiting = min(count, self.queued)
+        self._read = (self._read + waiting) % self._ring.size
+        self.queued -= waiting
+
+    def _take(self, out: FloatArray) -> None:
+        """Move the oldest samples to `out`, which has room for no more than wait."""
+        first = self._ring[self._read : self._read + out.size]
+        out[: first.size] = first
+        out[first.size :] = self._ring[: out.size - first.size]
+        self._read = (self._read + out.size) % self._ring.size
+        self.queued -= out.size
