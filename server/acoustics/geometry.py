@@ -17,7 +17,9 @@ Points = npt.NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-_TOUCH_M = 1e-9
+# Nearer than this, a point is on a wall; two points are one.
+TOUCH_M = 1e-9
+COINCIDENT_M = 1e-9
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class FloorPlan:
         rise = np.where(start[:, 1] == end[:, 1], 1.0, end[:, 1] - start[:, 1])
         crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
         inside = np.sum(straddles & (x < crossing), axis=-1) % 2 == 1
-        touches = self.wall_distance_m(points) < _TOUCH_M
+        touches = self.wall_distance_m(points) < TOUCH_M
         return np.asarray((inside | touches) & (points[..., 2] >= 0) & (points[..., 2] <= self.height_m))
 
     def wall_distance_m(self, points: Points) -> npt.NDArray[np.float64]:
@@ -133,8 +135,8 @@ class FloorPlan:
             edge, offset = tip - origin, point - origin
             return np.asarray(edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0])
 
-        crosses = (side(start, end, p) * side(start, end, q) < -_TOUCH_M) & (
-            side(p, q, start) * side(p, q, end) < -_TOUCH_M
+        crosses = (side(start, end, p) * side(start, end, q) < -TOUCH_M) & (
+            side(p, q, start) * side(p, q, end) < -TOUCH_M
         )
         # A sight line through the inside of a wall block may pass exactly through its corners: its midpoint tells.
         middle = (a + b) / 2

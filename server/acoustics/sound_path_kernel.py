@@ -1,0 +1,166 @@
+"""The compiled counterpart of SoundPathFinder's NumPy path: the same questions, one emitter after the other.
+
+Points are scalars (x, y in plan, metres); `corners` is (corner, 2), the polygon of a floor plan.
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.geometry import COINCIDENT_M, TOUCH_M
+from server.acoustics.screen import CLEAR_FRESNEL_NUMBER, GRAZING_LOSS_DB, SMALL_ARGUMENT
+from server.compiled import compiled
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+
+@compiled
+def _contains(corners: Floats, x: float, y: float) -> bool:
+    """As FloorPlan.contains, in plan."""
+    inside = False
+    x0, y0 = corners[-1]
+    for x1, y1 in corners:
+        if (y0 > y) != (y1 > y) and x < x0 + (y - y0) * (x1 - x0) / (y1 - y0):
+            inside = not inside
+        x0, y0 = x1, y1
+    if inside:
+        return True
+    for x1, y1 in corners:
+        along_x, along_y = x1 - x0, y1 - y0
+        share = ((x - x0) * along_x + (y - y0) * along_y) / (along_x**2 + along_y**2)
+        share = min(1.0, max(0.0, share))
+        if math.hypot(x - x0 - share * along_x, y - y0 - share * along_y) < TOUCH_M:
+            return True
+        x0, y0 = x1, y1
+    return False
+
+
+@compiled
+def _is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> bool:
+    """As FloorPlan.is_visible."""
+    ray_x, ray_y = qx - px, qy - py
+    x0, y0 = corners[-1]
+    start = ray_x * (y0 - py) - ray_y * (x0 - px)
+    for x1, y1 in corners:
+        end = ray_x * (y1 - py) - ray_y * (x1 - px)
+        if start * end < -TOUCH_M:
+            wall_x, wall_y = x1 - x0, y1 - y0
+            p_side = wall_x * (py - y0) - wall_y * (px - x0)
+            q_side = wall_x * (qy - y0) - wall_y * (qx - x0)
+            if p_side * q_side < -TOUCH_M:
+                return False
+        x0, y0, start = x1, y1, end
+    return _contains(corners, (px + qx) / 2, (py + qy) / 2)
+
+
+@compiled
+def _screen_gain_db(fresnel_number: float) -> float:
+    """As screen.screen_gain_db."""
+    if fresnel_number <= CLEAR_FRESNEL_NUMBER:
+        return 0.0
+    x = math.sqrt(2 * math.pi * abs(fresnel_number))
+    if x < SMALL_ARGUMENT:
+        return -GRAZING_LOSS_DB
+    bent = x / math.tanh(x) if fresnel_number > 0 else x / math.tan(x)
+    return min(0.0, -(GRAZING_LOSS_DB + 20 * math.log10(bent)))
+
+
+@compiled
+def _clearance_m(
+    corners: Floats, bends: Floats, from_listener: Floats, listener: Floats, emitter: Floats, widest_m: float
+) -> float:
+    """As SoundPathFinder's, for one emitter in sight: `widest_m` where every corner is farther off than that."""
+    plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
+    rise = emitter[2] - listener[2]
+    straight = math.hypot(plan, rise)
+    clearance = widest_m
+    for bend in range(len(bends)):
+        to_listener = from_listener[bend]
+        x, y = bends[bend]
+        to_emitter = math.hypot(emitter[0] - x, emitter[1] - y)
+        if to_listener == np.inf or to_emitter < COINCIDENT_M:
+            continue
+        ahead = -((listener[0] - x) * (emitter[0] - x) + (listener[1] - y) * (emitter[1] - y))
+        if ahead <= 0:
+            continue
+        detour = math.hypot(to_listener + to_emitter, rise) - straight
+        detour = max(0.0, detour) * to_listener * to_emitter / ahead
+        if detour < clearance and _is_visible(corners, emitter[0], emitter[1], x, y):
+            clearance = detour
+    return clearance
+
+
+@compiled
+def find_sound_paths(
+    corners: Floats,
+    bends: Floats,
+    bend_lengths_m: Floats,
+    wavelengths_m: Floats,
+    listener: Floats,
+    emitters: Floats,
+    length_m: Floats,
+    arrival: Floats,
+    departure: Floats,
+    excess_m: Floats,
+    in_sight: Flags,
+    screen_db: Floats,
+) -> None:
+    """Fills the last six, one row per emitter; see SoundPaths."""
+    count = len(bends)
+    # Twice what the longest wave takes notice of, so that rounding leaves exactly 0 dB beyond it.
+    widest_m = -CLEAR_FRESNEL_NUMBER * wavelengths_m.max()
+    # Over plan: to each corner that the listener sees, and to each corner round whichever others, the first of them.
+    from_listener, to_bend = np.full(count, np.inf), np.full(count, np.inf)
+    first = np.zeros(count, np.int64)
+    for bend in range(count):
+        x, y = bends[bend]
+        distance = math.hypot(x - listener[0], y - listener[1])
+        if distance >= COINCIDENT_M and _is_visible(corners, listener[0], listener[1], x, y):
+            from_listener[bend] = distance
+    for bend in range(count):
+        for via in range(count):
+            length = from_listener[via] + bend_lengths_m[via, bend]
+            if length < to_bend[bend]:
+                to_bend[bend], first[bend] = length, via
+
+    for row in range(len(emitters)):
+        emitter = emitters[row]
+        rise = emitter[2] - listener[2]
+        plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
+        straight = math.hypot(plan, rise)
+        seen = count == 0 or _is_visible(corners, listener[0], listener[1], emitter[0], emitter[1])
+        around, last = np.inf, -1
+        if not seen:
+            for bend in range(count):
+                x, y = bends[bend]
+                distance = math.hypot(x - emitter[0], y - emitter[1])
+                if (
+                    distance >= COINCIDENT_M
+                    and to_bend[bend] + distance < around
+                    and _is_visible(corners, emitter[0], emitter[1], x, y)
+                ):
+                    around, last = to_bend[bend] + distance, bend
+        in_sight[row] = last < 0
+        if last < 0:
+            length_m[row], excess_m[row] = straight, 0.0
+            if straight < COINCIDENT_M:
+                arrival[row, 0], arrival[row, 1], arrival[row, 2] = 1.0, 0.0, 0.0
+            else:
+                for axis in range(3):
+                    arrival[row, axis] = (emitter[axis] - listener[axis]) / straight
+            for axis in range(3):
+                departure[row, axis] = -arrival[row, axis]
+            detour = -_clearance_m(corners, bends, from_listener, listener, emitter, widest_m)
+        else:
+            length = math.hypot(around, rise)
+            length_m[row], excess_m[row] = length, max(0.0, length - straight)
+            level, near = around / length, first[last]
+            for axis in range(2):
+                arrival[row, axis] = level * (bends[near, axis] - listener[axis]) / from_listener[near]
+                departure[row, axis] = level * (bends[last, axis] - emitter[axis]) / (around - to_bend[last])
+            arrival[row, 2], departure[row, 2] = rise / length, -rise / length
+            detour = excess_m[row]
+        for band in range(len(wavelengths_m)):
+            screen_db[row, band] = _screen_gain_db(2 * detour / wavelengths_m[band])
