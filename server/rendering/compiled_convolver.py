@@ -1,0 +1,240 @@
+"""The arrays behind the compiled convolver, and impulse responses (IRs) in the layout it multiplies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.compiled import compiled
+from server.rendering import right_angle
+from server.rendering.convolver_kernel import CONVOLVER, PROGRESS, STAGE, process_block
+from server.rendering.fade import raised_cosine
+from server.rendering.partitions import Partitioning, Stage
+from server.rendering.simd import LANES, load, store
+
+FloatArray = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+
+_CACHE_LINE = 64
+_PER_SOURCE = ("current", "job_source", "job_old", "job_new")
+
+
+def _address(array: npt.NDArray[np.generic]) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+def _zeros(*shape: int) -> FloatArray:
+    """float32 at the start of a cache line; pages are mapped when first written, so what is not used costs nothing."""
+    count = int(np.prod(shape))
+    raw = np.zeros(4 * count + _CACHE_LINE, np.uint8)
+    skip = -_address(raw) % _CACHE_LINE
+    return raw[skip : skip + 4 * count].view(np.float32).reshape(shape)
+
+
+@dataclass(frozen=True)
+class PackedFilter:
+    """An IR (channel, sample) transformed for every stage; immutable, so threads may share it.
+
+    `header` holds, per stage, the address of its spectra, how many partitions they have, and the address of a digest of
+    each partition's samples.
+    """
+
+    header: IntArray
+    spectra: tuple[FloatArray, ...]
+    digests: tuple[IntArray, ...]
+
+    @property
+    def address(self) -> int:
+        return _address(self.header)
+
+
+def pack(ir: FloatArray, partitioning: Partitioning) -> PackedFilter:
+    """Transform an IR (channels, n), n >= 1, n <= the partitioning's; on any thread."""
+    channels, samples = ir.shape
+    header, spectra, digests = [], [], []
+    for stage in partitioning.stages:
+        count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
+        padded = np.zeros((channels, count * stage.size), np.float32)
+        piece = ir[:, stage.start : stage.start + padded.shape[1]]
+        padded[:, : piece.shape[1]] = piece
+        cut = padded.reshape(channels, count, stage.size)
+        packed = _zeros(stage.size // LANES, count, channels, 2, LANES)
+        tables = right_angle.tables(stage.size)
+        _pack(
+            _address(padded), _address(packed), count, channels, stage.size, *_addresses(tables), _zeros(3, stage.size)
+        )
+        # Hashes of bytes: equal samples, equal partitions, which an exchange need not compute.
+        digest = np.array([hash(cut[:, partition].tobytes()) for partition in range(count)], np.int64)
+        header += [_address(packed), count, _address(digest)]
+        spectra.append(packed)
+        digests.append(digest)
+    return PackedFilter(np.array(header, np.int64), tuple(spectra), tuple(digests))
+
+
+def _addresses(tables: right_angle.Tables) -> tuple[int, int, int]:
+    return _address(tables.twist), _address(tables.passes), _address(tables.lanes)
+
+
+@compiled
+def _pack(
+    samples: int,
+    packed: int,
+    count: int,
+    channels: int,
+    size: int,
+    twist: int,
+    passes: int,
+    lanes: int,
+    scratch: FloatArray,
+) -> None:
+    bins, silence = scratch.ctypes.data, scratch.ctypes.data + 8 * size
+    for channel in range(channels):
+        for partition in range(count):
+            first = samples + 4 * (channel * count + partition) * size
+            right_angle.forward(first, silence, bins, size, twist, passes, lanes)
+            for tile in range(size // 8):
+                at = ((tile * count + partition) * channels + channel) * 16
+                store(packed, at, load(bins, 8 * tile))
+                store(packed, at + 8, load(bins, size + 8 * tile))
+
+
+class CompiledConvolver:
+    """Owns the arrays; see `server.rendering.convolver.Convolver` for what they mean to a user.
+
+    `wanted` (source,) holds the address of each source's filter, 0 for none; `silent` (source,) its blocks of silence.
+    """
+
+    def __init__(self, partitioning: Partitioning, sources: int, channels: int, *, has_shared_tail: bool) -> None:
+        block_size, history = partitioning.block_size, partitioning.history_blocks
+        stages = partitioning.stages
+        self._partitioning = partitioning
+        self.input = _zeros(sources, block_size)
+        self.output = _zeros(channels, block_size)
+        self.silent: IntArray = np.zeros(sources, np.int64)
+        self.exchanged: IntArray = np.zeros(sources, np.int64)
+        self.tail_gain = _zeros(2, sources)
+        self._history = _zeros(sources, history * block_size)
+        self._wanted: IntArray = np.zeros(sources, np.int64)
+        self._tail_history = _zeros(1, history * block_size)
+        self._tail_wanted: IntArray = np.zeros(1, np.int64)
+        self._tail_silent: IntArray = np.zeros(1, np.int64)
+        self._scratch = _zeros(2, stages[-1].size)
+        self._fade_in = raised_cosine(block_size)
+        self._stages = np.zeros(len(stages), STAGE)
+        self._stage_arrays = [
+            _StageArrays(
+                stage,
+                1 if has_shared_tail and number == len(stages) - 1 else sources,
+                channels,
+            )
+            for number, stage in enumerate(stages)
+        ]
+        for number, arrays in enumerate(self._stage_arrays):
+            is_shared = has_shared_tail and number == len(stages) - 1
+            record = self._stages[number : number + 1]
+            record["number"] = number
+            record["history"] = _address(self._tail_history if is_shared else self._history)
+            record["wanted"] = _address(self._tail_wanted if is_shared else self._wanted)
+            record["silent"] = _address(self._tail_silent if is_shared else self.silent)
+            arrays.enter(record)
+        self._record = np.zeros(1, CONVOLVER)
+        for name, value in {
+            "sources": sources,
+            "channels": channels,
+            "block_size": block_size,
+            "history_blocks": history,
+            "quiet_blocks": partitioning.quiet_blocks,
+            "stages": len(stages),
+            "has_shared_tail": has_shared_tail,
+        }.items():
+            self._record[name] = value
+        for name, array in {
+            "stage": self._stages,
+            "input": self.input,
+            "output": self.output,
+            "history": self._history,
+            "wanted": self._wanted,
+            "silent": self.silent,
+            "exchanged": self.exchanged,
+            "scratch": self._scratch,
+            "tail_history": self._tail_history,
+            "tail_silent": self._tail_silent,
+            "tail_gain": self.tail_gain,
+            "fade_in": self._fade_in,
+        }.items():
+            self._record[name] = _address(array)
+        self.address = _address(self._record)
+
+    @property
+    def blocks(self) -> int:
+        return int(self._record["blocks"][0])
+
+    def prepare(self, ir: FloatArray) -> PackedFilter:
+        return pack(ir, self._partitioning)
+
+    def want(self, source: int, filters: PackedFilter) -> None:
+        self._wanted[source] = filters.address
+
+    def want_tail(self, filters: PackedFilter) -> None:
+        self._tail_wanted[0] = filters.address
+
+    def process(self, blocks: FloatArray, output: FloatArray) -> None:
+        process_block(self.address, blocks, output)
+
+    def clear(self, source: int) -> None:
+        self._wanted[source] = 0
+        self._history[source] = 0
+        self.silent[source] = 0
+        self.tail_gain[:, source] = 0
+        for arrays in self._stage_arrays:
+            if arrays.sources > source and arrays.sources == len(self._wanted):
+                arrays.clear(source)
+
+    def reset(self) -> None:
+        for source in range(len(self._wanted)):
+            self.clear(source)
+        self.exchanged.fill(0)
+        self._tail_history.fill(0)
+        self._tail_wanted.fill(0)
+        self._tail_silent.fill(0)
+        self._record["blocks"] = 0
+        for number, arrays in enumerate(self._stage_arrays):
+            arrays.reset()
+            for name in PROGRESS:
+                self._stages[name][number] = 0
+
+
+class _StageArrays:
+    """What one stage needs."""
+
+    def __init__(self, stage: Stage, sources: int, channels: int) -> None:
+        self.stage = stage
+        self.sources = sources
+        self.tables = right_angle.tables(stage.size)
+        self.fade_out = raised_cosine(stage.size)[::-1].copy()
+        self.spectra = _zeros(sources, stage.size // LANES, stage.partitions, 2, LANES)
+        self.mix, self.next_mix, self.surplus = (_zeros(channels, 2, stage.size) for _ in range(3))
+        self.output = _zeros(2, channels, stage.size)
+        self.current, self.job_source, self.job_old, self.job_new = (np.zeros(sources, np.int64) for _ in _PER_SOURCE)
+
+    def enter(self, record: npt.NDArray[np.void]) -> None:
+        """Write sizes and addresses into a STAGE record (1,)."""
+        record["size"], record["ticks"] = self.stage.size, self.stage.ticks
+        record["partitions"], record["sources"] = self.stage.partitions, self.sources
+        record["twist"], record["passes"], record["lanes"] = _addresses(self.tables)
+        for name in ("fade_out", "spectra", "mix", "next_mix", "surplus", "output", *_PER_SOURCE):
+            record[name] = _address(getattr(self, name))
+
+    def clear(self, source: int) -> None:
+        if self.current[source]:
+            self.current[source] = 0
+            self.spectra[source] = 0
+        is_at_work = self.job_source == source
+        self.job_old[is_at_work] = 0
+        self.job_new[is_at_work] = 0
+
+    def reset(self) -> None:
+        self.spectra.fill(0)
+        self.current.fill(0)
+        self.job_old.fill(0)
+        self.job_new.fill(0)

@@ -1,0 +1,67 @@
+"""How an impulse response (IR) is cut for convolution in real time: non-uniform, time-distributed partitions.
+
+Small partitions first, so that nothing is delayed; large ones later, because a partition costs the same per block
+however long it is (Gardner 1995; Wefers 2015, chapters 5 and 6). A stage of partitions of n samples transforms a window
+of 2 n, and has the time of another n to do it, a share in every block: so it may begin 2 n samples into the IR.
+
+Letters: b block size; a stage has partitions of `size` samples, `ticks` = size / b blocks long.
+"""
+
+from dataclasses import dataclass
+
+_GROWTH = 4
+_STAGES = 3
+SMALLEST_BLOCK = 64
+
+
+@dataclass(frozen=True)
+class Stage:
+    """`partitions` partitions of `size` samples, the first at sample `start` of the IR."""
+
+    size: int
+    ticks: int
+    start: int
+    partitions: int
+
+    @property
+    def end(self) -> int:
+        return self.start + self.size * self.partitions
+
+
+@dataclass(frozen=True)
+class Partitioning:
+    """The stages of a convolver: b, 4 b and 16 b, as many of them as the longest IR needs."""
+
+    block_size: int
+    ir_samples: int
+
+    def __post_init__(self) -> None:
+        if self.block_size < SMALLEST_BLOCK or self.block_size & (self.block_size - 1):
+            raise ValueError(f"block_size is a power of two from {SMALLEST_BLOCK} on, not {self.block_size}")
+        if self.ir_samples < 1:
+            raise ValueError("ir_samples must be at least 1")
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        stages: list[Stage] = []
+        start = 0
+        for number in range(_STAGES):
+            ticks = _GROWTH**number
+            size = ticks * self.block_size
+            is_last = number == _STAGES - 1
+            end = self.ir_samples if is_last else min(self.ir_samples, 2 * _GROWTH * size)
+            stages.append(Stage(size, ticks, start, -(-(end - start) // size)))
+            start = stages[-1].end
+            if start >= self.ir_samples:
+                break
+        return tuple(stages)
+
+    @property
+    def history_blocks(self) -> int:
+        """Blocks of input to keep: three windows' worth of the largest stage, one of which is being filled."""
+        return 3 * self.stages[-1].ticks
+
+    @property
+    def quiet_blocks(self) -> int:
+        """Blocks of silence after which no window of any stage holds anything else, and nothing is left to come out."""
+        return max(self.history_blocks, *((stage.partitions + 3) * stage.ticks for stage in self.stages))

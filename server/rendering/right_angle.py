@@ -1,0 +1,345 @@
+"""The transform of the compiled convolver: right-angle, in place, in no particular order of bins.
+
+A window of 2 n real samples x is a polynomial modulo z^2n = -1, that is, negacyclic; at the n roots of z^n = -i it
+takes the values of the n complex numbers x[j] - i x[n + j], j < n, twisted by exp(-i pi j / 2 n) and transformed by an
+ordinary complex FFT of size n (Nussbaumer 1981; the "right-angle" convolution of Krot and Minervina 1992). The other n
+roots give the conjugates. So 2 n real samples need n complex bins, all alike: no bin is real, and nothing has to be
+untangled as after a real FFT. Overlap-save does not mind the sign with which products wrap: it drops what wrapped.
+
+The FFT splits n = 8 m: m-point transforms in every lane (radix 4, decimation in frequency), twiddles, then 8 points
+across the lanes after a transposition of eight vectors. Bins stay where that leaves them, since only products of bins
+follow, and the inverse undoes the steps in reverse.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from server.compiled import compiled
+from server.rendering.simd import (
+    LANES,
+    add,
+    broadcast,
+    load,
+    load_broadcast,
+    multiply,
+    multiply_add,
+    multiply_subtract,
+    store,
+    subtract,
+    transpose,
+)
+
+SMALLEST = LANES * LANES
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Constants of size n = `size`, a power of two from `SMALLEST` on; float32, real parts then imaginary parts.
+
+    `twist` (2, n) is exp(-i pi j / 2 n), `lanes` (2, n) the twiddles before the transform across lanes, in the order of
+    the bins; `passes` the twiddles of each radix-4 pass, six per butterfly.
+    """
+
+    size: int
+    twist: npt.NDArray[np.float32]
+    passes: npt.NDArray[np.float32]
+    lanes: npt.NDArray[np.float32]
+
+
+@cache
+def tables(size: int) -> Tables:
+    """Raises ValueError for a size that is no power of two, or below `SMALLEST`."""
+    if size < SMALLEST or size & (size - 1):
+        raise ValueError(f"the transform has a size of {SMALLEST} or more, a power of two, not {size}")
+    vectors = size // LANES
+    passes, order = [np.zeros(0)], np.arange(1)
+    if vectors.bit_length() % 2 == 0:  # an odd power of two: one pass of radix 2 first
+        turn = np.exp(-2j * np.pi * np.arange(vectors // 2) / vectors)
+        passes.append(np.stack([turn.real, turn.imag], axis=-1).ravel())
+    span = _first_span(vectors)
+    while span:
+        turn = np.exp(-2j * np.pi * np.arange(span)[:, None] * np.arange(1, 4) / (4 * span))
+        passes.append(np.stack([turn.real, turn.imag], axis=-1).ravel())
+        span //= 4
+    # order[position] is the bin that the lanes' transforms leave there: digits reversed.
+    length = 1
+    while length < vectors:
+        radix = 2 if length * 2 == vectors and vectors.bit_length() % 2 == 0 else 4
+        order = np.concatenate([order * radix + digit for digit in range(radix)])
+        length *= radix
+    lanes = np.exp(-2j * np.pi * order[:, None] * np.arange(LANES) / size).ravel()
+    twist = np.exp(-0.5j * np.pi * np.arange(size) / size)
+    return Tables(size, _parts(twist), np.concatenate(passes).astype(np.float32), _parts(lanes))
+
+
+def _first_span(vectors: int) -> int:
+    """Of the radix-4 passes: a quarter of what is left to transform after the pass of radix 2, where there is one."""
+    return vectors // 8 if vectors.bit_length() % 2 == 0 else vectors // 4
+
+
+def _parts(values: npt.NDArray[np.complex128]) -> npt.NDArray[np.float32]:
+    return np.ascontiguousarray(np.stack([values.real, values.imag]).astype(np.float32))
+
+
+@compiled
+def forward(first: int, second: int, bins: int, size: int, twist: int, passes: int, lanes: int) -> None:
+    """Transform the window whose halves (n,) are at addresses `first` and `second` to `bins` (2, n); all addresses."""
+    vectors = size // 8
+    for n in range(0, size, 8):
+        a, b = load(first, n), load(second, n)
+        c, s = load(twist, n), load(twist, size + n)
+        store(bins, n, multiply_add(b, s, multiply(a, c)))  # (a - i b)(c + i s)
+        store(bins, size + n, multiply_subtract(b, c, multiply(a, s)))
+    table = 0
+    span = vectors // 4
+    if _is_odd_power(vectors):
+        span = vectors // 8
+        half = vectors // 2
+        for j in range(half):
+            at, to = 8 * j, 8 * (j + half)
+            ar, ai, br, bi = load(bins, at), load(bins, size + at), load(bins, to), load(bins, size + to)
+            store(bins, at, add(ar, br))
+            store(bins, size + at, add(ai, bi))
+            dr, di = subtract(ar, br), subtract(ai, bi)
+            c, s = load_broadcast(passes, table + 2 * j), load_broadcast(passes, table + 2 * j + 1)
+            store(bins, to, multiply_subtract(di, s, multiply(dr, c)))
+            store(bins, size + to, multiply_add(di, c, multiply(dr, s)))
+        table += 2 * half
+    while span > 0:
+        for j in range(span):
+            t = table + 6 * j
+            c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
+            c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
+            c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
+            for group in range(j, vectors, 4 * span):
+                p0, p1 = 8 * group, 8 * (group + span)
+                p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
+                ar, ai, br, bi = load(bins, p0), load(bins, size + p0), load(bins, p1), load(bins, size + p1)
+                cr, ci, dr, di = load(bins, p2), load(bins, size + p2), load(bins, p3), load(bins, size + p3)
+                er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
+                gr, gi = add(br, dr), add(bi, di)
+                hr, hi = subtract(bi, di), subtract(dr, br)  # -i (b - d)
+                store(bins, p0, add(er, gr))
+                store(bins, size + p0, add(ei, gi))
+                yr, yi = add(fr, hr), add(fi, hi)
+                store(bins, p1, multiply_subtract(yi, s1, multiply(yr, c1)))
+                store(bins, size + p1, multiply_add(yi, c1, multiply(yr, s1)))
+                yr, yi = subtract(er, gr), subtract(ei, gi)
+                store(bins, p2, multiply_subtract(yi, s2, multiply(yr, c2)))
+                store(bins, size + p2, multiply_add(yi, c2, multiply(yr, s2)))
+                yr, yi = subtract(fr, hr), subtract(fi, hi)
+                store(bins, p3, multiply_subtract(yi, s3, multiply(yr, c3)))
+                store(bins, size + p3, multiply_add(yi, c3, multiply(yr, s3)))
+        table += 6 * span
+        span //= 4
+    for at in range(0, size, 64):
+        re, im = _load_8(bins, at), _load_8(bins, size + at)
+        cos, sin = _load_8(lanes, at), _load_8(lanes, size + at)
+        re, im = _multiply_8(re, im, cos, sin)
+        re, im = _eight_points(transpose(re), transpose(im))
+        _store_8(bins, at, re)
+        _store_8(bins, size + at, im)
+
+
+@compiled
+def inverse(bins: int, size: int, passes: int, lanes: int) -> None:
+    """Undo `forward` in place but for the twist, and n times too large: `finish` takes the samples from there."""
+    vectors = size // 8
+    for at in range(0, size, 64):
+        im, re = _eight_points(_load_8(bins, size + at), _load_8(bins, at))  # parts swapped: the inverse
+        re, im = transpose(re), transpose(im)
+        cos, sin = _load_8(lanes, at), _load_8(lanes, size + at)
+        re, im = _multiply_conjugate_8(re, im, cos, sin)
+        _store_8(bins, at, re)
+        _store_8(bins, size + at, im)
+    is_odd = _is_odd_power(vectors)
+    largest = vectors // 8 if is_odd else vectors // 4
+    span = 1
+    while span <= largest:
+        # Before the twiddles of this span lie those of all larger ones, six floats per butterfly.
+        table = (vectors if is_odd else 0) + 2 * (4 * largest - 4 * span)
+        for j in range(span):
+            t = table + 6 * j
+            c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
+            c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
+            c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
+            for group in range(j, vectors, 4 * span):
+                p0, p1 = 8 * group, 8 * (group + span)
+                p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
+                ar, ai = load(bins, p0), load(bins, size + p0)
+                yr, yi = load(bins, p1), load(bins, size + p1)
+                br, bi = multiply_add(yi, s1, multiply(yr, c1)), multiply_subtract(yr, s1, multiply(yi, c1))
+                yr, yi = load(bins, p2), load(bins, size + p2)
+                cr, ci = multiply_add(yi, s2, multiply(yr, c2)), multiply_subtract(yr, s2, multiply(yi, c2))
+                yr, yi = load(bins, p3), load(bins, size + p3)
+                dr, di = multiply_add(yi, s3, multiply(yr, c3)), multiply_subtract(yr, s3, multiply(yi, c3))
+                er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
+                gr, gi = add(br, dr), add(bi, di)
+                hr, hi = subtract(di, bi), subtract(br, dr)  # i (b - d)
+                store(bins, p0, add(er, gr))
+                store(bins, size + p0, add(ei, gi))
+                store(bins, p1, add(fr, hr))
+                store(bins, size + p1, add(fi, hi))
+                store(bins, p2, subtract(er, gr))
+                store(bins, size + p2, subtract(ei, gi))
+                store(bins, p3, subtract(fr, hr))
+                store(bins, size + p3, subtract(fi, hi))
+        span *= 4
+    if is_odd:
+        half = vectors // 2
+        for j in range(half):
+            at, to = 8 * j, 8 * (j + half)
+            c, s = load_broadcast(passes, 2 * j), load_broadcast(passes, 2 * j + 1)
+            ar, ai, yr, yi = load(bins, at), load(bins, size + at), load(bins, to), load(bins, size + to)
+            br, bi = multiply_add(yi, s, multiply(yr, c)), multiply_subtract(yr, s, multiply(yi, c))
+            store(bins, at, add(ar, br))
+            store(bins, size + at, add(ai, bi))
+            store(bins, to, subtract(ar, br))
+            store(bins, size + to, subtract(ai, bi))
+
+
+@compiled
+def second_half(bins: int, size: int, twist: int, out: int) -> None:
+    """Write the second half (n,) of the window, the half overlap-save keeps, of what `inverse` left, to `out`."""
+    scale = broadcast(np.float32(-1.0 / size))
+    for n in range(0, size, 8):
+        # -Im((re + i im)(c - i s))
+        part = multiply_subtract(load(bins, n), load(twist, size + n), multiply(load(bins, size + n), load(twist, n)))
+        store(out, n, multiply(part, scale))
+
+
+@compiled
+def _is_odd_power(value: int) -> bool:
+    power = 0
+    while value > 1:
+        value >>= 1
+        power += 1
+    return power % 2 == 1
+
+
+@compiled
+def _load_8(address: int, index: int) -> Any:
+    return (
+        load(address, index),
+        load(address, index + 8),
+        load(address, index + 16),
+        load(address, index + 24),
+        load(address, index + 32),
+        load(address, index + 40),
+        load(address, index + 48),
+        load(address, index + 56),
+    )
+
+
+@compiled
+def _store_8(address: int, index: int, rows: Any) -> None:
+    store(address, index, rows[0])
+    store(address, index + 8, rows[1])
+    store(address, index + 16, rows[2])
+    store(address, index + 24, rows[3])
+    store(address, index + 32, rows[4])
+    store(address, index + 40, rows[5])
+    store(address, index + 48, rows[6])
+    store(address, index + 56, rows[7])
+
+
+@compiled
+def _multiply_8(ar: Any, ai: Any, br: Any, bi: Any) -> Any:
+    return (
+        (
+            multiply_subtract(ai[0], bi[0], multiply(ar[0], br[0])),
+            multiply_subtract(ai[1], bi[1], multiply(ar[1], br[1])),
+            multiply_subtract(ai[2], bi[2], multiply(ar[2], br[2])),
+            multiply_subtract(ai[3], bi[3], multiply(ar[3], br[3])),
+            multiply_subtract(ai[4], bi[4], multiply(ar[4], br[4])),
+            multiply_subtract(ai[5], bi[5], multiply(ar[5], br[5])),
+            multiply_subtract(ai[6], bi[6], multiply(ar[6], br[6])),
+            multiply_subtract(ai[7], bi[7], multiply(ar[7], br[7])),
+        ),
+        (
+            multiply_add(ai[0], br[0], multiply(ar[0], bi[0])),
+            multiply_add(ai[1], br[1], multiply(ar[1], bi[1])),
+            multiply_add(ai[2], br[2], multiply(ar[2], bi[2])),
+            multiply_add(ai[3], br[3], multiply(ar[3], bi[3])),
+            multiply_add(ai[4], br[4], multiply(ar[4], bi[4])),
+            multiply_add(ai[5], br[5], multiply(ar[5], bi[5])),
+            multiply_add(ai[6], br[6], multiply(ar[6], bi[6])),
+            multiply_add(ai[7], br[7], multiply(ar[7], bi[7])),
+        ),
+    )
+
+
+@compiled
+def _multiply_conjugate_8(ar: Any, ai: Any, br: Any, bi: Any) -> Any:
+    return (
+        (
+            multiply_add(ai[0], bi[0], multiply(ar[0], br[0])),
+            multiply_add(ai[1], bi[1], multiply(ar[1], br[1])),
+            multiply_add(ai[2], bi[2], multiply(ar[2], br[2])),
+            multiply_add(ai[3], bi[3], multiply(ar[3], br[3])),
+            multiply_add(ai[4], bi[4], multiply(ar[4], br[4])),
+            multiply_add(ai[5], bi[5], multiply(ar[5], br[5])),
+            multiply_add(ai[6], bi[6], multiply(ar[6], br[6])),
+            multiply_add(ai[7], bi[7], multiply(ar[7], br[7])),
+        ),
+        (
+            multiply_subtract(ar[0], bi[0], multiply(ai[0], br[0])),
+            multiply_subtract(ar[1], bi[1], multiply(ai[1], br[1])),
+            multiply_subtract(ar[2], bi[2], multiply(ai[2], br[2])),
+            multiply_subtract(ar[3], bi[3], multiply(ai[3], br[3])),
+            multiply_subtract(ar[4], bi[4], multiply(ai[4], br[4])),
+            multiply_subtract(ar[5], bi[5], multiply(ai[5], br[5])),
+            multiply_subtract(ar[6], bi[6], multiply(ai[6], br[6])),
+            multiply_subtract(ar[7], bi[7], multiply(ai[7], br[7])),
+        ),
+    )
+
+
+@compiled
+def _four_points(ar: Any, ai: Any, br: Any, bi: Any, cr: Any, ci: Any, dr: Any, di: Any) -> Any:
+    er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
+    gr, gi = add(br, dr), add(bi, di)
+    hr, hi = subtract(bi, di), subtract(dr, br)  # -i (b - d)
+    return (
+        (add(er, gr), add(fr, hr), subtract(er, gr), subtract(fr, hr)),
+        (add(ei, gi), add(fi, hi), subtract(ei, gi), subtract(fi, hi)),
+    )
+
+
+@compiled
+def _eight_points(re: Any, im: Any) -> Any:
+    """The transform of eight points, in order, in every lane."""
+    half = broadcast(np.float32(np.sqrt(0.5)))
+    er, ei = _four_points(re[0], im[0], re[2], im[2], re[4], im[4], re[6], im[6])
+    odd_r, odd_i = _four_points(re[1], im[1], re[3], im[3], re[5], im[5], re[7], im[7])
+    # Turned by exp(-i pi k / 4): k = 1 and 3 need a rotation, k = 2 is -i.
+    ar, ai = odd_r[0], odd_i[0]
+    br, bi = multiply(add(odd_r[1], odd_i[1]), half), multiply(subtract(odd_i[1], odd_r[1]), half)
+    cr, ci = odd_i[2], odd_r[2]  # the imaginary part with the other sign
+    dr, di = multiply(subtract(odd_i[3], odd_r[3]), half), multiply(add(odd_r[3], odd_i[3]), half)  # so here
+    return (
+        (
+            add(er[0], ar),
+            add(er[1], br),
+            add(er[2], cr),
+            add(er[3], dr),
+            subtract(er[0], ar),
+            subtract(er[1], br),
+            subtract(er[2], cr),
+            subtract(er[3], dr),
+        ),
+        (
+            add(ei[0], ai),
+            add(ei[1], bi),
+            subtract(ei[2], ci),
+            subtract(ei[3], di),
+            subtract(ei[0], ai),
+            subtract(ei[1], bi),
+            add(ei[2], ci),
+            add(ei[3], di),
+        ),
+    )

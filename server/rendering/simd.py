@@ -1,0 +1,170 @@
+"""Vectors of eight float32 for compiled code: what a loop over contiguous samples becomes when it must.
+
+LLVM vectorises simple loops by itself, but keeps no accumulators in registers and gives up where it cannot prove that
+arrays do not overlap. The convolver's two inner loops, transform and multiplication, decide what a host can carry, so
+they say what they mean. `Float32x8` is one LLVM vector: one register with AVX, two with SSE or NEON.
+
+Memory is addressed as (byte address, index of a float32): inside a compiled function, of an array, by `.ctypes.data`.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, register_model
+
+LANES = 8
+
+_VECTOR = ir.VectorType(ir.FloatType(), LANES)
+_INT32 = ir.IntType(32)
+_INT64 = ir.IntType(64)
+
+# Lanes of two vectors, 0-7 and 8-15, that the steps of a transposition bring together.
+_LOW_1, _HIGH_1 = [0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]
+_LOW_2, _HIGH_2 = [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]
+_LOW_4, _HIGH_4 = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
+
+
+class Float32x8(types.Type):
+    def __init__(self) -> None:
+        super().__init__("Float32x8")
+
+
+float32x8 = Float32x8()
+
+
+@register_model(Float32x8)
+class _Float32x8Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, front_end_type: Any) -> None:
+        super().__init__(manager, front_end_type, _VECTOR)
+
+
+def _pointer(builder: Any, address: Any, index: Any, to: Any, size: int) -> Any:
+    return builder.inttoptr(builder.add(address, builder.mul(index, ir.Constant(_INT64, size))), to.as_pointer())
+
+
+def _shuffle(builder: Any, a: Any, b: Any, lanes: list[int]) -> Any:
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT32, len(lanes)), lanes))
+
+
+@intrinsic
+def pointer(_context: Any, _address: Any) -> Any:
+    """An address as `numba.carray` takes it."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
+
+    return types.voidptr(types.int64), generate
+
+
+@intrinsic
+def load(_context: Any, _address: Any, _index: Any) -> Any:
+    """The eight floats from `index` on."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.load(_pointer(builder, *args, _VECTOR, 4), align=4)
+
+    return float32x8(types.int64, types.int64), generate
+
+
+@intrinsic
+def store(_context: Any, _address: Any, _index: Any, _value: Any) -> Any:
+    def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        builder.store(args[2], _pointer(builder, args[0], args[1], _VECTOR, 4), align=4)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, float32x8), generate
+
+
+@intrinsic
+def load_int(_context: Any, _address: Any, _index: Any) -> Any:
+    """One int64; `index` counts int64."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.load(_pointer(builder, *args, _INT64, 8), align=8)
+
+    return types.int64(types.int64, types.int64), generate
+
+
+@intrinsic
+def broadcast(_context: Any, _value: Any) -> Any:
+    """One float32 in every lane."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        undefined = ir.Constant(_VECTOR, ir.Undefined)
+        first = builder.insert_element(undefined, args[0], ir.Constant(_INT32, 0))
+        return _shuffle(builder, first, undefined, [0] * LANES)
+
+    return float32x8(types.float32), generate
+
+
+@intrinsic
+def load_broadcast(_context: Any, _address: Any, _index: Any) -> Any:
+    """The float at `index` in every lane."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        value = builder.load(_pointer(builder, *args, ir.FloatType(), 4), align=4)
+        undefined = ir.Constant(_VECTOR, ir.Undefined)
+        first = builder.insert_element(undefined, value, ir.Constant(_INT32, 0))
+        return _shuffle(builder, first, undefined, [0] * LANES)
+
+    return float32x8(types.int64, types.int64), generate
+
+
+def _binary(instruction: str) -> Callable[..., Any]:
+    @intrinsic
+    def operation(_context: Any, _a: Any, _b: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            return getattr(builder, instruction)(*args)
+
+        return float32x8(float32x8, float32x8), generate
+
+    return operation
+
+
+add = _binary("fadd")
+subtract = _binary("fsub")
+multiply = _binary("fmul")
+
+
+def _fused(negate_product: bool) -> Callable[..., Any]:
+    @intrinsic
+    def operation(_context: Any, _a: Any, _b: Any, _c: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
+            fused = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{LANES}f32")
+            a, b, c = args
+            return builder.call(fused, (builder.fneg(a) if negate_product else a, b, c))
+
+        return float32x8(float32x8, float32x8, float32x8), generate
+
+    return operation
+
+
+multiply_add = _fused(negate_product=False)
+"""a b + c, rounded once."""
+multiply_subtract = _fused(negate_product=True)
+"""c - a b, rounded once."""
+
+
+@intrinsic
+def transpose(_context: Any, _rows: Any) -> Any:
+    """Eight vectors as the rows of a matrix; its columns."""
+    rows_type = types.UniTuple(float32x8, LANES)
+
+    def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        rows = cgutils.unpack_tuple(builder, args[0], LANES)
+        # Pairs of rows, then of pairs, then of fours; within halves of a register but for the last step.
+        pairs = [_shuffle(builder, rows[i], rows[i + 1], lanes) for i in (0, 2, 4, 6) for lanes in (_LOW_1, _HIGH_1)]
+        fours = [
+            _shuffle(builder, pairs[i + j], pairs[i + j + 2], lanes)
+            for i in (0, 4)
+            for j in (0, 1)
+            for lanes in (_LOW_2, _HIGH_2)
+        ]
+        columns = [_shuffle(builder, fours[i], fours[i + 4], lanes) for lanes in (_LOW_4, _HIGH_4) for i in range(4)]
+        return context.make_tuple(builder, rows_type, columns)
+
+    return rows_type(rows_type), generate
