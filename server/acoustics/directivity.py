@@ -20,6 +20,7 @@ Gains = npt.NDArray[np.float64]
 GAIN_FLOOR_DB = -60.0
 _LARGEST_GAIN_DB = 40.0
 _SHARPEST_ORDER = 32.0
+_FLOOR = float(db_to_amplitude(GAIN_FLOOR_DB))
 _BANDS = len(OCTAVE_BANDS_HZ)
 
 
@@ -42,8 +43,10 @@ class Cardioid:
     def gain_db(self, directions: npt.ArrayLike) -> Gains:
         """(..., 3) -> (..., band)."""
         ahead = np.asarray(directions, dtype=np.float64)[..., :1]
+        if self.omni_share == 1:
+            return np.zeros((*ahead.shape[:-1], _BANDS))
         amplitude = np.abs(self.omni_share + (1 - self.omni_share) * ahead) ** self.order
-        gain = amplitude_to_db(np.maximum(amplitude, db_to_amplitude(GAIN_FLOOR_DB)))
+        gain = amplitude_to_db(np.maximum(amplitude, _FLOOR))
         return np.repeat(gain, _BANDS, axis=-1)
 
     @cached_property

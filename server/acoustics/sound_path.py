@@ -116,7 +116,7 @@ class SoundPathFinder:
 
         arrival = np.where(in_sight[:, None], towards, leg(listener, first[last], rise))
         departure = np.where(in_sight[:, None], -towards, leg(emitters, last, -rise))
-        detour = np.where(in_sight, -self._clearance_m(listener, emitters, from_listener, from_emitters), excess)
+        detour = np.where(in_sight, -self._clearance_m(listener, emitters, from_listener), excess)
         return SoundPaths(
             length, arrival, departure, excess, in_sight, screen_gain_db(2 * detour[:, None] / self._wavelengths_m)
         )
@@ -128,18 +128,20 @@ class SoundPathFinder:
         reached = self._plan.is_visible(points[..., None, :], level) & (distance >= COINCIDENT_M)
         return np.where(reached, distance, np.inf)
 
-    def _clearance_m(self, listener: Floats, emitters: Floats, from_listener: Floats, from_emitters: Floats) -> Floats:
-        """(n,) how much farther than the straight line it is over the nearest corner that both ends see.
+    def _clearance_m(self, listener: Floats, emitters: Floats, from_listener: Floats) -> Floats:
+        """(n,) how much farther than the straight line it is over the nearest corner, for emitters in sight.
 
         Divided by the cosine of the turn at the corner: next to 1 where the line grazes it, and without end where one
         would turn by a right angle or more, since such a corner is beside the line and screens nothing. The nearest
-        corner changes without a jump: where one is hidden by another, the other is as near and both ends see it.
+        corner changes without a jump, and it is enough to ask which corners the listener sees: whatever hides one from
+        the emitter stands in the triangle of the three, so it has a corner that is nearer and that both see.
         """
-        both = from_listener + from_emitters
-        seen = np.isfinite(both)
+        from_emitters = np.linalg.norm(emitters[:, None, :2] - self._bends, axis=-1)
+        seen = np.isfinite(from_listener) & (from_emitters >= COINCIDENT_M)
+        from_listener = np.where(seen, from_listener, 1.0)
         ahead = -np.sum((listener[:2] - self._bends) * (emitters[:, None, :2] - self._bends), axis=-1)
-        cosine = np.where(seen, ahead, 0.0) / np.where(seen, from_listener * from_emitters, 1.0)
+        cosine = np.where(seen, ahead, 0.0) / (from_listener * np.where(seen, from_emitters, 1.0))
         offset = emitters - listener
-        longer = np.hypot(np.where(seen, both, 0.0), offset[:, 2:]) - np.linalg.norm(offset, axis=-1)[:, None]
+        longer = np.hypot(from_listener + from_emitters, offset[:, 2:]) - np.linalg.norm(offset, axis=-1)[:, None]
         detour = np.maximum(0.0, longer) / np.where(cosine > 0, cosine, 1.0)
         return np.asarray(np.min(np.where(cosine > 0, detour, np.inf), axis=-1, initial=np.inf))

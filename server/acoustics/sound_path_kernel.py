@@ -68,14 +68,12 @@ def _screen_gain_db(fresnel_number: float) -> float:
 
 
 @compiled
-def _clearance_m(
-    corners: Floats, bends: Floats, from_listener: Floats, listener: Floats, emitter: Floats, widest_m: float
-) -> float:
-    """As SoundPathFinder's, for one emitter in sight: `widest_m` where every corner is farther off than that."""
+def _clearance_m(bends: Floats, from_listener: Floats, listener: Floats, emitter: Floats) -> float:
+    """As SoundPathFinder's, for one emitter in sight."""
     plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
     rise = emitter[2] - listener[2]
     straight = math.hypot(plan, rise)
-    clearance = widest_m
+    clearance = np.inf
     for bend in range(len(bends)):
         to_listener = from_listener[bend]
         x, y = bends[bend]
@@ -86,9 +84,7 @@ def _clearance_m(
         if ahead <= 0:
             continue
         detour = math.hypot(to_listener + to_emitter, rise) - straight
-        detour = max(0.0, detour) * to_listener * to_emitter / ahead
-        if detour < clearance and _is_visible(corners, emitter[0], emitter[1], x, y):
-            clearance = detour
+        clearance = min(clearance, max(0.0, detour) * to_listener * to_emitter / ahead)
     return clearance
 
 
@@ -109,8 +105,6 @@ def find_sound_paths(
 ) -> None:
     """Fills the last six, one row per emitter; see SoundPaths."""
     count = len(bends)
-    # Twice what the longest wave takes notice of, so that rounding leaves exactly 0 dB beyond it.
-    widest_m = -CLEAR_FRESNEL_NUMBER * wavelengths_m.max()
     # Over plan: to each corner that the listener sees, and to each corner round whichever others, the first of them.
     from_listener, to_bend = np.full(count, np.inf), np.full(count, np.inf)
     first = np.zeros(count, np.int64)
@@ -152,7 +146,7 @@ def find_sound_paths(
                     arrival[row, axis] = (emitter[axis] - listener[axis]) / straight
             for axis in range(3):
                 departure[row, axis] = -arrival[row, axis]
-            detour = -_clearance_m(corners, bends, from_listener, listener, emitter, widest_m)
+            detour = -_clearance_m(bends, from_listener, listener, emitter)
         else:
             length = math.hypot(around, rise)
             length_m[row], excess_m[row] = length, max(0.0, length - straight)
