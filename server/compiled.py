@@ -1,13 +1,22 @@
 """Compilation of hot loops, where numba is installed; elsewhere each has a NumPy counterpart.
 
-Compiled code runs without the interpreter's lock, follows NumPy's rules for division by zero, and is kept on disk.
+Compiled code runs without the interpreter's lock, follows NumPy's rules for division by zero, and is kept on disk: in
+NUMBA_CACHE_DIR if that is set, else beside the source, else in the user's cache folder. Numba by itself would take code
+for fresh as long as the one file is unchanged that a function is written in; here it is fresh as long as no module that
+holds compiled code has changed. A folder that cannot be written, as in a container, is read all the same.
 """
 
+import hashlib
+import os
+import tempfile
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 try:
     import numba
+    from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
 except ImportError:  # a Python too new for it, or a platform it is not built for
     numba = None
 
@@ -20,4 +29,64 @@ def compiled(function: Function) -> Function:
     """Compile on first call; without numba, the function as it is."""
     if numba is None:
         return function
-    return numba.njit(nogil=True, cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    dispatcher._cache = _Cache(function)
+    return dispatcher  # type: ignore[no-any-return]
+
+
+@cache
+def _digest_of_sources() -> str:
+    """Of every module beside this one that says "compiled"."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("**/*.py")):
+        source = path.read_bytes()
+        if b"compiled" in source:
+            digest.update(source)
+    return digest.hexdigest()
+
+
+@cache
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+if numba is not None:
+
+    class _Locator(_CacheLocator):  # type: ignore[misc]
+        def __init__(self, function: Callable[..., Any], file: str) -> None:
+            self._line = function.__code__.co_firstlineno
+            beside = Path(file).parent / "__pycache__"
+            if "NUMBA_CACHE_DIR" in os.environ:
+                self._folder = Path(os.environ["NUMBA_CACHE_DIR"]) / "nafir" / beside.parent.name
+            elif _is_writable(beside) or any(beside.glob("*.nbi")):
+                self._folder = beside
+            else:
+                self._folder = Path(UserWideCacheLocator(function, file).get_cache_path())
+
+        def get_cache_path(self) -> str:
+            return str(self._folder)
+
+        def get_source_stamp(self) -> str:
+            return _digest_of_sources()
+
+        def get_disambiguator(self) -> str:
+            return str(self._line)
+
+        @classmethod
+        def from_function(cls, function: Callable[..., Any], file: str) -> "_Locator":
+            return cls(function, file)
+
+    class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
+        _locator_classes = (_Locator,)
+
+    class _Cache(FunctionCache):  # type: ignore[misc]
+        _impl_class = _CacheFiles
+
+        def save_overload(self, signature: Any, result: Any) -> None:
+            if _is_writable(Path(self.cache_path)):
+                super().save_overload(signature, result)

@@ -1,0 +1,81 @@
+"""Compiled code is kept on disk, and never outlives its source."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import server
+
+MODULES = {
+    "server/__init__.py": "",
+    "server/inner.py": "from server.compiled import compiled\n\n@compiled\ndef inner(x):\n    return x + 1\n",
+    "server/outer.py": (
+        "from server.compiled import compiled\nfrom server.inner import inner\n\n"
+        "@compiled\ndef outer(x):\n    return 10 * inner(x)\n"
+    ),
+}
+RUN = "from server.outer import outer; print(outer(1), sum(outer.stats.cache_hits.values()))"
+
+
+@pytest.fixture
+def package(tmp_path):
+    for name, source in MODULES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(source)
+    shutil.copy(Path(server.__file__).parent / "compiled.py", tmp_path / "server")
+    return tmp_path
+
+
+def run(package, **environment):
+    """What `outer(1)` gives, and whether it came from disk."""
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
+    environment["PYTHONPATH"] = str(package)
+    output = subprocess.run(
+        [sys.executable, "-c", RUN], cwd=package, env=environment, check=True, capture_output=True, text=True
+    )
+    value, hits = output.stdout.split()
+    return int(value), int(hits)
+
+
+def test_a_second_start_compiles_nothing(package):
+    assert run(package) == (20, 0)
+    assert run(package) == (20, 1)
+    assert list((package / "server" / "__pycache__").glob("outer.outer-*.nbc"))
+
+
+def test_a_change_in_a_function_called_is_heeded(package):
+    assert run(package) == (20, 0)
+    inner = package / "server" / "inner.py"
+    inner.write_text(inner.read_text().replace("x + 1", "x + 2"))
+    assert run(package) == (30, 0)
+
+
+def test_the_folder_can_be_chosen(package, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cache")
+    assert run(package, NUMBA_CACHE_DIR=str(folder)) == (20, 0)
+    assert run(package, NUMBA_CACHE_DIR=str(folder)) == (20, 1)
+    assert list(folder.glob("**/*.nbc"))
+    assert not list(package.glob("**/*.nbc"))
+
+
+def test_where_nothing_can_be_written_what_is_there_is_read(package):
+    """A folder is made unwritable for anyone, root too, by a file in its place, or by what fills it being elsewhere."""
+    assert run(package) == (20, 0)
+    check = (
+        "import server.compiled as c; c._is_writable = lambda folder: False; "
+        "import server.outer as o; print(o.outer(1), sum(o.outer.stats.cache_hits.values()))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(package)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    files = sorted(package.glob("**/*.nb?"))
+    for expected, prepare in (("20 1", lambda: None), ("20 0", lambda: [path.unlink() for path in files])):
+        prepare()
+        output = subprocess.run(
+            [sys.executable, "-c", check], cwd=package, env=environment, check=True, capture_output=True, text=True
+        )
+        assert output.stdout.strip() == expected
+    assert not list(package.glob("**/*.nbc"))
