@@ -1,4 +1,4 @@
-"""Head-related transfer functions read from SOFA, as spectra ready to multiply.
+"""Head-related transfer functions: as spectra ready to multiply, and as filters ready to interpolate.
 
 Directions are unit vectors in the head's frame (x ahead, y left, z up). Ear 0 is the left one: checked by energy,
 because the receiver order written in public files is not reliable.
@@ -10,9 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import sofar
 import soxr
 from scipy.spatial import cKDTree
+
+from server.acoustics.minimum_phase import excess_delays_samples, folded_cepstrum
+from server.rendering.sofa import HeadMeasurements, HrtfError, read_sofa
+from server.rendering.sphere import CoverageError, Triangulation, fill_gaps, solid_angles, triangulate
+
+_Floats = npt.NDArray[np.float64]
 
 KEMAR = Path(__file__).parent / "hrtf_data" / "mit_kemar_normal_pinna.sofa"
 
@@ -20,14 +25,22 @@ _TAPER_S = 0.0005
 _LEAD_S = 0.001
 _LENGTH_S = 0.0045
 
+_LEVEL_RATE = 24_000
+"""Level is measured in the band of this rate, so that it is the same at every rate."""
+
+_FILTER_S = 0.004
+"""KEMAR's responses truncated here keep their magnitude to 0.01 dB; at 2.7 ms one percent of it is off by 1 dB."""
+_TAPS_MULTIPLE = 8
+_FLOOR = 1e-5  # of the loudest frequency of a response: no file is accurate below -100 dB
+
 
 @dataclass(frozen=True)
 class Hrtf:
     """`impulse_responses` is (direction, ear, sample); sample `lead_samples` is the moment the wave passes the
-    head's centre."""
+    head's centre: when a source ahead begins to be heard, beyond what its magnitude delays."""
 
-    directions: npt.NDArray[np.float64]
-    impulse_responses: npt.NDArray[np.float64]
+    directions: _Floats
+    impulse_responses: _Floats
     sample_rate: int
     lead_samples: int
 
@@ -36,41 +49,96 @@ class Hrtf:
         """Reads a SimpleFreeFieldHRIR file, resampled, levelled to unit diffuse-field energy and cut to the head's
         response.
 
-        Raises ValueError if the file's ears cannot be told apart at azimuth 90 degrees.
+        Raises HrtfError if the file cannot be used, or its ears cannot be told apart at azimuth 90 degrees.
         """
-        sofa = sofar.read_sofa(str(path), verify=False, verbose=False)
-        responses = soxr.resample(
-            np.moveaxis(np.asarray(sofa.Data_IR, dtype=np.float64), -1, 0).reshape(sofa.Data_IR.shape[-1], -1),
-            float(sofa.Data_SamplingRate),
-            sample_rate,
-        )
-        responses = np.moveaxis(responses.reshape(-1, *sofa.Data_IR.shape[:2]), 0, -1)
-        azimuth, elevation = np.radians(np.asarray(sofa.SourcePosition)[:, :2]).T
-        directions = np.stack(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
-        )
-        at_left = np.sum(responses[np.argmax(directions[:, 1])] ** 2, axis=-1)
+        measured = read_sofa(path)
+        try:
+            triangulate(fill_gaps(measured.directions)[0])
+        except CoverageError as exc:
+            raise HrtfError(path, str(exc)) from exc
+        at_left = np.sum(measured.responses[np.argmax(measured.directions[:, 1])] ** 2, axis=-1)
         if not at_left.max() > 2 * at_left.min():
-            raise ValueError(f"{path}: the ears sound alike at azimuth 90 degrees; not a free-field HRIR")
-        if at_left[1] > at_left[0]:
-            responses = responses[:, ::-1]
-        ahead = responses[np.argmax(directions[:, 0])]
-        onset = int(np.min(np.argmax(np.abs(ahead) > 0.1 * np.max(np.abs(ahead)), axis=-1)))
-        lead, length = round(_LEAD_S * sample_rate), round(_LENGTH_S * sample_rate)
-        padded = np.pad(responses, ((0, 0), (0, 0), (lead, length)))[..., onset : onset + length]
-        taper = round(_TAPER_S * sample_rate)
-        fade = 0.5 + 0.5 * np.cos(np.pi * np.arange(taper) / taper)
-        padded[..., -taper:] *= fade
-        padded[..., :taper] *= fade[::-1]
-        padded /= np.sqrt(np.mean(np.sum(padded**2, axis=-1)))
-        return cls(directions, padded, sample_rate, lead)
+            raise HrtfError(path, "the ears sound alike at azimuth 90 degrees; not a free-field HRIR")
+        swapped = bool(at_left[1] > at_left[0])
+        reference = _cut(measured, _LEVEL_RATE, swapped)
+        energy = np.mean(np.sum(reference**2, axis=-1), axis=-1)
+        responses = reference if sample_rate == _LEVEL_RATE else _cut(measured, sample_rate, swapped)
+        gain = _LEVEL_RATE / sample_rate / np.sqrt(np.sum(solid_angles(measured.directions) * energy))
+        return cls(measured.directions, responses * gain, sample_rate, round(_LEAD_S * sample_rate))
 
     @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.directions)
 
-    def spectra(self, directions: npt.NDArray[np.float64], n_fft: int) -> npt.NDArray[np.complex128]:
+    def spectra(self, directions: _Floats, n_fft: int) -> npt.NDArray[np.complex128]:
         """(..., ear, bin) spectrum of the measured direction nearest to each; time zero is the head's centre."""
         _, nearest = self._tree.query(directions)
         advance = np.exp(2j * np.pi * np.fft.rfftfreq(n_fft) * self.lead_samples)
         return np.asarray((np.fft.rfft(self.impulse_responses, n_fft) * advance)[nearest])
+
+
+def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats:
+    """(direction, ear, sample): the head's response alone, tapered at both ends."""
+    count, ears, samples = measured.responses.shape
+    in_rows = measured.responses.reshape(-1, samples).T
+    resampled = (
+        soxr.resample(in_rows, measured.sample_rate, sample_rate) if measured.sample_rate != sample_rate else in_rows
+    )
+    responses = resampled.T.reshape(count, ears, -1)
+    if swapped:
+        responses = responses[:, ::-1]
+    lead, length, taper = (round(time_s * sample_rate) for time_s in (_LEAD_S, _LENGTH_S, _TAPER_S))
+    ahead = responses[np.argmax(measured.directions[:, 0])]
+    centre = round(float(np.mean(excess_delays_samples(ahead, sample_rate))))
+    before = max(0, lead - centre)
+    padded = np.pad(responses, ((0, 0), (0, 0), (before, length)))
+    start = centre - lead + before
+    cut = padded[..., start : start + length].copy()
+    fade = 0.5 + 0.5 * np.cos(np.pi * np.arange(taper) / taper)
+    cut[..., -taper:] *= fade
+    cut[..., :taper] *= fade[::-1]
+    return np.asarray(cut)
+
+
+@dataclass(frozen=True)
+class HeadFilters:
+    """What a head does to a sound in a form that can be interpolated: minimum phase and delay, per direction.
+
+    `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear) after the wave passes the head's centre.
+    Between directions, logarithms of magnitude and delays are interpolated over spherical triangles.
+    """
+
+    sample_rate: int
+    directions: _Floats
+    cepstra: npt.NDArray[np.float32]
+    delays_s: _Floats
+    triangulation: Triangulation
+
+    @classmethod
+    def from_hrtf(cls, hrtf: Hrtf, taps: int | None = None) -> "HeadFilters":
+        """`taps` are 4 ms unless given; a multiple of 8 is fastest."""
+        if taps is None:
+            taps = -(-round(_FILTER_S * hrtf.sample_rate) // _TAPS_MULTIPLE) * _TAPS_MULTIPLE
+        responses = hrtf.impulse_responses
+        n_fft = 8 * 2 ** int(np.ceil(np.log2(max(responses.shape[-1], taps))))
+        magnitude = np.abs(np.fft.rfft(responses, n_fft))
+        magnitude = np.maximum(magnitude, _FLOOR * magnitude.max(axis=-1, keepdims=True))
+        cepstra = folded_cepstrum(np.log(magnitude))[..., :taps]
+        delays_s = (excess_delays_samples(responses, hrtf.sample_rate) - hrtf.lead_samples) / hrtf.sample_rate
+        directions, shares = fill_gaps(hrtf.directions)
+        cepstra = np.concatenate([cepstra, np.einsum("gd,det->get", shares, cepstra)])
+        delays_s = np.concatenate([delays_s, shares @ delays_s])
+        return cls(hrtf.sample_rate, directions, cepstra.astype(np.float32), delays_s, triangulate(directions))
+
+    @property
+    def taps(self) -> int:
+        return int(self.cepstra.shape[-1])
+
+    @cached_property
+    def longest_advance_s(self) -> float:
+        """How much before the head's centre an ear can hear."""
+        return float(max(0.0, -self.delays_s.min()))
+
+    @cached_property
+    def longest_delay_s(self) -> float:
+        return float(max(0.0, self.delays_s.max()))

@@ -1,13 +1,21 @@
+"""Heads read from SOFA files: KEMAR, and spheres written here with sofar in every form the convention allows."""
+
 import shutil
+import subprocess
+import sys
 
 import h5py
 import numpy as np
 import pytest
+import sofar
+from scipy.signal import butter, sosfiltfilt
 
-from server.acoustics.decibels import power_to_db
-from server.rendering.hrtf import KEMAR, Hrtf
+from server.acoustics.decibels import amplitude_to_db, power_to_db
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.sofa import HrtfError, read_sofa
 
 HEAD_RADIUS_M = 0.0875
+SPEED_OF_SOUND = 343.0
 
 
 def towards(azimuth_deg):
@@ -39,7 +47,25 @@ def test_the_near_ear_is_the_louder(kemar):
 
 
 def test_diffuse_field_has_unit_energy(kemar):
-    assert np.mean(np.sum(kemar.impulse_responses**2, axis=-1)) == pytest.approx(1)
+    everywhere = np.random.default_rng(1).standard_normal((20_000, 3))
+    responses = np.fft.irfft(kemar.spectra(everywhere / np.linalg.norm(everywhere, axis=-1, keepdims=True), 256))
+    assert power_to_db(np.mean(np.sum(responses**2, axis=-1))) == pytest.approx(0, abs=0.05)
+
+
+@pytest.mark.parametrize("sample_rate", [16_000, 44_100, 48_000])
+def test_level_is_the_same_at_every_rate(kemar, sample_rate):
+    hrtf = Hrtf.read(KEMAR, sample_rate)
+    for frequency in (500, 1000, 2000, 5000):
+        levels = [
+            np.abs(
+                h.impulse_responses
+                @ np.exp(-2j * np.pi * frequency / h.sample_rate * np.arange(h.impulse_responses.shape[-1]))
+            )
+            for h in (kemar, hrtf)
+        ]
+        # The far ear's notches are as deep as the window is long.
+        difference = amplitude_to_db(levels[1] / levels[0])[levels[0] > 0.1]
+        assert np.abs(difference).max() < 0.2
 
 
 @pytest.mark.parametrize("sample_rate", [16_000, 24_000, 44_100, 48_000])
@@ -64,5 +90,215 @@ def test_a_file_with_one_signal_in_both_ears_is_refused(tmp_path):
     shutil.copy(KEMAR, mono)
     with h5py.File(mono, "r+") as file:
         file["Data.IR"][...] = np.repeat(file["Data.IR"][:, :1], 2, axis=1)
-    with pytest.raises(ValueError, match="alike"):
+    with pytest.raises(HrtfError, match="alike"):
         Hrtf.read(mono, 24_000)
+
+
+def sphere_directions(count=50):
+    """Fibonacci's lattice; every direction differs from all others."""
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * index
+    return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=-1)
+
+
+def sphere_delays_s(directions):
+    """(direction, ear) after the centre: Woodworth's, along the ray to the near side and around to the far one."""
+    lateral = directions[:, 1]
+    angle = np.arcsin(lateral)
+    near, far = -HEAD_RADIUS_M / SPEED_OF_SOUND * np.abs(lateral), HEAD_RADIUS_M / SPEED_OF_SOUND * np.abs(angle)
+    return np.where((lateral > 0)[:, None], np.stack([near, far], -1), np.stack([far, near], -1))
+
+
+def spherical(directions, *, scale=180 / np.pi, radius=1.5):
+    x, y, z = directions.T
+    return np.stack([np.arctan2(y, x) * scale, np.arcsin(z) * scale, np.full(len(x), radius)], axis=-1)
+
+
+@pytest.fixture
+def write_sphere(tmp_path):
+    """Writes the responses of a sphere whose far ear is quieter; returns the path. Anything of the file can be set."""
+
+    def write(directions=None, *, rate=48_000, delay_in_file=False, name="sphere.sofa", swap=False, **variables):
+        directions = sphere_directions() if directions is None else directions
+        delays = (0.001 + sphere_delays_s(directions)) * rate
+        samples, n_fft = 256, 1024
+        shift = 0 * delays if delay_in_file else delays
+        spectra = np.exp(-2j * np.pi * np.fft.rfftfreq(n_fft) * (shift[..., None] + 20))
+        smooth = butter(2, 0.3, output="sos")
+        responses = sosfiltfilt(smooth, np.fft.irfft(spectra, n_fft), axis=-1)[..., :samples]
+        responses *= (1 + 0.8 * directions[:, 1:2] * np.array([1, -1]))[..., None]
+        sofa = sofar.Sofa("SimpleFreeFieldHRIR")
+        sofa.Data_IR = responses[:, ::-1] if swap else responses
+        sofa.Data_Delay = delays if delay_in_file else np.zeros((1, 2))
+        sofa.Data_SamplingRate = rate
+        sofa.SourcePosition = spherical(directions)
+        units = variables.pop("unchecked_units", None)
+        for variable, value in variables.items():
+            setattr(sofa, variable, value)
+        sofar.write_sofa(str(tmp_path / name), sofa)
+        if units:  # sofar writes degrees only
+            with h5py.File(tmp_path / name, "r+") as file:
+                file["SourcePosition"].attrs["Units"] = units
+        return tmp_path / name
+
+    return write
+
+
+def assert_is_the_sphere(hrtf, *, directions=None):
+    directions = sphere_directions() if directions is None else directions
+    filters = HeadFilters.from_hrtf(hrtf)
+    expected = sphere_delays_s(directions)
+    between = np.diff(expected, axis=-1)[:, 0]
+    for direction, delay in zip(directions, between, strict=True):
+        found = np.argmax(filters.directions @ direction)
+        np.testing.assert_allclose(filters.directions[found], direction, atol=1e-6)
+        assert np.diff(filters.delays_s[found])[0] == pytest.approx(delay, abs=5e-6)
+    by_side = np.sum(hrtf.impulse_responses[np.abs(hrtf.directions[:, 1]) > 0.5] ** 2, axis=-1)
+    left = hrtf.directions[np.abs(hrtf.directions[:, 1]) > 0.5][:, 1] > 0
+    assert ((by_side[:, 0] > by_side[:, 1]) == left).all()
+
+
+@pytest.mark.parametrize("sample_rate", [24_000, 48_000])
+@pytest.mark.parametrize(
+    "form",
+    [
+        {},
+        {"rate": 44_100},
+        {"rate": 96_000},
+        {"swap": True},
+        {"delay_in_file": True},
+        {
+            "SourcePosition": 2.0 * sphere_directions(),
+            "SourcePosition_Type": "cartesian",
+            "SourcePosition_Units": "metre",
+        },
+        {"SourcePosition": spherical(sphere_directions(), scale=1.0), "unchecked_units": "radian, radian, metre"},
+        # The listener looks along y: everything is turned a quarter round.
+        {
+            "SourcePosition": (2.0 * sphere_directions())[:, [1, 0, 2]] * [-1, 1, 1] + [1.0, 2.0, 3.0],
+            "SourcePosition_Type": "cartesian",
+            "SourcePosition_Units": "metre",
+            "ListenerPosition": [1.0, 2.0, 3.0],
+            "ListenerView": [0.0, 1.0, 0.0],
+        },
+        {"ReceiverPosition": [[0.0, -0.09, 0.0], [0.0, 0.09, 0.0]]},
+    ],
+    ids=[
+        "plain",
+        "44.1 kHz",
+        "96 kHz",
+        "swapped",
+        "Data.Delay",
+        "cartesian",
+        "radian",
+        "turned",
+        "receivers mislabelled",
+    ],
+)
+def test_every_form_of_the_convention_reads_as_the_same_sphere(write_sphere, form, sample_rate):
+    assert_is_the_sphere(Hrtf.read(write_sphere(**form), sample_rate))
+
+
+def test_of_several_distances_the_farthest_counts(write_sphere):
+    directions = np.repeat(sphere_directions(), 2, axis=0)
+    positions = spherical(directions)
+    positions[::2, 2] = 0.3
+    path = write_sphere(directions, SourcePosition=positions)
+    measured = read_sofa(path)
+    assert len(measured.directions) == 50
+    np.testing.assert_allclose(measured.responses, sofar.read_sofa(str(path), verbose=False).Data_IR[1::2])
+
+
+def test_a_ring_around_the_head_is_enough(write_sphere):
+    azimuth = np.radians(np.arange(0, 360, 15) + 0.5)
+    ring = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=-1)
+    filters = HeadFilters.from_hrtf(Hrtf.read(write_sphere(ring), 24_000))
+    above = np.argmax(filters.directions[:, 2])
+    assert filters.directions[above, 2] == 1
+    assert np.diff(filters.delays_s[above])[0] == pytest.approx(0, abs=20e-6)
+
+
+def test_few_directions_will_do(write_sphere):
+    axes = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
+    filters = HeadFilters.from_hrtf(Hrtf.read(write_sphere(axes), 24_000))
+    assert np.isfinite(filters.cepstra).all()
+    assert np.isfinite(filters.delays_s).all()
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(HrtfError, match=r"nowhere\.sofa: no such file"):
+        Hrtf.read(tmp_path / "nowhere.sofa", 24_000)
+
+
+def test_a_file_of_another_suffix_is_not_mistaken_for_its_neighbour(write_sphere, tmp_path):
+    write_sphere()
+    other = tmp_path / "sphere.txt"
+    other.write_text("not a head")
+    with pytest.raises(HrtfError, match=r"ends in \.sofa"):
+        Hrtf.read(other, 24_000)
+
+
+def test_a_file_that_is_not_sofa_is_refused(tmp_path):
+    path = tmp_path / "text.sofa"
+    path.write_text("not a head")
+    with pytest.raises(HrtfError, match=r"text\.sofa: not a readable SOFA file"):
+        Hrtf.read(path, 24_000)
+
+
+def test_another_convention_is_refused_by_name(tmp_path):
+    sofa = sofar.Sofa("GeneralFIR")
+    sofa.Data_IR = np.ones((5, 2, 16))
+    sofa.Data_Delay = np.zeros((1, 2))
+    sofa.SourcePosition = np.eye(5, 3)
+    sofa.ReceiverPosition = np.zeros((2, 3))
+    sofar.write_sofa(str(tmp_path / "general.sofa"), sofa)
+    with pytest.raises(HrtfError, match="convention is GeneralFIR, not SimpleFreeFieldHRIR"):
+        Hrtf.read(tmp_path / "general.sofa", 24_000)
+
+
+def test_too_few_directions_are_refused(write_sphere):
+    with pytest.raises(HrtfError, match="it has 3 directions"):
+        Hrtf.read(write_sphere(sphere_directions(3)), 24_000)
+
+
+def test_samples_that_are_not_finite_are_refused(write_sphere):
+    path = write_sphere()
+    with h5py.File(path, "r+") as file:
+        file["Data.IR"][7, 1, 30] = np.inf
+    with pytest.raises(HrtfError, match="not finite"):
+        Hrtf.read(path, 24_000)
+
+
+@pytest.mark.parametrize("delay", [np.nan, 1e9])
+def test_absurd_delays_are_refused(write_sphere, delay):
+    path = write_sphere(delay_in_file=True)
+    with h5py.File(path, "r+") as file:
+        file["Data.Delay"][3, 0] = delay
+    with pytest.raises(HrtfError, match=r"Data\.Delay"):
+        Hrtf.read(path, 24_000)
+
+
+def test_silence_in_one_direction_is_refused(write_sphere):
+    path = write_sphere()
+    with h5py.File(path, "r+") as file:
+        file["Data.IR"][7] = 0
+    with pytest.raises(HrtfError, match="silent"):
+        Hrtf.read(path, 24_000)
+
+
+def test_more_than_two_receivers_are_refused(tmp_path):
+    sofa = sofar.Sofa("SimpleFreeFieldHRIR")
+    sofa.Data_IR = np.ones((50, 3, 64))
+    sofa.Data_Delay = np.zeros((1, 3))
+    sofa.SourcePosition = spherical(sphere_directions())
+    sofa.ReceiverPosition = np.zeros((3, 3))
+    sofar.write_sofa(str(tmp_path / "array.sofa"), sofa)
+    with pytest.raises(HrtfError, match="3 receivers, not two ears"):
+        Hrtf.read(tmp_path / "array.sofa", 24_000)
+
+
+def test_the_server_starts_without_reading_conventions_or_reaching_for_the_network():
+    """Only a file that is read may cost the import of sofar."""
+    code = "import sys, server.rendering.hrtf; sys.exit(bool({'sofar', 'netCDF4', 'requests'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

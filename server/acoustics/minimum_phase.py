@@ -1,0 +1,58 @@
+"""Minimum phase by the cepstrum: the filter of a given magnitude whose energy comes as early as it can.
+
+A folded cepstrum is the power series of the logarithm of a causal minimum-phase filter, log H(z) = sum_n c[n] z**-n
+(Oppenheim & Schafer, "Discrete-Time Signal Processing", ch. 13). Magnitudes multiply where folded cepstra add.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+_Floats = npt.NDArray[np.float64]
+
+_ITD_BAND_HZ = 1500.0
+_LONGEST_ADVANCE_S = 0.002
+
+
+def folded_cepstrum(log_magnitude: _Floats) -> _Floats:
+    """(..., n_fft / 2 + 1) natural logarithms of magnitude -> (..., n_fft / 2 + 1) coefficients."""
+    cepstrum = np.fft.irfft(log_magnitude)
+    half = cepstrum.shape[-1] // 2
+    cepstrum[..., 1:half] *= 2
+    return np.asarray(cepstrum[..., : half + 1])
+
+
+def excess_delays_samples(pairs: _Floats, sample_rate: float) -> _Floats:
+    """(..., ear) how much later the impulse responses (..., ear, sample) of two ears are than minimum-phase ones of
+    the same magnitude.
+
+    The delay between the ears is that of the peak of their cross-correlation below 1.5 kHz, where it is heard
+    (Wightman & Kistler, "The dominant role of low-frequency interaural time differences in sound localization", 1992),
+    less what the minimum-phase pair has of it already. The delay of both is that of the envelope of the correlation
+    with the minimum-phase pair, which the phase of the loudspeaker that measured them does not move.
+    """
+    n_fft = 4 * 2 ** int(np.ceil(np.log2(max(pairs.shape[-1], 64))))
+    spectra = np.fft.rfft(pairs, n_fft)
+    magnitude = np.maximum(np.abs(spectra), 1e-6 * np.abs(spectra).max(axis=-1, keepdims=True))
+    minimum = np.exp(np.fft.rfft(folded_cepstrum(np.log(magnitude)), n_fft))
+    low = 1 / (1 + (np.fft.rfftfreq(n_fft, 1 / sample_rate) / _ITD_BAND_HZ) ** 8)
+    advance = round(_LONGEST_ADVANCE_S * sample_rate)
+
+    def between(pair: npt.NDArray[np.complex128]) -> _Floats:
+        return _peak(np.fft.irfft(pair[..., 1, :] * np.conj(pair[..., 0, :]) * low, n_fft), advance)
+
+    analytic = np.zeros((*spectra.shape[:-1], n_fft), np.complex128)
+    analytic[..., : spectra.shape[-1]] = spectra * np.conj(minimum) * low
+    both = np.mean(_peak(np.abs(np.fft.ifft(analytic)), advance), axis=-1)
+    half = 0.5 * (between(spectra) - between(minimum))
+    return np.stack([both - half, both + half], axis=-1)
+
+
+def _peak(circular: _Floats, advance: int) -> _Floats:
+    """(...,) lag of the greatest sample of (..., lag), interpolated; what begins up to `advance` early is negative."""
+    turned = np.roll(circular, advance, axis=-1)
+    peak = np.argmax(turned, axis=-1)
+    around = np.clip(peak[..., None] + np.array([-1, 0, 1]), 0, turned.shape[-1] - 1)
+    before, at, after = np.moveaxis(np.take_along_axis(turned, around, axis=-1), -1, 0)
+    # The vertex of the parabola through three points: what is below 1.5 kHz is smooth between samples.
+    curvature = np.minimum(before - 2 * at + after, -1e-30)
+    return np.asarray(peak - advance + np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))

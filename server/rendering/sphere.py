@@ -1,0 +1,128 @@
+"""Directions on the sphere: what lies between measured ones, and how much of it is nearest to each.
+
+A direction d in the triangle of corners v is d = w0 v0 + w1 v1 + w2 v2 with all w positive; each corner counts by its
+share of w0 + w1 + w2. That is continuous over the whole sphere, and at a corner only that corner counts.
+
+Directions are unit vectors in the head's frame: x ahead, y left, z up.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from server.compiled import compiled
+from server.errors import NafirError
+
+_Floats = npt.NDArray[np.float64]
+
+_WIDEST_GAP = np.radians(30)
+_SAME_CONE = np.radians(10)
+_SAME_SIDE = np.radians(60)
+_SPHERE_POINTS = 20_000
+
+
+class CoverageError(NafirError):
+    """Directions that leave some others without a triangle."""
+
+
+class Triangulation(NamedTuple):
+    triangles: npt.NDArray[np.int64]
+    """(t, 3) corners: indices of directions."""
+    across: npt.NDArray[np.int64]
+    """(t, 3) the triangle on the other side of the edge opposite each corner."""
+    inverses: _Floats
+    """(t, 3, 3) from a direction to its w."""
+
+
+@compiled
+def find_triangle(
+    across: npt.NDArray[np.int64],
+    inverses: _Floats,
+    direction: _Floats,
+    start: int,
+    weights: _Floats,
+) -> int:
+    """The triangle that `direction` (3,) points into, and the weights (3,) of its corners, which sum to one.
+
+    Walks from `start` across the edge that the direction lies furthest beyond. In a triangulation of a convex hull such
+    a walk arrives; it is cut short all the same, and the weights made positive, so that rounding cannot trap it.
+    """
+    triangle = start
+    for _ in range(across.shape[0]):
+        least = 0
+        for corner in range(3):
+            weights[corner] = (
+                inverses[triangle, corner, 0] * direction[0]
+                + inverses[triangle, corner, 1] * direction[1]
+                + inverses[triangle, corner, 2] * direction[2]
+            )
+            if weights[corner] < weights[least]:
+                least = corner
+        if weights[least] >= -1e-9:
+            break
+        triangle = across[triangle, least]
+    total = 0.0
+    for corner in range(3):
+        weights[corner] = max(weights[corner], 0.0)
+        total += weights[corner]
+    if not total > 0.0:
+        weights[:] = 1.0
+        total = 3.0
+    for corner in range(3):
+        weights[corner] /= total
+    return triangle
+
+
+def fill_gaps(measured: _Floats) -> tuple[_Floats, _Floats]:
+    """(d + gap, 3) directions that leave no wide gap, and (gap, d) what each measured one contributes to the added.
+
+    What is heard from a gap, such as below KEMAR, is about what is heard from elsewhere on the same cone around the
+    axis of the ears: it has the same delay and nearly the same level difference.
+    """
+    lattice = np.array([corner for corner in product((0, 1, -1), repeat=3) if any(corner)], dtype=np.float64)
+    lattice /= np.linalg.norm(lattice, axis=-1, keepdims=True)
+    # The axes first: straight down is where most files have their gap.
+    lattice = lattice[np.argsort(-np.abs(lattice).max(axis=-1), kind="stable")]
+    directions = measured
+    shares = []
+    side = np.arcsin(np.clip(measured[:, 1], -1, 1))
+    for candidate in lattice:
+        if (directions @ candidate).max() >= np.cos(_WIDEST_GAP):
+            continue
+        off_cone = (side - np.arcsin(candidate[1])) / _SAME_CONE
+        away = np.arccos(np.clip(measured @ candidate, -1, 1)) / _SAME_SIDE
+        distance = off_cone**2 + away**2
+        share = np.exp(distance.min() - distance)
+        shares.append(share / share.sum())
+        directions = np.concatenate([directions, candidate[None]])
+    return directions, np.array(shares).reshape(len(shares), len(measured))
+
+
+def triangulate(directions: _Floats) -> Triangulation:
+    """Raises CoverageError if some direction has no triangle, or a measured one no corner."""
+    try:
+        hull = ConvexHull(directions)
+    except QhullError as exc:
+        raise CoverageError("the directions do not surround the head") from exc
+    triangles = hull.simplices.astype(np.int64)
+    across = hull.neighbors.astype(np.int64)
+    corners = directions[triangles]
+    surrounded = hull.equations[:, 3].max() < -1e-3
+    if not surrounded or len(hull.vertices) != len(directions) or np.abs(np.linalg.det(corners)).min() < 1e-9:
+        raise CoverageError("the directions do not surround the head")
+    inverses = np.ascontiguousarray(np.linalg.inv(np.swapaxes(corners, 1, 2)))
+    return Triangulation(triangles, across, inverses)
+
+
+def solid_angles(directions: _Floats) -> _Floats:
+    """(direction,) share of the sphere to which each direction is the nearest; measured grids crowd at the poles."""
+    index = np.arange(_SPHERE_POINTS) + 0.5
+    height = 1 - 2 * index / _SPHERE_POINTS
+    azimuth = np.pi * (1 + np.sqrt(5)) * index
+    ring = np.sqrt(1 - height**2)
+    sphere = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=-1)  # Fibonacci's
+    _, nearest = cKDTree(directions).query(sphere)
+    return np.bincount(nearest, minlength=len(directions)) / _SPHERE_POINTS
