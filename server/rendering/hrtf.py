@@ -37,7 +37,7 @@ _FLOOR = 1e-5  # of the loudest frequency of a response: no file is accurate bel
 @dataclass(frozen=True)
 class Hrtf:
     """`impulse_responses` is (direction, ear, sample); sample `lead_samples` is the moment the wave passes the
-    head's centre: when a source ahead begins to be heard, beyond what its magnitude delays."""
+    head's centre, which is when a source ahead begins to be heard."""
 
     directions: _Floats
     impulse_responses: _Floats
@@ -89,7 +89,7 @@ def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats
         responses = responses[:, ::-1]
     lead, length, taper = (round(time_s * sample_rate) for time_s in (_LEAD_S, _LENGTH_S, _TAPER_S))
     ahead = responses[np.argmax(measured.directions[:, 0])]
-    centre = round(float(np.mean(excess_delays_samples(ahead, sample_rate))))
+    centre = int(np.min(np.argmax(np.abs(ahead) > 0.1 * np.max(np.abs(ahead)), axis=-1)))
     before = max(0, lead - centre)
     padded = np.pad(responses, ((0, 0), (0, 0), (before, length)))
     start = centre - lead + before
@@ -104,8 +104,9 @@ def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats
 class HeadFilters:
     """What a head does to a sound in a form that can be interpolated: minimum phase and delay, per direction.
 
-    `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear) after the wave passes the head's centre.
-    Between directions, logarithms of magnitude and delays are interpolated over spherical triangles.
+    `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear) after the wave passes the head's centre,
+    which is when a source ahead begins to be heard. Between directions, logarithms of magnitude and delays are
+    interpolated over spherical triangles.
     """
 
     sample_rate: int
@@ -124,7 +125,8 @@ class HeadFilters:
         magnitude = np.abs(np.fft.rfft(responses, n_fft))
         magnitude = np.maximum(magnitude, _FLOOR * magnitude.max(axis=-1, keepdims=True))
         cepstra = folded_cepstrum(np.log(magnitude))[..., :taps]
-        delays_s = (excess_delays_samples(responses, hrtf.sample_rate) - hrtf.lead_samples) / hrtf.sample_rate
+        delays_s = excess_delays_samples(responses, hrtf.sample_rate) / hrtf.sample_rate
+        delays_s -= delays_s[np.argmax(hrtf.directions[:, 0])].mean()
         directions, shares = fill_gaps(hrtf.directions)
         cepstra = np.concatenate([cepstra, np.einsum("gd,det->get", shares, cepstra)])
         delays_s = np.concatenate([delays_s, shares @ delays_s])
