@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from server import bench
+from server.bench import cli as bench
 from server.errors import NafirError, RequestError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 from websockets.asyncio.server import serve
 
-from server import bench
-from server.bench import app
+from server.bench.cli import app
+from server.bench.listen import listen
 from server.catalogue import describe_scene
 from server.errors import NafirError
 from server.protocol import AddEmitter, AudioBlock, Welcome, parse_client_message
@@ -23,8 +23,8 @@ def test_field_bench_reports_the_scene_it_was_given(bundle):
     assert 0 < measured["median_ms"] <= measured["p99_ms"]
 
 
-def test_stream_bench_hears_what_it_does(served):
-    measured = asyncio.run(bench._listen(f"ws://{served}/v1/stream", "flat", 2, 2.0, 20.0))
+def test_listen_bench_hears_what_it_does(served):
+    measured = asyncio.run(listen(f"ws://{served}/v1/stream", "flat", 2, 2.0, 20.0))
     # Two seconds of 256-sample blocks at 24 kHz, and those the server runs ahead.
     assert 150 < measured["blocks"] < 230
     assert 30 <= measured["poses"] <= 41
@@ -33,9 +33,9 @@ def test_stream_bench_hears_what_it_does(served):
     assert measured["errors"] == []
 
 
-def test_stream_bench_says_what_the_server_refuses(served):
+def test_listen_bench_says_what_the_server_refuses(served):
     with pytest.raises(NafirError, match="unknown_scene"):
-        asyncio.run(bench._listen(f"ws://{served}/v1/stream", "atlantis", 1, 1.0, 1.0))
+        asyncio.run(listen(f"ws://{served}/v1/stream", "atlantis", 1, 1.0, 1.0))
 
 
 class SkippingServer:
@@ -72,17 +72,17 @@ class SkippingServer:
         async def scenario():
             async with serve(self, "127.0.0.1", 0) as server:
                 port = server.sockets[0].getsockname()[1]
-                return await bench._listen(f"ws://127.0.0.1:{port}", "flat", 2, 0.2, 20.0)
+                return await listen(f"ws://127.0.0.1:{port}", "flat", 2, 0.2, 20.0)
 
         return asyncio.run(scenario())
 
 
-def test_stream_bench_counts_the_blocks_that_the_sample_clock_jumps_over(field):
+def test_listen_bench_counts_the_blocks_that_the_sample_clock_jumps_over(field):
     measured = SkippingServer(field, [0, 256, 4 * 256, 5 * 256, 7 * 256]).hear()
     assert (measured["blocks"], measured["blocks_skipped"]) == (5, 3)
 
 
-def test_stream_bench_hears_different_clips_from_different_places(field):
+def test_listen_bench_hears_different_clips_from_different_places(field):
     server = SkippingServer(field, [0, 256])
     server.hear()
     one, other = server.emitters
@@ -92,9 +92,9 @@ def test_stream_bench_hears_different_clips_from_different_places(field):
 
 
 @pytest.mark.parametrize("url", ["ws://127.0.0.1:1/v1/stream", "http://127.0.0.1/", "ws://{served}/v1/elsewhere"])
-def test_stream_bench_says_in_one_line_why_it_cannot_connect(served, url):
+def test_listen_bench_says_in_one_line_why_it_cannot_connect(served, url):
     url = url.format(served=served)
-    outcome = CliRunner().invoke(app, ["stream", "--url", url, "--duration-s", "1"])
+    outcome = CliRunner().invoke(app, ["listen", "--url", url, "--duration-s", "1"])
     assert isinstance(outcome.exception, NafirError)
     assert str(outcome.exception).startswith(f"{url}: ")
     assert "\n" not in str(outcome.exception)

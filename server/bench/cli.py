@@ -1,0 +1,127 @@
+"""`nafir bench`: what things cost on this host. Medians of several rounds; run it on an idle machine."""
+
+import asyncio
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from server.bench.report import print_json, print_measures, print_rows
+from server.errors import NafirError
+
+app = typer.Typer(help="Measure what things cost on this host.", no_args_is_help=True)
+
+Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+
+
+@app.command()
+def field(
+    scene: Scene = "apartment",
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds, of which the median counts.")] = 20,
+    poses: Annotated[int, typer.Option(min=1, help="Random poses per round.")] = 20,
+    as_json: AsJson = False,
+) -> None:
+    """Time from a pose to a binaural impulse response, one at a time on one core."""
+    from server.bench.field import measure_field
+    from server.field.field import AcousticField
+    from server.scene.bundle import Bundle, find_bundle
+
+    acoustic_field = AcousticField.load(Bundle.load(find_bundle(scene)), threads=1)
+    measured = measure_field(acoustic_field, rounds=rounds, poses=poses)
+    _report(as_json, f"One impulse response of scene {acoustic_field.bundle.id}", measured)
+
+
+@app.command()
+def convolver(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Only blocks of 256, 1 s of impulse response, 1 and 16 sources.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """The convolver beside pedalboard and SciPy: speed, exactness, evenness, exchanges, drift, start.
+
+    Six minutes, or one with --quick. Without pedalboard (extra `dev`) its columns stay empty.
+    """
+    from server.bench.convolver import FULL, QUICK, measure_convolver
+
+    plan = QUICK if quick else FULL
+    # Redrawn between measurements only: a thread that redraws would be measured too.
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
+        task = progress.add_task("", total=plan.steps)
+
+        def advance(step: str) -> None:
+            progress.update(task, advance=1, description=step, refresh=True)
+
+        measured = measure_convolver(plan, advance)
+    if as_json:
+        print_json(measured)
+        return
+    if measured["peer"] is None:
+        Console().print("pedalboard is not installed: there is nothing to compare with (pip install pedalboard)")
+    _print_convolver(measured)
+
+
+@app.command()
+def listen(
+    url: Annotated[str, typer.Option(help="The server's stream.")] = "ws://127.0.0.1:8000/v1/stream",
+    scene: Annotated[str, typer.Option(help="Id of a scene it serves.")] = "apartment",
+    emitters: Annotated[int, typer.Option(min=1, help="Emitters that sound.")] = 2,
+    duration_s: Annotated[float, typer.Option(min=1, help="How long to listen.")] = 60.0,
+    poses_per_second: Annotated[float, typer.Option(min=0.1, help="How often the listener moves.")] = 30.0,
+    as_json: AsJson = False,
+) -> None:
+    """Listen to a running server while walking in circles: late blocks, and the time from a pose to its sound."""
+    from websockets.exceptions import WebSocketException
+
+    from server.bench import listen as one_stream
+
+    try:
+        measured = asyncio.run(one_stream.listen(url, scene, emitters, duration_s, poses_per_second))
+    except (OSError, WebSocketException) as exc:
+        raise NafirError(f"{url}: {exc}") from exc
+    _report(as_json, f"One stream of {url}", measured)
+
+
+def _report(as_json: bool, title: str, measured: dict[str, Any]) -> None:
+    if as_json:
+        print_json(measured)
+    else:
+        print_measures(title, measured)
+
+
+def _print_convolver(measured: dict[str, Any]) -> None:
+    print_measures("Host", measured["host"])
+    print_rows("Source-seconds per CPU-second at 48 kHz, stereo IRs", map(_shortened, measured["cases"]))
+    fades, splatter, drift = measured["fade_cost_ratio"], measured["splatter_db"], measured["drift"]
+    print_measures(
+        "Exchanges, drift, threads, start",
+        {
+            **{f"splatter above 4 kHz, {name}, dB": level for name, level in splatter.items()},
+            **{f"cost of exchanging every block, {sources} sources": ratio for sources, ratio in fades.items()},
+            f"error after {drift['duration_s']:.0f} s (in the first), dB": (
+                f"{drift['last_second_error_db']:.1f} ({drift['first_second_error_db']:.1f})"
+            ),
+            **{name: measured[name] for name in ("threads_scale", "warm_start_s", "cold_start_s")},
+        },
+    )
+    print_rows("Goals", measured["summary"])
+
+
+_SHORT = {
+    "block_size": "block",
+    "x_realtime": "ours",
+    "peer_x_realtime": "pedalboard",
+    "oaconvolve_x_realtime": "oaconvolve",
+    "max_error_db": "error dB",
+    "worst_to_mean_block": "worst / mean",
+    "shared_tail_x_realtime": "shared tail",
+    "shared_tail_ratio": "its ratio",
+    "shared_tail_worst_to_mean_block": "its worst / mean",
+}
+
+
+def _shortened(case: dict[str, Any]) -> dict[str, Any]:
+    return {_SHORT.get(name, name): value for name, value in case.items()}

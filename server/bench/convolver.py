@@ -1,0 +1,161 @@
+"""The convolver beside pedalboard and SciPy, and what can only be measured of ours; everything in one run.
+
+At 48 kHz, with stereo IRs. The modules say what each measure means: `server.bench.throughput`, `.exchanges`,
+`.endurance` and `.startup`.
+"""
+
+import itertools
+import os
+import platform
+import re
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from server.bench.endurance import measure_drift, threads_scale
+from server.bench.exchanges import fade_cost_ratio, splatter_db
+from server.bench.peers import Pedalboard, error_db, find_pedalboard, reference
+from server.bench.report import Goal, Judgement
+from server.bench.rooms import noise, room
+from server.bench.startup import cold_start_s, warm_start_s
+from server.bench.throughput import SAMPLE_RATE, Case, Rooms, measure_case
+
+Advance = Callable[[str], None]
+"""Told what has just been measured."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure, and for how long."""
+
+    cases: tuple[Case, ...]
+    rounds: int
+    splatter_s: float
+    drift_s: float
+    fade_sources: tuple[int, ...] = (1, 16)
+    thread_sources: int = 16
+    thread_blocks: int = 1_000
+    has_cold_start: bool = True
+    """It takes half a minute."""
+
+    @property
+    def steps(self) -> int:
+        return len(self.cases) + len(self.fade_sources) + 4 + self.has_cold_start
+
+
+FULL = Plan(
+    cases=tuple(
+        Case(block_size, ir_s, sources)
+        for ir_s, block_size, sources in itertools.product((0.5, 1.0, 2.0), (128, 256, 512), (1, 4, 16, 64))
+    ),
+    rounds=5,
+    splatter_s=10.0,
+    drift_s=600.0,
+)
+QUICK = Plan(
+    cases=(Case(256, 1.0, 1), Case(256, 1.0, 16)), rounds=3, splatter_s=3.0, drift_s=600.0, has_cold_start=False
+)
+
+_RATIO_1, _RATIO_16, _EVENNESS = (
+    Goal("ratio to pedalboard, 1 source", 15, 27),
+    Goal("ratio to pedalboard, 16 sources", 40, 77),
+    Goal("worst block / mean block, 16 sources", 2.5, 1.5, is_at_most=True),
+)
+_ERROR = Goal("largest error of any case, dB", -120, -126, is_at_most=True)
+_SPLATTER = Goal("splatter above 4 kHz of a 997 Hz tone at 90 exchanges/s, dB", -95, -98, is_at_most=True)
+_DRIFT = Goal("growth of the error over 10 minutes, dB", 0, is_at_most=True)
+_WARM_START = Goal("fresh process to its first block, s", 1, is_at_most=True)
+
+
+def measure_convolver(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
+    """Everything in the plan; `advance` is called `plan.steps` times."""
+    peer = find_pedalboard()
+    measured: dict[str, Any] = {"host": _describe_host(), "rounds": plan.rounds}
+    measured["peer"] = None if peer is None else {"name": "pedalboard", "error_db": peer_error_db(peer)}
+    cases = []
+    for ir_samples, group in itertools.groupby(plan.cases, lambda case: case.ir_samples):
+        alike = list(group)
+        rooms = Rooms.of(ir_samples, {case.sources for case in alike})
+        for case in alike:
+            cases.append(measure_case(case, rooms, rounds=plan.rounds, peer=peer))
+            advance(f"{case.block_size} samples, {case.ir_s:g} s, {case.sources} sources")
+    measured["cases"] = cases
+    measured["splatter_db"] = {
+        name: splatter_db(exchanges_per_s=rate, duration_s=plan.splatter_s)
+        for name, rate in {"steady": 0, "10_hz": 10, "90_hz": 90}.items()
+    }
+    advance("splatter")
+    measured["fade_cost_ratio"] = {}
+    for sources in plan.fade_sources:
+        measured["fade_cost_ratio"][str(sources)] = fade_cost_ratio(sources=sources, rounds=plan.rounds)
+        advance(f"fades of {sources}")
+    measured["drift"] = measure_drift(duration_s=plan.drift_s)
+    advance("drift")
+    measured["threads_scale"] = threads_scale(
+        sources=plan.thread_sources, rounds=plan.rounds, blocks=plan.thread_blocks
+    )
+    advance("two threads")
+    measured["warm_start_s"] = warm_start_s(plan.rounds)
+    advance("warm start")
+    measured["cold_start_s"] = None
+    if plan.has_cold_start:
+        measured["cold_start_s"] = cold_start_s()
+        advance("cold start")
+    measured["summary"] = [asdict(judgement) for judgement in judge(measured)]
+    return measured
+
+
+def judge(measured: dict[str, Any]) -> list[Judgement]:
+    """Beside the goals, which are for 256-sample blocks and 1 s of IR; of the largest error, any case counts."""
+    typical = {case["sources"]: case for case in measured["cases"] if (case["block_size"], case["ir_s"]) == (256, 1)}
+    one, sixteen = typical.get(1, {}), typical.get(16, {})
+    return [
+        _RATIO_1.judge(one.get("ratio")),
+        _RATIO_16.judge(sixteen.get("ratio")),
+        _ERROR.judge(max(case["max_error_db"] for case in measured["cases"])),
+        _SPLATTER.judge(measured["splatter_db"]["90_hz"]),
+        _DRIFT.judge(measured["drift"]["drift_db"]),
+        _EVENNESS.judge(sixteen.get("worst_to_mean_block")),
+        _WARM_START.judge(measured["warm_start_s"]),
+    ]
+
+
+def peer_error_db(peer: ModuleType) -> float:
+    """Whether pedalboard does the same work: its largest error, but for the level to which it normalises an IR."""
+    block_size = 256
+    dry, ir = noise(1, 300 * block_size), room(2, SAMPLE_RATE)
+    player = Pedalboard(peer, ir[np.newaxis], SAMPLE_RATE)
+    stereo = np.repeat(dry.reshape(-1, 1, 1, block_size), 2, axis=2)
+    wet = np.concatenate([player.process(block)[0] for block in stereo], axis=1)
+    expected = reference(dry, ir)
+    gain = np.vdot(wet, expected) / np.vdot(expected, expected)
+    return error_db(wet, gain * expected)
+
+
+def _describe_host() -> dict[str, Any]:
+    """What to tell with the figures; a load beyond a few tenths spoils them."""
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "python": platform.python_version(),
+        **{name: _version(name) for name in ("numpy", "scipy", "numba", "pedalboard")},
+    }
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    names = re.findall(r"^model name\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

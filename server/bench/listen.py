@@ -1,0 +1,116 @@
+"""One stream of a running server, as its listener finds it: late blocks, and the time from a pose to its sound."""
+
+import math
+import statistics
+import time
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.client import connect
+
+from server.acoustics.geometry import Vector3
+from server.clips import ClipLibrary
+from server.errors import NafirError
+from server.protocol import (
+    PROTOCOL,
+    Acknowledge,
+    AddEmitter,
+    AudioBlock,
+    Error,
+    Hello,
+    ListenerPose,
+    Welcome,
+    parse_server_message,
+)
+
+_TURN_S = 12.0
+_ACKNOWLEDGE_EVERY = 4
+
+
+class _Waits:
+    """Milliseconds from a pose to the first block that has it, or a newer one."""
+
+    def __init__(self) -> None:
+        self._sent_s: dict[int, float] = {}
+        self.waits_ms: list[float] = []
+
+    def send(self, pose_id: int, now_s: float) -> None:
+        self._sent_s[pose_id] = now_s
+
+    def hear(self, pose_id: int, now_s: float) -> None:
+        heard = [number for number in self._sent_s if number <= pose_id]
+        self.waits_ms += [(now_s - self._sent_s.pop(number)) * 1000 for number in heard]
+
+    def summary(self, name: str) -> dict[str, float | None]:
+        waits_ms = self.waits_ms
+        return {
+            f"{name}_median_ms": statistics.median(waits_ms) if waits_ms else None,
+            f"{name}_p99_ms": float(np.percentile(waits_ms, 99)) if waits_ms else None,
+        }
+
+
+async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_per_second: float) -> dict[str, Any]:
+    """Raises NafirError where the server refuses, OSError and WebSocketException where there is none."""
+    async with connect(url, compression=None) as socket:
+        await socket.send(Hello(protocol=PROTOCOL, scene=scene).serialize())
+        answer = parse_server_message(str(await socket.recv()))
+        if not isinstance(answer, Welcome):
+            raise NafirError(f"{url} does not serve {scene}: {answer.serialize()}")
+        for emitter in _sounding(answer, emitters):
+            await socket.send(emitter.serialize())
+        blocks = blocks_skipped = exchanges = pose_id = next_clock = 0
+        late_at_s: list[float] = []
+        to_block = _Waits()
+        errors: list[str] = []
+        started_s = now_s = time.monotonic()
+        while now_s - started_s < duration_s:
+            message = await socket.recv()
+            now_s = time.monotonic()
+            if isinstance(message, str):
+                event = parse_server_message(message)
+                errors += [event.code] if isinstance(event, Error) else []
+                continue
+            block = AudioBlock.parse(message, answer.encoding)
+            blocks += 1
+            blocks_skipped += (block.sample_clock - next_clock) // answer.block_size
+            next_clock = block.sample_clock + answer.block_size
+            late_at_s += [round(now_s - started_s, 1)] if block.is_late else []
+            exchanges += block.is_exchange
+            to_block.hear(block.pose_id, now_s)
+            if blocks % _ACKNOWLEDGE_EVERY == 0:
+                await socket.send(Acknowledge(sequence=block.sequence).serialize())
+            if now_s - started_s > pose_id / poses_per_second:
+                pose_id += 1
+                to_block.send(pose_id, now_s)
+                await socket.send(
+                    _walking(pose_id, answer.scene.listener.position, now_s - started_s).serialize_binary()
+                )
+    return {
+        "emitters": emitters,
+        "duration_s": round(now_s - started_s, 1),
+        "blocks": blocks,
+        "blocks_skipped": blocks_skipped,
+        "blocks_late": len(late_at_s),
+        "late_at_s": late_at_s,
+        "ir_exchanges": exchanges,
+        "poses": pose_id,
+        **to_block.summary("pose_to_block"),
+        "errors": errors,
+    }
+
+
+def _sounding(welcome: Welcome, count: int) -> list[AddEmitter]:
+    """Clips in turn, and in turn where the scene's own emitter is and where a visitor starts: two differ in both."""
+    clips = ClipLibrary(welcome.sample_rate).names
+    places = welcome.scene.emitter.position, welcome.scene.listener.position
+    return [
+        AddEmitter(id=str(number), clip=clips[number % len(clips)], position=places[number % len(places)])
+        for number in range(count)
+    ]
+
+
+def _walking(pose_id: int, centre: Vector3, time_s: float) -> ListenerPose:
+    """A circle of half a metre around where a visitor starts, looking about."""
+    angle = 2 * math.pi * time_s / _TURN_S
+    position = (centre[0] + 0.5 * math.cos(angle), centre[1] + 0.5 * math.sin(angle), centre[2])
+    return ListenerPose(pose_id=pose_id, position=position, yaw=math.remainder(angle, 2 * math.pi))

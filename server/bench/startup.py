@@ -1,0 +1,40 @@
+"""How long a fresh process takes to its first convolved block, from its start to its end."""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+from server.errors import NafirError
+
+_FIRST_BLOCK = """
+import numpy as np
+from server.rendering.convolver import Convolver
+convolver = Convolver(sources=1, channels=2, block_size=256, ir_samples=48_000)
+convolver.set_ir(0, np.ones((2, 48_000), np.float32))
+assert np.isfinite(convolver.process(np.ones((1, 256), np.float32))).all()
+"""
+
+
+def warm_start_s(rounds: int) -> float:
+    """With the machine code on disk already."""
+    _first_block_s(os.environ)
+    return statistics.median(_first_block_s(os.environ) for _ in range(rounds))
+
+
+def cold_start_s() -> float:
+    """With everything to be translated to machine code."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _first_block_s({**os.environ, "NUMBA_CACHE_DIR": folder})
+
+
+def _first_block_s(environment: "os._Environ[str] | dict[str, str]") -> float:
+    started_s = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", _FIRST_BLOCK], env=dict(environment), capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise NafirError(f"a fresh process could not convolve a block: {done.stderr.strip()}")
+    return time.perf_counter() - started_s
