@@ -87,7 +87,8 @@ def _pack(
     lanes: int,
     scratch: FloatArray,
 ) -> None:
-    bins, silence = scratch.ctypes.data, scratch.ctypes.data + 8 * size
+    bins = int(scratch.ctypes.data)
+    silence = bins + 8 * size
     for channel in range(channels):
         for partition in range(count):
             first = samples + 4 * (channel * count + partition) * size

@@ -143,6 +143,11 @@ class Convolver:
         self.release()
         return out
 
+    @property
+    def compiled(self) -> "CompiledConvolver":
+        """What the compiled renderer runs in its own call; it has to `release` after each block."""
+        return self._engine  # type: ignore[no-any-return]
+
     def release(self) -> None:
         """Let go of IRs that no stage can be using any more."""
         while self._retired and self._retired[0][0] <= self._engine.blocks:

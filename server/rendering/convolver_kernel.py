@@ -205,7 +205,7 @@ def _head(convolver, stage) -> None:
     for job in range(stage.jobs):
         exchanged[job_source[job]] = job_old[job] != 0
         _transform(convolver, stage, job)
-        _multiply(convolver, stage, job, 0, size // 8)
+        _multiply(convolver, stage, job, np.int64(0), size // 8)
     for channel in range(channels):
         if stage.jobs == 0:
             for n in range(0, size, 8):

@@ -1,0 +1,105 @@
+"""Named tuples of many arrays, handed to compiled code by reference.
+
+Numba passes a tuple by value: every array of it, field by field, at every call. With tens of arrays that takes longer
+than what is done with them, and longer still to compile. A `Reference` is one address there, and has the attributes of
+the tuple.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import typeof, types
+from numba.core.imputils import impl_ret_borrowed, lower_getattr_generic
+from numba.core.typing.templates import AttributeTemplate, infer_getattr
+from numba.core.typing.typeof import typeof_impl
+from numba.extending import NativeValue, intrinsic, models, register_model, unbox
+
+_WORD = ir.IntType(64)
+
+
+class Reference:
+    """To a named tuple of contiguous arrays, floats and ints, which it keeps alive.
+
+    `address` may be handed to compiled code as well, which makes a reference of it with `reference_at`.
+    """
+
+    def __init__(self, value: NamedTuple) -> None:
+        self.value = value
+        self._type = ReferenceType(typeof(value))
+        # As numba lays arrays out: who owns them (nobody, here), sizes, address, shape and strides, a word each.
+        words = [word for field in value for word in _words(field)]
+        self._words = np.array(words, np.int64)
+        self.address = int(self._words.ctypes.data)
+
+
+def _words(field: Any) -> list[int]:
+    if isinstance(field, np.ndarray):
+        return [0, 0, field.size, field.itemsize, field.ctypes.data, *field.shape, *field.strides]
+    return [int(np.float64(field).view(np.int64)) if isinstance(field, float) else int(field)]
+
+
+def _word_count(kind: Any) -> int:
+    return 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
+
+
+class ReferenceType(types.Type):
+    def __init__(self, to: Any) -> None:
+        self.to = to
+        super().__init__(f"Reference({to.name})")
+
+    def index(self, name: str) -> int:
+        return int(self.to.fields.index(name))
+
+    def offset(self, name: str) -> int:
+        """Bytes before a field."""
+        return 8 * sum(_word_count(kind) for kind in self.to.types[: self.index(name)])
+
+
+@register_model(ReferenceType)
+class _ReferenceModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, front_end_type: Any) -> None:
+        super().__init__(manager, front_end_type, _WORD)
+
+
+@typeof_impl.register(Reference)
+def _type_of_reference(value: Reference, _context: Any) -> ReferenceType:
+    return value._type
+
+
+@unbox(ReferenceType)
+def _unbox_reference(_kind: Any, obj: Any, context: Any) -> NativeValue:
+    address = context.pyapi.object_getattr_string(obj, "address")
+    native = context.pyapi.long_as_longlong(address)
+    context.pyapi.decref(address)
+    return NativeValue(native, is_error=context.builder.icmp_signed("!=", context.pyapi.err_occurred(), _null(context)))
+
+
+def _null(context: Any) -> Any:
+    return ir.Constant(context.pyapi.pyobj, None)
+
+
+@infer_getattr
+class _ReferenceAttributes(AttributeTemplate):
+    key = ReferenceType
+
+    def generic_resolve(self, kind: ReferenceType, name: str) -> Any:
+        return kind.to.types[kind.index(name)] if name in kind.to.fields else None
+
+
+@lower_getattr_generic(ReferenceType)
+def _lower_attribute(context: Any, builder: Any, kind: ReferenceType, value: Any, name: str) -> Any:
+    field = kind.to.types[kind.index(name)]
+    address = builder.add(value, ir.Constant(_WORD, kind.offset(name)))
+    loaded = builder.load(builder.inttoptr(address, context.get_value_type(field).as_pointer()))
+    return impl_ret_borrowed(context, builder, field, loaded)
+
+
+@intrinsic
+def reference_at(_context: Any, _address: Any, like: Any) -> Any:
+    """The reference whose `address` is given, of the type of `like`."""
+
+    def generate(_context: Any, _builder: Any, _signature: Any, args: Any) -> Any:
+        return args[0]
+
+    return like(types.int64, like), generate

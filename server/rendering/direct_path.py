@@ -1,0 +1,196 @@
+"""The direct sound of many emitters at one listener's ears, following poses every block.
+
+Free-field pressure is 1 / r at r metres, nearer than the near limit that of the near limit, through the air and the
+listener's head. What lies on the way besides (screens, directivity) comes as a gain per octave band.
+
+World axes are those of the scene; the head's are x ahead, y left, z up.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.minimum_phase import band_cepstra
+from server.compiled import HAS_NUMBA
+from server.rendering.direct_path_kernel import SLOT, TILE, DirectPathState, FloatArray, render_direct_paths
+from server.rendering.fade import raised_cosine
+from server.rendering.fractional_delay import AFTER, TAPS, sinc_table
+from server.rendering.hrtf import HeadFilters
+
+NEAR_LIMIT_M = 0.25
+
+_LEVEL: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+
+class PathTarget(NamedTuple):
+    """The way that an emitter's first sound takes to the listener's head."""
+
+    length_m: float
+    arrival: Sequence[float] | npt.NDArray[np.floating]
+    """(3,) unit vector in the world, from the listener towards where the sound comes from."""
+    band_gain_db: npt.NDArray[np.floating]
+    """(band,) beside distance and air."""
+
+
+class DirectPath:
+    """Sizes everything here and allocates nothing afterwards. One thread at a time may use it.
+
+    Ways beyond `max_distance_m` are as late as if they were that long.
+    """
+
+    def __init__(
+        self,
+        *,
+        slots: int,
+        block_size: int,
+        sample_rate: int,
+        filters: HeadFilters,
+        speed_of_sound: float,
+        air_db_per_m: npt.NDArray[np.floating],
+        max_distance_m: float = 200.0,
+    ) -> None:
+        if min(slots, block_size) < 1 or filters.sample_rate != sample_rate:
+            raise ValueError("slots and block_size are at least 1, and filters are of the same sample rate")
+        self.slots = slots
+        self.block_size = block_size
+        self._alike = partial(
+            DirectPath,
+            block_size=block_size,
+            sample_rate=sample_rate,
+            filters=filters,
+            speed_of_sound=speed_of_sound,
+            air_db_per_m=air_db_per_m,
+            max_distance_m=max_distance_m,
+        )
+        self.state = _state(slots, block_size, filters, speed_of_sound, air_db_per_m, max_distance_m)
+        self.reset()
+
+    def set_target(self, slot: int, target: PathTarget, *, jump: bool = False) -> None:
+        """From the next block on. The first of a slot is reached at once, later ones as fast as things move, unless
+        they `jump`. Values are finite, `arrival` a unit vector."""
+        record = self.state.slots[slot]
+        record["present"] = True
+        record["asked"] = True
+        record["jump"] |= jump
+        record["goal_m"] = target.length_m
+        record["arrival"] = target.arrival
+        record["band_gain_db"] = target.band_gain_db
+
+    def set_orientation(self, quaternion: Sequence[float] | npt.NDArray[np.floating]) -> None:
+        """(x, y, z, w), unit: turns the head's axes to where they are in the world. From the next block on."""
+        x, y, z, w = (float(part) for part in quaternion)
+        # The transpose of the usual matrix: from the world to the head.
+        self.state.to_head[0] = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)
+        self.state.to_head[1] = 2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)
+        self.state.to_head[2] = 2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)
+
+    def process(self, blocks: FloatArray, out: FloatArray) -> None:
+        """Add to `out` (2, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored."""
+        render_direct_paths(self.state, blocks, out)
+
+    def clear(self, slot: int) -> None:
+        """Forget a slot, target and signal."""
+        if not self.is_quiet(slot):
+            self.state.line[slot] = 0
+            self.state.heard[slot] = 0
+        self.state.slots[slot] = np.zeros((), SLOT)
+        self.state.slots[slot]["silent"] = self.state.quiet
+
+    def reset(self) -> None:
+        """Forget everything, as if just constructed."""
+        for slot in range(self.slots):
+            self.clear(slot)
+        self.state.position[0] = 0
+        self.set_orientation(_LEVEL)
+
+    def is_quiet(self, slot: int) -> bool:
+        """Whether this slot has rung out: it adds exactly nothing until it is fed a sample that is not zero."""
+        record = self.state.slots[slot]
+        return not record["present"] or bool(record["silent"] == self.state.quiet)
+
+    def impulse_response(
+        self, target: PathTarget, orientation: Sequence[float] | npt.NDArray[np.floating], samples: int
+    ) -> FloatArray:
+        """(2, samples) of an emitter at rest; sample 0 is emission."""
+        alone = self._alike(slots=1)
+        alone.set_target(0, target)
+        alone.set_orientation(orientation)
+        size = self.block_size
+        response = np.zeros((2, -(-samples // size) * size), np.float32)
+        block = np.zeros((1, size), np.float32)
+        block[0, 0] = 1
+        for start in range(0, samples, size):
+            alone.process(block, response[:, start : start + size])
+            block[0, 0] = 0
+        return response[:, :samples]
+
+
+def _state(
+    slots: int,
+    block_size: int,
+    filters: HeadFilters,
+    speed_of_sound: float,
+    air_db_per_m: npt.NDArray[np.floating],
+    max_distance_m: float,
+) -> DirectPathState:
+    taps, sample_rate = filters.taps, filters.sample_rate
+    wide = -(-block_size // TILE) * TILE
+    shortest_m = speed_of_sound * ((AFTER + 1) / sample_rate + filters.longest_advance_s)
+    longest_m = max(max_distance_m, shortest_m)
+    longest = (longest_m / speed_of_sound + filters.longest_delay_s) * sample_rate + TAPS + 2 * block_size
+    ring = -(-int(longest) // block_size) * block_size
+    again = -(-(wide + TAPS) // block_size) * block_size
+    orders = np.maximum(np.arange(taps), 1)
+
+    def floats(*shape: int) -> FloatArray:
+        return np.zeros(shape, np.float32)
+
+    def doubles(*shape: int) -> npt.NDArray[np.float64]:
+        return np.zeros(shape, np.float64)
+
+    def integers(*shape: int) -> npt.NDArray[np.int64]:
+        return np.zeros(shape, np.int64)
+
+    records = np.zeros(slots, SLOT)
+    records["silent"] = quiet = ring + again + taps + block_size
+    return DirectPathState(
+        slots=records if HAS_NUMBA else records.view(np.recarray),
+        to_head=doubles(3, 3),
+        position=integers(1),
+        line=floats(slots, ring + again),
+        heard=floats(slots, 2, taps - 1 + wide),
+        taps=floats(slots, 2, taps),
+        cepstra=filters.cepstra,
+        head_delays_s=filters.delays_s,
+        triangles=filters.triangulation.triangles,
+        across=filters.triangulation.across,
+        inverses=filters.triangulation.inverses,
+        band_cepstra=band_cepstra(sample_rate, taps).astype(np.float32),
+        orders=orders.astype(np.float32),
+        reciprocals=(1 / orders).astype(np.float32),
+        sinc=sinc_table(),
+        fade=raised_cosine(block_size),
+        ramp=(np.arange(1, block_size + 1) / block_size).astype(np.float32),
+        air_db_per_m=np.array(air_db_per_m, np.float64).reshape(len(OCTAVE_BANDS_HZ)),
+        weights=doubles(3),
+        cepstrum=floats(2, taps + 8),
+        sums=floats(2, taps + 8),
+        next_taps=floats(2, taps),
+        first=integers(wide),
+        row=integers(wide),
+        share=floats(wide),
+        still_taps=floats(TAPS),
+        read=floats(2, wide),
+        filtered=floats(2, wide),
+        sample_rate=float(sample_rate),
+        speed_of_sound=float(speed_of_sound),
+        nearest_m=NEAR_LIMIT_M,
+        shortest_m=float(shortest_m),
+        longest_m=float(longest_m),
+        ring=ring,
+        quiet=quiet,
+    )

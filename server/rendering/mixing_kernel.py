@@ -1,0 +1,89 @@
+"""The compiled part of `server.rendering.mixing`."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import carray
+
+from server.compiled import compiled
+from server.rendering.by_reference import Reference, reference_at
+from server.rendering.convolver_kernel import process_convolver
+from server.rendering.direct_path_kernel import render_direct_paths
+from server.rendering.simd import broadcast, load, multiply, multiply_add, pointer, store
+
+MIXER = np.dtype(
+    [
+        (name, np.int64)
+        for name in (
+            "slots",
+            "channels",
+            "block_size",
+            "plays",  # (slot,) int64
+            "dry",  # (slot, block_size) float32
+            "gain",  # (2, slot) float32
+            "send",  # (2, slot) float32
+            "sent",  # (slot, block_size) float32, the convolver's input
+            "fade_in",  # (block_size,) float32
+            "output",  # (channel, block_size) float32
+            "convolver",
+            "convolver_output",
+            "direct",  # address of a reference to a DirectPathState, 0 for none
+        )
+    ]
+)
+
+
+@compiled
+def mix_mixers(addresses: npt.NDArray[np.int64], like: Reference | None) -> None:
+    """One block of every renderer, each a MIXER record at its address. `like` refers to any direct path's state, or is
+    None where none of them has one."""
+    for number in range(addresses.size):
+        mixer = carray(pointer(addresses[number]), (1,), MIXER)[0]
+        _scale(mixer)
+        process_convolver(mixer.convolver)
+        for n in range(0, mixer.channels * mixer.block_size, 8):
+            store(mixer.output, n, load(mixer.convolver_output, n))
+        if like is not None and mixer.direct != 0:
+            blocks = carray(pointer(mixer.dry), (mixer.slots, mixer.block_size), np.float32)
+            output = carray(pointer(mixer.output), (mixer.channels, mixer.block_size), np.float32)
+            render_direct_paths(reference_at(mixer.direct, like), blocks, output)
+
+
+@compiled
+def _scale(mixer) -> None:
+    """Apply gains in place, and send what is left to the convolver."""
+    slots, size = mixer.slots, mixer.block_size
+    plays = carray(pointer(mixer.plays), (slots,), np.int64)
+    gain = carray(pointer(mixer.gain), (2, slots), np.float32)
+    send = carray(pointer(mixer.send), (2, slots), np.float32)
+    for slot in range(slots):
+        row = slot * size
+        if plays[slot] == 0:
+            for n in range(0, size, 8):
+                store(mixer.dry, row + n, broadcast(np.float32(0)))
+                store(mixer.sent, row + n, broadcast(np.float32(0)))
+            continue
+        start, change = broadcast(gain[0, slot]), broadcast(gain[1, slot] - gain[0, slot])
+        send_start, send_change = broadcast(send[0, slot]), broadcast(send[1, slot] - send[0, slot])
+        for n in range(0, size, 8):
+            rise = load(mixer.fade_in, n)
+            scaled = multiply(load(mixer.dry, row + n), multiply_add(change, rise, start))
+            store(mixer.dry, row + n, scaled)
+            store(mixer.sent, row + n, multiply(scaled, multiply_add(send_change, rise, send_start)))
+        gain[0, slot] = gain[1, slot]
+        send[0, slot] = send[1, slot]
+
+
+def record_of(mixer: Any) -> npt.NDArray[np.void]:
+    """The MIXER record (1,) of a `server.rendering.mixing.Mixer`, which has to outlive it."""
+    record = np.zeros(1, MIXER)
+    record["slots"], record["block_size"] = mixer.dry.shape
+    record["channels"] = mixer.output.shape[0]
+    for name in ("plays", "dry", "gain", "send", "fade_in", "output"):
+        record[name] = getattr(mixer, name).ctypes.data
+    engine = mixer.convolver.compiled
+    record["convolver"] = engine.address
+    record["direct"] = 0 if mixer.direct_state is None else mixer.direct_state.address
+    record["sent"], record["convolver_output"] = engine.input.ctypes.data, engine.output.ctypes.data
+    return record

@@ -1,0 +1,231 @@
+"""The loops over samples of the direct path, compiled; `path_loops_numpy` has the same functions without a compiler.
+
+Outputs of `filter_block` and `filter_twice` are a multiple of `TILE` long: accumulators stay in registers that long.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from server.compiled import compiled
+from server.rendering.fractional_delay import PHASES, TAPS
+from server.rendering.simd import (
+    add,
+    broadcast,
+    load,
+    load_broadcast,
+    load_int,
+    multiply,
+    multiply_add,
+    store,
+    transpose,
+)
+
+FloatArray = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+
+TILE = 64
+_HALF_TILE = TILE // 2
+_ROW = 2 * TAPS
+
+
+@compiled
+def filter_block(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
+    """out[i] = sum over k of taps[k] samples[i + len(taps) - 1 - k]"""
+    x, h, y = samples.ctypes.data, taps.ctypes.data, out.ctypes.data
+    last = taps.size - 1
+    zero = broadcast(np.float32(0))
+    for i in range(0, out.size, TILE):
+        a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = zero
+        for k in range(taps.size):
+            tap = load_broadcast(h, k)
+            at = i + last - k
+            a0 = multiply_add(tap, load(x, at), a0)
+            a1 = multiply_add(tap, load(x, at + 8), a1)
+            a2 = multiply_add(tap, load(x, at + 16), a2)
+            a3 = multiply_add(tap, load(x, at + 24), a3)
+            a4 = multiply_add(tap, load(x, at + 32), a4)
+            a5 = multiply_add(tap, load(x, at + 40), a5)
+            a6 = multiply_add(tap, load(x, at + 48), a6)
+            a7 = multiply_add(tap, load(x, at + 56), a7)
+        store(y, i, a0)
+        store(y, i + 8, a1)
+        store(y, i + 16, a2)
+        store(y, i + 24, a3)
+        store(y, i + 32, a4)
+        store(y, i + 40, a5)
+        store(y, i + 48, a6)
+        store(y, i + 56, a7)
+
+
+@compiled
+def filter_twice(
+    samples: FloatArray, first: FloatArray, second: FloatArray, out_first: FloatArray, out_second: FloatArray
+) -> None:
+    """`filter_block` by two filters of one length."""
+    x, h, g = samples.ctypes.data, first.ctypes.data, second.ctypes.data
+    y, z = out_first.ctypes.data, out_second.ctypes.data
+    last = first.size - 1
+    zero = broadcast(np.float32(0))
+    for i in range(0, out_first.size, _HALF_TILE):
+        a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = zero
+        for k in range(first.size):
+            a, b = load_broadcast(h, k), load_broadcast(g, k)
+            at = i + last - k
+            x0, x1, x2, x3 = load(x, at), load(x, at + 8), load(x, at + 16), load(x, at + 24)
+            a0 = multiply_add(a, x0, a0)
+            a1 = multiply_add(a, x1, a1)
+            a2 = multiply_add(a, x2, a2)
+            a3 = multiply_add(a, x3, a3)
+            b0 = multiply_add(b, x0, b0)
+            b1 = multiply_add(b, x1, b1)
+            b2 = multiply_add(b, x2, b2)
+            b3 = multiply_add(b, x3, b3)
+        store(y, i, a0)
+        store(y, i + 8, a1)
+        store(y, i + 16, a2)
+        store(y, i + 24, a3)
+        store(z, i, b0)
+        store(z, i + 8, b1)
+        store(z, i + 16, b2)
+        store(z, i + 24, b3)
+
+
+@compiled
+def read_at(
+    line: FloatArray, first: IntArray, row: IntArray, share: FloatArray, table: FloatArray, out: FloatArray
+) -> None:
+    """out[i] = the sinc of `row[i]`, and `share[i]` of the way to the next, over line[first[i] :]; for i a multiple
+    of 8."""
+    x, t, y = line.ctypes.data, table.ctypes.data, out.ctypes.data
+    f, r, s = first.ctypes.data, row.ctypes.data, share.ctypes.data
+    for i in range(0, out.size, 8):
+        lanes = transpose(
+            (
+                _products(x, t, f, r, s, i),
+                _products(x, t, f, r, s, i + 1),
+                _products(x, t, f, r, s, i + 2),
+                _products(x, t, f, r, s, i + 3),
+                _products(x, t, f, r, s, i + 4),
+                _products(x, t, f, r, s, i + 5),
+                _products(x, t, f, r, s, i + 6),
+                _products(x, t, f, r, s, i + 7),
+            )
+        )
+        lower = add(add(lanes[0], lanes[1]), add(lanes[2], lanes[3]))
+        upper = add(add(lanes[4], lanes[5]), add(lanes[6], lanes[7]))
+        store(y, i, add(lower, upper))
+
+
+@compiled
+def _products(x: int, t: int, f: int, r: int, s: int, i: int):  # type: ignore[no-untyped-def]
+    """What the sinc of one sample adds to, in eight lanes."""
+    at, row, share = load_int(f, i), load_int(r, i) * _ROW, load_broadcast(s, i)
+    total = multiply(multiply_add(share, load(t, row + TAPS), load(t, row)), load(x, at))
+    for k in range(8, TAPS, 8):
+        tap = multiply_add(share, load(t, row + TAPS + k), load(t, row + k))
+        total = multiply_add(tap, load(x, at + k), total)
+    return total
+
+
+@compiled
+def locate(
+    start: float,
+    ring: int,
+    a0: float,
+    a1: float,
+    a2: float,
+    a3: float,
+    first: IntArray,
+    row: IntArray,
+    share: FloatArray,
+) -> None:
+    """Where `read_at` reads sample i: (start + i - delay) modulo `ring`, the delay being the polynomial of `a` at
+    i + 1."""
+    turn, last = float(ring), np.int32(PHASES - 1)
+    for i in range(first.size):
+        u = i + 1.0
+        at = start + i - (a0 + u * (a1 + u * (a2 + u * a3)))
+        at += 0.0 if at >= 0.0 else turn
+        # 32 bits, because processors convert several of those at once.
+        whole = np.int32(at)
+        phase = (at - whole) * PHASES
+        step = np.int32(phase)
+        step = min(last, step)
+        first[i] = whole
+        row[i] = step
+        share[i] = phase - step
+
+
+@compiled
+def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, sums: FloatArray, taps: FloatArray) -> None:
+    """taps (2, n) of the minimum-phase filters whose folded cepstra are c: h = exp(c) as power series.
+
+    `cepstra` (2, n + 8) holds c[0] and then k c[k], `reciprocals` (n,) 1 and then 1 / k; `sums` (2, n + 8) is room for
+    n h[n] = sum over k of k c[k] h[n - k].
+    """
+    count = taps.shape[1]
+    width = cepstra.shape[1]
+    c, s, h = cepstra.ctypes.data, sums.ctypes.data, taps.ctypes.data
+    sums[:] = 0
+    for ear in range(2):
+        taps[ear, 0] = np.exp(cepstra[ear, 0])
+    for n in range(count - 1):
+        left, right = load_broadcast(h, n), load_broadcast(h, count + n)
+        for k in range(1, count - n, 8):
+            store(s, n + k, multiply_add(left, load(c, k), load(s, n + k)))
+            store(s, width + n + k, multiply_add(right, load(c, width + k), load(s, width + n + k)))
+        for ear in range(2):
+            taps[ear, n + 1] = sums[ear, n + 1] * reciprocals[n + 1]
+
+
+@compiled
+def scale(samples: FloatArray, start: float, end: float, ramp: FloatArray) -> None:
+    """Multiply by what goes from `start` to `end` along `ramp` (b,); what is beyond the ramp stays."""
+    first, rise = np.float32(start), np.float32(end - start)
+    for i in range(ramp.size):
+        samples[i] *= first + rise * ramp[i]
+
+
+@compiled
+def add_block(block: FloatArray, out: FloatArray) -> None:
+    for i in range(out.size):
+        out[i] += block[i]
+
+
+@compiled
+def add_scaled(values: FloatArray, factor: float, out: FloatArray) -> None:
+    scalar = np.float32(factor)
+    for i in range(out.size):
+        out[i] += scalar * values[i]
+
+
+@compiled
+def add_faded(before: FloatArray, after: FloatArray, fade: FloatArray, out: FloatArray) -> None:
+    for i in range(out.size):
+        out[i] += before[i] + fade[i] * (after[i] - before[i])
+
+
+@compiled
+def shift(samples: FloatArray, by: int, count: int) -> None:
+    """samples[:count] = what is `by` further on; the two may overlap."""
+    for i in range(count):
+        samples[i] = samples[i + by]
+
+
+@compiled
+def interpolate_reversed(row: FloatArray, share: float, taps: FloatArray) -> None:
+    """A row of the table and `share` of the way to the next, for `filter_block`, which takes the last tap first."""
+    scalar = np.float32(share)
+    for k in range(TAPS):
+        taps[TAPS - 1 - k] = row[k] + scalar * row[TAPS + k]
+
+
+@compiled
+def is_silent(block: FloatArray) -> bool:
+    """Whether all samples are zero, of either sign."""
+    bits = block.view(np.int32)
+    some = np.int32(0)
+    for i in range(bits.size):
+        some |= bits[i]
+    # The sign apart: doubling drops it.
+    return bool(np.int32(some << np.int32(1)) == 0)
