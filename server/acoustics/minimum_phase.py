@@ -7,6 +7,8 @@ A folded cepstrum is the power series of the logarithm of a causal minimum-phase
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+
 _Floats = npt.NDArray[np.float64]
 
 _ITD_BAND_HZ = 1500.0
@@ -56,3 +58,22 @@ def _peak(circular: _Floats, advance: int) -> _Floats:
     # The vertex of the parabola through three points: what is below 1.5 kHz is smooth between samples.
     curvature = np.minimum(before - 2 * at + after, -1e-30)
     return np.asarray(peak - advance + np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+
+
+def band_cepstra(sample_rate: float, taps: int) -> _Floats:
+    """(band, tap) folded cepstrum of one decibel in each octave band: linear over log frequency between the centres of
+    bands, flat beyond the first and the last.
+
+    Few taps round the corners off; the shapes are mixed so that at the centres the gains are what they should be.
+    """
+    centres = np.array(OCTAVE_BANDS_HZ)
+    n_fft = 2 ** int(np.ceil(np.log2(64 * taps)))
+    frequency = np.maximum(np.fft.rfftfreq(n_fft, 1 / sample_rate), 1.0)
+    octave = np.clip(np.log2(frequency / centres[0]), 0, len(centres) - 1)
+    decibels = np.maximum(0.0, 1 - np.abs(octave - np.arange(len(centres))[:, None]))
+    nepers = np.log(10) / 20
+    shapes = folded_cepstrum(nepers * decibels)[:, :taps]
+    audible = centres < sample_rate / 2
+    at_centres = shapes @ np.cos(2 * np.pi / sample_rate * np.outer(np.arange(taps), centres)) / nepers
+    shapes[audible] = np.linalg.solve(at_centres[np.ix_(audible, audible)], shapes[audible])
+    return shapes

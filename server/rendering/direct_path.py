@@ -57,6 +57,7 @@ class DirectPath:
             raise ValueError("slots and block_size are at least 1, and filters are of the same sample rate")
         self.slots = slots
         self.block_size = block_size
+        self.sample_rate = sample_rate
         self._alike = partial(
             DirectPath,
             block_size=block_size,
@@ -67,6 +68,8 @@ class DirectPath:
             max_distance_m=max_distance_m,
         )
         self.state = _state(slots, block_size, filters, speed_of_sound, air_db_per_m, max_distance_m)
+        self._blocks = np.zeros((slots, block_size), np.float32)
+        self._heard = np.zeros((2, block_size), np.float32)
         self.reset()
 
     def set_target(self, slot: int, target: PathTarget, *, jump: bool = False) -> None:
@@ -89,8 +92,19 @@ class DirectPath:
         self.state.to_head[2] = 2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)
 
     def process(self, blocks: FloatArray, out: FloatArray) -> None:
-        """Add to `out` (2, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored."""
-        render_direct_paths(self.state, blocks, out)
+        """Add to `out` (2, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored.
+
+        Fastest where both are contiguous; other layouts are copied rather than compiled for.
+        """
+        if not (blocks.flags.c_contiguous and blocks.flags.writeable):
+            np.copyto(self._blocks, blocks)
+            blocks = self._blocks
+        if out.flags.c_contiguous:
+            render_direct_paths(self.state, blocks, out)
+        else:
+            self._heard.fill(0)
+            render_direct_paths(self.state, blocks, self._heard)
+            out += self._heard
 
     def clear(self, slot: int) -> None:
         """Forget a slot, target and signal."""

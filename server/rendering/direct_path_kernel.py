@@ -6,8 +6,9 @@ and hears it through one minimum-phase filter: what the head, the air and the wa
 What is asked for jumps from block to block; what is heard follows. Lengths and the head's delays go to where they are
 asked to be like critically damped springs whose anchor moves steadily through a block, and within the block the delay
 is the cubic that meets position and speed at both of its ends. A filter is computed anew where direction or bands have
-moved by what could be heard, long before it is, and crossfaded over the block. A length that jumps further than
-anything moves is crossfaded too, from the old delay to the new.
+moved, long before it could be heard, and crossfaded over the block: along a straight line in steady motion, whose
+blocks then join without a ripple at their rate, and along a raised cosine where they leap. A length that jumps further
+than anything moves is crossfaded too, from the old delay to the new.
 
 Letters: s slots, e ears, n taps, b block size, w the same in whole tiles of the loops (what
 is beyond b means nothing), r ring of the delay line. Lengths in metres, delays in samples unless
@@ -40,6 +41,9 @@ _POSE_INTERVAL_S = 0.020
 """A length asked for longer ago than this says nothing about speed."""
 _ANGLE_STEP = np.radians(0.1)
 _BAND_STEP_DB = 0.02
+_ANGLE_LEAP = np.radians(10.0)
+_BAND_LEAP_DB = 3.0
+_NONE, _STEP, _LEAP = 0, 1, 2
 _REST_M = 1e-6
 _REST_S = 3e-9
 TILE = loops.TILE
@@ -168,7 +172,9 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, out: FloatArray)
     gain = 1.0 / max(slot.length[_AT], state.nearest_m)
     gain_before = gain if starts else slot.gain
     slot.gain = gain
-    refilter = _direction_or_bands_moved(slot, state.to_head, state.air_db_per_m) or starts or jumps
+    change = _change(slot, state.to_head, state.air_db_per_m)
+    refilter = change != _NONE or starts or jumps
+    fade = state.ramp if change != _LEAP and not jumps else state.fade
     if refilter:
         _find_filters(state, slot)
 
@@ -181,7 +187,7 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, out: FloatArray)
         taps = state.taps[index, ear]
         if refilter and not starts:
             loops.filter_twice(samples, taps, state.next_taps[ear], before, after)
-            loops.add_faded(before, after, state.fade, out[ear])
+            loops.add_faded(before, after, fade, out[ear])
         else:
             if starts:
                 taps[:] = state.next_taps[ear]
@@ -224,8 +230,9 @@ def _follow(spring: DoubleArray, goal: float, period_s: float, time_s: float, re
 
 
 @compiled
-def _direction_or_bands_moved(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> bool:
-    """By enough to be worth a filter."""
+def _change(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> int:
+    """How far direction and bands are from what the filters were computed for: not worth new ones, a step of steady
+    motion, or a leap."""
     turned = 0.0
     for axis in range(3):
         along = 0.0
@@ -233,12 +240,14 @@ def _direction_or_bands_moved(slot: Any, to_head: DoubleArray, air_db_per_m: Dou
             along += to_head[axis, world] * slot.arrival[world]
         slot.direction[axis] = along
         turned += (along - slot.filtered_direction[axis]) ** 2
-    moved = turned > _ANGLE_STEP**2
+    difference_db = 0.0
     for band in range(BANDS):
         level = slot.band_gain_db[band] - air_db_per_m[band] * slot.length[_AT]
         slot.bands_db[band] = level
-        moved = moved or abs(level - slot.filtered_db[band]) > _BAND_STEP_DB
-    return bool(moved)
+        difference_db = max(difference_db, abs(level - slot.filtered_db[band]))
+    if turned > _ANGLE_LEAP**2 or difference_db > _BAND_LEAP_DB:
+        return _LEAP
+    return _STEP if turned > _ANGLE_STEP**2 or difference_db > _BAND_STEP_DB else _NONE
 
 
 @compiled

@@ -31,6 +31,7 @@ _LEVEL_RATE = 24_000
 _FILTER_S = 0.004
 """KEMAR's responses truncated here keep their magnitude to 0.01 dB; at 2.7 ms one percent of it is off by 1 dB."""
 _TAPS_MULTIPLE = 8
+_RESTRAINT = 1e-3
 _FLOOR = 1e-5  # of the loudest frequency of a response: no file is accurate below -100 dB
 
 
@@ -126,7 +127,8 @@ class HeadFilters:
         magnitude = np.maximum(magnitude, _FLOOR * magnitude.max(axis=-1, keepdims=True))
         cepstra = folded_cepstrum(np.log(magnitude))[..., :taps]
         delays_s = excess_delays_samples(responses, hrtf.sample_rate) / hrtf.sample_rate
-        delays_s -= delays_s[np.argmax(hrtf.directions[:, 0])].mean()
+        common_s = delays_s.mean(axis=-1)
+        delays_s += (_smooth(hrtf.directions, common_s) - common_s)[:, None]
         directions, shares = fill_gaps(hrtf.directions)
         cepstra = np.concatenate([cepstra, np.einsum("gd,det->get", shares, cepstra)])
         delays_s = np.concatenate([delays_s, shares @ delays_s])
@@ -144,3 +146,24 @@ class HeadFilters:
     @cached_property
     def longest_delay_s(self) -> float:
         return float(max(0.0, self.delays_s.max()))
+
+
+def _smooth(directions: _Floats, common_s: _Floats) -> _Floats:
+    """(d,) the delay common to both ears without the errors of measuring it, counted from straight ahead.
+
+    A loudspeaker a few centimetres out of place shifts whole rings of a measured set by 0.1 ms (KEMAR at elevations of
+    30, 50 and 60 degrees), which in a moving source would sound like a jump. The smoothest function that is the same on
+    the left and on the right is kept; the delay between the ears is not touched.
+    """
+
+    def shapes(xyz: _Floats) -> _Floats:
+        x, _, z = xyz.T
+        return np.stack([np.ones_like(x), x, z, x * x, z * z, x * z], axis=-1)
+
+    shares = np.sqrt(solid_angles(directions))
+    at_measured = shapes(directions) * shares[:, None]
+    values = common_s * shares
+    # A little of each shape but the constant is given up where directions are too few to tell them apart.
+    restraint = _RESTRAINT * np.diag([0.0, 1, 1, 1, 1, 1])
+    weights = np.linalg.solve(at_measured.T @ at_measured + restraint, at_measured.T @ values)
+    return np.asarray((shapes(directions) - shapes(np.array([[1.0, 0.0, 0.0]]))) @ weights)

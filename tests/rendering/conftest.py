@@ -1,8 +1,51 @@
+from functools import cache
+
+import numpy as np
 import pytest
 
-from server.rendering.hrtf import KEMAR, Hrtf
+from server.rendering.direct_path import DirectPath
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.sphere import triangulate
+
+SPEED_OF_SOUND = 343.0
 
 
 @pytest.fixture(scope="session")
 def kemar() -> Hrtf:
     return Hrtf.read(KEMAR, 24_000)
+
+
+@pytest.fixture(scope="session")
+def kemar_at():
+    """Of a sample rate, the responses and the filters."""
+
+    @cache
+    def at(sample_rate: int) -> tuple[Hrtf, HeadFilters]:
+        hrtf = Hrtf.read(KEMAR, sample_rate)
+        return hrtf, HeadFilters.from_hrtf(hrtf)
+
+    return at
+
+
+def no_head(sample_rate: int, taps: int) -> HeadFilters:
+    """What a microphone hears: no filter and no delay."""
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    cepstra, delays_s = np.zeros((6, 2, taps), np.float32), np.zeros((6, 2))
+    return HeadFilters(sample_rate, axes, cepstra, delays_s, triangulate(axes))
+
+
+@pytest.fixture
+def make_path(kemar_at):
+    def make(*, head=True, slots=1, block_size=256, sample_rate=48_000, taps=64, air_db_per_m=0.0, **rest):
+        filters = kemar_at(sample_rate)[1] if head else no_head(sample_rate, taps)
+        return DirectPath(
+            slots=slots,
+            block_size=block_size,
+            sample_rate=sample_rate,
+            filters=filters,
+            speed_of_sound=SPEED_OF_SOUND,
+            air_db_per_m=np.broadcast_to(air_db_per_m, 7),
+            **rest,
+        )
+
+    return make
