@@ -16,13 +16,21 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.minimum_phase import band_cepstra
 from server.compiled import HAS_NUMBA
-from server.rendering.direct_path_kernel import SLOT, TILE, DirectPathState, FloatArray, render_direct_paths
+from server.rendering.direct_path_kernel import (
+    SLOT,
+    TILE,
+    DirectPathState,
+    FloatArray,
+    render_direct_paths,
+    transform_tables,
+)
 from server.rendering.fade import raised_cosine
 from server.rendering.fractional_delay import AFTER, TAPS, sinc_table
 from server.rendering.hrtf import HeadFilters
 
 NEAR_LIMIT_M = 0.25
 
+_FEWEST_BINS = 64
 _LEVEL: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -159,6 +167,9 @@ def _state(
     ring = -(-int(longest) // block_size) * block_size
     again = -(-(wide + TAPS) // block_size) * block_size
     orders = np.maximum(np.arange(taps), 1)
+    # Half a window of the transform: what is new, and no fewer than the filter has taps.
+    bins = max(_FEWEST_BINS, 2 ** (max(taps, wide) - 1).bit_length())
+    twist, passes, lanes = transform_tables(bins)
 
     def floats(*shape: int) -> FloatArray:
         return np.zeros(shape, np.float32)
@@ -170,14 +181,14 @@ def _state(
         return np.zeros(shape, np.int64)
 
     records = np.zeros(slots, SLOT)
-    records["silent"] = quiet = ring + again + taps + block_size
+    records["silent"] = quiet = ring + again + 2 * bins + block_size
     return DirectPathState(
         slots=records if HAS_NUMBA else records.view(np.recarray),
         to_head=doubles(3, 3),
         position=integers(1),
         line=floats(slots, ring + again),
-        heard=floats(slots, 2, taps - 1 + wide),
-        taps=floats(slots, 2, taps),
+        heard=floats(slots, 2, 2 * bins + TILE),
+        spectra=floats(slots, 2, 2, bins),
         cepstra=filters.cepstra,
         head_delays_s=filters.delays_s,
         triangles=filters.triangulation.triangles,
@@ -187,6 +198,9 @@ def _state(
         orders=orders.astype(np.float32),
         reciprocals=(1 / orders).astype(np.float32),
         sinc=sinc_table(),
+        twist=twist,
+        passes=passes,
+        lanes=lanes,
         fade=raised_cosine(block_size),
         ramp=(np.arange(1, block_size + 1) / block_size).astype(np.float32),
         air_db_per_m=np.array(air_db_per_m, np.float64).reshape(len(OCTAVE_BANDS_HZ)),
@@ -194,12 +208,16 @@ def _state(
         cepstrum=floats(2, taps + 8),
         sums=floats(2, taps + 8),
         next_taps=floats(2, taps),
+        padded=floats(2 * bins),
+        next_spectra=floats(2, 2, bins),
+        bins=floats(2, bins),
+        mix=floats(3, 2, 2, bins),
         first=integers(wide),
         row=integers(wide),
         share=floats(wide),
         still_taps=floats(TAPS),
         read=floats(2, wide),
-        filtered=floats(2, wide),
+        filtered=floats(bins),
         sample_rate=float(sample_rate),
         speed_of_sound=float(speed_of_sound),
         nearest_m=NEAR_LIMIT_M,

@@ -10,9 +10,11 @@ moved, long before it could be heard, and crossfaded over the block: along a str
 blocks then join without a ripple at their rate, and along a raised cosine where they leap. A length that jumps further
 than anything moves is crossfaded too, from the old delay to the new.
 
-Letters: s slots, e ears, n taps, b block size, w the same in whole tiles of the loops (what
-is beyond b means nothing), r ring of the delay line. Lengths in metres, delays in samples unless
-their name says seconds.
+Filters work on the right-angle spectra of `server.rendering.right_angle`, all slots summed before the one way back: a
+spectrum per ear of what it hears, one per filter whenever that changes.
+
+Letters: s slots, e ears, n taps, f bins, b block size, w the same in whole tiles of the loops (what is beyond b means
+nothing), r ring of the delay line. Lengths in metres, delays in samples unless their name says seconds.
 """
 
 from typing import Any, NamedTuple
@@ -39,7 +41,7 @@ _GREATEST_SPEED_RATIO = 0.5
 """Of the speed of sound; what implies more is a jump, not a motion."""
 _POSE_INTERVAL_S = 0.020
 """A length asked for longer ago than this says nothing about speed."""
-_ANGLE_STEP = np.radians(0.1)
+_ANGLE_STEP = np.radians(0.3)
 _BAND_STEP_DB = 0.02
 _ANGLE_LEAP = np.radians(10.0)
 _BAND_LEAP_DB = 3.0
@@ -47,6 +49,7 @@ _NONE, _STEP, _LEAP = 0, 1, 2
 _REST_M = 1e-6
 _REST_S = 3e-9
 TILE = loops.TILE
+transform_tables = loops.transform_tables
 BANDS = 7
 
 SLOT = np.dtype(
@@ -89,8 +92,8 @@ class DirectPathState(NamedTuple):
     to_head: DoubleArray  # (3, 3) from world to head
     position: IntArray  # (1,) in the line, of the next block
     line: FloatArray  # (s, r and its beginning once more)
-    heard: FloatArray  # (s, e, n - 1 + w) delayed; the newest n - 1 are kept
-    taps: FloatArray  # (s, e, n)
+    heard: FloatArray  # (s, e, 2 f and room for whole tiles) delayed, the newest 2 f samples
+    spectra: FloatArray  # (s, e, part, f) of the filter in effect
 
     # Tables.
     cepstra: FloatArray  # (direction, e, n)
@@ -102,6 +105,9 @@ class DirectPathState(NamedTuple):
     orders: FloatArray  # (n,) 1, 1, 2, 3 ...
     reciprocals: FloatArray  # (n,) of `orders`
     sinc: FloatArray
+    twist: FloatArray
+    passes: FloatArray
+    lanes: FloatArray
     fade: FloatArray  # (b,) from 0 to 1
     ramp: FloatArray  # (b,) likewise, straight, the end of each sample
     air_db_per_m: DoubleArray  # (band,) >= 0
@@ -111,12 +117,16 @@ class DirectPathState(NamedTuple):
     cepstrum: FloatArray  # (e, n + 8)
     sums: FloatArray  # (e, n + 8)
     next_taps: FloatArray  # (e, n)
+    padded: FloatArray  # (2 f,)
+    next_spectra: FloatArray  # (e, part, f)
+    bins: FloatArray  # (part, f)
+    mix: FloatArray  # (3, e, part, f) by the filters in effect; what those before add, in a step and in a leap
     first: IntArray  # (w,)
     row: IntArray  # (w,)
     share: FloatArray  # (w,)
     still_taps: FloatArray  # (TAPS,)
     read: FloatArray  # (2, w)
-    filtered: FloatArray  # (2, w)
+    filtered: FloatArray  # (f,)
 
     # Constants.
     sample_rate: float
@@ -132,11 +142,39 @@ class DirectPathState(NamedTuple):
 def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatArray) -> None:
     """Add what both ears (2, b) hear of the blocks (s, b) of all slots."""
     position = state.position[0]
+    size = out.shape[1]
+    sounding, steps, leaps = 0, 0, 0
     for index in range(blocks.shape[0]):
         slot = state.slots[index]
         if slot.present and _take_in(slot, state.line[index], position, state.ring, state.quiet, blocks[index]):
-            _render_slot(state, slot, index, out)
-    state.position[0] = (position + blocks.shape[1]) % state.ring
+            if sounding == 0:
+                state.mix[:] = 0
+            sounding += 1
+            change = _render_slot(state, slot, index, size)
+            steps += change == _STEP
+            leaps += change == _LEAP
+    state.position[0] = (position + size) % state.ring
+    if sounding > 0:
+        _synthesise(state, 0, out)
+    if steps > 0:
+        _synthesise(state, _STEP, out)
+    if leaps > 0:
+        _synthesise(state, _LEAP, out)
+
+
+@compiled
+def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
+    """Add one of the mixes: what the filters in effect make, or what those before add to it while they fade out."""
+    block = state.filtered
+    for ear in range(2):
+        loops.synthesise(state.mix[kind, ear], state.twist, state.passes, state.lanes, block)
+        newest = block[block.size - out.shape[1] :]
+        if kind == 0:
+            loops.add_block(newest, out[ear])
+        elif kind == _STEP:
+            loops.add_fading(newest, state.ramp, out[ear])
+        else:
+            loops.add_fading(newest, state.fade, out[ear])
 
 
 @compiled
@@ -158,8 +196,8 @@ def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, 
 
 
 @compiled
-def _render_slot(state: DirectPathState, slot: Any, index: int, out: FloatArray) -> None:
-    size = out.shape[1]
+def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> int:
+    """Add a slot to the mix. How its filters changed: not, or by a fade along a straight line or a raised cosine."""
     period_s = size / state.sample_rate
     starts = not slot.started
     jumps = slot.started and _jumps(slot, size, state.sample_rate, state.speed_of_sound)
@@ -173,29 +211,27 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, out: FloatArray)
     gain_before = gain if starts else slot.gain
     slot.gain = gain
     change = _change(slot, state.to_head, state.air_db_per_m)
-    refilter = change != _NONE or starts or jumps
-    fade = state.ramp if change != _LEAP and not jumps else state.fade
-    if refilter:
+    if jumps:
+        change = _LEAP
+    if change != _NONE or starts:
         _find_filters(state, slot)
 
-    kept = state.taps.shape[2] - 1
-    before, after = state.filtered[0], state.filtered[1]
+    window = 2 * state.bins.shape[1]
     for ear in range(2):
         _follow(slot.head[ear], slot.head_goal_s[ear], period_s, _HEAD_TIME_S, _REST_S, starts or jumps)
         samples = state.heard[index, ear]
-        _read(state, slot, state.line[index], ear, size, starts, jumps, gain_before, samples[kept:])
-        taps = state.taps[index, ear]
-        if refilter and not starts:
-            loops.filter_twice(samples, taps, state.next_taps[ear], before, after)
-            loops.add_faded(before, after, fade, out[ear])
-        else:
-            if starts:
-                taps[:] = state.next_taps[ear]
-            loops.filter_block(samples, taps, before)
-            loops.add_block(before, out[ear])
-        if refilter:
-            taps[:] = state.next_taps[ear]
-        loops.shift(samples, size, kept)
+        loops.shift(samples, size, window - size)
+        newest = samples[window - size : window - size + state.first.size]
+        _read(state, slot, state.line[index], ear, size, starts, jumps, gain_before, newest)
+        loops.transform(samples, state.twist, state.passes, state.lanes, state.bins)
+        in_effect = state.spectra[index, ear]
+        if change != _NONE or starts:
+            if not starts:
+                fading = state.mix[change, ear]
+                loops.accumulate_change(state.bins, in_effect, state.next_spectra[ear], fading)
+            in_effect[:] = state.next_spectra[ear]
+        loops.accumulate(state.bins, in_effect, state.mix[0, ear])
+    return _NONE if starts else change
 
 
 @compiled
@@ -259,7 +295,7 @@ def _find_filters(state: DirectPathState, slot: Any) -> None:
         slot.filtered_db[band] = slot.bands_db[band]
     triangle = find_triangle(state.across, state.inverses, slot.direction, slot.triangle, state.weights)
     slot.triangle = triangle
-    count = state.taps.shape[2]
+    count = state.next_taps.shape[1]
     for ear in range(2):
         delay = 0.0
         cepstrum = state.cepstrum[ear, :count]
@@ -273,6 +309,9 @@ def _find_filters(state: DirectPathState, slot: Any) -> None:
         cepstrum *= state.orders
         slot.head_goal_s[ear] = delay
     loops.series_exponential(state.cepstrum, state.reciprocals, state.sums, state.next_taps)
+    for ear in range(2):
+        state.padded[:count] = state.next_taps[ear]
+        loops.transform(state.padded, state.twist, state.passes, state.lanes, state.next_spectra[ear])
 
 
 @compiled
@@ -285,7 +324,7 @@ def _read(
     starts: bool,
     jumps: bool,
     gain_before: float,
-    heard: FloatArray,
+    heard: FloatArray,  # (s, e, 2 f and room for whole tiles) delayed, the newest 2 f samples
 ) -> None:
     """What one ear's delay makes of the line, at the gain of the distance."""
     within = min(max(slot.length[_AT], state.shortest_m), state.longest_m)

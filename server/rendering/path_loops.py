@@ -1,12 +1,13 @@
 """The loops over samples of the direct path, compiled; `path_loops_numpy` has the same functions without a compiler.
 
-Outputs of `filter_block` and `filter_twice` are a multiple of `TILE` long: accumulators stay in registers that long.
+Outputs of `filter_block` are a multiple of `TILE` long: accumulators stay in registers that long.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from server.compiled import compiled
+from server.rendering import right_angle
 from server.rendering.fractional_delay import PHASES, TAPS
 from server.rendering.simd import (
     add,
@@ -16,7 +17,9 @@ from server.rendering.simd import (
     load_int,
     multiply,
     multiply_add,
+    multiply_subtract,
     store,
+    subtract,
     transpose,
 )
 
@@ -24,7 +27,6 @@ FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 
 TILE = 64
-_HALF_TILE = TILE // 2
 _ROW = 2 * TAPS
 
 
@@ -57,37 +59,53 @@ def filter_block(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None
         store(y, i + 56, a7)
 
 
+def transform_tables(size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What `transform` and `synthesise` of `size` bins take."""
+    tables = right_angle.tables(size)
+    return tables.twist, tables.passes, tables.lanes
+
+
 @compiled
-def filter_twice(
-    samples: FloatArray, first: FloatArray, second: FloatArray, out_first: FloatArray, out_second: FloatArray
-) -> None:
-    """`filter_block` by two filters of one length."""
-    x, h, g = samples.ctypes.data, first.ctypes.data, second.ctypes.data
-    y, z = out_first.ctypes.data, out_second.ctypes.data
-    last = first.size - 1
-    zero = broadcast(np.float32(0))
-    for i in range(0, out_first.size, _HALF_TILE):
-        a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = zero
-        for k in range(first.size):
-            a, b = load_broadcast(h, k), load_broadcast(g, k)
-            at = i + last - k
-            x0, x1, x2, x3 = load(x, at), load(x, at + 8), load(x, at + 16), load(x, at + 24)
-            a0 = multiply_add(a, x0, a0)
-            a1 = multiply_add(a, x1, a1)
-            a2 = multiply_add(a, x2, a2)
-            a3 = multiply_add(a, x3, a3)
-            b0 = multiply_add(b, x0, b0)
-            b1 = multiply_add(b, x1, b1)
-            b2 = multiply_add(b, x2, b2)
-            b3 = multiply_add(b, x3, b3)
-        store(y, i, a0)
-        store(y, i + 8, a1)
-        store(y, i + 16, a2)
-        store(y, i + 24, a3)
-        store(z, i, b0)
-        store(z, i + 8, b1)
-        store(z, i + 16, b2)
-        store(z, i + 24, b3)
+def transform(samples: FloatArray, twist: FloatArray, passes: FloatArray, lanes: FloatArray, bins: FloatArray) -> None:
+    """The right-angle spectrum (2, f) of the first 2 f samples."""
+    size = bins.shape[1]
+    first = int(samples.ctypes.data)
+    second, to = first + 4 * size, int(bins.ctypes.data)
+    right_angle.forward(
+        first, second, to, size, int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data)
+    )
+
+
+@compiled
+def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: FloatArray, out: FloatArray) -> None:
+    """The second half (f,) of a window from its spectrum (2, f), which is used up."""
+    size = mix.shape[1]
+    bins = int(mix.ctypes.data)
+    right_angle.inverse(bins, size, int(passes.ctypes.data), int(lanes.ctypes.data))
+    right_angle.second_half(bins, size, int(twist.ctypes.data), int(out.ctypes.data))
+
+
+@compiled
+def accumulate(bins: FloatArray, filters: FloatArray, mix: FloatArray) -> None:
+    """Add the product of two spectra (2, f) to a third."""
+    size = bins.shape[1]
+    x, h, y = bins.ctypes.data, filters.ctypes.data, mix.ctypes.data
+    for n in range(0, size, 8):
+        xr, xi, hr, hi = load(x, n), load(x, size + n), load(h, n), load(h, size + n)
+        store(y, n, multiply_subtract(xi, hi, multiply_add(xr, hr, load(y, n))))
+        store(y, size + n, multiply_add(xi, hr, multiply_add(xr, hi, load(y, size + n))))
+
+
+@compiled
+def accumulate_change(bins: FloatArray, before: FloatArray, after: FloatArray, mix: FloatArray) -> None:
+    """`accumulate` by the difference of two filters, the one before less the one after."""
+    size = bins.shape[1]
+    x, h, g, y = bins.ctypes.data, before.ctypes.data, after.ctypes.data, mix.ctypes.data
+    for n in range(0, size, 8):
+        xr, xi = load(x, n), load(x, size + n)
+        hr, hi = subtract(load(h, n), load(g, n)), subtract(load(h, size + n), load(g, size + n))
+        store(y, n, multiply_subtract(xi, hi, multiply_add(xr, hr, load(y, n))))
+        store(y, size + n, multiply_add(xi, hr, multiply_add(xr, hi, load(y, size + n))))
 
 
 @compiled
@@ -197,6 +215,13 @@ def add_scaled(values: FloatArray, factor: float, out: FloatArray) -> None:
     scalar = np.float32(factor)
     for i in range(out.size):
         out[i] += scalar * values[i]
+
+
+@compiled
+def add_fading(block: FloatArray, fade: FloatArray, out: FloatArray) -> None:
+    """Add a block that fades out as `fade` rises."""
+    for i in range(out.size):
+        out[i] += (np.float32(1) - fade[i]) * block[i]
 
 
 @compiled

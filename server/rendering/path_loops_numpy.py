@@ -18,11 +18,32 @@ def filter_block(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None
     out[:] = np.convolve(samples[: out.size + taps.size - 1], taps, "valid")
 
 
-def filter_twice(
-    samples: FloatArray, first: FloatArray, second: FloatArray, out_first: FloatArray, out_second: FloatArray
+def transform_tables(size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    twist = np.exp(-0.5j * np.pi * np.arange(size) / size)
+    none = np.zeros(1, np.float32)
+    return np.stack([twist.real, twist.imag]).astype(np.float32), none, none
+
+
+def transform(
+    samples: FloatArray, twist: FloatArray, _passes: FloatArray, _lanes: FloatArray, bins: FloatArray
 ) -> None:
-    filter_block(samples, first, out_first)
-    filter_block(samples, second, out_second)
+    size = bins.shape[1]
+    folded = samples[:size] - 1j * samples[size : 2 * size]
+    spectrum = scipy.fft.fft(folded * (twist[0] + 1j * twist[1]))
+    bins[0], bins[1] = spectrum.real, spectrum.imag
+
+
+def synthesise(mix: FloatArray, twist: FloatArray, _passes: FloatArray, _lanes: FloatArray, out: FloatArray) -> None:
+    out[:] = -(scipy.fft.ifft(mix[0] + 1j * mix[1]) * (twist[0] - 1j * twist[1])).imag
+
+
+def accumulate(bins: FloatArray, filters: FloatArray, mix: FloatArray) -> None:
+    mix[0] += bins[0] * filters[0] - bins[1] * filters[1]
+    mix[1] += bins[0] * filters[1] + bins[1] * filters[0]
+
+
+def accumulate_change(bins: FloatArray, before: FloatArray, after: FloatArray, mix: FloatArray) -> None:
+    accumulate(bins, before - after, mix)
 
 
 def read_at(
@@ -70,6 +91,10 @@ def add_block(block: FloatArray, out: FloatArray) -> None:
 
 def add_scaled(values: FloatArray, factor: float, out: FloatArray) -> None:
     out += np.float32(factor) * values[: out.size]
+
+
+def add_fading(block: FloatArray, fade: FloatArray, out: FloatArray) -> None:
+    out += (1 - fade) * block
 
 
 def add_faded(before: FloatArray, after: FloatArray, fade: FloatArray, out: FloatArray) -> None:
