@@ -1,4 +1,5 @@
-"""Single impulse responses (IRs): one way to compute and write them, for the command line and for HTTP alike.
+"""Single impulse responses (IRs), direct sound included: one way to compute and write them, for the command line and
+for HTTP alike.
 
 Metres; angles in degrees, since these are human edges. Samples are (channel, sample) float32, channel 0 the left ear.
 """
@@ -18,6 +19,7 @@ import scipy.io.wavfile
 from server.acoustics.geometry import Vector3
 from server.errors import RequestError
 from server.field.field import AcousticField
+from server.whole_field import WholeField
 
 IrFormat = Literal["wav", "npy", "json"]
 IR_FORMATS: tuple[IrFormat, ...] = get_args(IrFormat)
@@ -84,7 +86,8 @@ class ImpulseResponse:
     def compute(cls, field: AcousticField, query: IrQuery) -> "ImpulseResponse":
         """Milliseconds of work: keep it off the event loop. Raises RequestError position_out_of_bounds."""
         query.require_inside(field)
-        samples = field.impulse_responses([query.listener], [query.emitter], [math.radians(query.yaw_deg)])[0]
+        whole = WholeField.through_kemar(field)
+        samples = whole.impulse_responses([query.listener], [query.emitter], [math.radians(query.yaw_deg)])[0]
         return cls(field.bundle.id, field.level.name, query, field.sample_rate, samples)
 
     def encode(self, name: IrFormat) -> bytes:

@@ -11,7 +11,6 @@ from pydantic import FiniteFloat
 from server.catalogue import describe_scene, playable_clips
 from server.errors import RequestError
 from server.field.field import AcousticField
-from server.field.loudness import loudness_map
 from server.impulse_response import (
     MEDIA_TYPES,
     ImpulseResponse,
@@ -20,7 +19,9 @@ from server.impulse_response import (
     parse_format,
     parse_position,
 )
+from server.loudness import loudness_map
 from server.streaming import Connection, StreamHost
+from server.whole_field import WholeField
 
 MAX_MAP_POINTS = 2_000
 """A point costs milliseconds."""
@@ -104,7 +105,8 @@ async def loudness(
         raise RequestError("map_too_fine", f"more than {MAX_MAP_POINTS} points: widen spacing_m", field="spacing_m")
 
     def draw() -> bytes:
-        levels = loudness_map(field, position, listener_height_m=height_m, spacing_m=spacing_m)
+        whole = WholeField.through_kemar(field)
+        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m)
         return levels.to_png() if format == "png" else json.dumps(levels.to_json()).encode()
 
     parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}

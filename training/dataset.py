@@ -1,4 +1,5 @@
-"""The dataset folder: `scene.toml`, and impulse responses of all pairs of probes in `pairs.h5`.
+"""The dataset folder: `scene.toml`, and in `pairs.h5` the reflected sound of all pairs of probes, which is what follows
+the direct sound. That one is not stored: `training.references` computes it from the scene whenever it is needed.
 
 Axes: emitter, listener, yaw, ear, sample. The pair of a probe with itself is absent (zeros). Samples are float16:
 eleven bits beneath the level of each sample, 66 dB under the signal at every point of its decay down to 6e-5. Smaller
@@ -18,7 +19,7 @@ from server.errors import NafirError
 from training.scene_file import SceneFile
 
 SPEED_OF_SOUND = 343.0
-FORMAT = 1
+FORMAT = 2
 
 
 class DatasetError(NafirError):
@@ -62,7 +63,7 @@ class Dataset:
             file.attrs.update(format=FORMAT, seed=seed, sample_rate=scene.simulation.sample_rate)
             file["probes"], file["yaws"], file["held_out"] = probes, yaws, held_out
             file.create_dataset("done", data=np.zeros(len(probes), dtype=bool))
-            for name in ("impulse_responses", "repeats"):
+            for name in ("reflected", "repeats"):
                 file.create_dataset(name, shape, np.float16, chunks=(1, 1, *shape[2:]))
         partial.replace(folder / "pairs.h5")
         return cls(folder, scene, seed, probes, yaws, held_out)
@@ -113,7 +114,7 @@ class Dataset:
         """Stores all listeners of one emitter (listener, yaw, ear, sample), and second takes of its held-out pairs
         by listener."""
         with h5py.File(self.folder / "pairs.h5", "r+") as file:
-            file["impulse_responses"][emitter] = responses
+            file["reflected"][emitter] = responses
             for listener, repeat in repeats.items():
                 file["repeats"][emitter, listener] = repeat
             file.flush()
@@ -124,8 +125,8 @@ class Dataset:
         chosen = self.held_out if held_out else ~self.held_out & ~np.eye(len(self.probes), dtype=bool)
         return np.argwhere(chosen)
 
-    def read(self, pairs: npt.NDArray[np.int64], name: str = "impulse_responses") -> npt.NDArray[np.float16]:
-        """(pair, yaw, ear, sample) responses, or second takes with `name` "repeats"."""
+    def read(self, pairs: npt.NDArray[np.int64], name: str = "reflected") -> npt.NDArray[np.float16]:
+        """(pair, yaw, ear, sample) reflected sound, or second takes with `name` "repeats"."""
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             return np.stack([file[name][emitter, listener] for emitter, listener in pairs])
 

@@ -136,6 +136,7 @@ def _manifest(dataset: Dataset, cells: Cells, rank: int, files: dict[str, bytes]
             maximum=(float(high[0]), float(high[1]), scene.probes.heights_m[1]),
         ),
         speed_of_sound=SPEED_OF_SOUND,
+        air=scene.air,
         start=scene.start,
         codec=CodecParameters(
             sample_rate=codec.sample_rate,

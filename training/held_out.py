@@ -10,35 +10,25 @@ import numpy.typing as npt
 from server.field.field import AcousticField
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy
+from server.whole_field import WholeField
 from training.baselines import TrainingPairs, linear, linear_aligned, nearest
 from training.dataset import Dataset, DatasetError
 from training.evaluate import FIELD, FLOOR, Evaluation, Responses, evaluate
 from training.evaluation_figure import draw_figure
-
-
-class _Pairs:
-    """Responses of an open dataset by flat pair index, emitter-major."""
-
-    def __init__(self, responses: h5py.Dataset, probes: int) -> None:
-        self._responses = responses
-        self._probes = probes
-
-    def __getitem__(self, pair: int) -> Responses:
-        emitter, listener = divmod(int(pair), self._probes)
-        return np.asarray(self._responses[emitter, listener], dtype=np.float32)
+from training.references import References
 
 
 class HeldOut:
     """Held-out pairs by index; every method takes one and gives (yaw, ear, sample)."""
 
-    def __init__(self, dataset: Dataset, field: AcousticField, file: h5py.File) -> None:
+    def __init__(self, dataset: Dataset, field: WholeField, file: h5py.File) -> None:
         probes = len(dataset.probes)
         emitter, listener = np.divmod(np.arange(probes**2), probes)
         self.dataset = dataset
         self.flat = np.flatnonzero(dataset.held_out.ravel())
         self._field = field
-        self._responses = _Pairs(file["impulse_responses"], probes)
-        self._repeats = _Pairs(file["repeats"], probes)
+        self._responses = References(dataset, file)
+        self._repeats = References(dataset, file, "repeats")
         self._training = TrainingPairs(
             self._responses,
             listener,
@@ -99,7 +89,7 @@ def evaluate_bundle(
     of_bundle = bundle.manifest.geometry, codec.sample_rate, codec.samples
     if of_bundle != (dataset.scene.geometry, dataset.sample_rate, dataset.samples):
         raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
-    field = AcousticField.load(bundle)
+    field = WholeField.through_kemar(AcousticField.load(bundle))
     with h5py.File(dataset.folder / "pairs.h5", "r") as file:
         held_out = HeldOut(dataset, field, file)
         evaluation = evaluate(

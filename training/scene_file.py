@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from server.errors import NafirError
 from server.scene.geometry import Geometry, Strict
-from server.scene.manifest import Start
+from server.scene.manifest import Air, Start
 
 _DRAWS_PER_CELL = 32
 # Two probes make one couple, and that one is held out.
@@ -38,7 +38,6 @@ class Simulation(Strict):
     duration_s: Annotated[float, Field(ge=0.25, allow_inf_nan=False)]
     yaws: Annotated[int, Field(ge=1)]
     rays: Annotated[int, Field(ge=100)]
-    # At order 0 the rays would bring the direct sound a second time.
     image_order: Annotated[int, Field(ge=0, le=6)]
     arrival_directions: Annotated[int, Field(ge=6)]
     held_out_share: Annotated[float, Field(gt=0, lt=0.5)]
@@ -51,6 +50,7 @@ class SceneFile(Strict):
     name: str
     description: str
     geometry: Geometry
+    air: Air = Air()
     start: Start
     probes: Probes
     simulation: Simulation

@@ -1,4 +1,5 @@
-"""Simulation of all pairs of probes of a scene: resumable emitter by emitter, the same for the same seed."""
+"""Simulation of what follows the direct sound, between all pairs of probes of a scene: resumable emitter by emitter,
+the same for the same seed."""
 
 import multiprocessing
 import os
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
-from server.rendering.hrtf import KEMAR, Hrtf
+from server.whole_field import kemar
 from training.dataset import Dataset, DatasetError
 from training.synthesis import BinauralSynthesis
 from training.tracing import RoomTracer, sphere_directions
@@ -78,12 +79,13 @@ def _responses(dataset: Dataset, emitter: int, listeners: npt.NDArray[np.int64],
     directions = sphere_directions(settings.arrival_directions)
     tracer = RoomTracer(
         dataset.scene.geometry,
+        dataset.scene.air,
         dataset.probes[listeners],
         duration_s=settings.duration_s,
         image_order=settings.image_order,
         arrival_directions=directions,
     )
-    synthesis = BinauralSynthesis(Hrtf.read(KEMAR, dataset.sample_rate), directions, dataset.yaws, dataset.samples)
+    synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
     rng = np.random.default_rng([dataset.seed, 2, emitter, take])
     arrivals = tracer.trace(dataset.probes[emitter], rays=settings.rays, seed=int(rng.integers(2**31)))
     return np.stack(

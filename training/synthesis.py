@@ -1,9 +1,12 @@
-"""Binaural impulse responses from traced arrivals.
+"""Binaural impulse responses: of the direct sound from geometry, and from traced arrivals of what follows it.
 
 Specular paths are exact: each is its own delayed, filtered head-related impulse response. What rays bring is noise
 shaped in time, frequency and direction by their energy, heard through the head from each direction of arrival
 (Schroeder, "Physically based real-time auralization of interactive virtual environments", 2011, ch. 5). One noise
 serves all head orientations of a pair, so turning the head changes the ears and not the room.
+
+The head is the one that direct paths are rendered through: minimum phase and a delay per ear. What a measurement has
+beside these is mostly the phase of its loudspeaker.
 """
 
 from dataclasses import dataclass
@@ -15,12 +18,16 @@ from scipy.signal import ShortTimeFFT
 from scipy.signal.windows import hann
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.rendering.hrtf import Hrtf
+from server.acoustics.minimum_phase import folded_cepstrum
+from server.rendering.hrtf import HeadFilters
+from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
-from training.tracing import HISTOGRAM_BIN_S, Arrivals
+from training.tracing import HISTOGRAM_BIN_S, Arrivals, free_field_amplitude
 
 _WINDOW_S = 0.010
 _DIFFUSE_RISE_S = 0.002
+# Ears may hear before a wave passes the head's centre, and a delay by a fraction of a sample rings on either side.
+_LEAD_S = 0.001
 
 
 def rotate_into_head(directions: npt.NDArray[np.float64], yaws: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -32,17 +39,17 @@ def rotate_into_head(directions: npt.NDArray[np.float64], yaws: npt.NDArray[np.f
 
 @dataclass(frozen=True)
 class BinauralSynthesis:
-    """Renders arrivals to `samples` samples at the rate of `hrtf`; `arrival_directions` are those of the traced
+    """Renders arrivals to `samples` samples at the rate of `head`; `arrival_directions` are those of the traced
     energy."""
 
-    hrtf: Hrtf
+    head: HeadFilters
     arrival_directions: npt.NDArray[np.float64]
     yaws: npt.NDArray[np.float64]
     samples: int
 
     @property
     def _sample_rate(self) -> int:
-        return self.hrtf.sample_rate
+        return self.head.sample_rate
 
     @property
     def _n_fft(self) -> int:
@@ -56,6 +63,21 @@ class BinauralSynthesis:
         octave = np.clip(np.log2(frequency / OCTAVE_BANDS_HZ[0]), 0, len(OCTAVE_BANDS_HZ) - 1)
         return np.maximum(0.0, 1 - np.abs(octave - np.arange(len(OCTAVE_BANDS_HZ))[:, None]))
 
+    def _heard_from(self, directions: npt.NDArray[np.float64]) -> npt.NDArray[np.complex128]:
+        """(..., ear, bin) spectra of the head; time zero is when a wave passes its centre."""
+        head, mesh = self.head, self.head.triangulation
+        flat = directions.reshape(-1, 3)
+        shares = (flat @ mesh.inverses.reshape(-1, 3).T).reshape(len(flat), len(mesh.inverses), 3)
+        around = np.argmax(np.minimum(np.minimum(shares[..., 0], shares[..., 1]), shares[..., 2]), axis=-1)
+        share = np.maximum(shares[np.arange(len(flat)), around], 0)
+        share /= np.sum(share, axis=-1, keepdims=True)
+        corners = mesh.triangles[around]
+        cepstra = np.einsum("dc,dcet->det", share, head.cepstra[corners])
+        delays = np.einsum("dc,dce->de", share, head.delays_s[corners]) * head.sample_rate
+        turn = -2j * np.pi * np.fft.rfftfreq(self._n_fft) * delays[..., None]
+        spectra = np.exp(np.fft.rfft(cepstra, self._n_fft) + turn)
+        return np.asarray(spectra).reshape(*directions.shape[:-1], *spectra.shape[1:])
+
     @cached_property
     def _transform(self) -> ShortTimeFFT:
         return ShortTimeFFT(hann(self._n_fft, sym=False), self._n_fft // 4, self._sample_rate)
@@ -64,15 +86,24 @@ class BinauralSynthesis:
     def _arrival_spectra(self) -> npt.NDArray[np.complex128]:
         """(bin, yaw and ear, direction)"""
         heard = rotate_into_head(self.arrival_directions, self.yaws)
-        spectra = self.hrtf.spectra(heard, self._n_fft)
+        spectra = self._heard_from(heard)
         return np.ascontiguousarray(np.moveaxis(spectra, (0, 3), (3, 0)).reshape(spectra.shape[-1], -1, len(heard)))
 
     def render(
         self, arrivals: Arrivals, receiver: npt.NDArray[np.float64], onset_s: float, rng: np.random.Generator
     ) -> npt.NDArray[np.float64]:
-        """(yaw, ear, sample) impulse responses; sample 0 is emission. Nothing diffuse is heard before `onset_s`."""
+        """(yaw, ear, sample) reflected sound; sample 0 is emission. Nothing diffuse is heard before `onset_s`."""
         response = self._late(arrivals.energy, onset_s, rng)
-        self._add_specular(arrivals, receiver, response)
+        self._add_specular(arrivals.image_positions, arrivals.image_amplitudes, receiver, response)
+        return response
+
+    def direct(
+        self, emitter: npt.NDArray[np.float64], receiver: npt.NDArray[np.float64], air: Air
+    ) -> npt.NDArray[np.float64]:
+        """(yaw, ear, sample) direct sound of an emitter in sight; sample 0 is emission."""
+        response = np.zeros((len(self.yaws), 2, self.samples))
+        amplitude = free_field_amplitude(np.linalg.norm(emitter - receiver, keepdims=True), air)
+        self._add_specular(emitter[None], amplitude, receiver, response)
         return response
 
     def _late(
@@ -96,17 +127,22 @@ class BinauralSynthesis:
         return np.asarray(late.reshape(len(self.yaws), 2, self.samples))
 
     def _add_specular(
-        self, arrivals: Arrivals, receiver: npt.NDArray[np.float64], response: npt.NDArray[np.float64]
+        self,
+        positions: npt.NDArray[np.float64],
+        amplitudes: npt.NDArray[np.float64],
+        receiver: npt.NDArray[np.float64],
+        response: npt.NDArray[np.float64],
     ) -> None:
-        offset = arrivals.image_positions - receiver
+        """Adds what comes from (image, xyz) with (image, band) pressure at the receiver."""
+        offset = positions - receiver
         distance = np.linalg.norm(offset, axis=-1)
         heard = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
-        gain = _minimum_phase(arrivals.image_amplitudes @ self._band_weights)
+        gain = _minimum_phase(amplitudes @ self._band_weights)
         delay = distance / SPEED_OF_SOUND * self._sample_rate
         start = np.floor(delay).astype(int)
-        lead = self.hrtf.lead_samples
+        lead = round(_LEAD_S * self._sample_rate)
         shift = np.exp(-2j * np.pi * np.fft.rfftfreq(self._n_fft) * (lead + delay - start)[:, None])
-        spectra = self.hrtf.spectra(heard, self._n_fft) * (gain * shift)[:, None, None]
+        spectra = self._heard_from(heard) * (gain * shift)[:, None, None]
         taps = np.fft.irfft(spectra, self._n_fft)
         for tap, at in zip(taps, start - lead, strict=True):
             first, last = max(0, -at), min(self._n_fft, self.samples - at)
@@ -115,9 +151,6 @@ class BinauralSynthesis:
 
 
 def _minimum_phase(magnitude: npt.NDArray[np.float64]) -> npt.NDArray[np.complex128]:
-    """(..., bin) spectra of the given magnitude whose energy comes as early as it can (real cepstrum, folded)."""
-    cepstrum = np.fft.irfft(np.log(np.maximum(magnitude, 1e-12)))
-    n = cepstrum.shape[-1]
-    cepstrum[..., 1 : n // 2] *= 2
-    cepstrum[..., n // 2 + 1 :] = 0
-    return np.asarray(np.exp(np.fft.rfft(cepstrum)))
+    """(..., bin) spectra of the given magnitude whose energy comes as early as it can."""
+    n_fft = 2 * (magnitude.shape[-1] - 1)
+    return np.asarray(np.exp(np.fft.rfft(folded_cepstrum(np.log(np.maximum(magnitude, 1e-12))), n_fft)))

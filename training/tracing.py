@@ -8,7 +8,9 @@ import pyroomacoustics as pra
 from scipy.stats import poisson
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import db_to_amplitude, db_to_power
 from server.scene.geometry import Geometry, Material
+from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
 
 HISTOGRAM_BIN_S = 0.004
@@ -23,11 +25,12 @@ _ENERGY_THRESHOLD = 1e-12
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Everything one emitter sends to one receiver, at unit pressure one metre from the emitter.
+    """What the room sends from one emitter to one receiver, at unit pressure one metre from the emitter: all but the
+    direct sound.
 
-    `image_positions` (image, xyz) are apparent emitter positions of the specular paths that reach the receiver, none
-    where every path is blocked; `image_amplitudes` (image, band) is their pressure there. `energy` (direction, band,
-    bin) is the squared pressure that rays bring per bin of HISTOGRAM_BIN_S, by direction of arrival.
+    `image_positions` (image, xyz) are apparent emitter positions of the specular reflections that reach the receiver,
+    none where every path is blocked; `image_amplitudes` (image, band) is their pressure there. `energy` (direction,
+    band, bin) is the squared pressure that rays bring per bin of HISTOGRAM_BIN_S, by direction of arrival.
     """
 
     image_positions: npt.NDArray[np.float64]
@@ -64,6 +67,13 @@ def counted_twice(geometry: Geometry, *, image_order: int, bins: int) -> npt.NDA
     return np.asarray(1 + mean_scattering[:, None] * poisson.sf(image_order, reflections))
 
 
+def free_field_amplitude(distance_m: npt.NDArray[np.float64], air: Air) -> npt.NDArray[np.float64]:
+    """(..., band) pressure at (...,) distances from an emitter of unit pressure at one metre: its wave spreads, and the
+    air takes its share."""
+    distance = np.asarray(distance_m)[..., None]
+    return np.asarray(db_to_amplitude(-distance * air.absorption_db_per_m) / distance)
+
+
 def _material(material: Material) -> pra.Material:
     def banded(coefficients: tuple[float, ...]) -> dict[str, list[float]]:
         return {"coeffs": list(coefficients), "center_freqs": list(OCTAVE_BANDS_HZ)}
@@ -77,6 +87,7 @@ class RoomTracer:
     def __init__(
         self,
         geometry: Geometry,
+        air: Air,
         receivers: npt.NDArray[np.float64],
         *,
         duration_s: float,
@@ -94,7 +105,6 @@ class RoomTracer:
             max_order=image_order + 1,
             materials=_material(geometry.materials.walls),
             ray_tracing=True,
-            air_absorption=True,
         )
         caps = {"floor": _material(geometry.materials.floor), "ceiling": _material(geometry.materials.ceiling)}
         room.extrude(geometry.height_m, materials=caps)
@@ -111,7 +121,7 @@ class RoomTracer:
         for microphone in self._engine.microphones:
             microphone.set_directions(arrival_directions.astype(np.float32))
         self._bands: int = room.octave_bands.n_bands
-        self._air_absorption_per_m = np.asarray(room.air_absorption, dtype=np.float64)
+        self._air = air
         self._image_order = image_order
         self._counted_twice = counted_twice(geometry, image_order=image_order, bins=self._bins)
 
@@ -129,11 +139,12 @@ class RoomTracer:
         if count == 0:
             none = np.zeros((len(self._receivers), 0))
             return np.zeros((0, 3)), np.zeros((*none.shape, self._bands)), none.astype(bool)
-        wanted = np.array(self._engine.orders) <= self._image_order
+        orders = np.array(self._engine.orders)
+        wanted = (orders > 0) & (orders <= self._image_order)
         images = np.array(self._engine.sources.T, dtype=np.float64)[wanted]
         damping = np.array(self._engine.attenuations.T, dtype=np.float64)[wanted]
-        distance = np.linalg.norm(images - self._receivers[:, None], axis=-1)[..., None]
-        amplitudes = damping / distance * np.exp(-0.5 * self._air_absorption_per_m * distance)
+        distance = np.linalg.norm(images - self._receivers[:, None], axis=-1)
+        amplitudes = damping * free_field_amplitude(distance, self._air)
         return images, amplitudes, np.array(self._engine.visible_mics, dtype=bool)[:, wanted]
 
     def _energy(self, emitter: npt.NDArray[np.float64], rays: int, seed: int) -> npt.NDArray[np.float64]:
@@ -146,7 +157,8 @@ class RoomTracer:
         energy = np.stack([self._read(microphone) for microphone in self._engine.microphones])
         self._engine.reset_mics()
         distance = (np.arange(self._bins) + 0.5) * HISTOGRAM_BIN_S * SPEED_OF_SOUND
-        return np.asarray(energy * np.exp(-self._air_absorption_per_m[:, None] * distance) / self._counted_twice)
+        kept = db_to_power(-self._air.absorption_db_per_m[:, None] * distance)
+        return np.asarray(energy * kept / self._counted_twice)
 
     def _read(self, microphone: pra.libroom.Microphone) -> npt.NDArray[np.float64]:
         energy = np.zeros((len(microphone.histograms), self._bands, self._bins))

@@ -1,9 +1,9 @@
 """Phase for a predicted binaural spectrogram: what is known is used, the rest is noise with the right correlation
 between the ears.
 
-A field knows the phase of the direct sound and of some early reflections, and cannot know that of late reverberation.
-It says how much it knows: `certainty` is the length of the mean phasor, 1 where the phase is determined and 0 where it
-is anybody's guess. A bin is then the known phasor plus frozen noise carrying the remaining energy:
+A field knows the phase of some early reflections, and cannot know that of late reverberation. It says how much it
+knows: `certainty` is the length of the mean phasor, 1 where the phase is determined and 0 where it is anybody's guess.
+A bin is then the known phasor plus frozen noise carrying the remaining energy:
 
     S = M (R exp(i phi) + sqrt(1 - R**2) N)
 

@@ -1,4 +1,7 @@
-"""A trained acoustic field: poses in, binaural impulse responses out.
+"""A trained acoustic field: poses in, binaural impulse responses of the reflected sound out.
+
+Reflected sound is all that follows the direct sound, which is not in here: it is computed from geometry
+(`server.whole_field` adds it).
 
 Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians, seconds.
 """
@@ -19,7 +22,7 @@ Float32 = npt.NDArray[np.float32]
 INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
 """Inputs of a graph, and their shapes after the batch axis."""
 OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
-_GATE_S = 0.0007
+_RISE_S = 0.0003
 _CHUNK = 32
 _TENSOR = "tensor(float)"
 
@@ -96,7 +99,8 @@ class AcousticField:
         return Spectrograms(log_magnitude, frequency, certainty, coherence[:, 0] + 1j * coherence[:, 1])
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
-        """(B, 2, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
+        """(B, 2, ir_samples) without the direct sound; sample 0 is the moment of emission, unit pressure at one
+        metre."""
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
         for start in range(0, len(yaws), _CHUNK):
@@ -128,16 +132,17 @@ class AcousticField:
         )
         shift = np.exp(-2j * np.pi * np.arange(codec.bins) / codec.n_fft * (aligned_s - start)[:, None])
         early = codec.synthesise(known * shift[:, None, :, None].astype(np.complex64))
-        for response, direct, at in zip(responses, early, start, strict=True):
-            _add(direct, response, at)
+        for response, part, at in zip(responses, early, start, strict=True):
+            _add(part, response, at)
             _apply(self._gate, response, at)
         return responses.astype(np.float32, copy=False)
 
     def _onset_gate(self) -> Float32:
-        """Silence until just before sound can arrive at the nearer ear: windows smear energy to where it cannot be."""
-        opens = max(0, self._lead - round(_GATE_S * self.sample_rate))
-        rise = (1 - np.cos(np.pi * np.arange(self._lead - opens) / max(1, 2 * (self._lead - opens)))) ** 0.5
-        return np.concatenate([np.zeros(opens), rise]).astype(np.float32)
+        """Silence until the direct sound passes the head, for windows smear energy to where it cannot be. What reaches
+        the nearer ear sooner is the direct sound alone."""
+        rise = round(_RISE_S * self.sample_rate)
+        opens = np.sin(np.pi / 2 * (np.arange(rise) + 0.5) / rise)
+        return np.concatenate([np.zeros(self._lead), opens]).astype(np.float32)
 
     def _check_outputs(self, name: str) -> None:
         """Runs the graph once, in the middle of the bounds."""

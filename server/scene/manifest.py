@@ -1,14 +1,22 @@
-"""`scene.json`: what a scene bundle says of itself."""
+"""`scene.json`: what a scene bundle says of itself.
+
+Since format 2 the responses of a bundle's fields hold what follows the direct sound and not the direct sound itself,
+which the server computes from geometry.
+"""
 
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+import numpy.typing as npt
+from pydantic import Field, field_validator, model_validator
 
+from server.acoustics.air import absorption_db_per_m
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.codec import Codec
 from server.scene.geometry import Finite, Geometry, Point, Strict
 
 ARRAYS_FILE = "arrays.npz"
+FORMAT_VERSION: Literal[2] = 2
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -32,6 +40,20 @@ class Start(Strict):
     listener: Point
     listener_yaw_deg: Finite = 0.0
     emitter: Point
+
+
+class Air(Strict):
+    """How much sound the air absorbs on the way; the speed of sound is stated on its own."""
+
+    temperature_c: Annotated[float, Field(ge=-20, le=50)] = 20.0
+    relative_humidity: Annotated[float, Field(ge=0.05, le=1)] = 0.5
+
+    @property
+    def absorption_db_per_m(self) -> npt.NDArray[np.float64]:
+        """(band,) at OCTAVE_BANDS_HZ."""
+        return absorption_db_per_m(
+            OCTAVE_BANDS_HZ, temperature_c=self.temperature_c, relative_humidity=self.relative_humidity
+        )
 
 
 class CodecParameters(Strict):
@@ -99,19 +121,27 @@ class QualityLevel(Strict):
 class Manifest(Strict):
     """All of `scene.json`; `files` maps every other file of the bundle to its SHA-256."""
 
-    format_version: Literal[1] = 1
+    format_version: Literal[2] = FORMAT_VERSION
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
     name: str
     description: str = ""
     geometry: Geometry
     bounds: Bounds
     speed_of_sound: Annotated[float, Field(gt=100, lt=1000)]
+    air: Air = Air()
     start: Start
     channels: tuple[Literal["left"], Literal["right"]] = ("left", "right")
     codec: CodecParameters
     fields: Annotated[dict[str, FieldFile], Field(min_length=1)]
     levels: Annotated[tuple[QualityLevel, ...], Field(min_length=1)]
     files: dict[FileName, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
+
+    @field_validator("format_version", mode="before")
+    @classmethod
+    def _is_of_this_format(cls, version: object) -> object:
+        if version == 1:
+            raise ValueError("is 1, whose fields hold the direct sound too: simulate, train and export the scene anew")
+        return version
 
     @model_validator(mode="after")
     def _refers_to_what_exists(self) -> "Manifest":

@@ -54,7 +54,9 @@ def test_missing_file_is_named(bundle_copy, name):
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
-        ({"format_version": 2}, "format_version"),
+        ({"format_version": 3}, "format_version"),
+        ({"format_version": 1}, "format_version: .*train and export the scene anew"),
+        ({"air": {"relative_humidity": 50}}, "air"),
         ({"speed_of_sound": -1}, "speed_of_sound"),
         ({"levels": [{"name": "standard", "field": "absent"}]}, "no field absent"),
         ({"bounds": {"minimum": [0, 0, 0], "maximum": [8, 5, 0]}}, "bounds"),

@@ -8,7 +8,8 @@ import pytest
 import torch
 from rich.progress import Progress
 
-from server.rendering.hrtf import KEMAR, Hrtf
+from server import whole_field
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from training.dataset import Dataset
 from training.export import export
@@ -36,8 +37,8 @@ def apartment() -> SceneFile:
 
 
 @pytest.fixture(scope="session")
-def kemar() -> Hrtf:
-    return Hrtf.read(KEMAR, 24_000)
+def kemar() -> HeadFilters:
+    return whole_field.kemar(24_000)
 
 
 @pytest.fixture(scope="session")

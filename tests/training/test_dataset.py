@@ -46,30 +46,19 @@ def test_pairs_are_emitter_and_listener(dataset):
     with h5py.File(dataset.folder / "pairs.h5", "r") as file:
         for emitter, listener in dataset.pairs(held_out=True):
             np.testing.assert_array_equal(
-                dataset.read(np.array([[emitter, listener]]))[0], file["impulse_responses"][emitter, listener]
+                dataset.read(np.array([[emitter, listener]]))[0], file["reflected"][emitter, listener]
             )
 
 
-def test_sound_arrives_when_it_can(dataset):
-    """In a shoebox every pair is in sight: the louder ear's direct sound comes after distance / c."""
-    for emitter, listener in dataset.pairs(held_out=False):
-        response = dataset.read(np.array([[emitter, listener]]))[0].astype(float)
-        loudest = np.abs(response).max(axis=1)
-        onset = np.argmax(loudest > 0.2 * loudest.max(axis=-1, keepdims=True), axis=-1)
-        distance = np.linalg.norm(dataset.probes[emitter] - dataset.probes[listener])
-        # Sound reaches the nearer ear up to a head's radius earlier.
-        early, late = ((distance + extra_m) / 343 * dataset.sample_rate for extra_m in (-0.13, 0.06))
-        assert ((onset >= early) & (onset <= late)).all()
-
-
-def test_second_takes_share_the_direct_sound_and_not_the_noise(dataset):
+def test_second_takes_share_the_mirrors_and_not_the_noise(dataset):
     pairs = dataset.pairs(held_out=True)
-    first, second = (dataset.read(pairs, name).astype(float) for name in ("impulse_responses", "repeats"))
+    first, second = (dataset.read(pairs, name).astype(float) for name in ("reflected", "repeats"))
     assert not np.array_equal(first, second)
     for (emitter, listener), one, other in zip(pairs, first, second, strict=True):
         onset = round(dataset.onset_s[emitter, listener] * dataset.sample_rate)
-        head = slice(onset - 4, onset + 12)
-        assert np.corrcoef(one[..., head].ravel(), other[..., head].ravel())[0, 1] > 0.8
+        # Most of the mirrors in the six walls are heard this early here.
+        head = slice(onset, onset + round(0.008 * dataset.sample_rate))
+        assert np.corrcoef(one[..., head].ravel(), other[..., head].ravel())[0, 1] > 0.3
         tail = slice(onset + 800, None)
         assert abs(np.corrcoef(one[..., tail].ravel(), other[..., tail].ravel())[0, 1]) < 0.2
         # Independent simulations of one room agree on its level.

@@ -9,14 +9,26 @@ from PIL import Image
 from server.acoustics.metrics import SPECTRAL_LOSS, spectral_loss
 from server.field.field import AcousticField
 from server.scene.bundle import Bundle
+from server.whole_field import WholeField
 from training.dataset import DatasetError
 from training.held_out import HeldOut, evaluate_bundle, record_accuracy
+from training.references import References
+
+
+@pytest.fixture(scope="module")
+def file(dataset):
+    with h5py.File(dataset.folder / "pairs.h5", "r") as opened:
+        yield opened
 
 
 @pytest.fixture
-def held_out(dataset, tiny_bundle):
-    with h5py.File(dataset.folder / "pairs.h5", "r") as file:
-        yield HeldOut(dataset, AcousticField.load(tiny_bundle), file)
+def references(dataset, file):
+    return References(dataset, file)
+
+
+@pytest.fixture
+def held_out(dataset, tiny_bundle, file):
+    return HeldOut(dataset, WholeField.through_kemar(AcousticField.load(tiny_bundle)), file)
 
 
 @pytest.fixture(scope="module")
@@ -29,23 +41,20 @@ def evaluation(dataset, tiny_bundle, figure):
     return evaluate_bundle(tiny_bundle, dataset, figure=figure)
 
 
-def pair_of(dataset, emitter, listener):
-    return dataset.read(np.array([[emitter, listener]]))[0]
-
-
-def test_references_are_the_held_out_pairs(held_out, dataset):
+def test_references_are_the_held_out_pairs(held_out, dataset, references):
     pairs = dataset.pairs(held_out=True)
     assert len(held_out.flat) == len(pairs)
     emitters, listeners = held_out.ends
     for index, (emitter, listener) in enumerate(pairs):
         np.testing.assert_array_equal(emitters[index], dataset.probes[emitter])
         np.testing.assert_array_equal(listeners[index], dataset.probes[listener])
-        np.testing.assert_array_equal(held_out.reference(index), pair_of(dataset, emitter, listener))
+        np.testing.assert_array_equal(held_out.reference(index), references[emitter * len(dataset.probes) + listener])
         assert not np.array_equal(held_out.repeat(index), held_out.reference(index))
 
 
-def test_the_nearest_answer_is_one_that_was_trained_on(held_out, dataset):
-    known = [pair_of(dataset, *pair) for pair in dataset.pairs(held_out=False)]
+def test_the_nearest_answer_is_one_that_was_trained_on(held_out, dataset, references):
+    pairs = dataset.pairs(held_out=False)
+    known = [references[emitter * len(dataset.probes) + listener] for emitter, listener in pairs]
     for index in range(len(held_out.flat)):
         answer = np.asarray(held_out.nearest(index))
         assert any(np.array_equal(answer, response) for response in known)
@@ -59,10 +68,10 @@ def test_every_method_answers_all_orientations(held_out, dataset):
         assert np.isfinite(answer).all()
 
 
-def test_the_floor_compares_two_takes_of_the_simulation(evaluation, dataset, tiny_bundle):
+def test_the_floor_compares_two_takes_of_the_simulation(evaluation, held_out, tiny_bundle):
     codec = tiny_bundle.manifest.codec.codec
-    pairs = dataset.pairs(held_out=True)
-    takes = (dataset.read(pairs, name).astype(np.float32) for name in ("impulse_responses", "repeats"))
+    pairs = range(len(held_out.flat))
+    takes = (np.stack([take(pair) for pair in pairs]) for take in (held_out.reference, held_out.repeat))
     expected = np.mean(spectral_loss(*(codec.log_magnitude(codec.transform(take)) for take in takes)))
     loss = next(row for row in evaluation.rows if row.name == SPECTRAL_LOSS.name)
     assert loss.columns["floor"].mean == pytest.approx(expected, rel=1e-4)

@@ -8,7 +8,7 @@ from training.cells import Cells
 from training.model import ExportedField, FactorisedField, FeatureGrid, FieldShape, Heads, PoseEncoder
 
 PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
-CELLS = Cells(Codec(16_000, 256, 64, 4_000, 1e-5))
+CELLS = Cells(Codec(16_000, 256, 64, 4_000, 1e-5), known_frames=12)
 SHAPE = FieldShape(rank=8, width=16, depth=2, grid_features=4)
 
 

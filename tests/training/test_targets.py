@@ -9,7 +9,7 @@ from training.model import Heads
 from training.targets import LEAD_SAMPLES, align, codec_of, flat_targets, load_targets
 
 CODEC = Codec(16_000, 256, 64, 4_000, 1e-5)
-CELLS = Cells(CODEC)
+CELLS = Cells(CODEC, known_frames=12)
 HEADS = Heads(CELLS)
 
 

@@ -7,12 +7,18 @@ import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from server.field.loudness import LoudnessMap, loudness_map
+from server.loudness import LoudnessMap, loudness_map
+from server.whole_field import WholeField
 
 
 @pytest.fixture
-def chart(field):
-    return loudness_map(field, (2.0, 2.5, 1.5), listener_height_m=1.5, spacing_m=0.5)
+def whole(field):
+    return WholeField.through_kemar(field)
+
+
+@pytest.fixture
+def chart(whole):
+    return loudness_map(whole, (2.0, 2.5, 1.5), listener_height_m=1.5, spacing_m=0.5)
 
 
 def test_cells_cover_the_bounds(chart, field):
@@ -29,13 +35,13 @@ def test_cells_cover_the_bounds(chart, field):
     assert np.isfinite(chart.levels_db).all()
 
 
-def test_levels_differ_as_those_of_the_responses_do(chart, field):
+def test_levels_differ_as_those_of_the_responses_do(chart, whole):
     """Only differences compare: the graph sounds from its first frame on, before the onset the field passes."""
     cells = np.array([(4, 4), (6, 11)])
     x, y = chart.origin[0] + cells[:, 1] * 0.5, chart.origin[1] + cells[:, 0] * 0.5
     listeners = np.repeat(np.stack([x, y, np.full(2, 1.5)], axis=-1), 4, axis=0)
     yaws = np.tile(np.arange(4) * np.pi / 2, 2)
-    responses = field.impulse_responses(listeners, np.broadcast_to((2.0, 2.5, 1.5), listeners.shape), yaws)
+    responses = whole.impulse_responses(listeners, np.broadcast_to((2.0, 2.5, 1.5), listeners.shape), yaws)
     levels = 10 * np.log10(np.mean(np.sum(responses.astype(np.float64) ** 2, axis=-1).reshape(2, 8), axis=-1))
     near, far = (chart.levels_db[row, column] for row, column in cells)
     assert_allclose(near - far, levels[0] - levels[1], atol=0.7)

@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import Vector3
 from server.field.field import AcousticField
+from server.whole_field import WholeField
 
 # Ears of two opposite heads face four ways.
 _YAWS = 2
@@ -71,7 +72,7 @@ class LoudnessMap:
 
 
 def loudness_map(
-    field: AcousticField, emitter: Vector3, *, listener_height_m: float, spacing_m: float = 0.25
+    field: WholeField, emitter: Vector3, *, listener_height_m: float, spacing_m: float = 0.25
 ) -> LoudnessMap:
     """Asks the field for every cell in the floor plan, on a grid centred in the bounds; about a millisecond each."""
     bundle = field.bundle
@@ -83,11 +84,14 @@ def loudness_map(
     cells = np.stack([*np.meshgrid(x, y), np.full((rows, columns), listener_height_m)], axis=-1)
     inside = bundle.floor_plan.contains(cells)
     levels = np.full((rows, columns), np.nan)
-    levels[inside] = power_to_db(_mean_power(field, cells[inside], emitter))
+    reflected = _reflected_power(field.field, cells[inside], emitter)
+    levels[inside] = power_to_db(field.direct_power(cells[inside], emitter) + reflected)
     return LoudnessMap(levels, (float(x[0]), float(y[0])), spacing_m, listener_height_m)
 
 
-def _mean_power(field: AcousticField, listeners: npt.NDArray[np.float64], emitter: Vector3) -> npt.NDArray[np.float64]:
+def _reflected_power(
+    field: AcousticField, listeners: npt.NDArray[np.float64], emitter: Vector3
+) -> npt.NDArray[np.float64]:
     """(listener,) energy per ear, averaged over ears and head orientations, straight from the predicted magnitudes."""
     codec = field.bundle.manifest.codec.codec
     yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS

@@ -1,0 +1,99 @@
+"""A scene's whole impulse responses: the direct path from geometry, and what follows it from the field.
+
+Axes: B poses; responses (B, ear, sample). Metres, radians.
+"""
+
+from functools import cache, cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import db_to_power
+from server.acoustics.geometry import Pose
+from server.acoustics.sound_path import SoundPathFinder
+from server.field.field import AcousticField
+from server.rendering.direct_path import NEAR_LIMIT_M, DirectPath, PathTarget
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.sphere import solid_angles
+from server.scene.bundle import Bundle
+
+_N_FFT = 512
+# For impulse responses every size gives the same, and a large one the soonest.
+_BLOCK = 4096
+
+
+@cache
+def kemar(sample_rate: int) -> HeadFilters:
+    """The head of single responses, of maps, and of simulations."""
+    return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
+
+
+class WholeField:
+    """A field heard through one head, direct sound included; thread-safe, as the field is. Emitters radiate alike in
+    all directions."""
+
+    def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
+        manifest = field.bundle.manifest
+        self.field = field
+        self._filters = filters
+        self._air_db_per_m = manifest.air.absorption_db_per_m
+        self._paths = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
+        self._direct = DirectPath(
+            slots=1,
+            block_size=_BLOCK,
+            sample_rate=field.sample_rate,
+            filters=filters,
+            speed_of_sound=manifest.speed_of_sound,
+            air_db_per_m=self._air_db_per_m,
+        )
+
+    @classmethod
+    def through_kemar(cls, field: AcousticField) -> "WholeField":
+        """Heard by the head that everything is heard by where no other was asked for."""
+        return cls(field, kemar(field.sample_rate))
+
+    @property
+    def bundle(self) -> Bundle:
+        return self.field.bundle
+
+    @property
+    def sample_rate(self) -> int:
+        return self.field.sample_rate
+
+    def impulse_responses(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
+    ) -> npt.NDArray[np.float32]:
+        """(B, 2, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
+        listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        responses = self.field.impulse_responses(listeners, emitters, yaws)
+        for response, listener, emitter, yaw in zip(responses, listeners, emitters, yaws, strict=True):
+            response += self._direct_sound(listener, emitter, yaw)
+        return responses
+
+    def direct_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """(B,) energy per ear of the direct path, averaged over all orientations of the head."""
+        # A path is the same both ways, and here are many listeners to one emitter.
+        paths = self._paths.find(emitter, listeners)
+        bands = db_to_power(paths.screen_db - paths.length_m[:, None] * self._air_db_per_m)
+        return np.asarray(bands @ self._diffuse_energy / np.maximum(paths.length_m, NEAR_LIMIT_M) ** 2)
+
+    def _direct_sound(
+        self, listener: npt.NDArray[np.float64], emitter: npt.NDArray[np.float64], yaw: float
+    ) -> npt.NDArray[np.float32]:
+        """(2, ir_samples)"""
+        paths = self._paths.find(listener, emitter[None])
+        target = PathTarget(float(paths.length_m[0]), tuple(paths.arrival[0]), paths.screen_db[0].astype(np.float32))
+        orientation = Pose.from_yaw((0.0, 0.0, 0.0), float(yaw)).orientation
+        return self._direct.impulse_response(target, orientation, self.field.ir_samples)
+
+    @cached_property
+    def _diffuse_energy(self) -> npt.NDArray[np.float64]:
+        """(band,) energy per ear of a unit impulse from everywhere, by octave band."""
+        spectra = np.abs(np.exp(np.fft.rfft(self._filters.cepstra, _N_FFT))) ** 2
+        everywhere = np.einsum("d,def->f", solid_angles(self._filters.directions), spectra) / 2
+        frequency = np.maximum(np.fft.rfftfreq(_N_FFT, 1 / self.sample_rate), 1.0)
+        band = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
+        # Bins between DC and Nyquist stand for two.
+        weight = np.r_[1, np.full(len(frequency) - 2, 2), 1] / _N_FFT
+        return np.asarray(np.bincount(band, everywhere * weight, len(OCTAVE_BANDS_HZ)), dtype=np.float64)

@@ -1,0 +1,145 @@
+"""The direct path that is rendered and the reflected sound that fields learn are one response, and no part of it comes
+twice.
+
+The oracle is the simulation with its own direct sound. Beside a wall's edge, and round it, the direct path bends and
+the simulated one does not: pairs for this stand clear of both.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from server.acoustics.decibels import power_to_db
+from server.acoustics.room_parameters import measure
+from server.field.field import AcousticField
+from server.rendering.direct_path import DirectPath, PathTarget
+from server.scene.bundle import BUNDLED, Bundle
+from server.whole_field import WholeField, kemar
+from training.dataset import SPEED_OF_SOUND
+from training.synthesis import BinauralSynthesis
+from training.tracing import RoomTracer, sphere_directions
+
+YAWS = 2 * np.pi * np.arange(3) / 3 + 0.2
+RATE = 24_000
+
+
+@dataclasses.dataclass
+class Simulated:
+    """Responses (yaw, ear, sample) of one pair: in two independent takes, and the direct sound in both."""
+
+    emitter: np.ndarray
+    listener: np.ndarray
+    direct: np.ndarray
+    reflected: np.ndarray
+    again: np.ndarray
+
+    @property
+    def onset(self):
+        """(yaw, ear)"""
+        return np.argmax(np.abs(self.direct) > 0.1 * np.abs(self.direct).max(axis=-1, keepdims=True), axis=-1)
+
+    def drr_db(self, response):
+        return measure(response, RATE, onset=self.onset).direct_to_reverberant_db
+
+
+@pytest.fixture(scope="module")
+def pairs(apartment):
+    """Fresh ones in the bundled apartment, at places where no probe stood, from 0.7 to 4.5 m apart."""
+    emitter = np.array([6.0, 2.2, 1.5])
+    away = np.array(
+        [(0.7, 0.0, 0.0), (-0.6, 0.9, 0.1), (1.2, 1.3, -0.2), (-1.1, -1.4, 0.1), (0.9, -1.6, 0.2), (-4.4, 0.3, 0.1)]
+    )
+    listeners = emitter + away
+    settings = apartment.simulation
+    directions = sphere_directions(settings.arrival_directions)
+    tracer = RoomTracer(
+        apartment.geometry,
+        apartment.air,
+        listeners,
+        duration_s=settings.duration_s,
+        image_order=settings.image_order,
+        arrival_directions=directions,
+    )
+    synthesis = BinauralSynthesis(kemar(RATE), directions, YAWS, round(settings.duration_s * RATE))
+    rng = np.random.default_rng(0)
+    takes = []
+    for seed in (1, 2):
+        arrivals = tracer.trace(emitter, rays=settings.rays, seed=seed)
+        onsets = np.linalg.norm(away, axis=-1) / SPEED_OF_SOUND
+        takes.append([synthesis.render(*what, rng) for what in zip(arrivals, listeners, onsets, strict=True)])
+    return [
+        Simulated(emitter, listener, synthesis.direct(emitter, listener, apartment.air), *reflected)
+        for listener, *reflected in zip(listeners, *takes, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def field():
+    return AcousticField.load(Bundle.load(BUNDLED / "apartment"))
+
+
+def direct_paths(pair, air):
+    """(yaw, ear, sample) by the code of the renderer, along a straight line."""
+    path = DirectPath(
+        slots=1,
+        block_size=256,
+        sample_rate=RATE,
+        filters=kemar(RATE),
+        speed_of_sound=SPEED_OF_SOUND,
+        air_db_per_m=air.absorption_db_per_m,
+    )
+    offset = pair.emitter - pair.listener
+    distance = np.linalg.norm(offset)
+    target = PathTarget(float(distance), offset / distance, np.zeros(7, np.float32))
+    turned = [(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)) for yaw in YAWS]
+    return np.stack([path.impulse_response(target, quaternion, pair.direct.shape[-1]) for quaternion in turned])
+
+
+def energy_db(response):
+    return power_to_db(np.sum(np.square(response, dtype=np.float64), axis=-1))
+
+
+def test_the_direct_path_is_the_direct_sound_of_the_simulation(pairs, apartment):
+    for pair in pairs:
+        difference = energy_db(direct_paths(pair, apartment.air)) - energy_db(pair.direct)
+        # One is filtered in the frequency domain, the other by short filters and a fractional delay line.
+        assert np.abs(difference).max() < 0.2
+
+
+def test_joined_to_the_simulated_reflections_nothing_counts_twice(pairs, apartment):
+    ratios, energies = [], []
+    for pair in pairs:
+        joined, reference = (pair.reflected + part for part in (direct_paths(pair, apartment.air), pair.direct))
+        ratios.append(pair.drr_db(joined) - pair.drr_db(reference))
+        energies.append(energy_db(joined) - energy_db(reference))
+    assert np.abs(ratios).mean() < 0.3
+    assert np.abs(np.mean(ratios)) < 0.15
+    assert np.abs(energies).mean() < 0.15
+    # A direct sound more, or less, and this is what it would be.
+    once, twice = ([pair.drr_db(pair.reflected + n * pair.direct) for pair in pairs] for n in (1, 2))
+    assert np.mean(np.array(twice) - once) > 2
+
+
+def test_the_bundled_field_is_the_reflected_sound(pairs, field):
+    """Against independent simulations, which differ among each other by 0.3 dB."""
+    levels = []
+    for pair in pairs:
+        predicted = field.impulse_responses([pair.listener] * len(YAWS), [pair.emitter] * len(YAWS), YAWS)
+        levels.append(energy_db(predicted) - energy_db(pair.reflected))
+    assert np.abs(levels).mean() < 0.7
+    assert np.abs(np.mean(levels)) < 0.35
+
+
+def test_the_bundled_field_and_the_direct_path_are_the_whole_response(pairs, field):
+    whole = WholeField.through_kemar(field)
+    ratios, floor, levels = [], [], []
+    for pair in pairs:
+        reference = pair.reflected + pair.direct
+        predicted = whole.impulse_responses([pair.listener] * len(YAWS), [pair.emitter] * len(YAWS), YAWS)
+        ratios.append(pair.drr_db(predicted) - pair.drr_db(reference))
+        floor.append(pair.drr_db(pair.again + pair.direct) - pair.drr_db(reference))
+        levels.append(energy_db(predicted) - energy_db(reference))
+    assert np.abs(ratios).mean() < np.abs(floor).mean() + 0.8
+    assert np.abs(np.mean(ratios)) < 0.7
+    assert np.abs(np.mean(levels)) < 0.3
