@@ -73,9 +73,9 @@ class Bundle:
         """Raises RequestError `position_out_of_bounds` unless the position is finite, within the bounds and not
         inside a wall."""
         bounds = self.manifest.bounds
-        point = np.asarray(position, dtype=np.float64)
-        in_box = np.all(point >= bounds.minimum) and np.all(point <= bounds.maximum)
-        if in_box and self.floor_plan.contains(point):
+        sides = zip(bounds.minimum, position, bounds.maximum, strict=True)
+        in_box = all(least <= at <= most for least, at, most in sides)
+        if in_box and self.floor_plan.holds(position):
             return
         place = ", ".join(f"{coordinate:g}" for coordinate in position)
         problem = "is inside a wall" if in_box else f"is outside {list(bounds.minimum)} to {list(bounds.maximum)} m"

@@ -17,6 +17,15 @@ point = st.tuples(st.floats(0.1, 7.9), st.floats(0.1, 4.9), st.floats(0.1, 2.7))
 )
 
 
+@given(
+    st.one_of(st.floats(-1, 9), st.sampled_from([0, 4, 4.2, 8])),
+    st.one_of(st.floats(-1, 6), st.sampled_from([0, 2, 3, 5])),
+    st.one_of(st.floats(-1, 4), st.sampled_from([0, 2.8, math.nan])),
+)
+def test_one_point_is_held_where_many_are_contained(x: float, y: float, z: float) -> None:
+    assert APARTMENT.holds((x, y, z)) == APARTMENT.contains(np.array((x, y, z)))
+
+
 @given(st.floats(-3.1, 3.1))
 def test_yaw_survives_the_quaternion(yaw: float) -> None:
     assert math.isclose(Pose.from_yaw((0, 0, 0), yaw).yaw, yaw, abs_tol=1e-9)
