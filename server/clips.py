@@ -17,12 +17,11 @@ import soundfile
 import soxr
 
 from server.errors import NafirError, RequestError
+from server.rendering.sources import LOUDEST
 
 FloatArray = npt.NDArray[np.float32]
 
 _BUNDLED = Path(__file__).parent / "clips_data"
-_LOUDEST = 1e6
-"""Full scale is 1. Integers written as float reach 2^31, and nobody wants to hear them so."""
 
 
 class DecodeError(NafirError):
@@ -70,7 +69,7 @@ def decode(path: Path, sample_rate: int) -> FloatArray:
     is_bad = ~np.isfinite(samples).all(axis=1)
     if is_bad.any():
         raise DecodeError(path.name, f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
-    if (peak := np.abs(samples).max()) > _LOUDEST:
+    if (peak := np.abs(samples).max()) > LOUDEST:
         raise DecodeError(path.name, f"its peak of {peak:.3g} is not audio, where full scale is 1")
     mono: FloatArray = samples.mean(axis=1, dtype=np.float32)
     if file_rate != sample_rate:

@@ -9,7 +9,7 @@ import sys
 
 _REAL_TIME = 20
 """Above every ordinary thread, below what keeps the machine itself alive (1 to 99)."""
-_NICENESS = 10
+_NICENESS = 5
 
 
 def become_real_time() -> str | None:

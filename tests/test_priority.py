@@ -46,5 +46,5 @@ def test_a_thread_in_the_background_yields_and_the_others_do_not():
         return os.getpriority(os.PRIO_PROCESS, 0)
 
     before = os.getpriority(os.PRIO_PROCESS, 0)
-    assert in_a_thread(try_it) == 10
+    assert in_a_thread(try_it) == 5
     assert os.getpriority(os.PRIO_PROCESS, 0) == before
