@@ -8,6 +8,11 @@ from pydantic import BeforeValidator, Field
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 
+def _usable_cores() -> int:
+    """Fewer than the machine's where the process is confined to some."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _split_paths(value: Any) -> Any:
     return tuple(part for part in value.split(os.pathsep) if part) if isinstance(value, str) else value
 
@@ -27,9 +32,15 @@ class Settings(BaseSettings):
     """Scene bundles to serve beside those that come with the package."""
     clips: Paths = ()
     """Audio files to offer as clips, named by their stem, beside those that come with the package."""
+    hrtfs: Paths = ()
+    """SOFA files (SimpleFreeFieldHRIR) to offer as heads, named by their stem, beside KEMAR."""
 
-    ir_workers: Annotated[int, Field(ge=1)] = max(1, (os.cpu_count() or 1) - 1)
-    """Threads that compute impulse responses. One core is left to the audio thread."""
+    audio_threads: Annotated[int, Field(ge=1)] = _usable_cores()
+    """Threads that render streams."""
+    realtime: bool = True
+    """Whether to ask for real-time priority for them; where the system refuses, they run without."""
+    ir_workers: Annotated[int, Field(ge=1)] = max(1, _usable_cores() - 1)
+    """Threads that compute impulse responses, behind all others. One core is left to the audio threads."""
     max_streams: Annotated[int, Field(ge=1)] = 64
     max_emitters: Annotated[int, Field(ge=1, le=64)] = 16
     """Of one stream."""

@@ -18,17 +18,30 @@ def test_defaults_serve_this_machine_only():
     settings = Settings()
     assert (settings.host, settings.port, settings.bundles) == ("127.0.0.1", 8000, ())
     assert settings.ir_workers >= 1
+    assert 1 <= settings.audio_threads <= os.cpu_count()
 
 
 def test_the_environment_is_heeded_and_arguments_win(monkeypatch):
     monkeypatch.setenv("NAFIR_PORT", "9000")
     monkeypatch.setenv("NAFIR_MAX_STREAMS", "3")
     monkeypatch.setenv("NAFIR_BUNDLES", os.pathsep.join(["one", "two"]))
+    monkeypatch.setenv("NAFIR_HRTFS", "head.sofa")
+    monkeypatch.setenv("NAFIR_REALTIME", "no")
     settings = Settings(port=9001)
     assert (settings.port, settings.max_streams, settings.bundles) == (9001, 3, (Path("one"), Path("two")))
+    assert (settings.hrtfs, settings.realtime) == ((Path("head.sofa"),), False)
 
 
-@pytest.mark.parametrize(("name", "value"), [("PORT", "70000"), ("IR_WORKERS", "0"), ("HELLO_TIMEOUT_S", "soon")])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("PORT", "70000"),
+        ("IR_WORKERS", "0"),
+        ("AUDIO_THREADS", "0"),
+        ("REALTIME", "perhaps"),
+        ("HELLO_TIMEOUT_S", "soon"),
+    ],
+)
 def test_impossible_settings_are_refused(monkeypatch, name, value):
     monkeypatch.setenv(f"NAFIR_{name}", value)
     with pytest.raises(ValidationError, match=name.lower()):
