@@ -15,6 +15,11 @@ COPY server server
 # Without `training` beside it the package is the server alone, so its other command goes.
 RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-deps . \
     && rm /opt/nafir/bin/nafir-train
+# What renders is compiled here, for this machine's processor, and kept beside its source; on another processor a
+# container compiles at its start, a matter of half a minute, and keeps that where NUMBA_CACHE_DIR says.
+WORKDIR /
+RUN /opt/nafir/bin/python -c "from server.rendering.renderer import warm_up; warm_up([256])"
+WORKDIR /source
 
 FROM ${BASE}
 LABEL org.opencontainers.image.title="Nafir" \

@@ -20,6 +20,10 @@ MIXER = np.dtype(
             "channels",
             "block_size",
             "plays",  # (slot,) int64
+            "clip",  # (slot,) int64: address of float32 samples that a slot plays, 0 where its row is filled for it
+            "clip_samples",  # (slot,) int64
+            "clip_at",  # (slot,) int64: next sample
+            "clip_loops",  # (slot,) int64
             "dry",  # (slot, block_size) float32
             "gain",  # (2, slot) float32
             "send",  # (2, slot) float32
@@ -40,6 +44,7 @@ def mix_mixers(addresses: npt.NDArray[np.int64], like: Reference | None) -> None
     None where none of them has one."""
     for number in range(addresses.size):
         mixer = carray(pointer(addresses[number]), (1,), MIXER)[0]
+        _play(mixer)
         _scale(mixer)
         process_convolver(mixer.convolver)
         for n in range(0, mixer.channels * mixer.block_size, 8):
@@ -48,6 +53,33 @@ def mix_mixers(addresses: npt.NDArray[np.int64], like: Reference | None) -> None
             blocks = carray(pointer(mixer.dry), (mixer.slots, mixer.block_size), np.float32)
             output = carray(pointer(mixer.output), (mixer.channels, mixer.block_size), np.float32)
             render_direct_paths(reference_at(mixer.direct, like), blocks, output)
+
+
+@compiled
+def _play(mixer) -> None:
+    """Fill the rows of slots that play a clip, as `server.rendering.sources.ClipPlayer` does."""
+    slots, size = mixer.slots, mixer.block_size
+    clip = carray(pointer(mixer.clip), (slots,), np.int64)
+    samples = carray(pointer(mixer.clip_samples), (slots,), np.int64)
+    at = carray(pointer(mixer.clip_at), (slots,), np.int64)
+    loops = carray(pointer(mixer.clip_loops), (slots,), np.int64)
+    dry = carray(pointer(mixer.dry), (slots, size), np.float32)
+    for slot in range(slots):
+        if clip[slot] == 0:
+            continue
+        values = carray(pointer(clip[slot]), (samples[slot],), np.float32)
+        written = 0
+        while written < size:
+            count = min(size - written, samples[slot] - at[slot])
+            if count == 0:  # only once, and over
+                dry[slot, written:] = 0
+                break
+            for n in range(count):
+                dry[slot, written + n] = values[at[slot] + n]
+            written += count
+            at[slot] += count
+            if loops[slot] != 0 and at[slot] == samples[slot]:
+                at[slot] = 0
 
 
 @compiled
@@ -80,7 +112,7 @@ def record_of(mixer: Any) -> npt.NDArray[np.void]:
     record = np.zeros(1, MIXER)
     record["slots"], record["block_size"] = mixer.dry.shape
     record["channels"] = mixer.output.shape[0]
-    for name in ("plays", "dry", "gain", "send", "fade_in", "output"):
+    for name in ("plays", "clip", "clip_samples", "clip_at", "clip_loops", "dry", "gain", "send", "fade_in", "output"):
         record[name] = getattr(mixer, name).ctypes.data
     engine = mixer.convolver.compiled
     record["convolver"] = engine.address

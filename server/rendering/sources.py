@@ -34,22 +34,22 @@ class ClipPlayer:
     def __init__(self, clip: FloatArray, *, loop: bool) -> None:
         if clip.ndim != 1 or clip.size == 0:
             raise ValueError(f"a clip is mono and not empty, got shape {clip.shape}")
-        self._clip = clip
-        self._loop = loop
+        self.clip = np.ascontiguousarray(clip, np.float32)
+        self.loop = loop
         self._position = 0
 
     def process(self, out: FloatArray) -> None:
         """Fill `out` (b,) with the next samples."""
         written = 0
         while written < out.size:
-            piece = self._clip[self._position : self._position + out.size - written]
+            piece = self.clip[self._position : self._position + out.size - written]
             if piece.size == 0:  # only once, and over
                 out[written:] = 0
                 return
             out[written : written + piece.size] = piece
             written += piece.size
             self._position += piece.size
-            if self._loop and self._position == self._clip.size:
+            if self.loop and self._position == self.clip.size:
                 self._position = 0
 
     def reset(self) -> None:

@@ -1,25 +1,27 @@
 """Laws of the renderer, against SciPy's convolution of what each emitter should have played."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.signal import fftconvolve
 
 from server.rendering.fade import raised_cosine
+from server.rendering.mixing_kernel import mix_mixers
+from server.rendering.partitions import Partitioning
 from server.rendering.renderer import (
-    ClipPlayer,
     DuplicateEmitterError,
     Renderer,
     RendererFullError,
     UnknownEmitterError,
+    render_all,
 )
+from server.rendering.sources import ClipPlayer
 
 SIZE = 64
 IR_SAMPLES = 500
-RING_OUT_BLOCKS = -(-IR_SAMPLES // SIZE) + 3
+RING_OUT_BLOCKS = Partitioning(SIZE, IR_SAMPLES).quiet_blocks
 
 
 def noise(seed, *shape):
@@ -31,7 +33,17 @@ def room(seed):
 
 
 def renderer(**options):
-    return Renderer(block_size=SIZE, ir_samples=IR_SAMPLES, **options)
+    """One without direct paths: its laws are those of mixing and convolving."""
+    defaults = {"sample_rate": 24_000, "filters": None, "speed_of_sound": 343.0, "air_db_per_m": np.zeros(7)}
+    return Renderer(block_size=SIZE, ir_samples=IR_SAMPLES, **(defaults | options))
+
+
+def add(engine, name, clip, *, gain=1.0, loop=True):
+    engine.add_emitter(name, ClipPlayer(clip, loop=loop), gain=gain)
+
+
+def emitter_ids(engine):
+    return tuple(engine._emitters)
 
 
 def run(engine, blocks):
@@ -46,47 +58,12 @@ def error_db(actual, expected):
     return 20 * np.log10(np.abs(actual - expected).max() / np.abs(expected).max() + 1e-30)
 
 
-@given(
-    clip_samples=st.integers(1, 300),
-    block_sizes=st.lists(st.integers(1, 100), max_size=20),
-    loop=st.booleans(),
-)
-@settings(deadline=None)
-def test_player_repeats_or_falls_silent(clip_samples, block_sizes, loop):
-    clip = 1 + np.arange(clip_samples, dtype=np.float32)
-    player = ClipPlayer(clip, loop=loop)
-    played = [np.full(size, np.nan, np.float32) for size in block_sizes]
-    for block in played:
-        player.process(block)
-    total = sum(block_sizes)
-    expected = np.resize(clip, total) if loop else np.pad(clip, (0, total))[:total]
-    np.testing.assert_array_equal(np.concatenate([*played, np.empty(0)]), expected)
-
-
-def test_player_starts_over_after_reset():
-    player = ClipPlayer(noise(1, 100), loop=False)
-    first, again = np.empty((2, 130), np.float32)
-    player.process(first)
-    player.reset()
-    player.process(again)
-    np.testing.assert_array_equal(first, again)
-
-
-@pytest.mark.parametrize("clip", [np.zeros(0, np.float32), np.zeros((2, 10), np.float32)])
-def test_a_clip_that_cannot_be_played_is_refused_and_leaves_nothing_behind(clip):
-    engine = renderer(max_emitters=1)
-    with pytest.raises(ValueError, match="mono"):
-        engine.add_emitter("a", clip)
-    assert engine.emitter_ids == ()
-    engine.add_emitter("a", noise(2, 10))
-
-
 def test_every_emitter_is_its_clip_in_its_room():
     engine = renderer()
     clips = [noise(seed, 700) for seed in (3, 4, 5)]
     gains = [1.0, 0.25, 2.0]
     for number, (clip, gain) in enumerate(zip(clips, gains, strict=True)):
-        engine.add_emitter(str(number), clip, gain=gain, loop=number > 0)
+        add(engine, str(number), clip, gain=gain, loop=number > 0)
         engine.set_ir(str(number), room(number))
     blocks = 40
     played = [np.pad(clips[0], (0, blocks * SIZE))[: blocks * SIZE], *(np.resize(c, blocks * SIZE) for c in clips[1:])]
@@ -104,7 +81,7 @@ def test_a_renderer_of_nothing_is_silent_and_keeps_time():
 def test_an_emitter_waits_for_its_room_at_the_first_sample():
     clip = noise(6, 1_000)
     engine = renderer()
-    engine.add_emitter("a", clip)
+    add(engine, "a", clip)
     assert not run(engine, 5).any()
     assert engine.applied("a") is None
     engine.set_ir("a", room(7), token=1)
@@ -115,7 +92,7 @@ def test_an_emitter_waits_for_its_room_at_the_first_sample():
 def test_blocks_say_whether_they_exchanged_and_which_token_is_in_effect():
     engine = renderer()
     for name in ("a", "b"):
-        engine.add_emitter(name, noise(8, 100))
+        add(engine, name, noise(8, 100))
         engine.set_ir(name, room(9), token=1)
         assert engine.applied(name) is None
     engine.process()
@@ -132,7 +109,7 @@ def test_blocks_say_whether_they_exchanged_and_which_token_is_in_effect():
 def test_exchange_crossfades_two_rooms_over_the_next_block():
     clip = noise(12, 20 * SIZE)
     engine = renderer()
-    engine.add_emitter("a", clip)
+    add(engine, "a", clip)
     engine.set_ir("a", room(13))
     head = run(engine, 8)
     engine.set_ir("a", room(14))
@@ -147,7 +124,7 @@ def test_a_prepared_room_renders_the_same_from_any_thread():
     outputs = []
     for prepare_elsewhere in (False, True):
         engine = renderer()
-        engine.add_emitter("a", noise(15, 300))
+        add(engine, "a", noise(15, 300))
         ir = room(16)
         if prepare_elsewhere:
             prepared = []
@@ -162,7 +139,7 @@ def test_a_prepared_room_renders_the_same_from_any_thread():
 
 def test_gain_ramps_over_one_block_from_wherever_it_was():
     engine = renderer()
-    engine.add_emitter("a", np.ones(100, np.float32), gain=0.5)
+    add(engine, "a", np.ones(100, np.float32), gain=0.5)
     engine.set_ir("a", np.ones((2, 1), np.float32))
     rise = raised_cosine(SIZE)
     expected = [np.full(SIZE, 0.5)]
@@ -181,7 +158,7 @@ def test_gain_ramps_over_one_block_from_wherever_it_was():
 
 def test_a_gain_set_before_the_first_block_is_not_ramped_to():
     engine = renderer()
-    engine.add_emitter("a", np.ones(10, np.float32))
+    add(engine, "a", np.ones(10, np.float32))
     engine.set_gain("a", 0.25)
     engine.process()
     engine.set_ir("a", np.ones((2, 1), np.float32))
@@ -191,11 +168,11 @@ def test_a_gain_set_before_the_first_block_is_not_ramped_to():
 def test_a_removed_emitter_ramps_down_and_rings_out():
     clip = noise(17, 10 * SIZE)
     engine = renderer()
-    engine.add_emitter("a", clip, gain=0.5)
+    add(engine, "a", clip, gain=0.5)
     engine.set_ir("a", room(18))
     head = run(engine, 4)
     engine.remove_emitter("a")
-    assert engine.emitter_ids == ()
+    assert emitter_ids(engine) == ()
     tail = run(engine, RING_OUT_BLOCKS + 2)
     played = 0.5 * clip
     played[4 * SIZE : 5 * SIZE] *= raised_cosine(SIZE)[::-1]
@@ -212,11 +189,11 @@ def test_others_are_bit_equal_before_an_emitter_comes_and_after_it_has_gone():
     def wet(guest):
         engine = renderer()
         for number in range(3):
-            engine.add_emitter(str(number), noise(number, 777))
+            add(engine, str(number), noise(number, 777))
             engine.set_ir(str(number), room(number))
         output = [run(engine, 5)]
         if guest:
-            engine.add_emitter("guest", noise(19, 400))
+            add(engine, "guest", noise(19, 400))
             engine.set_ir("guest", room(20))
         output.append(run(engine, 5))
         if guest:
@@ -237,11 +214,11 @@ def test_others_are_bit_equal_before_an_emitter_comes_and_after_it_has_gone():
 
 def test_an_id_is_free_at_once_and_its_successor_inherits_nothing():
     engine = renderer()
-    engine.add_emitter("a", noise(22, 300), gain=0.5)
+    add(engine, "a", noise(22, 300), gain=0.5)
     engine.set_ir("a", room(23), token=7)
     engine.process()
     engine.remove_emitter("a")
-    engine.add_emitter("a", noise(24, 10 * SIZE))
+    add(engine, "a", noise(24, 10 * SIZE))
     assert engine.applied("a") is None
     run(engine, RING_OUT_BLOCKS)
     assert not engine.process().any()
@@ -252,7 +229,7 @@ def test_an_id_is_free_at_once_and_its_successor_inherits_nothing():
 @pytest.mark.parametrize("with_room", [False, True])
 def test_an_emitter_removed_before_it_sounded_never_sounds(with_room):
     engine = renderer()
-    engine.add_emitter("a", noise(26, 300))
+    add(engine, "a", noise(26, 300))
     if with_room:
         engine.set_ir("a", room(27))
     engine.remove_emitter("a")
@@ -262,29 +239,29 @@ def test_an_emitter_removed_before_it_sounded_never_sounds(with_room):
 def test_no_more_emitters_than_allowed():
     engine = renderer(max_emitters=2)
     for name in ("a", "b"):
-        engine.add_emitter(name, noise(28, 10))
+        add(engine, name, noise(28, 10))
     with pytest.raises(RendererFullError, match="at most 2"):
-        engine.add_emitter("c", noise(28, 10))
-    assert engine.emitter_ids == ("a", "b")
+        add(engine, "c", noise(28, 10))
+    assert emitter_ids(engine) == ("a", "b")
     engine.process()
     engine.remove_emitter("a")
-    engine.add_emitter("c", noise(28, 10))
-    assert engine.emitter_ids == ("b", "c")
+    add(engine, "c", noise(28, 10))
+    assert emitter_ids(engine) == ("b", "c")
 
 
 def test_slots_come_back_when_removed_emitters_have_rung_out():
     engine = renderer(max_emitters=1)
     for name in ("a", "b"):
-        engine.add_emitter(name, noise(29, 10))
+        add(engine, name, noise(29, 10))
         engine.set_ir(name, room(30))
         engine.process()
         engine.remove_emitter(name)
         engine.process()
     with pytest.raises(RendererFullError, match="ring out"):
-        engine.add_emitter("c", noise(29, 10))
+        add(engine, "c", noise(29, 10))
     run(engine, RING_OUT_BLOCKS)
     for name in ("c", "d"):
-        engine.add_emitter(name, noise(29, 10))
+        add(engine, name, noise(29, 10))
         engine.remove_emitter(name)
 
 
@@ -294,30 +271,30 @@ def test_coming_and_going_for_ever_leaks_nothing():
     refused = 0
     for step in range(600):
         try:
-            engine.add_emitter(str(step), noise(step, 100))
+            add(engine, str(step), noise(step, 100))
         except RendererFullError:
             refused += 1
         else:
             if rng.random() < 0.7:
                 engine.set_ir(str(step), room(step))
         assert np.isfinite(engine.process()).all()
-        if len(engine.emitter_ids) == 2 or rng.random() < 0.5:
-            for name in engine.emitter_ids[:1]:
+        if len(emitter_ids(engine)) == 2 or rng.random() < 0.5:
+            for name in emitter_ids(engine)[:1]:
                 engine.remove_emitter(name)
     assert 0 < refused < 600
-    for name in engine.emitter_ids:
+    for name in emitter_ids(engine):
         engine.remove_emitter(name)
     run(engine, RING_OUT_BLOCKS + 1)
     assert not engine.process().any()
     for name in ("x", "y"):
-        engine.add_emitter(name, noise(32, 100))
+        add(engine, name, noise(32, 100))
 
 
 def test_names_that_are_taken_or_unknown():
     engine = renderer()
-    engine.add_emitter("a", noise(33, 10))
+    add(engine, "a", noise(33, 10))
     with pytest.raises(DuplicateEmitterError, match="'a'"):
-        engine.add_emitter("a", noise(33, 10))
+        add(engine, "a", noise(33, 10))
     for call in (engine.remove_emitter, engine.applied, lambda name: engine.set_gain(name, 1.0)):
         with pytest.raises(UnknownEmitterError, match="'b'"):
             call("b")
@@ -327,7 +304,7 @@ def test_names_that_are_taken_or_unknown():
 
 def test_a_bad_room_is_refused_and_the_old_one_stays_in_effect():
     engine = renderer()
-    engine.add_emitter("a", noise(35, 100))
+    add(engine, "a", noise(35, 100))
     engine.set_ir("a", room(36), token=1)
     engine.process()
     for bad in (np.full((2, 10), np.nan, np.float32), room(37)[:1], np.zeros((2, IR_SAMPLES + 1), np.float32)):
@@ -339,10 +316,10 @@ def test_a_bad_room_is_refused_and_the_old_one_stays_in_effect():
 
 def test_reset_is_as_good_as_new():
     def play(engine):
-        engine.add_emitter("a", noise(38, 300))
+        add(engine, "a", noise(38, 300))
         engine.set_ir("a", room(39), token=1)
         output = [engine.process()]
-        engine.add_emitter("b", noise(40, 200))
+        add(engine, "b", noise(40, 200))
         engine.set_ir("b", room(41))
         output.append(run(engine, 3))
         engine.set_ir("a", room(42), token=2)
@@ -354,5 +331,54 @@ def test_reset_is_as_good_as_new():
     first = play(used)
     used.remove_emitter("a")
     used.reset()
-    assert (used.sample_clock, used.emitter_ids, used.exchanged) == (0, (), False)
+    assert (used.sample_clock, emitter_ids(used), used.exchanged) == (0, (), False)
     np.testing.assert_array_equal(play(used), first)
+
+
+def test_many_rendered_in_one_call_are_each_alone_to_the_bit():
+    def play(together):
+        engines = [renderer(max_emitters=2) for _ in range(4)]
+        output = [[] for _ in engines]
+        for block in range(30):
+            for number, engine in enumerate(engines):
+                if block == 2 * number:
+                    add(engine, "a", noise(50 + number, 300))
+                    engine.set_ir("a", room(60 + number))
+                if block == 12 + number:
+                    engine.set_ir("a", room(70 + number))
+                if block == 20:
+                    engine.set_gain("a", 0.5)
+            due = [engine for number, engine in enumerate(engines) if (block + number) % 3]
+            blocks = render_all(due) if together else [engine.process() for engine in due]
+            for engine, samples in zip(due, blocks, strict=True):
+                output[engines.index(engine)].append(samples)
+        return [np.concatenate(blocks, axis=1) for blocks in output]
+
+    for together, alone in zip(play(True), play(False), strict=True):
+        np.testing.assert_array_equal(together, alone)
+    assert render_all([]) == []
+
+
+def test_rendering_leaves_the_interpreter_to_others():
+    """While one call renders, another thread runs Python: it counts on, as it could not if the call held the lock."""
+    engine = renderer(max_emitters=4)
+    for number in range(4):
+        add(engine, str(number), noise(number, 500))
+        engine.set_ir(str(number), room(number))
+    run(engine, 2)
+    addresses = np.full(20_000, engine._mixer.address, np.int64)  # the same one, over and over: some hundred ms
+    counted = []
+
+    def count():
+        while not counted or counted[-1] >= 0:
+            counted.append(len(counted))
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    before = len(counted)
+    mix_mixers(addresses, None)
+    during = len(counted) - before
+    counted.append(-1)
+    thread.join()
+    assert during >= 3
