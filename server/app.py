@@ -1,24 +1,29 @@
-"""The ASGI application: loads scenes, starts the audio thread, warms up, serves."""
+"""The ASGI application: loads scenes, starts the audio engine, warms up, serves."""
 
 import asyncio
+import gc
 import logging
 from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 from pathlib import Path
+from typing import get_args
 
-import numpy as np
 from fastapi import FastAPI
 from starlette.staticfiles import StaticFiles
 
 from server.answers import Answers
-from server.audio_thread import AudioThread
-from server.catalogue import load_fields, open_clips, playable_clips
+from server.audio_engine import AudioEngine
+from server.catalogue import load_fields, load_hrtfs, open_clips, playable_clips
 from server.field.field import AcousticField
+from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.priority import become_background
 from server.problems import install_problems
-from server.rendering.renderer import Renderer
+from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
+from server.rendering.renderer import warm_up
 from server.routes import api, health
+from server.session import Session, compute_irs
 from server.settings import Settings
 from server.streaming import StreamHost
 
@@ -27,20 +32,29 @@ WEB = Path(__file__).parent / "web"
 _logger = logging.getLogger(__name__)
 
 
-def create_app(settings: Settings, *, fields: Mapping[str, AcousticField] | None = None) -> FastAPI:
-    """`fields` by scene id, where the caller has loaded them already to see their errors first.
+def create_app(
+    settings: Settings, *, fields: Mapping[str, AcousticField] | None = None, hrtfs: HrtfLibrary | None = None
+) -> FastAPI:
+    """`fields` by scene id, and `hrtfs`, where the caller has loaded them already to see their errors first.
 
-    Otherwise they are loaded at start-up, which raises BundleError for a damaged bundle.
+    Otherwise they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError for an HRTF.
     """
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
         loaded = await asyncio.to_thread(load_fields, settings.bundles) if fields is None else fields
-        with ThreadPoolExecutor(settings.ir_workers, "nafir-ir") as workers:
-            audio = AudioThread(asyncio.get_running_loop().call_soon_threadsafe, workers)
+        heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
+        with ThreadPoolExecutor(settings.ir_workers, "nafir-ir", initializer=become_background) as workers:
+            audio = AudioEngine(
+                asyncio.get_running_loop().call_soon_threadsafe,
+                workers,
+                threads=settings.audio_threads,
+                is_real_time=settings.realtime,
+            )
             host = StreamHost(
                 fields=loaded,
                 clips=open_clips(loaded, settings.clips),
+                hrtfs=heads,
                 audio=audio,
                 settings=settings,
                 # One more than there are IR workers: a map must not hold up an IR.
@@ -53,6 +67,7 @@ def create_app(settings: Settings, *, fields: Mapping[str, AcousticField] | None
             finally:
                 warming.cancel()
                 await asyncio.to_thread(audio.stop)
+                gc.unfreeze()
 
     app = FastAPI(
         title="Nafir",
@@ -75,19 +90,25 @@ async def _become_ready(host: StreamHost) -> None:
     except Exception:  # whatever it is, the server stays up, and not ready, for an operator to look at
         _logger.exception("warm-up failed")
         return
+    # A full collection looks at all there is, for longer than a block lasts; what is here by now stays.
+    gc.collect()
+    gc.freeze()
     host.is_ready = True
     _logger.info("ready: %s", ", ".join(host.fields))
 
 
 def _warm_up(host: StreamHost) -> None:
-    """Do once what every stream does, so that the first one does not pay for it: decode clips, an IR, some blocks."""
+    """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render."""
+    warm_up(get_args(BlockSize))
     for scene, field in host.fields.items():
         clips = playable_clips(host.clips[scene])
+        filters = host.hrtfs.filters(DEFAULT_HRTF, field.sample_rate)
+        session = Session(Hello(protocol=PROTOCOL, scene=scene), field, filters, host.clips[scene].load, window=100)
         start = field.bundle.manifest.start
-        ir = field.impulse_responses([start.listener], [start.emitter], [0.0])[0]
-        renderer = Renderer(block_size=256, ir_samples=field.ir_samples, channels=field.channels, max_emitters=1)
-        samples = host.clips[scene].load(clips[0].name) if clips else np.ones(field.sample_rate, np.float32)
-        renderer.add_emitter("warm-up", samples)
-        for _ in range(8):
-            renderer.set_ir("warm-up", renderer.prepare(ir))
-            renderer.process()
+        clip = clips[0].name if clips else None
+        session.receive(AddEmitter(id="warm-up", clip=clip, live=clip is None, position=start.emitter))
+        for turn in range(1, 9):
+            session.receive(ListenerPose(pose_id=turn, position=start.listener, yaw=0.1 * turn))
+            if (request := session.take_request()) is not None:
+                session.accept(compute_irs(field, request, session.prepare))
+            session.render_block()

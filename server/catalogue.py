@@ -1,4 +1,4 @@
-"""What a server offers: scenes with their fields, and clips to hear in them."""
+"""What a server offers: scenes with their fields, clips to hear in them, and heads to hear them through."""
 
 import logging
 import math
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from server.clips import Clip, ClipLibrary, DecodeError
 from server.field.field import AcousticField
+from server.hrtfs import HrtfLibrary
 from server.protocol import Place, SceneDescription
 from server.scene.bundle import Bundle, bundled_scenes
 
@@ -23,6 +24,11 @@ def load_fields(bundles: Iterable[Path]) -> dict[str, AcousticField]:
         bundle = Bundle.load(folder)
         fields[bundle.id] = AcousticField.load(bundle)
     return fields
+
+
+def load_hrtfs(files: Iterable[Path], fields: Mapping[str, AcousticField]) -> HrtfLibrary:
+    """Heads for the sample rates of the scenes. Raises HrtfError for the first file that cannot be used."""
+    return HrtfLibrary(files, {field.sample_rate for field in fields.values()})
 
 
 def open_clips(fields: Mapping[str, AcousticField], files: Iterable[Path]) -> dict[str, ClipLibrary]:

@@ -55,6 +55,9 @@ def serve(
         typer.Option(help="Scene bundle to serve as well, in place of a bundled scene of the same id; repeatable."),
     ] = None,
     clip: Annotated[list[Path] | None, typer.Option(help="Audio file to offer as a clip; repeatable.")] = None,
+    hrtf: Annotated[
+        list[Path] | None, typer.Option(help="SOFA file with a head to offer beside KEMAR; repeatable.")
+    ] = None,
 ) -> None:
     """Serve scenes over HTTP and WebSocket, and a page to walk through them.
 
@@ -64,10 +67,10 @@ def serve(
     from pydantic import ValidationError
 
     from server.app import create_app
-    from server.catalogue import load_fields
+    from server.catalogue import load_fields, load_hrtfs
     from server.settings import Settings
 
-    given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip}
+    given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf}
     try:
         settings = Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as exc:
@@ -76,12 +79,13 @@ def serve(
     fields = load_fields(settings.bundles)
     if not fields:
         raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
+    hrtfs = load_hrtfs(settings.hrtfs, fields)
     if settings.port:
         Console().print(
             f"[bold]Nafir[/] serves {', '.join(fields)} at [link]http://{settings.host}:{settings.port}[/]",
             highlight=False,
         )
-    uvicorn.run(create_app(settings, fields=fields), **server_options(settings))
+    uvicorn.run(create_app(settings, fields=fields, hrtfs=hrtfs), **server_options(settings))
 
 
 def server_options(settings: "Settings") -> dict[str, Any]:
@@ -143,10 +147,18 @@ def render(
     emitter: Annotated[
         list[str], typer.Option(help="Clip name or audio file, and where it plays; repeatable.", metavar="CLIP@X,Y,Z")
     ],
-    path: Annotated[Path, typer.Option(help="CSV: sample or time_s, x, y, z, and qx, qy, qz, qw or yaw_deg.")],
+    path: Annotated[
+        Path,
+        typer.Option(
+            help="CSV: sample or time_s; x, y, z; qx, qy, qz, qw or yaw_deg; reverberation_sample where it is later."
+        ),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32, stereo.")],
     block_size: Annotated[int, typer.Option(help="Poses take effect at multiples of it, samples.", min=16)] = 256,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
+    hrtf: Annotated[
+        Path | None, typer.Option(help="SOFA file with the head to hear through, instead of KEMAR.")
+    ] = None,
     duration_s: Annotated[
         float | None, typer.Option(help="Length to render; by default until all has rung out.")
     ] = None,
@@ -155,7 +167,9 @@ def render(
     """Render to a file what a listener hears who walks along a path."""
     import scipy.io.wavfile
 
+    from server.direct_sound import DirectSound
     from server.field.field import AcousticField
+    from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
     from server.render import MAX_RENDER_S, read_path
     from server.render import render as render_path
     from server.scene.bundle import Bundle, find_bundle
@@ -174,11 +188,14 @@ def render(
     for number, point in enumerate(points, start=1):
         field.bundle.require_inside(point.pose.position, f"path point {number}")
     length = None if duration_s is None else round(duration_s * field.sample_rate)
+    heads = HrtfLibrary([] if hrtf is None else [hrtf], [field.sample_rate])
+    filters = heads.filters(DEFAULT_HRTF if hrtf is None else hrtf.stem, field.sample_rate)
     started_s = time.perf_counter()
     with Progress(transient=True, disable=as_json, console=Console(stderr=True)) as progress:
         task = progress.add_task("rendering", total=1.0)
         samples = render_path(
             field,
+            DirectSound.of(field.bundle, filters),
             emitters,
             points,
             block_size=block_size,
@@ -206,6 +223,7 @@ def render(
 
 def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "RenderedEmitter":
     """`CLIP@x,y,z`, where CLIP names a bundled clip, or else an audio file."""
+    from server.acoustics.geometry import Pose
     from server.clips import ClipLibrary, decode
     from server.impulse_response import parse_position
     from server.render import RenderedEmitter
@@ -217,7 +235,7 @@ def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "Rendered
     field.bundle.require_inside(position, "emitter")
     clips = ClipLibrary(field.sample_rate)
     samples = clips.load(clip) if clip in clips.names else decode(Path(clip), field.sample_rate)
-    return RenderedEmitter(samples, position, loop=loop)
+    return RenderedEmitter(samples, Pose(position), loop=loop)
 
 
 def _write(output: Path, content: bytes) -> None:

@@ -4,6 +4,8 @@ Seconds of one monotonic clock. Block k of a stream plays from `origin_s + k * b
 blocks earlier. Everything is measured from the origin, so the error of one sleep never adds to the next.
 """
 
+import math
+
 from server.errors import RequestError
 
 
@@ -28,8 +30,9 @@ class StreamClock:
         return self.deadline_s(block) - now_s
 
     def slip(self, block: int, now_s: float) -> None:
-        """Move the origin so that `block` is due now: after a stall, sound resumes instead of arriving in a burst."""
-        self._origin_s += now_s - self.due_s(block)
+        """Move the origin by whole blocks so that `block` is due next: after a stall, sound resumes instead of arriving
+        in a burst, and other streams' blocks still fall due between this one's."""
+        self._origin_s += math.ceil((now_s - self.due_s(block)) / self._block_s) * self._block_s
 
 
 class SendWindow:

@@ -1,8 +1,8 @@
-"""Wire types of the WebSocket stream at /v1/stream, protocol version 1.
+"""Messages of the WebSocket stream at /v1/stream, protocol version 2.
 
 Control travels as JSON text, one object with a `type` per message; listener poses may travel as 36-byte binary messages
-instead, and audio always travels as binary blocks. Binary is little endian. Metres, radians, decibels, samples of the
-scene's rate.
+instead, and audio always travels as binary blocks (`server.blocks`). Binary is little endian. Metres, radians,
+decibels, samples of the scene's rate.
 
 Every type here parses and serialises itself, so the tests, the documentation and both ends of the wire read one
 definition. What a client sends is validated here, once; a `RequestError` carries the code that goes back to it.
@@ -10,28 +10,28 @@ definition. What a client sends is validated here, once; a `RequestError` carrie
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from server.acoustics import directivity
+from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
+from server.blocks import DryBlock, Encoding
+from server.durations import DurationHistogram
 from server.errors import RequestError
 from server.scene.geometry import Opening
 from server.scene.manifest import Bounds, QualityLevel
 
-PROTOCOL: Final = 1
+PROTOCOL: Final = 2
 
-FloatArray = npt.NDArray[np.float32]
-Encoding = Literal["f32", "s16"]
 BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
 PoseId = Annotated[int, Field(ge=0, lt=2**32)]
 Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Quaternion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
 
 _POSE_FIELDS = frozenset({"position", "orientation", "yaw", "listener"})
 
@@ -45,7 +45,7 @@ class _Message(BaseModel):
 
 
 class _Directed(_Message):
-    """A position and a heading: a quaternion, or a yaw for a level head; with neither, the head looks along +x."""
+    """A position and where front is: a quaternion, or a yaw where up is up; with neither, front is along +x."""
 
     position: Position
     orientation: Quaternion | None = None
@@ -62,6 +62,11 @@ class _Directed(_Message):
         return self
 
     @property
+    def has_front(self) -> bool:
+        """Whether the message says where front is."""
+        return self.orientation is not None or self.yaw is not None
+
+    @property
     def pose(self) -> Pose:
         if self.orientation is not None:
             return Pose(self.position, self.orientation)
@@ -74,7 +79,8 @@ class ListenerStart(_Directed):
 
 class Hello(_Message):
     """First message. `sample_rate` may be left out; given, it has to be the scene's. `buffer_blocks` is how many blocks
-    ahead of real time the server runs: more survives a worse network, less is heard sooner."""
+    ahead of real time the server runs: more survives a worse network, less is heard sooner. `hrtf` names the head to
+    hear through, one of GET /v1/hrtfs."""
 
     type: Literal["hello"] = "hello"
     protocol: int
@@ -83,23 +89,78 @@ class Hello(_Message):
     block_size: BlockSize = 256
     encoding: Encoding = "f32"
     listener: ListenerStart | None = None
+    hrtf: Annotated[str, Field(max_length=256)] | None = None
     buffer_blocks: Annotated[int, Field(ge=1, le=32)] = 8
 
 
-class AddEmitter(_Message):
+class DirectivityPattern(_Message):
+    """How loud an emitter is in each direction, as seen by itself: one of the cardioid family, narrowed by `order`, or
+    measured: `gains_db`, seven octave bands from 125 Hz of one gain for each of `angles_deg`, which rise from 0 (its
+    front) to 180."""
+
+    pattern: Literal[
+        "omnidirectional", "subcardioid", "cardioid", "supercardioid", "hypercardioid", "figure_of_eight", "measured"
+    ]
+    order: FiniteFloat | None = None
+    angles_deg: Annotated[tuple[FiniteFloat, ...], Field(max_length=361)] | None = None
+    gains_db: Annotated[tuple[tuple[FiniteFloat, ...], ...], Field(max_length=7)] | None = None
+
+    @model_validator(mode="after")
+    def _is_one_pattern(self) -> Self:
+        try:
+            _ = self.directivity
+        except ValueError as exc:
+            raise PydanticCustomError("malformed_directivity", "{reason}", {"reason": str(exc)}) from exc
+        return self
+
+    @property
+    def directivity(self) -> Directivity:
+        measured = self.angles_deg, self.gains_db
+        if self.pattern == "measured":
+            if self.order is not None or None in measured:
+                raise ValueError("a measured pattern has angles_deg and gains_db, and no order")
+            return directivity.PolarPattern(self.angles_deg or (), self.gains_db or ())
+        if measured != (None, None):
+            raise ValueError(f"angles_deg and gains_db belong to a measured pattern, not to {self.pattern!r}")
+        family: directivity.Cardioid = getattr(directivity, self.pattern.upper())
+        return family if self.order is None else directivity.Cardioid(family.omni_share, self.order)
+
+
+class AddEmitter(_Directed):
+    """An emitter that plays a clip, or, with `live`, what the client sends for it in dry blocks (`server.blocks`).
+
+    Its front matters to its directivity only; without one it is equally loud all round.
+    """
+
     type: Literal["add_emitter"] = "add_emitter"
     id: EmitterId
-    clip: Annotated[str, Field(max_length=256)]
-    position: Position
-    gain_db: Annotated[FiniteFloat, Field(ge=-80, le=24)] = 0.0
+    clip: Annotated[str, Field(max_length=256)] | None = None
+    live: bool = False
+    gain_db: GainDb = 0.0
     loop: bool = True
+    directivity: DirectivityPattern | None = None
+
+    @model_validator(mode="after")
+    def _has_one_sound(self) -> Self:
+        if self.live == (self.clip is not None):
+            raise PydanticCustomError("malformed_emitter", "give a clip or live, one of them")
+        return self
 
 
-class MoveEmitter(_Message):
+class MoveEmitter(_Directed):
+    """Where an emitter is from now on; without orientation and yaw its front stays where it was."""
+
     type: Literal["move_emitter"] = "move_emitter"
     id: EmitterId
-    position: Position
     pose_id: PoseId
+
+
+class SetGain(_Message):
+    """How loud an emitter is from now on, direct sound and reverberation alike."""
+
+    type: Literal["set_gain"] = "set_gain"
+    id: EmitterId
+    gain_db: GainDb
 
 
 class RemoveEmitter(_Message):
@@ -149,17 +210,19 @@ class Ping(_Message):
     id: Annotated[int, Field(ge=0, lt=2**53)]  # what JavaScript counts exactly
 
 
-ClientMessage = Hello | AddEmitter | MoveEmitter | RemoveEmitter | ListenerPose | Acknowledge | Ping
-_CLIENT: TypeAdapter[ClientMessage] = TypeAdapter(Annotated[ClientMessage, Field(discriminator="type")])
+TextMessage = Hello | AddEmitter | MoveEmitter | SetGain | RemoveEmitter | ListenerPose | Acknowledge | Ping
+ClientMessage = TextMessage | DryBlock
+_CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(discriminator="type")])
 
 
 def parse_client_message(data: str | bytes) -> ClientMessage:
     """One message as it came off the socket: text or binary.
 
-    Raises RequestError with code malformed_message, unknown_message or malformed_pose, naming the field at fault.
+    Raises RequestError with code malformed_message, unknown_message, malformed_pose, malformed_directivity or
+    malformed_block, naming the field at fault.
     """
     if isinstance(data, bytes):
-        return ListenerPose.parse_binary(data)
+        return DryBlock.parse(data) if data[:1] == bytes([DryBlock.KIND]) else ListenerPose.parse_binary(data)
     try:
         return _CLIENT.validate_json(data)
     except ValidationError as exc:
@@ -175,6 +238,8 @@ def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
         code, field = "unknown_message", "type"
     elif kind == "malformed_pose" or (place and place[0] in _POSE_FIELDS):
         code = "malformed_pose"
+    elif place and place[0] == "directivity":
+        code = "malformed_directivity"
     else:
         code = "malformed_message"
     return RequestError(code, f"{field}: {first['msg']}" if field else str(first["msg"]), field=field)
@@ -212,7 +277,7 @@ class Welcome(_Message):
     """Answer to a good hello. `window` is how many blocks may be unacknowledged before the server skips ahead."""
 
     type: Literal["welcome"] = "welcome"
-    protocol: Literal[1] = PROTOCOL
+    protocol: Literal[2] = PROTOCOL
     session: str
     scene: SceneDescription
     sample_rate: int
@@ -222,11 +287,13 @@ class Welcome(_Message):
     buffer_blocks: int
     window: int
     ir_samples: int
+    hrtf: str
     level: str
 
 
 class EmitterAdded(_Message):
-    """The emitter's first IR is in effect: its clip begins at `sample_clock`, in the block that follows."""
+    """The emitter's first IR is in effect: its clip begins at `sample_clock`, in the block that follows, and so does
+    what was sent live, once enough of it waits."""
 
     type: Literal["emitter_added"] = "emitter_added"
     id: str
@@ -239,14 +306,40 @@ class EmitterRemoved(_Message):
 
 
 class Durations(_Message):
-    """Milliseconds over the last second; None where nothing happened in it."""
+    """Milliseconds that a half, 99 % and 99.9 % did not exceed; None before the first."""
 
     p50: float | None
     p99: float | None
+    p99_9: float | None
+
+    @classmethod
+    def of(cls, durations: DurationHistogram) -> Self:
+        def milliseconds(share: float) -> float | None:
+            quantile_s = durations.quantile_s(share)
+            return None if quantile_s is None else round(1000 * quantile_s, 3)
+
+        return cls(p50=milliseconds(0.5), p99=milliseconds(0.99), p99_9=milliseconds(0.999))
+
+
+class LiveStatus(_Message):
+    """What became of a live emitter's samples: waiting, dropped because too many waited, silenced because they were no
+    audio; and how often there were too few."""
+
+    id: str
+    samples_queued: int
+    samples_dropped: int
+    samples_gated: int
+    underruns: int
 
 
 class Status(_Message):
-    """Once a second. Counts run from the start of the stream; `buffer_ms` is how far ahead of real time it is."""
+    """Once a second. Counts and durations run from the start of the stream.
+
+    `buffer_ms` is how far ahead of real time it is. `render_ms` is what a block costs; of blocks rendered together with
+    other streams', its share. `lateness_ms` is how long after it was due a block was ready to be sent: what it cost,
+    what was rendered with it, and how late the audio thread woke. `pose_ms` and `reverberation_ms` run from the arrival
+    of a pose to the first block, ready to be sent, whose direct sound and whose reverberation has it.
+    """
 
     type: Literal["status"] = "status"
     sample_clock: int
@@ -256,8 +349,12 @@ class Status(_Message):
     unacknowledged: int
     buffer_ms: float
     render_ms: Durations
+    lateness_ms: Durations
     ir_ms: Durations
+    pose_ms: Durations
+    reverberation_ms: Durations
     ir_exchanges: int
+    live: tuple[LiveStatus, ...] = ()
 
 
 class Pong(_Message):
@@ -285,51 +382,3 @@ _SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field
 def parse_server_message(data: str) -> ServerMessage:
     """A text message as a client receives it; raises pydantic.ValidationError."""
     return _SERVER.validate_json(data)
-
-
-@dataclass(frozen=True)
-class AudioBlock:
-    """One block of audio: `samples` (channel, frame) float32.
-
-    `sequence` counts blocks sent and has no gaps; `sample_clock` is the clock of the first frame and jumps over blocks
-    the server skipped. `pose_id` is the newest pose whose IRs are all in effect; with `is_exchange` this block fades to
-    them.
-    """
-
-    sequence: int
-    sample_clock: int
-    pose_id: int
-    samples: FloatArray
-    is_exchange: bool = False
-    is_late: bool = False
-
-    KIND: ClassVar[int] = 1
-    _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBHIQII")
-    HEADER_BYTES: ClassVar[int] = _LAYOUT.size
-    _EXCHANGE: ClassVar[int] = 1
-    _LATE: ClassVar[int] = 2
-
-    def serialize(self, encoding: Encoding) -> bytes:
-        """24-byte header, then the frames with their channels interleaved."""
-        channels, frames = self.samples.shape
-        flags = self._EXCHANGE * self.is_exchange | self._LATE * self.is_late
-        header = self._LAYOUT.pack(
-            self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, self.pose_id, frames
-        )
-        interleaved = self.samples.T
-        if encoding == "s16":
-            return header + np.rint(np.clip(interleaved, -1, 1) * 32767).astype("<i2").tobytes()
-        return header + interleaved.astype("<f4").tobytes()
-
-    @classmethod
-    def parse(cls, data: bytes, encoding: Encoding) -> Self:
-        """Raises ValueError for anything but a whole audio block."""
-        if len(data) < cls.HEADER_BYTES or data[0] != cls.KIND:
-            raise ValueError("not an audio block")
-        _, flags, channels, sequence, sample_clock, pose_id, frames = cls._LAYOUT.unpack_from(data)
-        dtype, scale = ("<i2", 32767) if encoding == "s16" else ("<f4", 1)
-        interleaved = np.frombuffer(data, dtype, offset=cls.HEADER_BYTES)
-        if interleaved.size != frames * channels:
-            raise ValueError(f"an audio block of {frames} frames holds {interleaved.size} samples")
-        samples = np.ascontiguousarray(interleaved.reshape(frames, channels).T.astype(np.float32) / np.float32(scale))
-        return cls(sequence, sample_clock, pose_id, samples, bool(flags & cls._EXCHANGE), bool(flags & cls._LATE))

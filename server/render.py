@@ -1,7 +1,8 @@
 """Rendering to a file: the live renderer, fed from a path instead of a connection.
 
-A path says from which sample on the listener has which pose. Poses take effect at block boundaries, as they do live; so
-a live session whose poses are written down with the sample clock of the block that first applied them renders the same.
+A path says from which sample on the listener has which pose, for the direct sound and for what follows it. Poses take
+effect at block boundaries, as they do live; so a live session whose poses are written down with the sample clocks of
+the blocks that first applied them renders the same.
 """
 
 import csv
@@ -14,9 +15,12 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.geometry import Pose, Vector3
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.geometry import Pose
+from server.direct_sound import DirectSound, reverberation_gain
 from server.errors import NafirError
-from server.rendering.renderer import Renderer
+from server.rendering.renderer import render_all
+from server.rendering.sources import ClipPlayer
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -24,6 +28,7 @@ MAX_RENDER_S = 2 * 3600
 """A render is held in memory as a whole: two hours of stereo at 48 kHz are 2.8 GB."""
 
 _CLOCKS = ("sample", "time_s")
+_REVERBERATION = "reverberation_sample"
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _YAW = ("yaw_deg",)
@@ -39,6 +44,9 @@ class ImpulseResponses(Protocol):
     @property
     def ir_samples(self) -> int: ...
 
+    @property
+    def sample_rate(self) -> int: ...
+
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
     ) -> FloatArray: ...
@@ -49,24 +57,33 @@ class RenderedEmitter:
     """A clip (n,) at the scene's rate, played at a place; `gain` is linear amplitude."""
 
     clip: FloatArray
-    position: Vector3
+    pose: Pose
+    directivity: Directivity = OMNIDIRECTIONAL
     gain: float = 1.0
     loop: bool = False
 
 
 @dataclass(frozen=True)
 class PathPoint:
-    """The listener's pose from `sample` on."""
+    """The listener's pose: that of the direct sound from `sample` on, and that of what follows it, the field's impulse
+    responses, from `reverberation_sample` on; with None, never, since another pose was faster."""
 
     sample: int
     pose: Pose
+    reverberation_sample: int | None
+
+    @classmethod
+    def at(cls, sample: int, pose: Pose) -> "PathPoint":
+        """For both from the same sample on."""
+        return cls(sample, pose, sample)
 
 
 def read_path(path: Path, sample_rate: int) -> list[PathPoint]:
     """Read a CSV file with a header line, columns in any order.
 
-    They are `sample` or `time_s`; `x`, `y`, `z` in metres; and `qx`, `qy`, `qz`, `qw` or `yaw_deg` (counter-clockwise,
-    0 looks along +x). Samples increase from line to line, up to `MAX_RENDER_S`. Raises PathError.
+    They are `sample` or `time_s`; `x`, `y`, `z` in metres; `qx`, `qy`, `qz`, `qw` or `yaw_deg` (counter-clockwise, 0
+    looks along +x); and, or else it is the same, `reverberation_sample`, empty for never. Neither clock goes back from
+    line to line, nor beyond `MAX_RENDER_S`. Raises PathError.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -82,29 +99,45 @@ def read_path(path: Path, sample_rate: int) -> list[PathPoint]:
 def _parse(lines: list[tuple[int, list[str]]], name: str, sample_rate: int) -> Iterator[PathPoint]:
     columns = [column.strip() for column in lines[0][1]] if lines else []
     _check_header(columns, name)
-    last_sample = -1
+    latest = dict.fromkeys((*_CLOCKS, _REVERBERATION), 0)
+    points = 0
     for line, row in lines[1:]:
         if not row:
             continue
         where = f"{name}: line {line}"
         if len(row) != len(columns):
             raise PathError(f"{where}: {len(row)} values for {len(columns)} columns")
-        values = {name: _number(text, f"{where}, column '{name}'") for name, text in zip(columns, row, strict=True)}
-        clock = "sample" if "sample" in values else "time_s"
-        if clock == "sample" and not values["sample"].is_integer():
-            raise PathError(f"{where}, column 'sample': {values['sample']:g} is not a whole number")
-        at = values[clock] * (sample_rate if clock == "time_s" else 1)
-        if at > MAX_RENDER_S * sample_rate:
-            problem = f"{values[clock]:g} is beyond the {MAX_RENDER_S} s that a render may last"
-            raise PathError(f"{where}, column '{clock}': {problem}")
-        sample = round(max(at, -1.0))  # any negative number is refused, and -inf cannot be rounded
-        if sample <= last_sample:
-            problem = "must not be negative" if last_sample < 0 else "must be later than on the line before"
-            raise PathError(f"{where}, column '{clock}': {problem}")
-        last_sample = sample
-        yield PathPoint(sample, _pose(values, where))
-    if last_sample < 0:
+        texts = dict(zip(columns, row, strict=True))
+        is_silent = _REVERBERATION in texts and not texts[_REVERBERATION].strip()
+        if is_silent:
+            del texts[_REVERBERATION]
+        values = {column: _number(text, f"{where}, column '{column}'") for column, text in texts.items()}
+        samples = {column: _sample(values, column, sample_rate, where) for column in latest if column in values}
+        for column, sample in samples.items():
+            if sample < latest[column]:
+                raise PathError(f"{where}, column '{column}': must not be earlier than on the line before")
+            latest[column] = sample
+        clock = "sample" if "sample" in samples else "time_s"
+        reverberation = None if is_silent else samples.get(_REVERBERATION, samples[clock])
+        if reverberation is not None and reverberation < samples[clock]:
+            raise PathError(f"{where}, column '{_REVERBERATION}': must not be before '{clock}'")
+        points += 1
+        yield PathPoint(samples[clock], _pose(values, where), reverberation)
+    if not points:
         raise PathError(f"{name}: no poses below the header line")
+
+
+def _sample(values: dict[str, float], column: str, sample_rate: int, where: str) -> int:
+    value = values[column]
+    if column != "time_s" and not value.is_integer():
+        raise PathError(f"{where}, column '{column}': {value:g} is not a whole number")
+    if value < 0:
+        raise PathError(f"{where}, column '{column}': must not be negative")
+    at = value * (sample_rate if column == "time_s" else 1)
+    if at > MAX_RENDER_S * sample_rate:
+        problem = f"{value:g} is beyond the {MAX_RENDER_S} s that a render may last"
+        raise PathError(f"{where}, column '{column}': {problem}")
+    return round(at)
 
 
 def _check_header(columns: list[str], name: str) -> None:
@@ -112,7 +145,7 @@ def _check_header(columns: list[str], name: str) -> None:
     if not any(columns):
         raise PathError(f"{where}: expected a header line such as sample,x,y,z,yaw_deg")
     for column in columns:
-        if column not in _CLOCKS + _POSITION + _QUATERNION + _YAW:
+        if column not in (*_CLOCKS, _REVERBERATION, *_POSITION, *_QUATERNION, *_YAW):
             raise PathError(f"{where}: unknown column '{column}'")
         if columns.count(column) > 1:
             raise PathError(f"{where}: column '{column}' is there twice")
@@ -149,6 +182,7 @@ def _pose(values: dict[str, float], where: str) -> Pose:
 
 def render(
     field: ImpulseResponses,
+    direct_sound: DirectSound,
     emitters: Sequence[RenderedEmitter],
     path: Sequence[PathPoint],
     *,
@@ -158,31 +192,45 @@ def render(
 ) -> FloatArray:
     """What a listener on `path` (one point or more, by rising sample) hears of `emitters` (one or more): (2, length).
 
-    A point takes effect with the first block that begins at its sample or later, faded to over that block, unless a
-    later point does too. The emitters start with the first point. `length` in samples defaults to the end of the path
-    or of the longest clip, whichever is later, and the reverberation after it. `progress` is told the fraction done.
+    A point takes effect with the first block that begins at its sample or later, unless a later point does too. The
+    emitters start where the path begins. `length` in samples defaults to the end of the path or of the longest clip,
+    whichever is later, and the reverberation after it. `progress` is told the fraction done.
     """
     if not path or not emitters:
         raise ValueError("a render needs a path and an emitter")
     if length is None:
         last_start = max(path[-1].sample, path[0].sample + max(emitter.clip.size for emitter in emitters))
         length = _block_at(last_start, block_size) * block_size + field.ir_samples
-    renderer = Renderer(block_size=block_size, ir_samples=field.ir_samples, max_emitters=len(emitters))
-    names = [str(number) for number in range(len(emitters))]
-    for name, emitter in zip(names, emitters, strict=True):
-        renderer.add_emitter(name, emitter.clip, gain=emitter.gain, loop=emitter.loop)
-    poses = {_block_at(point.sample, block_size): point.pose for point in path}
+    renderer = direct_sound.renderer(
+        block_size=block_size,
+        ir_samples=field.ir_samples,
+        sample_rate=field.sample_rate,
+        max_emitters=len(emitters),
+    )
+    named = {str(number): emitter for number, emitter in enumerate(emitters)}
+    for name, emitter in named.items():
+        renderer.add_emitter(name, ClipPlayer(emitter.clip, loop=emitter.loop), gain=emitter.gain)
+        if emitter.directivity != OMNIDIRECTIONAL:
+            renderer.set_reverberation_gain(name, reverberation_gain(emitter.directivity))
+    direct = {_block_at(point.sample, block_size): point.pose for point in path}
+    reverberation = {
+        _block_at(point.reverberation_sample, block_size): point.pose
+        for point in path
+        if point.reverberation_sample is not None
+    }
     blocks = -(-length // block_size)
-    output = np.empty((renderer.channels, blocks, block_size), np.float32)
+    output = np.empty((2, blocks, block_size), np.float32)
     for block in range(blocks):
-        if block in poses:
-            irs = _irs(field, [emitter.position for emitter in emitters], poses[block])
-            for name, ir in zip(names, irs, strict=True):
+        if block in direct:
+            direct_sound.aim(renderer, direct[block], named)
+            renderer.set_orientation(direct[block].orientation)
+        if block in reverberation:
+            for name, ir in zip(named, _irs(field, emitters, reverberation[block]), strict=True):
                 renderer.set_ir(name, ir)
-        output[:, block] = renderer.process()
+        (output[:, block],) = render_all([renderer])
         if progress:
             progress((block + 1) / blocks)
-    return output.reshape(renderer.channels, -1)[:, :length]
+    return output.reshape(2, -1)[:, :length]
 
 
 def _block_at(sample: int, block_size: int) -> int:
@@ -190,6 +238,7 @@ def _block_at(sample: int, block_size: int) -> int:
     return -(-sample // block_size)
 
 
-def _irs(field: ImpulseResponses, emitters: Sequence[Vector3], listener: Pose) -> FloatArray:
+def _irs(field: ImpulseResponses, emitters: Sequence[RenderedEmitter], listener: Pose) -> FloatArray:
     count = len(emitters)
-    return field.impulse_responses([listener.position] * count, emitters, [listener.yaw] * count)
+    places = [emitter.pose.position for emitter in emitters]
+    return field.impulse_responses([listener.position] * count, places, [listener.yaw] * count)

@@ -11,6 +11,7 @@ from pydantic import FiniteFloat
 from server.catalogue import describe_scene, playable_clips
 from server.errors import RequestError
 from server.field.field import AcousticField
+from server.hrtfs import DEFAULT_HRTF
 from server.impulse_response import (
     MEDIA_TYPES,
     ImpulseResponse,
@@ -123,6 +124,12 @@ async def clips(request: Request) -> dict[str, Any]:
         for clip in await anyio.to_thread.run_sync(playable_clips, library):
             named[clip.name] = clip
     return {"clips": [named[name] for name in sorted(named)]}
+
+
+@api.get("/hrtfs")
+async def hrtfs(request: Request) -> dict[str, Any]:
+    """Heads a stream can be heard through."""
+    return {"default": DEFAULT_HRTF, "hrtfs": _host(request).hrtfs.names}
 
 
 @api.websocket("/stream")

@@ -1,8 +1,12 @@
 """One listener's stream as a state machine without input, output or waiting.
 
-Messages go in, messages and audio blocks come out. Poses only change what is wanted: `take_request` hands out one
-request for impulse responses (IRs) at a time, always for the newest poses, and whoever computes them brings the answer
-back through `accept` between two blocks. Sound never waits for it.
+Messages go in, messages and audio blocks come out. The direct paths of each block follow the newest poses. What follows
+the direct sound comes later: `take_request` hands out one request for impulse responses (IRs) at a time, always for the
+newest poses, and whoever computes them brings the answer back through `accept` between two blocks. Sound never waits
+for it.
+
+Blocks are rendered in three steps, so that many sessions' can be rendered in one call: `begin_block`, rendering
+`renderer`, `finish_block`.
 
 A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
 """
@@ -13,7 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from server.acoustics.decibels import db_to_amplitude
+from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose, Vector3
+from server.blocks import AudioBlock, DryBlock, FloatArray
+from server.direct_sound import DirectSound, reverberation_gain
+from server.emitters import Emitter, LiveInput
 from server.errors import RequestError
 from server.field.field import AcousticField
 from server.pacing import SendWindow
@@ -21,20 +30,22 @@ from server.protocol import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
-    AudioBlock,
     ClientMessage,
     EmitterAdded,
     EmitterRemoved,
     Error,
-    FloatArray,
     Hello,
     ListenerPose,
+    LiveStatus,
     MoveEmitter,
     RemoveEmitter,
     ServerMessage,
+    SetGain,
 )
 from server.rendering.convolver import PartitionedIr
-from server.rendering.renderer import DuplicateEmitterError, Renderer, RendererFullError
+from server.rendering.hrtf import HeadFilters
+from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
+from server.rendering.sources import ClipPlayer, Source
 from server.scene.bundle import Bundle
 
 
@@ -66,15 +77,6 @@ def compute_irs(field: AcousticField, request: IrRequest, prepare: Callable[[Flo
     return IrResponse(request, tuple(prepare(ir) for ir in irs))
 
 
-@dataclass
-class _Emitter:
-    serial: int
-    position: Vector3
-    is_outdated: bool = True
-    token: int | None = None
-    """Pose id of the newest IR handed to the renderer; None before the first."""
-
-
 def _start_pose(bundle: Bundle) -> Pose:
     start = bundle.manifest.start
     return Pose.from_yaw(start.listener, math.radians(start.listener_yaw_deg))
@@ -83,7 +85,8 @@ def _start_pose(bundle: Bundle) -> Pose:
 class Session:
     """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
 
-    `load_clip` gives mono float32 at the field's rate, and is quick: it is called on the rendering thread.
+    `filters` are the head it hears through. `load_clip` gives mono float32 at the field's rate, and is quick: it is
+    called on the rendering thread.
     Raises RequestError for a hello that cannot be served.
     """
 
@@ -91,6 +94,7 @@ class Session:
         self,
         hello: Hello,
         field: AcousticField,
+        filters: HeadFilters,
         load_clip: Callable[[str], FloatArray],
         *,
         max_emitters: int = 16,
@@ -112,28 +116,36 @@ class Session:
         self.ir_exchanges = 0
         self.blocks_dropped = 0
         self._bundle = field.bundle
+        self._sample_rate = field.sample_rate
         self._load_clip = load_clip
-        self._renderer = Renderer(
+        self._direct_sound = DirectSound.of(self._bundle, filters)
+        self.renderer = self._direct_sound.renderer(
             block_size=hello.block_size,
             ir_samples=field.ir_samples,
-            channels=field.channels,
+            sample_rate=field.sample_rate,
             max_emitters=max_emitters,
         )
-        self.prepare = self._renderer.prepare
+        self.prepare = self.renderer.prepare
         self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
         self._bundle.require_inside(self._listener.position, "listener.position")
-        self._emitters: dict[str, _Emitter] = {}
+        self._emitters: dict[str, Emitter] = {}
         self._next_serial = 0
         self._newest_pose_id = 0
+        self._followed_pose_id = 0  # by the direct paths
         self._accepted_pose_id = 0
-        self._applied_pose_id = 0
+        self._applied_pose_id = 0  # by the impulse responses
         self._in_flight: IrRequest | None = None
         self._waits_for_change = False
 
     @property
     def sample_clock(self) -> int:
         """Samples rendered so far: the clock of the next block's first frame."""
-        return self._renderer.sample_clock
+        return self.renderer.sample_clock
+
+    @property
+    def awaits_irs(self) -> bool:
+        """Whether a request is unanswered; may be asked from any thread."""
+        return self._in_flight is not None
 
     def receive(self, message: ClientMessage) -> list[ServerMessage]:
         """Take in one message; what is wrong with it comes back as an `Error`, and nothing has changed then."""
@@ -145,6 +157,11 @@ class Session:
                     self._move_emitter(message)
                 case AddEmitter():
                     self._add_emitter(message)
+                case SetGain():
+                    self._require_emitter(message.id)
+                    self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)))
+                case DryBlock():
+                    self._push(message)
                 case RemoveEmitter():
                     return self._remove_emitter(message)
                 case Acknowledge():
@@ -179,7 +196,7 @@ class Session:
         for identifier, emitter in self._emitters.items():
             if emitter.serial not in arrived:
                 continue
-            self._renderer.set_ir(identifier, arrived[emitter.serial], token=pose_id)
+            self.renderer.set_ir(identifier, arrived[emitter.serial], token=pose_id)
             if emitter.token is None:
                 events.append(EmitterAdded(id=identifier, sample_clock=self.sample_clock))
             emitter.token = pose_id
@@ -197,16 +214,24 @@ class Session:
             Error(code="field_failure", message=f"no impulse response could be computed for pose {request.pose_id}")
         ]
 
-    def render_block(self) -> AudioBlock | None:
-        """Render the next block; None when the window is full, so that it is not to be sent.
+    def begin_block(self) -> None:
+        """Have the direct paths of the next block follow the newest poses."""
+        displaced = {name: emitter for name, emitter in self._emitters.items() if emitter.is_displaced}
+        self._direct_sound.aim(self.renderer, self._listener, displaced)
+        for emitter in displaced.values():
+            emitter.is_displaced = False
+        self.renderer.set_orientation(self._listener.orientation)
+        self._followed_pose_id = self._newest_pose_id
 
-        A block that is not sent is rendered all the same: clips and reverberation keep their place on the sample clock.
+    def finish_block(self, sample_clock: int, samples: FloatArray) -> AudioBlock | None:
+        """The block just rendered, which began at `sample_clock`; None when the window is full, so that it is not to be
+        sent.
+
+        A block that is not sent was rendered all the same: clips and reverberation keep their place on the clock.
         """
-        sample_clock = self.sample_clock
-        samples = self._renderer.process()
-        self.ir_exchanges += self._renderer.exchanged
-        sounding = [(name, emitter.token) for name, emitter in self._emitters.items() if emitter.token is not None]
-        if all(self._renderer.applied(name) == token for name, token in sounding):
+        is_exchange = self.renderer.exchanged
+        self.ir_exchanges += is_exchange
+        if self._applied_pose_id != self._accepted_pose_id and self._has_applied_all():
             self._applied_pose_id = self._accepted_pose_id
         if not self.window.is_open:
             self.blocks_dropped += 1
@@ -214,25 +239,48 @@ class Session:
         return AudioBlock(
             sequence=self.window.take_sequence(),
             sample_clock=sample_clock,
-            pose_id=self._applied_pose_id,
+            pose_id=self._followed_pose_id,
+            reverberation_pose_id=self._applied_pose_id,
             samples=samples,
-            is_exchange=self._renderer.exchanged,
+            is_exchange=is_exchange,
+        )
+
+    def render_block(self) -> AudioBlock | None:
+        """All three steps for this session alone."""
+        self.begin_block()
+        sample_clock = self.sample_clock
+        (samples,) = render_all([self.renderer])
+        return self.finish_block(sample_clock, samples)
+
+    def live_statuses(self) -> tuple[LiveStatus, ...]:
+        return tuple(emitter.live.status for emitter in self._emitters.values() if emitter.live)
+
+    def complaints(self) -> list[ServerMessage]:
+        """What was wrong with live samples since this was asked last."""
+        refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
+        return [Error.from_refusal(refusal) for refusal in refusals if refusal]
+
+    def _has_applied_all(self) -> bool:
+        return all(
+            self.renderer.applied(name) == emitter.token
+            for name, emitter in self._emitters.items()
+            if emitter.token is not None
         )
 
     def _move_listener(self, message: ListenerPose) -> None:
         pose = message.pose
         self._bundle.require_inside(pose.position, "position")
         self._advance_pose_id(message.pose_id)
-        self._listener = pose
         for emitter in self._emitters.values():
             emitter.is_outdated = True
+            emitter.is_displaced |= pose.position != self._listener.position
+        self._listener = pose
 
     def _move_emitter(self, message: MoveEmitter) -> None:
         emitter = self._require_emitter(message.id)
         self._bundle.require_inside(message.position, "position")
         self._advance_pose_id(message.pose_id)
-        emitter.position = message.position
-        emitter.is_outdated = True
+        emitter.move(message)
 
     def _advance_pose_id(self, pose_id: int) -> None:
         if pose_id <= self._newest_pose_id:
@@ -244,24 +292,39 @@ class Session:
 
     def _add_emitter(self, message: AddEmitter) -> None:
         self._bundle.require_inside(message.position, "position")
-        clip = self._load_clip(message.clip)
+        live, source = self._open_source(message)
         try:
-            self._renderer.add_emitter(message.id, clip, gain=10 ** (message.gain_db / 20), loop=message.loop)
+            self.renderer.add_emitter(message.id, source, gain=float(db_to_amplitude(message.gain_db)))
         except DuplicateEmitterError as exc:
             raise RequestError("duplicate_emitter", f"emitter {message.id!r} is already there", field="id") from exc
         except RendererFullError as exc:
             raise RequestError("too_many_emitters", str(exc)) from exc
-        self._emitters[message.id] = _Emitter(self._next_serial, message.position)
+        emitter = Emitter.added_by(message, self._next_serial, live)
+        if emitter.directivity != OMNIDIRECTIONAL:
+            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.directivity))
+        self._emitters[message.id] = emitter
         self._next_serial += 1
         self._waits_for_change = False
+
+    def _open_source(self, message: AddEmitter) -> tuple[LiveInput | None, Source]:
+        if message.clip is not None:
+            return None, ClipPlayer(self._load_clip(message.clip), loop=message.loop)
+        live = LiveInput.opened(message.id, sample_rate=self._sample_rate, block_size=self.renderer.block_size)
+        return live, live.source
+
+    def _push(self, block: DryBlock) -> None:
+        live = self._require_emitter(block.id).live
+        if live is None:
+            raise RequestError("not_live", f"emitter {block.id!r} plays a clip", field="id")
+        live.push(block)
 
     def _remove_emitter(self, message: RemoveEmitter) -> list[ServerMessage]:
         self._require_emitter(message.id)
         del self._emitters[message.id]
-        self._renderer.remove_emitter(message.id)
+        self.renderer.remove_emitter(message.id)
         return [EmitterRemoved(id=message.id)]
 
-    def _require_emitter(self, identifier: str) -> _Emitter:
+    def _require_emitter(self, identifier: str) -> Emitter:
         if identifier not in self._emitters:
             raise RequestError("unknown_emitter", f"there is no emitter {identifier!r}", field="id", status=404)
         return self._emitters[identifier]

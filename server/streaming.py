@@ -18,16 +18,17 @@ from dataclasses import dataclass
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.answers import Answers
-from server.audio_thread import AudioThread, Outgoing, Stream, StreamFailed, TimedBlock
+from server.audio_engine import AudioEngine
+from server.blocks import FloatArray
 from server.catalogue import describe_scene
 from server.clips import ClipLibrary, DecodeError
 from server.errors import RequestError
 from server.field.field import AcousticField
+from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.protocol import (
     AddEmitter,
     ClientMessage,
     Error,
-    FloatArray,
     Hello,
     Ping,
     Pong,
@@ -37,6 +38,7 @@ from server.protocol import (
 )
 from server.session import Session
 from server.settings import Settings
+from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
 MAX_WAITING_ANSWERS = 256
@@ -63,12 +65,14 @@ class ClosingError(Exception):
 
 @dataclass
 class StreamHost:
-    """What all connections share: loaded scenes, their clips, the audio thread, and how many streams there are."""
+    """What all connections share: loaded scenes, their clips, heads, the audio engine, and how many streams there
+    are."""
 
     fields: Mapping[str, AcousticField]
     clips: Mapping[str, ClipLibrary]
     """By scene, since every scene has its sample rate."""
-    audio: AudioThread
+    hrtfs: HrtfLibrary
+    audio: AudioEngine
     settings: Settings
     answers: Answers
     is_ready: bool = False
@@ -129,6 +133,7 @@ class Connection:
     async def _open(self, hello: Hello) -> Stream:
         settings = self._host.settings
         field = self._host.fields.get(hello.scene)
+        hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
         window = settings.window_blocks + hello.buffer_blocks
         self._capacity = window + MAX_WAITING_ANSWERS
         try:
@@ -138,6 +143,7 @@ class Connection:
                 Session,
                 hello,
                 field,
+                self._host.hrtfs.filters(hrtf, field.sample_rate),
                 lambda name: load_clip(self._host.clips[hello.scene], name),
                 max_emitters=settings.max_emitters,
                 window=window,
@@ -155,6 +161,7 @@ class Connection:
                 buffer_blocks=hello.buffer_blocks,
                 window=window,
                 ir_samples=field.ir_samples,
+                hrtf=hrtf,
                 level=field.level.name,
             )
         )
@@ -194,7 +201,7 @@ class Connection:
             if isinstance(message, Ping):
                 self._enqueue([Pong(id=message.id)])
                 return
-            if isinstance(message, AddEmitter):
+            if isinstance(message, AddEmitter) and message.clip is not None:
                 # Decoded once, here and off the loop, so that the audio thread finds it ready.
                 await asyncio.to_thread(load_clip, self._host.clips[hello.scene], message.clip)
             if not stream.offer(message):

@@ -12,6 +12,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from server.field.field import AcousticField
+from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.geometry import Geometry, Material, Materials, Opening
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
@@ -120,6 +122,17 @@ def bundle(tmp_path_factory) -> Bundle:
 @pytest.fixture
 def field(bundle) -> AcousticField:
     return AcousticField.load(bundle)
+
+
+@pytest.fixture(scope="session")
+def hrtfs() -> HrtfLibrary:
+    """KEMAR at the scene's rate."""
+    return HrtfLibrary((), [CODEC.sample_rate])
+
+
+@pytest.fixture(scope="session")
+def filters(hrtfs) -> HeadFilters:
+    return hrtfs.filters(DEFAULT_HRTF, CODEC.sample_rate)
 
 
 @pytest.fixture

@@ -10,12 +10,13 @@ import pytest
 from starlette.websockets import WebSocketDisconnect
 
 from server.answers import Answers
-from server.audio_thread import AudioThread
+from server.audio_engine import AudioEngine
+from server.blocks import AudioBlock
 from server.catalogue import open_clips
 from server.protocol import (
+    PROTOCOL,
     Acknowledge,
     AddEmitter,
-    AudioBlock,
     Error,
     Hello,
     Ping,
@@ -26,7 +27,7 @@ from server.protocol import (
 from server.settings import Settings
 from server.streaming import Connection, StreamHost
 
-HELLO = Hello(protocol=1, scene="flat")
+HELLO = Hello(protocol=PROTOCOL, scene="flat")
 
 
 class Socket:
@@ -62,12 +63,13 @@ class Socket:
 
 
 @asynccontextmanager
-async def hosting(field, **settings):
+async def hosting(field, hrtfs, **settings):
     with ThreadPoolExecutor(1) as workers:
-        audio = AudioThread(asyncio.get_running_loop().call_soon_threadsafe, workers)
+        audio = AudioEngine(asyncio.get_running_loop().call_soon_threadsafe, workers)
         host = StreamHost(
             fields={"flat": field},
             clips=open_clips({"flat": field}, ()),
+            hrtfs=hrtfs,
             audio=audio,
             settings=Settings(**settings),
             answers=Answers(workers=1, waiting=1),
@@ -91,10 +93,10 @@ async def stop_reading(socket, message):
         await asyncio.sleep(0.015)  # a block: what the audio thread is to answer has to come slowly
 
 
-def test_blocks_that_leave_after_their_deadline_are_flagged_and_counted(field):
+def test_blocks_that_leave_after_their_deadline_are_flagged_and_counted(field, hrtfs):
     async def scenario():
         socket = Socket()
-        async with hosting(field) as host:
+        async with hosting(field, hrtfs) as host:
             running = asyncio.create_task(Connection(socket, host, time_s=lambda: time.monotonic() + 1.0).run())
             socket.say(HELLO)
             while not any(isinstance(message, Status) for message in socket.sent):
@@ -113,10 +115,10 @@ def test_blocks_that_leave_after_their_deadline_are_flagged_and_counted(field):
 
 
 @pytest.mark.parametrize("message", [Ping(id=1), RemoveEmitter(id="ghost")])
-def test_a_client_that_never_reads_its_answers_is_cut_off(field, message):
+def test_a_client_that_never_reads_its_answers_is_cut_off(field, hrtfs, message):
     async def scenario():
         socket = Socket()
-        async with hosting(field) as host:
+        async with hosting(field, hrtfs) as host:
             running = asyncio.create_task(Connection(socket, host).run())
             await stop_reading(socket, message)
             await asyncio.wait_for(running, 5)
@@ -125,10 +127,10 @@ def test_a_client_that_never_reads_its_answers_is_cut_off(field, message):
     assert asyncio.run(scenario()) == 0
 
 
-def test_a_client_that_reads_too_late_learns_why_it_was_cut_off(field):
+def test_a_client_that_reads_too_late_learns_why_it_was_cut_off(field, hrtfs):
     async def scenario():
         socket = Socket()
-        async with hosting(field) as host:
+        async with hosting(field, hrtfs) as host:
             running = asyncio.create_task(Connection(socket, host).run())
             await stop_reading(socket, Ping(id=1))
             socket.reads.set()
@@ -140,10 +142,10 @@ def test_a_client_that_reads_too_late_learns_why_it_was_cut_off(field):
     assert socket.sent[-1].code == "reads_too_slowly"
 
 
-def test_before_the_server_is_warm_a_client_is_told_to_come_back(field):
+def test_before_the_server_is_warm_a_client_is_told_to_come_back(field, hrtfs):
     async def scenario():
         socket = Socket()
-        async with hosting(field) as host:
+        async with hosting(field, hrtfs) as host:
             host.is_ready = False
             await Connection(socket, host).run()
         return socket
@@ -153,7 +155,7 @@ def test_before_the_server_is_warm_a_client_is_told_to_come_back(field):
     assert socket.close_code == 1013
 
 
-def test_a_client_may_leave_at_any_moment(field):
+def test_a_client_may_leave_at_any_moment(field, hrtfs):
     class Gone(Socket):
         """Whose client left after the given number of sends."""
 
@@ -176,7 +178,7 @@ def test_a_client_may_leave_at_any_moment(field):
 
     async def scenario(first, sends):
         socket = Gone(sends)
-        async with hosting(field) as host:
+        async with hosting(field, hrtfs) as host:
             socket.say(first)
             await asyncio.wait_for(Connection(socket, host).run(), 5)
             return host.streams
@@ -185,10 +187,10 @@ def test_a_client_may_leave_at_any_moment(field):
         assert asyncio.run(scenario(first, sends)) == 0
 
 
-def test_a_stream_that_fails_is_closed_with_an_internal_error(field):
+def test_a_stream_that_fails_is_closed_with_an_internal_error(field, hrtfs):
     async def scenario():
         socket = Socket()
-        async with hosting(field) as host:
+        async with hosting(field, hrtfs) as host:
             running = asyncio.create_task(Connection(socket, host).run())
             # Fewer responses than poses, however many are asked for at once: stands for a defect of our own.
             field.impulse_responses = lambda *_: np.zeros((0, 2, 100), np.float32)

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose, assert_array_equal
 
+from server.acoustics.directivity import CARDIOID, Cardioid, PolarPattern
 from server.acoustics.geometry import Pose
+from server.blocks import DryBlock
 from server.catalogue import describe_scene
 from server.errors import RequestError
 from server.protocol import (
+    PROTOCOL,
     Acknowledge,
     AddEmitter,
-    AudioBlock,
+    DirectivityPattern,
     Durations,
     EmitterAdded,
     EmitterRemoved,
@@ -22,10 +24,12 @@ from server.protocol import (
     Hello,
     ListenerPose,
     ListenerStart,
+    LiveStatus,
     MoveEmitter,
     Ping,
     Pong,
     RemoveEmitter,
+    SetGain,
     Status,
     Welcome,
     parse_client_message,
@@ -33,18 +37,29 @@ from server.protocol import (
 )
 
 CLIENT_MESSAGES = [
-    Hello(protocol=1, scene="flat"),
+    Hello(protocol=PROTOCOL, scene="flat"),
     Hello(
-        protocol=1,
+        protocol=PROTOCOL,
         scene="flat",
         sample_rate=24_000,
         block_size=512,
         encoding="s16",
         listener=ListenerStart(position=(1, 2, 1.5), yaw=0.3),
+        hrtf="kemar",
         buffer_blocks=4,
     ),
     AddEmitter(id="talker", clip="speech", position=(1, 2, 3), gain_db=-6, loop=False),
+    AddEmitter(id="talker", live=True, position=(1, 2, 3), yaw=2.0, directivity=DirectivityPattern(pattern="cardioid")),
+    AddEmitter(
+        id="talker",
+        clip="speech",
+        position=(1, 2, 3),
+        orientation=(0, 0, 1, 0),
+        directivity=DirectivityPattern(pattern="measured", angles_deg=(0, 180), gains_db=((0, -12),) * 7),
+    ),
     MoveEmitter(id="talker", position=(1, 2, 3), pose_id=2**32 - 1),
+    MoveEmitter(id="talker", position=(1, 2, 3), yaw=0.0, pose_id=1),
+    SetGain(id="talker", gain_db=-80),
     RemoveEmitter(id="talker"),
     ListenerPose(pose_id=4, position=(1, 2, 3), yaw=-math.pi),
     ListenerPose(pose_id=4, position=(1, 2, 3), orientation=(0, 0, 1, 0)),
@@ -62,9 +77,13 @@ SERVER_MESSAGES = [
         blocks_dropped=2,
         unacknowledged=3,
         buffer_ms=80.5,
-        render_ms=Durations(p50=0.5, p99=1.5),
-        ir_ms=Durations(p50=None, p99=None),
+        render_ms=Durations(p50=0.5, p99=1.5, p99_9=2.5),
+        lateness_ms=Durations(p50=0.6, p99=1.6, p99_9=2.6),
+        ir_ms=Durations(p50=None, p99=None, p99_9=None),
+        pose_ms=Durations(p50=None, p99=None, p99_9=None),
+        reverberation_ms=Durations(p50=None, p99=None, p99_9=None),
         ir_exchanges=4,
+        live=(LiveStatus(id="talker", samples_queued=1, samples_dropped=2, samples_gated=3, underruns=4),),
     ),
     Pong(id=3),
     Error(code="stale_pose", message="older than the newest", field="pose_id"),
@@ -92,6 +111,7 @@ def test_a_welcome_with_its_scene_survives_the_wire(field):
         buffer_blocks=8,
         window=40,
         ir_samples=4_000,
+        hrtf="kemar",
         level="standard",
     )
     assert parse_server_message(welcome.serialize()) == welcome
@@ -99,10 +119,14 @@ def test_a_welcome_with_its_scene_survives_the_wire(field):
 
 def test_hello_as_a_person_would_type_it():
     hello = parse_client_message(
-        '{"type": "hello", "protocol": 1, "scene": "flat", "listener": {"position": [1, 2, 1.5]}}'
+        '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [1, 2, 1.5]}}'
     )
     assert (hello.block_size, hello.encoding, hello.buffer_blocks) == (256, "f32", 8)
     assert hello.listener.pose == Pose((1, 2, 1.5))
+
+
+def directive(pattern):
+    return f'{{"type": "add_emitter", "id": "a", "clip": "b", "position": [1, 2, 3], "directivity": {pattern}}}'
 
 
 @pytest.mark.parametrize(
@@ -144,17 +168,45 @@ def test_hello_as_a_person_would_type_it():
             "orientation",
         ),
         (
-            '{"type": "hello", "protocol": 1, "scene": "a", "listener": {"position": [1,2,-Infinity]}}',
+            '{"type": "hello", "protocol": 2, "scene": "a", "listener": {"position": [1,2,-Infinity]}}',
             "malformed_pose",
             "listener.position",
         ),
-        ('{"type": "hello", "protocol": 1, "scene": "a", "block_size": 100}', "malformed_message", "block_size"),
-        ('{"type": "hello", "protocol": 1, "scene": "a", "encoding": "mp3"}', "malformed_message", "encoding"),
+        ('{"type": "hello", "protocol": 2, "scene": "a", "block_size": 100}', "malformed_message", "block_size"),
+        ('{"type": "hello", "protocol": 2, "scene": "a", "encoding": "mp3"}', "malformed_message", "encoding"),
         ('{"type": "move_emitter", "id": "", "position": [1,2,3], "pose_id": 1}', "malformed_message", "id"),
         (
             '{"type": "add_emitter", "id": "a", "clip": "b", "position": [1,2,3], "gain_db": 400}',
             "malformed_message",
             "gain_db",
+        ),
+        ('{"type": "set_gain", "id": "a", "gain_db": 25}', "malformed_message", "gain_db"),
+        ('{"type": "add_emitter", "id": "a", "position": [1,2,3]}', "malformed_message", None),
+        (
+            '{"type": "add_emitter", "id": "a", "clip": "b", "live": true, "position": [1,2,3]}',
+            "malformed_message",
+            None,
+        ),
+        (
+            '{"type": "add_emitter", "id": "a", "clip": "b", "position": [1,2,3], "orientation": [0,0,0,0]}',
+            "malformed_pose",
+            None,
+        ),
+        (directive('{"pattern": "shotgun"}'), "malformed_directivity", "directivity.pattern"),
+        (directive('{"order": 2}'), "malformed_directivity", "directivity.pattern"),
+        (directive('{"pattern": "cardioid", "order": NaN}'), "malformed_directivity", "directivity.order"),
+        (directive('{"pattern": "cardioid", "order": 0}'), "malformed_directivity", "directivity"),
+        (directive('{"pattern": "cardioid", "angles_deg": [0, 180]}'), "malformed_directivity", "directivity"),
+        (directive('{"pattern": "measured", "angles_deg": [0, 180]}'), "malformed_directivity", "directivity"),
+        (
+            directive('{"pattern": "measured", "angles_deg": [0, "x"], "gains_db": []}'),
+            "malformed_directivity",
+            "directivity.angles_deg",
+        ),
+        (
+            directive('{"pattern": "measured", "angles_deg": [0, 90], "gains_db": [[0, 0]]}'),
+            "malformed_directivity",
+            "directivity",
         ),
     ],
 )
@@ -177,7 +229,32 @@ def test_any_bytes_parse_or_are_refused(data):
         message = parse_client_message(data)
     except RequestError:
         return
-    assert isinstance(message, ListenerPose)
+    assert isinstance(message, ListenerPose | DryBlock)
+
+
+def test_a_dry_block_is_a_client_message():
+    message = parse_client_message(DryBlock("voice", 3, np.ones(5, np.float32)).serialize("s16"))
+    assert (message.id, message.sequence, message.samples.tolist()) == ("voice", 3, [1.0] * 5)
+
+
+ROWS = [[0.0, -3.0 - band, -6.0] for band in range(7)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "expected"),
+    [
+        ('{"pattern": "omnidirectional"}', Cardioid(1.0)),
+        ('{"pattern": "cardioid"}', CARDIOID),
+        ('{"pattern": "cardioid", "order": 2.5}', Cardioid(0.5, 2.5)),
+        ('{"pattern": "figure_of_eight"}', Cardioid(0.0)),
+        (
+            json.dumps({"pattern": "measured", "angles_deg": [0, 60, 180], "gains_db": ROWS}),
+            PolarPattern((0, 60, 180), tuple(tuple(row) for row in ROWS)),
+        ),
+    ],
+)
+def test_patterns_are_those_of_the_acoustics(pattern, expected):
+    assert parse_client_message(directive(pattern)).directivity.directivity == expected
 
 
 def test_a_binary_pose_has_the_documented_layout():
@@ -203,44 +280,6 @@ def test_bad_binary_is_refused_with_a_code(data, code):
     with pytest.raises(RequestError) as refusal:
         parse_client_message(data)
     assert refusal.value.code == code
-
-
-def test_an_audio_block_has_the_documented_layout():
-    block = AudioBlock(3, 768, 12, np.array([[0.25, 0.5], [-0.25, -0.5]], np.float32), is_exchange=True, is_late=True)
-    header = bytes([1, 3]) + struct.pack("<HIQII", 2, 3, 768, 12, 2)
-    assert len(header) == AudioBlock.HEADER_BYTES == 24
-    assert block.serialize("f32") == header + np.array([0.25, -0.25, 0.5, -0.5], "<f4").tobytes()
-
-
-@given(
-    st.integers(0, 2**32 - 1),
-    st.integers(0, 2**64 - 1),
-    st.integers(0, 2**32 - 1),
-    st.booleans(),
-    st.booleans(),
-    st.integers(0, 9),
-)
-def test_float_blocks_survive_the_wire_exactly(sequence, clock, pose_id, is_exchange, is_late, seed):
-    samples = np.random.default_rng(seed).standard_normal((2, 16), dtype=np.float32)
-    block = AudioBlock(sequence, clock, pose_id, samples, is_exchange, is_late)
-    back = AudioBlock.parse(block.serialize("f32"), "f32")
-    assert_array_equal(back.samples, samples)
-    assert (back.sequence, back.sample_clock, back.pose_id) == (sequence, clock, pose_id)
-    assert (back.is_exchange, back.is_late) == (is_exchange, is_late)
-
-
-def test_integer_blocks_keep_half_a_step_and_clip_instead_of_wrapping():
-    samples = np.array([np.linspace(-1, 1, 101), np.linspace(-3, 3, 101)], np.float32)
-    back = AudioBlock.parse(AudioBlock(0, 0, 0, samples).serialize("s16"), "s16").samples
-    assert_allclose(back, np.clip(samples, -1, 1), atol=0.5 / 32767 + 1e-7)
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"\x02" * 40, AudioBlock(0, 0, 0, np.zeros((2, 4), np.float32)).serialize("f32")[:-8]]
-)
-def test_a_partial_block_is_not_a_block(data):
-    with pytest.raises(ValueError):
-        AudioBlock.parse(data, "f32")
 
 
 def test_messages_are_plain_json():

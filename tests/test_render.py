@@ -1,4 +1,4 @@
-"""Offline rendering: agrees with convolution, with the live renderer, and explains what is wrong with a path."""
+"""Offline rendering: agrees with convolution, with live sessions, and explains what is wrong with a path."""
 
 import math
 
@@ -6,19 +6,25 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from server.acoustics.geometry import Pose
+from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL
+from server.acoustics.geometry import FloorPlan, Pose
+from server.direct_sound import DirectSound
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
 from server.render import PathError, PathPoint, RenderedEmitter, read_path, render
 from server.rendering.fade import raised_cosine
-from server.rendering.renderer import Renderer
+from server.session import Session, compute_irs
 
 SAMPLE_RATE = 24_000
 SIZE = 256
+HERE, THERE = Pose((1.0, 2.0, 1.5)), Pose((6.0, 3.0, 1.5))
+SPEED_OF_SOUND = 343.0
 
 
 class NoiseField:
     """Decaying noise, another for each pair of poses: enough to tell which impulse response was used, and where."""
 
     ir_samples = 1_500
+    sample_rate = SAMPLE_RATE
 
     def impulse_responses(self, listeners, emitters, yaws):
         return np.stack([self.one(*poses) for poses in zip(listeners, emitters, yaws, strict=True)])
@@ -29,8 +35,21 @@ class NoiseField:
         return (samples * np.exp(-np.arange(self.ir_samples) / 200)).astype(np.float32)
 
 
-FIELD = NoiseField()
-HERE, THERE = (1.0, 2.0, 1.5), (6.0, 3.0, 1.5)
+class DeadField(NoiseField):
+    """Nothing follows the direct sound."""
+
+    def one(self, *_):
+        return np.zeros((2, self.ir_samples), np.float32)
+
+
+FIELD, DEAD = NoiseField(), DeadField()
+
+
+@pytest.fixture(scope="module")
+def open_hall(filters):
+    """A hall in which everyone sees everyone."""
+    plan = FloorPlan(((0.0, 0.0), (40.0, 0.0), (40.0, 20.0), (0.0, 20.0)), 5.0)
+    return DirectSound(plan, speed_of_sound=SPEED_OF_SOUND, air_db_per_m=np.zeros(7), filters=filters)
 
 
 def noise(seed, samples):
@@ -38,12 +57,18 @@ def noise(seed, samples):
 
 
 def point(sample, x, yaw_rad=0.0):
-    return PathPoint(sample, Pose.from_yaw((x, 2.0, 1.5), yaw_rad))
+    return PathPoint.at(sample, Pose.from_yaw((x, 2.0, 1.5), yaw_rad))
+
+
+def reverberation(open_hall, emitters, path, **options):
+    """What is rendered beside the direct sound."""
+    whole = render(FIELD, open_hall, emitters, path, **options).astype(float)
+    return whole - render(DEAD, open_hall, emitters, path, **options)
 
 
 def heard(emitter, at, samples):
-    """Oracle: the clip in one room throughout, float64."""
-    ir = FIELD.one(at.pose.position, emitter.position, at.pose.yaw).astype(float)
+    """Oracle of the reverberation: the clip in one room throughout, float64."""
+    ir = FIELD.one(at.pose.position, emitter.pose.position, at.pose.yaw).astype(float)
     return fftconvolve(emitter.clip[np.newaxis].astype(float), ir, axes=1)[:, :samples]
 
 
@@ -51,9 +76,13 @@ def error_db(actual, expected):
     return 20 * np.log10(np.abs(actual - expected).max() / np.abs(expected).max() + 1e-30)
 
 
-def test_standing_still_is_convolution():
+def level_db(samples):
+    return 10 * np.log10(np.mean(samples.astype(float) ** 2))
+
+
+def test_standing_still_is_convolution(open_hall):
     emitters = [RenderedEmitter(noise(1, 5_000), HERE), RenderedEmitter(noise(2, 3_000), THERE, gain=0.5)]
-    wet = render(FIELD, emitters, [point(0, 2.0)])
+    wet = render(FIELD, open_hall, emitters, [point(0, 2.0)])
     assert wet.shape[0] == 2
     assert wet.dtype == np.float32
     assert wet.shape[1] >= 5_000 + FIELD.ir_samples - 1  # the reverberation is not cut off
@@ -61,80 +90,154 @@ def test_standing_still_is_convolution():
     for emitter in emitters:
         part = emitter.gain * heard(emitter, point(0, 2.0), wet.shape[1])
         expected[:, : part.shape[1]] += part
-    assert error_db(wet, expected) < -120
+    assert error_db(reverberation(open_hall, emitters, [point(0, 2.0)]), expected) < -110
+
+
+def test_the_direct_sound_arrives_when_it_can_and_fades_with_distance(open_hall):
+    clip = noise(12, 12_000)
+    levels = []
+    for distance_m in (1.0, 2.0, 8.0):
+        emitter = RenderedEmitter(clip, Pose((2.0 + distance_m, 2.0, 1.5)))
+        wet = render(DEAD, open_hall, [emitter], [point(0, 2.0)], length=13_000)
+        onset = np.argmax(np.abs(wet).max(axis=0) > 0.05 * np.abs(wet).max())
+        # Both ears are a head's radius behind the plane through its middle, at most; half a millisecond of filters.
+        assert onset / SAMPLE_RATE == pytest.approx(distance_m / SPEED_OF_SOUND, abs=0.0007)
+        levels.append(level_db(wet[:, 2_000:12_000]))
+    np.testing.assert_allclose(np.diff(levels), [-6.02, -12.04], atol=0.05)
+
+
+def test_an_emitter_that_looks_away_is_heard_by_its_reverberation(open_hall):
+    clip = noise(13, 12_000)
+    towards, away = (Pose.from_yaw((6.0, 2.0, 1.5), yaw) for yaw in (math.pi, 0.0))
+
+    def level(field, pose, directivity):
+        emitter = RenderedEmitter(clip, pose, directivity)
+        return level_db(render(field, open_hall, [emitter], [point(0, 2.0)], length=12_000)[:, 2_000:])
+
+    assert level(DEAD, towards, CARDIOID) == pytest.approx(level(DEAD, towards, OMNIDIRECTIONAL), abs=0.1)
+    assert level(DEAD, away, CARDIOID) < level(DEAD, towards, CARDIOID) - 40
+    # A third of the power of an omnidirectional emitter goes into the room, whichever way it looks.
+    whole = reverberation(open_hall, [RenderedEmitter(clip, away)], [point(0, 2.0)], length=12_000)
+    for directivity in (CARDIOID, FIGURE_OF_EIGHT):
+        part = reverberation(open_hall, [RenderedEmitter(clip, away, directivity)], [point(0, 2.0)], length=12_000)
+        assert error_db(part, whole / math.sqrt(3)) < -60
 
 
 @pytest.mark.parametrize("length", [1, 255, 256, 1_000])
-def test_length_is_as_asked(length):
+def test_length_is_as_asked(open_hall, length):
     emitter = RenderedEmitter(noise(3, 400), HERE, loop=True)
-    wet = render(FIELD, [emitter], [point(0, 2.0)], length=length)
-    np.testing.assert_array_equal(wet, render(FIELD, [emitter], [point(0, 2.0)], length=2_000)[:, :length])
+    wet = render(FIELD, open_hall, [emitter], [point(0, 2.0)], length=length)
+    whole = render(FIELD, open_hall, [emitter], [point(0, 2.0)], length=2_000)
+    np.testing.assert_array_equal(wet, whole[:, :length])
 
 
 @pytest.mark.parametrize(("sample", "block"), [(1, 1), (256, 1), (257, 2), (2_560, 10)])
-def test_a_pose_is_faded_to_over_the_first_block_at_or_after_its_sample(sample, block):
+def test_a_pose_is_faded_to_over_the_first_block_at_or_after_its_sample(open_hall, sample, block):
     emitter = RenderedEmitter(noise(4, 20 * SIZE), HERE)
     before, after = point(0, 2.0), point(sample, 3.0)
-    wet = render(FIELD, [emitter], [before, after], length=20 * SIZE)
+    wet = reverberation(open_hall, [emitter], [before, after], length=20 * SIZE)
     weight = np.zeros(20 * SIZE)
     weight[block * SIZE : (block + 1) * SIZE] = raised_cosine(SIZE)
     weight[(block + 1) * SIZE :] = 1
     old, new = heard(emitter, before, 20 * SIZE), heard(emitter, after, 20 * SIZE)
-    assert error_db(wet, (1 - weight) * old + weight * new) < -120
+    assert error_db(wet, (1 - weight) * old + weight * new) < -110
 
 
-def test_of_poses_within_a_block_the_last_counts():
+def test_of_poses_within_a_block_the_last_counts(open_hall):
     emitter = RenderedEmitter(noise(5, 20 * SIZE), HERE)
     many = [point(0, 2.0), *(point(1_000 + step, 3.0 + step) for step in range(20))]
     few = [point(0, 2.0), point(1_024, 22.0)]
-    np.testing.assert_array_equal(render(FIELD, [emitter], many), render(FIELD, [emitter], few))
+    np.testing.assert_array_equal(render(FIELD, open_hall, [emitter], many), render(FIELD, open_hall, [emitter], few))
 
 
-def test_nothing_sounds_before_the_path_begins_and_the_clip_begins_with_it():
+def test_direct_sound_and_reverberation_follow_the_path_each_at_its_own_sample(open_hall):
+    emitter = RenderedEmitter(noise(14, 40 * SIZE), HERE)
+    length = 40 * SIZE
+    moved = [point(0, 2.0), PathPoint(10 * SIZE, point(0, 6.0).pose, 20 * SIZE)]
+    never = [point(0, 2.0), PathPoint(10 * SIZE, point(0, 6.0).pose, None)]
+    direct_only = render(DEAD, open_hall, [emitter], [point(0, 2.0), point(10 * SIZE, 6.0)], length=length)
+    for path, at in ((moved, 20 * SIZE), (never, None)):
+        wet = render(FIELD, open_hall, [emitter], path, length=length).astype(float)
+        stays = [point(0, 2.0)] if at is None else [point(0, 2.0), point(at, 6.0)]
+        assert error_db(wet - direct_only, reverberation(open_hall, [emitter], stays, length=length)) < -110
+
+
+def test_nothing_sounds_before_the_path_begins_and_the_clip_begins_with_it(open_hall):
     emitter = RenderedEmitter(noise(6, 3_000), HERE)
-    late, prompt = (render(FIELD, [emitter], [point(start, 2.0)], length=20 * SIZE) for start in (5 * SIZE, 0))
+    late, prompt = (
+        render(FIELD, open_hall, [emitter], [point(start, 2.0)], length=20 * SIZE) for start in (5 * SIZE, 0)
+    )
     assert not late[:, : 5 * SIZE].any()
-    np.testing.assert_array_equal(late[:, 5 * SIZE :], prompt[:, : 15 * SIZE])
+    assert error_db(late[:, 5 * SIZE :], prompt[:, : 15 * SIZE]) < -120
 
 
-def test_a_live_session_replayed_is_equal_to_the_bit():
-    """Live: IRs arrive when they arrive, some never heard. Its log of (sample clock, pose) is all the replay gets."""
+def test_a_live_session_replayed_is_equal_to_the_bit(field, filters):
+    """Live: IRs arrive when they arrive, some poses are never heard. The replay gets what the blocks' headers say."""
     rng = np.random.default_rng(7)
-    emitters = [RenderedEmitter(noise(8, 2_000), HERE, loop=True), RenderedEmitter(noise(9, 5_000), THERE, gain=0.7)]
-    live = Renderer(block_size=SIZE, ir_samples=FIELD.ir_samples)
-    for name, emitter in enumerate(emitters):
-        live.add_emitter(str(name), emitter.clip, gain=emitter.gain, loop=emitter.loop)
-    poses, log, blocks = {}, [], []
-    for number in range(60):
+    clips = {"a": noise(8, 2_000), "b": noise(9, 5_000)}
+    session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, clips.get, window=1_000)
+    places = {"a": Pose.from_yaw((1.0, 2.0, 1.5), 1.0), "b": THERE}
+    session.receive(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)))
+    poses = {1: Pose((2.0, 2.0, 1.5))}
+    pattern = {"pattern": "cardioid"}
+    position = places["a"].position
+    session.receive(AddEmitter(id="a", clip="a", position=position, yaw=1.0, directivity=pattern))
+    session.receive(AddEmitter(id="b", clip="b", position=THERE.position))
+    blocks, request = [], None
+    for number in range(80):
         for _ in range(rng.integers(0, 3) if number > 3 else 0):
-            poses[len(poses)] = Pose.from_yaw((rng.uniform(0, 8), 2.0, 1.5), rng.uniform(-math.pi, math.pi))
-            pose = poses[len(poses) - 1]
-            for name, emitter in enumerate(emitters):
-                ir = FIELD.one(pose.position, emitter.position, pose.yaw)
-                live.set_ir(str(name), live.prepare(ir), token=len(poses) - 1)
-        clock = live.sample_clock
-        blocks.append(live.process())
-        token = live.applied("0")
-        assert live.applied("1") == token
-        if token is not None and (not log or log[-1][1] != token):
-            log.append((clock, token))
-    assert 1 < len(log) < len(poses)
+            pose_id = len(poses) + 1
+            poses[pose_id] = Pose.from_yaw((rng.uniform(0.5, 7.5), 2.0, 1.5), rng.uniform(-math.pi, math.pi))
+            session.receive(
+                ListenerPose(pose_id=pose_id, position=poses[pose_id].position, orientation=poses[pose_id].orientation)
+            )
+        if request is not None and rng.random() < 0.5:
+            session.accept(compute_irs(field, request, session.prepare))
+            request = None
+        request = session.take_request() or request
+        blocks.append(session.render_block())
 
-    replay = render(FIELD, emitters, [PathPoint(clock, poses[token]) for clock, token in log], length=60 * SIZE)
-    np.testing.assert_array_equal(replay, np.concatenate(blocks, axis=1))
+    def first_clocks(pose_of_block):
+        clocks = {}
+        for block in blocks:
+            clocks.setdefault(pose_of_block(block), block.sample_clock)
+        return clocks
+
+    direct = first_clocks(lambda block: block.pose_id)
+    later = first_clocks(lambda block: block.reverberation_pose_id)
+    del later[0]
+    assert 1 < len(later) < len(direct) < len(poses)
+    # A pose that was superseded within its block was never heard directly, but may have been in the reverberation.
+    newest = sorted(direct)
+    superseded = {
+        pose_id: direct[min(other for other in newest if other > pose_id)] for pose_id in later.keys() - direct
+    }
+    path = [
+        PathPoint((direct | superseded)[pose_id], poses[pose_id], later.get(pose_id))
+        for pose_id in sorted(direct | superseded)
+        if pose_id
+    ]
+    start = min(later.values())
+    path = [PathPoint(max(start, each.sample), each.pose, each.reverberation_sample) for each in path]
+    emitters = [
+        RenderedEmitter(clips["a"], places["a"], CARDIOID, loop=True),
+        RenderedEmitter(clips["b"], places["b"], loop=True),
+    ]
+    replay = render(field, DirectSound.of(field.bundle, filters), emitters, path, length=80 * SIZE)
+    np.testing.assert_array_equal(replay, np.concatenate([block.samples for block in blocks], axis=1))
 
 
-def test_progress_rises_to_one():
+def test_progress_rises_to_one(open_hall):
     told = []
-    render(FIELD, [RenderedEmitter(noise(10, 2_000), HERE)], [point(0, 2.0)], progress=told.append)
+    render(FIELD, open_hall, [RenderedEmitter(noise(10, 2_000), HERE)], [point(0, 2.0)], progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 1
 
 
 @pytest.mark.parametrize(("emitters", "path"), [([], [point(0, 2.0)]), ([RenderedEmitter(noise(11, 9), HERE)], [])])
-def test_nothing_to_render_is_refused(emitters, path):
+def test_nothing_to_render_is_refused(open_hall, emitters, path):
     with pytest.raises(ValueError, match="a path and an emitter"):
-        render(FIELD, emitters, path)
+        render(FIELD, open_hall, emitters, path)
 
 
 @pytest.fixture
@@ -151,7 +254,7 @@ def test_reads_samples_and_quaternions(write):
     half = math.sqrt(0.5)
     path = write(f"sample,x,y,z,qx,qy,qz,qw\n0,1,2,1.5,0,0,0,1\n512,1.5,2,1.5,0,0,{half},{half}\n")
     first, second = read_path(path, SAMPLE_RATE)
-    assert first == PathPoint(0, Pose((1, 2, 1.5)))
+    assert first == PathPoint(0, Pose((1, 2, 1.5)), 0)
     assert (second.sample, second.pose.position) == (512, (1.5, 2, 1.5))
     assert second.pose.yaw == pytest.approx(math.pi / 2)
 
@@ -159,12 +262,19 @@ def test_reads_samples_and_quaternions(write):
 def test_reads_seconds_and_degrees_in_any_order_as_a_spreadsheet_writes_them(write):
     path = write("\ufeffyaw_deg, z ,y,x,time_s\r\n\r\n90,1.5,2,1,0\r\n-30,1.5,2.5,1,0.25\r\n")
     assert read_path(path, SAMPLE_RATE) == [
-        PathPoint(0, Pose.from_yaw((1, 2, 1.5), math.radians(90))),
-        PathPoint(6_000, Pose.from_yaw((1, 2.5, 1.5), math.radians(-30))),
+        PathPoint.at(0, Pose.from_yaw((1, 2, 1.5), math.radians(90))),
+        PathPoint.at(6_000, Pose.from_yaw((1, 2.5, 1.5), math.radians(-30))),
     ]
 
 
+def test_reads_when_the_reverberation_followed_if_it_did(write):
+    path = write("sample,reverberation_sample,x,y,z,yaw_deg\n0,512,1,2,1.5,0\n256,,1,2,1.5,0\n256,512,1,2,1.5,0\n")
+    points = read_path(path, SAMPLE_RATE)
+    assert [(point.sample, point.reverberation_sample) for point in points] == [(0, 512), (256, None), (256, 512)]
+
+
 YAW = "sample,x,y,z,yaw_deg\n"
+LATER = "sample,reverberation_sample,x,y,z,yaw_deg\n"
 QUATERNION = "sample,x,y,z,qx,qy,qz,qw\n"
 
 
@@ -194,12 +304,29 @@ QUATERNION = "sample,x,y,z,qx,qy,qz,qw\n"
         (YAW + "0.5,1,2,1.5,0\n", "path.csv: line 2, column 'sample': 0.5 is not a whole number"),
         (YAW + "-256,1,2,1.5,0\n", "path.csv: line 2, column 'sample': must not be negative"),
         (
-            YAW + "256,1,2,1.5,0\n256,1,2,1.5,0\n",
-            "path.csv: line 3, column 'sample': must be later than on the line before",
+            YAW + "256,1,2,1.5,0\n255,1,2,1.5,0\n",
+            "path.csv: line 3, column 'sample': must not be earlier than on the line before",
+        ),
+        (
+            LATER + "0,512,1,2,1.5,0\n256,511,1,2,1.5,0\n",
+            "path.csv: line 3, column 'reverberation_sample': must not be earlier than on the line before",
+        ),
+        (
+            LATER + "256,255,1,2,1.5,0\n",
+            "path.csv: line 2, column 'reverberation_sample': must not be before 'sample'",
+        ),
+        (LATER + "0,x,1,2,1.5,0\n", "path.csv: line 2, column 'reverberation_sample': 'x' is not a number"),
+        (
+            LATER + "0,0.5,1,2,1.5,0\n",
+            "path.csv: line 2, column 'reverberation_sample': 0.5 is not a whole number",
+        ),
+        (
+            LATER + "0,172800001,1,2,1.5,0\n",
+            "path.csv: line 2, column 'reverberation_sample': 1.728e+08 is beyond the 7200 s that a render may last",
         ),
         (
             "time_s,x,y,z,yaw_deg\n0.5,1,2,1.5,0\n0.25,1,2,1.5,0\n",
-            "path.csv: line 3, column 'time_s': must be later than on the line before",
+            "path.csv: line 3, column 'time_s': must not be earlier than on the line before",
         ),
         (
             "time_s,x,y,z,yaw_deg\n0,1,2,1.5,0\n1e9,1,2,1.5,0\n",

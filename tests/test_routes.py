@@ -18,7 +18,7 @@ PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
 
 
 def wait_until_ready(client):
-    for _ in range(200):
+    for _ in range(3_600):  # the first time ever, everything is compiled
         if client.get("/readyz").status_code == 200:
             return
         time.sleep(0.05)
@@ -26,9 +26,9 @@ def wait_until_ready(client):
 
 
 @pytest.fixture
-def client(field):
+def client(field, hrtfs):
     settings = Settings(ir_workers=1, max_waiting_requests=1)
-    with TestClient(create_app(settings, fields={"flat": field}), raise_server_exceptions=False) as client:
+    with TestClient(create_app(settings, fields={"flat": field}, hrtfs=hrtfs), raise_server_exceptions=False) as client:
         wait_until_ready(client)
         yield client
 
@@ -51,7 +51,7 @@ def test_health(client):
     assert client.get("/readyz").json() == {"status": "ready"}
 
 
-def test_ready_only_after_the_field_has_been_used(field):
+def test_ready_only_after_the_field_has_been_used(field, hrtfs):
     compute, may_go_on = field.impulse_responses, threading.Event()
 
     def held_up(*arguments):
@@ -59,20 +59,20 @@ def test_ready_only_after_the_field_has_been_used(field):
         return compute(*arguments)
 
     field.impulse_responses = held_up
-    with TestClient(create_app(Settings(), fields={"flat": field})) as client:
+    with TestClient(create_app(Settings(), fields={"flat": field}, hrtfs=hrtfs)) as client:
         assert client.get("/livez").status_code == 200
         check_problem(client.get("/readyz"), 503, "not_ready")
         may_go_on.set()
         wait_until_ready(client)
 
 
-def test_a_failing_warm_up_leaves_the_server_live_and_not_ready(field, caplog):
+def test_a_failing_warm_up_leaves_the_server_live_and_not_ready(field, hrtfs, caplog):
     def broken(*_):
         raise RuntimeError("the field broke")
 
     field.impulse_responses = broken
-    with TestClient(create_app(Settings(), fields={"flat": field})) as client:
-        for _ in range(100):
+    with TestClient(create_app(Settings(), fields={"flat": field}, hrtfs=hrtfs)) as client:
+        for _ in range(3_600):
             if "warm-up failed" in caplog.text:
                 break
             time.sleep(0.05)
@@ -94,9 +94,14 @@ def test_clips(client):
     assert all(clip["duration_s"] > 0 and clip["title"] for clip in clips)
 
 
-def test_a_clip_that_cannot_be_decoded_is_left_out_and_the_log_says_why(field, tmp_path, caplog):
+def test_heads_are_named_and_kemar_is_the_default(client):
+    assert client.get("/v1/hrtfs").json() == {"default": "kemar", "hrtfs": ["kemar"]}
+
+
+def test_a_clip_that_cannot_be_decoded_is_left_out_and_the_log_says_why(field, hrtfs, tmp_path, caplog):
     (tmp_path / "noise.flac").write_bytes(b"not audio")
-    with TestClient(create_app(Settings(clips=(tmp_path / "noise.flac",)), fields={"flat": field})) as client:
+    settings = Settings(clips=(tmp_path / "noise.flac",))
+    with TestClient(create_app(settings, fields={"flat": field}, hrtfs=hrtfs)) as client:
         names = {clip["name"] for clip in client.get("/v1/clips").json()["clips"]}
     assert "noise" not in names
     assert "noise.flac" in caplog.text

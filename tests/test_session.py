@@ -8,10 +8,13 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from numpy.testing import assert_allclose
 
 from server.acoustics.geometry import Pose
+from server.blocks import DryBlock
 from server.errors import RequestError
 from server.protocol import (
+    PROTOCOL,
     Acknowledge,
     AddEmitter,
+    DirectivityPattern,
     EmitterAdded,
     EmitterRemoved,
     Error,
@@ -21,8 +24,10 @@ from server.protocol import (
     MoveEmitter,
     Ping,
     RemoveEmitter,
+    SetGain,
 )
 from server.session import Session, compute_irs
+from server.whole_field import WholeField
 
 CLIP = np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
 HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
@@ -35,8 +40,8 @@ def load_clip(name):
 
 
 @pytest.fixture
-def session(field):
-    return Session(Hello(protocol=1, scene="flat"), field, load_clip, window=1_000)
+def session(field, filters):
+    return Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=1_000)
 
 
 def add(session, identifier="talker", **changes):
@@ -49,19 +54,126 @@ def answer(session, field):
     return [] if request is None else session.accept(compute_irs(field, request, session.prepare))
 
 
+def poses(block):
+    return block.pose_id, block.reverberation_pose_id
+
+
 def codes(events):
     return [event.code for event in events if isinstance(event, Error)]
 
 
-def test_sound_is_the_clip_convolved_with_the_fields_ir(session, field):
-    session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
-    add(session, loop=False, gain_db=-6.0)
-    assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
-    heard = np.concatenate([session.render_block().samples for _ in range(40)], axis=1)
+def dead(field):
+    """Nothing follows the direct sound any more."""
+    field.impulse_responses = lambda listeners, *_: np.zeros((len(listeners), 2, field.ir_samples), np.float32)
+    return field
+
+
+def hear(session, blocks):
+    """(2, n)"""
+    return np.concatenate([session.render_block().samples for _ in range(blocks)], axis=1).astype(float)
+
+
+def level_db(samples):
+    return 10 * np.log10(np.mean(samples**2))
+
+
+def test_sound_is_the_clip_along_the_direct_path_and_convolved_with_the_fields_ir(field, filters):
+    def heard(field):
+        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=1_000)
+        session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
+        add(session, loop=False, gain_db=-6.0)
+        assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
+        return hear(session, 40)
+
     ir = field.impulse_responses([HERE], [THERE], [0.5])[0]
-    expected = [np.convolve(CLIP * 10 ** (-6 / 20), ear)[: heard.shape[1]] for ear in ir.astype(float)]
-    padded = [np.pad(ear, (0, heard.shape[1] - len(ear))) for ear in expected]
-    assert_allclose(heard, padded, atol=1e-5)
+    whole, direct = heard(field), heard(dead(field))
+    assert np.any(direct)
+    expected = [np.convolve(CLIP * 10 ** (-6 / 20), ear)[: whole.shape[1]] for ear in ir.astype(float)]
+    assert_allclose(whole - direct, [np.pad(ear, (0, whole.shape[1] - len(ear))) for ear in expected], atol=1e-5)
+
+
+def test_the_direct_sound_follows_poses_that_no_ir_was_computed_for(session, field):
+    session.receive(ListenerPose(pose_id=1, position=(5.0, 3.0, 1.5), yaw=0.0))
+    add(session, gain_db=-6.0)
+    answer(session, dead(field))
+    near = hear(session, 100)
+    session.receive(ListenerPose(pose_id=2, position=(2.0, 3.0, 1.5), yaw=0.0))
+    session.take_request()  # and never answered
+    block = session.render_block()
+    assert poses(block) == (2, 1)
+    hear(session, 30)
+    far = hear(session, 100)
+    # From one metre to four.
+    assert level_db(near[:, 2_000:]) - level_db(far) == pytest.approx(12.04, abs=0.5)
+    session.receive(ListenerPose(pose_id=3, position=(2.0, 3.0, 1.5), yaw=math.pi / 2))
+    hear(session, 10)
+    left, right = hear(session, 100)
+    assert level_db(right) > level_db(left) + 6
+
+
+def test_an_emitter_is_moved_and_turned(session, field):
+    session.receive(ListenerPose(pose_id=1, position=(2.0, 2.5, 1.5), yaw=0.0))
+    add(session, position=(4.0, 2.5, 1.5), yaw=math.pi, directivity=DirectivityPattern(pattern="cardioid"))
+    answer(session, dead(field))
+    hear(session, 10)
+    facing = hear(session, 100)
+    session.receive(MoveEmitter(id="talker", position=(4.0, 2.5, 1.5), yaw=0.0, pose_id=2))
+    hear(session, 10)
+    away = hear(session, 100)
+    assert level_db(away) < level_db(facing) - 40
+    # Without a front it keeps the one it had.
+    session.receive(MoveEmitter(id="talker", position=(3.0, 2.5, 1.5), pose_id=3))
+    hear(session, 30)
+    assert level_db(hear(session, 100)) < level_db(facing) - 30
+    session.receive(MoveEmitter(id="talker", position=(1.0, 2.5, 1.5), pose_id=4))
+    hear(session, 30)
+    assert level_db(hear(session, 100)) == pytest.approx(level_db(facing) + 6, abs=3)  # from behind
+
+
+def test_a_gain_scales_direct_sound_and_reverberation_alike(session, field):
+    add(session)
+    answer(session, field)
+    hear(session, 100)
+    before = hear(session, 100)
+    session.receive(SetGain(id="talker", gain_db=-20.0))
+    hear(session, 100)
+    assert level_db(before) - level_db(hear(session, 100)) == pytest.approx(20, abs=0.5)
+
+
+def test_what_is_sent_live_sounds_as_the_same_clip_does(field, filters):
+    def heard(message, blocks):
+        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=1_000)
+        session.receive(message)
+        answer(session, field)
+        for sequence, block in enumerate(blocks):
+            assert session.receive(DryBlock("a", sequence, block)) == []
+        return hear(session, 40)
+
+    dry = np.concatenate([CLIP, CLIP])
+    live = heard(AddEmitter(id="a", live=True, position=THERE), np.split(dry, [500, 501, 3_000]))
+    clip = heard(AddEmitter(id="a", clip="noise", position=THERE), [])
+    samples = 5_000  # before it ends
+    assert_allclose(live[:, :samples], clip[:, :samples], atol=1e-6)
+
+
+def test_live_blocks_have_to_come_in_order(session, field):
+    session.receive(AddEmitter(id="a", live=True, position=THERE))
+    answer(session, field)
+    assert session.receive(DryBlock("a", 7, CLIP)) == []
+    assert codes(session.receive(DryBlock("a", 7, CLIP))) == ["stale_block"]
+    assert session.receive(DryBlock("a", 9, CLIP)) == []
+    (status,) = session.live_statuses()
+    assert (status.id, status.samples_queued) == ("a", 2 * CLIP.size)
+
+
+def test_who_stands_still_hears_the_scenes_whole_response(session, field, filters):
+    session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
+    add(session, loop=False)
+    answer(session, field)
+    heard = hear(session, 40)
+    ir = WholeField(field, filters).impulse_responses([HERE], [THERE], [0.5])[0].astype(float)
+    expected = [np.pad(np.convolve(CLIP, ear), (0, 10_000))[: heard.shape[1]] for ear in ir]
+    assert_allclose(heard, expected, atol=1e-4)
 
 
 def test_sound_never_waits_for_the_field(session):
@@ -83,17 +195,19 @@ def test_poses_that_arrive_during_a_computation_become_one_request(session, fiel
     assert (second.pose_id, second.listener.position) == (99, (2.99, 2.0, 1.5))
 
 
-def test_a_block_carries_the_pose_whose_irs_it_fades_to(session, field):
+def test_a_block_carries_the_pose_of_its_direct_paths_and_the_one_whose_irs_it_fades_to(session, field):
     add(session)
     answer(session, field)
-    assert session.render_block().pose_id == 0
+    assert poses(session.render_block()) == (0, 0)
     session.receive(ListenerPose(pose_id=7, position=HERE))
     request = session.take_request()
-    assert session.render_block().pose_id == 0
+    assert poses(session.render_block()) == (7, 0)
+    session.receive(ListenerPose(pose_id=8, position=HERE))
+    session.receive(ListenerPose(pose_id=9, position=HERE))
     session.accept(compute_irs(field, request, session.prepare))
     exchange, after = session.render_block(), session.render_block()
-    assert (exchange.pose_id, exchange.is_exchange) == (7, True)
-    assert (after.pose_id, after.is_exchange) == (7, False)
+    assert (*poses(exchange), exchange.is_exchange) == (9, 7, True)
+    assert (*poses(after), after.is_exchange) == (9, 7, False)
     assert session.ir_exchanges == 1
 
 
@@ -112,13 +226,21 @@ def test_a_pose_of_one_emitter_counts_for_the_whole(session, field):
     session.render_block()
     session.receive(MoveEmitter(id="b", position=HERE, pose_id=5))
     answer(session, field)
-    assert session.render_block().pose_id == 5
+    assert poses(session.render_block()) == (5, 5)
 
 
 def test_without_emitters_every_pose_is_in_effect_at_once(session):
     session.receive(ListenerPose(pose_id=3, position=HERE))
     assert session.take_request() is None
-    assert session.render_block().pose_id == 3
+    assert poses(session.render_block()) == (3, 3)
+
+
+def test_an_emitter_that_turns_on_the_spot_needs_no_new_ir(session, field):
+    add(session)
+    answer(session, field)
+    session.receive(MoveEmitter(id="talker", position=THERE, yaw=1.0, pose_id=1))
+    assert session.take_request() is None
+    assert poses(session.render_block()) == (1, 1)
 
 
 def test_an_answer_for_an_emitter_that_left_is_ignored_even_if_its_id_is_taken_again(session, field):
@@ -139,15 +261,15 @@ def test_after_a_failure_sound_goes_on_and_the_next_pose_asks_for_everything_out
     assert codes(session.give_up(session.take_request())) == ["field_failure"]
     assert session.take_request() is None
     block = session.render_block()
-    assert block.pose_id == 0
+    assert poses(block) == (1, 0)
     assert np.any(block.samples)
     session.receive(MoveEmitter(id="a", position=HERE, pose_id=2))
     assert len(session.take_request().emitters) == 2
 
 
-def test_a_full_window_drops_blocks_but_not_time(field):
+def test_a_full_window_drops_blocks_but_not_time(field, filters):
     def run(acknowledged):
-        session = Session(Hello(protocol=1, scene="flat"), field, load_clip, window=4)
+        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=4)
         add(session)
         answer(session, field)
         blocks = []
@@ -178,8 +300,12 @@ def test_a_full_window_drops_blocks_but_not_time(field):
         (AddEmitter(id="talker", clip="noise", position=HERE), "duplicate_emitter"),
         (AddEmitter(id="new", clip="nothing", position=HERE), "unknown_clip"),
         (AddEmitter(id="new", clip="noise", position=(0.0, 0.0, 9.0)), "position_out_of_bounds"),
+        (AddEmitter(id="talker", live=True, position=HERE), "duplicate_emitter"),
+        (SetGain(id="nobody", gain_db=-6.0), "unknown_emitter"),
+        (DryBlock("nobody", 0, CLIP), "unknown_emitter"),
+        (DryBlock("talker", 0, CLIP), "not_live"),
         (Acknowledge(sequence=4_000), "unknown_sequence"),
-        (Hello(protocol=1, scene="flat"), "unexpected_hello"),
+        (Hello(protocol=PROTOCOL, scene="flat"), "unexpected_hello"),
         (Ping(id=1), "unexpected_ping"),
     ],
     ids=lambda value: value if isinstance(value, str) else value.type,
@@ -197,31 +323,35 @@ def test_a_bad_message_changes_nothing_and_the_stream_goes_on(session, field, me
     assert session.receive(ListenerPose(pose_id=9, position=HERE)) == []
 
 
-def test_emitters_are_limited(field):
-    session = Session(Hello(protocol=1, scene="flat"), field, load_clip, max_emitters=2)
+def test_emitters_are_limited(field, filters):
+    session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, max_emitters=2)
     assert codes(add(session, "a") + add(session, "b") + add(session, "c")) == ["too_many_emitters"]
 
 
 @pytest.mark.parametrize(
     ("changes", "code"),
     [
-        ({"protocol": 2}, "unsupported_protocol"),
+        ({"protocol": 1}, "unsupported_protocol"),
+        ({"protocol": 3}, "unsupported_protocol"),
         ({"sample_rate": 44_100}, "unsupported_sample_rate"),
         ({"listener": ListenerStart(position=(-5.0, 0.0, 0.0))}, "position_out_of_bounds"),
     ],
 )
-def test_a_hello_that_cannot_be_served_is_refused(field, changes, code):
+def test_a_hello_that_cannot_be_served_is_refused(field, filters, changes, code):
     with pytest.raises(RequestError) as refusal:
-        Session(Hello(**{"protocol": 1, "scene": "flat", **changes}), field, load_clip)
+        Session(Hello(**{"protocol": PROTOCOL, "scene": "flat", **changes}), field, filters, load_clip)
     assert refusal.value.code == code
 
 
-def test_a_listener_starts_where_the_scene_says_unless_hello_says_otherwise(field):
+def test_a_listener_starts_where_the_scene_says_unless_hello_says_otherwise(field, filters):
     for hello, expected in [
-        (Hello(protocol=1, scene="flat"), Pose.from_yaw((2.0, 2.5, 1.5), math.pi / 2)),
-        (Hello(protocol=1, scene="flat", listener=ListenerStart(position=HERE, yaw=1.0)), Pose.from_yaw(HERE, 1.0)),
+        (Hello(protocol=PROTOCOL, scene="flat"), Pose.from_yaw((2.0, 2.5, 1.5), math.pi / 2)),
+        (
+            Hello(protocol=PROTOCOL, scene="flat", listener=ListenerStart(position=HERE, yaw=1.0)),
+            Pose.from_yaw(HERE, 1.0),
+        ),
     ]:
-        session = Session(hello, field, load_clip)
+        session = Session(hello, field, filters, load_clip)
         add(session)
         assert session.take_request().listener == expected
 
@@ -233,12 +363,14 @@ def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
         compute_irs(field, session.take_request(), session.prepare)
 
 
-def test_laws_hold_whatever_a_client_says_in_whatever_order(field):
+def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
     class AnyOrder(RuleBasedStateMachine):
         @initialize()
         def begin(self):
-            self.session = Session(Hello(protocol=1, scene="flat", block_size=128), field, load_clip, window=6)
-            self.pose_id = 0
+            self.session = Session(
+                Hello(protocol=PROTOCOL, scene="flat", block_size=128), field, filters, load_clip, window=6
+            )
+            self.pose_id = self.sequence = 0
             self.request = None
             self.blocks = []
 
@@ -259,6 +391,19 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field):
         def move(self, identifier):
             if not self.session.receive(MoveEmitter(id=identifier, position=HERE, pose_id=self.pose_id + 1)):
                 self.pose_id += 1
+
+        @rule(identifier=st.sampled_from("abc"))
+        def add_live(self, identifier):
+            self.session.receive(AddEmitter(id=identifier, live=True, position=HERE))
+
+        @rule(identifier=st.sampled_from("abc"), frames=st.integers(1, 5_000), value=st.floats(width=32))
+        def speak(self, identifier, frames, value):
+            self.sequence += 1
+            self.session.receive(DryBlock(identifier, self.sequence, np.full(frames, value, np.float32)))
+
+        @rule(identifier=st.sampled_from("abc"), gain_db=st.floats(-80, 24))
+        def make_louder(self, identifier, gain_db):
+            self.session.receive(SetGain(id=identifier, gain_db=gain_db))
 
         @rule()
         def ask(self):
@@ -289,7 +434,10 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field):
             assert all(np.isfinite(block.samples).all() for block in self.blocks[-1:])
             assert [block.sequence for block in self.blocks] == list(range(len(self.blocks)))
             assert all(a.sample_clock < b.sample_clock for a, b in zip(self.blocks, self.blocks[1:], strict=False))
-            assert all(a.pose_id <= b.pose_id for a, b in zip(self.blocks, self.blocks[1:], strict=False))
-            assert all(block.pose_id <= self.pose_id for block in self.blocks)
+            assert all(
+                a.pose_id <= b.pose_id and a.reverberation_pose_id <= b.reverberation_pose_id
+                for a, b in zip(self.blocks, self.blocks[1:], strict=False)
+            )
+            assert all(block.reverberation_pose_id <= block.pose_id <= self.pose_id for block in self.blocks)
 
     run_state_machine_as_test(AnyOrder, settings=settings(max_examples=60, stateful_step_count=40, deadline=None))

@@ -10,10 +10,11 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from server.app import create_app
+from server.blocks import AudioBlock, DryBlock
 from server.protocol import (
+    PROTOCOL,
     Acknowledge,
     AddEmitter,
-    AudioBlock,
     EmitterAdded,
     EmitterRemoved,
     Error,
@@ -28,7 +29,7 @@ from server.protocol import (
 )
 from server.settings import Settings
 
-HELLO = Hello(protocol=1, scene="flat")
+HELLO = Hello(protocol=PROTOCOL, scene="flat")
 TALKER = AddEmitter(id="talker", clip="tone", position=(6.0, 3.0, 1.5))
 
 
@@ -42,10 +43,10 @@ def clip_files(tmp_path):
 
 
 @pytest.fixture
-def client(field, clip_files):
+def client(field, hrtfs, clip_files):
     settings = Settings(clips=clip_files, hello_timeout_s=0.5, max_streams=2)
-    with TestClient(create_app(settings, fields={"flat": field})) as client:
-        for _ in range(200):
+    with TestClient(create_app(settings, fields={"flat": field}, hrtfs=hrtfs)) as client:
+        for _ in range(3_600):  # the first time ever, everything is compiled
             if client.get("/readyz").status_code == 200:
                 break
             time.sleep(0.05)
@@ -109,7 +110,7 @@ def test_turning_the_head_swaps_the_louder_ear(ears):
 
     def louder_ear(yaw, pose_id):
         ears.send(ListenerPose(pose_id=pose_id, position=(6.0, 1.0, 1.5), yaw=yaw))
-        ears.until(AudioBlock, lambda block: block.pose_id == pose_id and not block.is_exchange)
+        ears.until(AudioBlock, lambda block: block.reverberation_pose_id == pose_id and not block.is_exchange)
         energy = sum(np.sum(ears.until(AudioBlock).samples ** 2, axis=1) for _ in range(40))
         return int(np.argmax(energy))
 
@@ -118,7 +119,7 @@ def test_turning_the_head_swaps_the_louder_ear(ears):
 
 
 def test_integer_samples_and_other_block_sizes_are_negotiated(client):
-    hello = Hello(protocol=1, scene="flat", encoding="s16", block_size=512, sample_rate=24_000, buffer_blocks=2)
+    hello = Hello(protocol=PROTOCOL, scene="flat", encoding="s16", block_size=512, sample_rate=24_000, buffer_blocks=2)
     with client.websocket_connect("/v1/stream") as socket:
         ears = Ears(socket, hello)
         assert ears.until(AudioBlock).samples.shape == (2, 512)
@@ -130,7 +131,24 @@ def test_binary_poses_are_heard(ears):
     ears.send(TALKER)
     ears.until(EmitterAdded)
     ears.socket.send_bytes(ListenerPose(pose_id=5, position=(3.0, 2.0, 1.5)).serialize_binary())
-    assert ears.until(AudioBlock, lambda block: block.pose_id == 5).is_exchange
+    exchange = ears.until(AudioBlock, lambda block: block.reverberation_pose_id == 5)
+    assert exchange.is_exchange
+    assert exchange.pose_id == 5
+
+
+def test_what_a_client_sends_live_comes_back_from_where_its_emitter_is(ears):
+    ears.send(ListenerPose(pose_id=1, position=(2.0, 2.5, 1.5), yaw=0.0))
+    ears.send(AddEmitter(id="voice", live=True, position=(2.0, 3.5, 1.5)))
+    ears.until(EmitterAdded)
+    assert not ears.until(AudioBlock).samples.any()
+    tone = np.sin(np.arange(256) * 2 * np.pi * 8 / 256).astype(np.float32)
+    energy = np.zeros(2)
+    for sequence in range(60):
+        ears.socket.send_bytes(DryBlock("voice", sequence, tone).serialize("s16"))
+        energy += np.sum(ears.until(AudioBlock).samples ** 2, axis=1)
+    assert energy[0] > 2 * energy[1] > 0  # it stands to the left
+    (live,) = ears.until(Status, lambda status: status.live and status.live[0].underruns).live
+    assert (live.id, live.samples_queued, live.samples_gated) == ("voice", 0, 0)
 
 
 def test_pings_and_status(ears):
@@ -156,7 +174,13 @@ BAD_TEXT = [
     ('{"type": "move_emitter", "id": "ghost", "position": [1, 2, 1], "pose_id": 1}', "unknown_emitter"),
     ('{"type": "remove_emitter", "id": "ghost"}', "unknown_emitter"),
     ('{"type": "acknowledge", "sequence": 4000000000}', "unknown_sequence"),
-    ('{"type": "hello", "protocol": 1, "scene": "flat"}', "unexpected_hello"),
+    ('{"type": "add_emitter", "id": "x", "position": [1, 2, 1]}', "malformed_message"),
+    (
+        '{"type": "add_emitter", "id": "x", "clip": "tone", "position": [1, 2, 1], "directivity": {"pattern": "odd"}}',
+        "malformed_directivity",
+    ),
+    ('{"type": "set_gain", "id": "ghost", "gain_db": 0}', "unknown_emitter"),
+    ('{"type": "hello", "protocol": 2, "scene": "flat"}', "unexpected_hello"),
     (json.dumps({"type": "ping", "id": 1, "padding": "x" * 70_000}), "message_too_large"),
     # Few enough characters, too many bytes.
     (json.dumps({"type": "ping", "id": 1, "padding": "é" * 40_000}, ensure_ascii=False), "message_too_large"),
@@ -166,6 +190,9 @@ BAD_BYTES = [
     (b"\xff" * 36, "unknown_message"),
     (b"\x02" * 35, "malformed_pose"),
     (struct.pack("<BBHI7f", 2, 0, 0, 1, math.inf, 0, 0, 0, 0, 0, 1), "malformed_pose"),
+    (b"\x03" * 40, "malformed_block"),
+    (DryBlock("ghost", 0, np.ones(4, np.float32)).serialize("f32"), "unknown_emitter"),
+    (DryBlock("talker", 0, np.ones(4, np.float32)).serialize("f32"), "not_live"),
     (bytes(70_000), "message_too_large"),
 ]
 
@@ -198,11 +225,12 @@ def test_a_clip_that_cannot_be_decoded_says_why(ears):
     [
         (Ping(id=1).serialize(), "hello_expected"),
         ("?", "malformed_message"),
-        (Hello(protocol=9, scene="flat").serialize(), "unsupported_protocol"),
-        (Hello(protocol=1, scene="moon").serialize(), "unknown_scene"),
-        (Hello(protocol=1, scene="flat", sample_rate=48_000).serialize(), "unsupported_sample_rate"),
+        (Hello(protocol=1, scene="flat").serialize(), "unsupported_protocol"),
+        (Hello(protocol=PROTOCOL, scene="flat", hrtf="moomin").serialize(), "unknown_hrtf"),
+        (Hello(protocol=PROTOCOL, scene="moon").serialize(), "unknown_scene"),
+        (Hello(protocol=PROTOCOL, scene="flat", sample_rate=48_000).serialize(), "unsupported_sample_rate"),
         (
-            '{"type": "hello", "protocol": 1, "scene": "flat", "listener": {"position": [99, 1, 1]}}',
+            '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [99, 1, 1]}}',
             "position_out_of_bounds",
         ),
         (None, "hello_expected"),

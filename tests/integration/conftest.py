@@ -16,10 +16,10 @@ from server.settings import Settings
 
 
 @pytest.fixture
-def served(bundle) -> Iterator[str]:
+def served(bundle, hrtfs) -> Iterator[str]:
     """HOST:PORT of a server of the arithmetic scene, ready, with the options of `nafir serve`."""
     settings = Settings(port=0)
-    app = create_app(settings, fields={bundle.id: AcousticField.load(bundle)})
+    app = create_app(settings, fields={bundle.id: AcousticField.load(bundle)}, hrtfs=hrtfs)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
     thread = threading.Thread(target=server.run)
     thread.start()
@@ -35,7 +35,8 @@ def served(bundle) -> Iterator[str]:
 
 
 def _wait_until_ready(address: str) -> None:
-    for _ in range(200):
+    """The first time ever, everything is compiled."""
+    for _ in range(3_600):
         try:
             with urllib.request.urlopen(f"http://{address}/readyz", timeout=5):
                 return

@@ -8,9 +8,10 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
 
-from server.protocol import Acknowledge, AudioBlock, Hello
+from server.blocks import AudioBlock
+from server.protocol import PROTOCOL, Acknowledge, Hello
 
-HELLO = Hello(protocol=1, scene="flat").serialize()
+HELLO = Hello(protocol=PROTOCOL, scene="flat").serialize()
 
 
 def blocks_for(client, duration_s):

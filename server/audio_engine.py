@@ -1,0 +1,233 @@
+"""The threads that render every stream, one per core.
+
+A hop through an executor costs a millisecond per block; a thread that stays awake for its streams costs none. A stream
+stays with the thread that was least busy when it came. Impulse responses (IRs) are computed by a pool of workers and
+picked up at the next block: an audio thread waits for no field and no network.
+
+**When blocks fall due.** Every block of a stream is due at a whole number of block durations from the stream's origin.
+Were all origins arbitrary, a thread would wake for every block of every stream, and each time the interpreter's lock,
+the renderer's call and the way to the event loop would cost about what rendering does; were all the same, the first
+stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly apart, gives a
+new stream the one with the fewest others, and renders all that is due at an instant in one call without the lock.
+
+Messages that may call for an IR wake the thread at once, which asks for the IR and renders nothing early.
+
+Who may touch what: a `Stream` belongs to its audio thread, but for `Stream.offer`; `AudioEngine` to the event loop.
+"""
+
+import logging
+import math
+import sys
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+
+from server.priority import become_real_time
+from server.rendering.renderer import render_all
+from server.stream import Outgoing, Stream, StreamFailed
+
+PHASES = 4
+_EARLY_S = 0.0002
+"""Blocks due within that are rendered now: sooner than one could sleep and wake again."""
+_PRESUMED_LOAD = 0.02
+"""Share of a core that a stream is taken to need at least, as long as it has shown no more."""
+_SWITCH_S = 0.0005
+"""How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, one that is busy
+half of the time holds audio up for longer than blocks last."""
+_logger = logging.getLogger(__name__)
+
+Post = Callable[[Callable[[], None]], object]
+"""Runs a call on the event loop (`loop.call_soon_threadsafe`)."""
+
+
+class AudioEngine:
+    """Renders streams until stopped.
+
+    `workers` computes IRs; each stream has at most one request with it, so its queue is never longer than there are
+    streams. `is_real_time` asks the system to schedule audio threads before all others.
+    """
+
+    def __init__(
+        self,
+        post: Post,
+        workers: Executor,
+        *,
+        threads: int = 1,
+        is_real_time: bool = False,
+        time_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.threads = [
+            AudioThread(post, workers, number=number, is_real_time=is_real_time, time_s=time_s)
+            for number in range(threads)
+        ]
+        self._thread_of: dict[Stream, AudioThread] = {}
+        self._switch_s_before = sys.getswitchinterval()
+
+    def start(self) -> None:
+        sys.setswitchinterval(_SWITCH_S)
+        for thread in self.threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Return once the threads have ended, which takes one tick."""
+        for thread in self.threads:
+            thread.stop()
+        for thread in self.threads:
+            thread.join()
+        sys.setswitchinterval(self._switch_s_before)
+
+    @property
+    def streams(self) -> tuple[Stream, ...]:
+        """Those open, in the order they came."""
+        return tuple(self._thread_of)
+
+    def open(self, stream: Stream) -> None:
+        """Start a stream now, on the thread that is least busy."""
+        loads = dict.fromkeys(self.threads, 0.0)
+        for other, thread in self._thread_of.items():
+            loads[thread] += max(_PRESUMED_LOAD, other.load)
+        thread = min(self.threads, key=loads.__getitem__)
+        self._thread_of[stream] = thread
+        thread.open(stream)
+
+    def close(self, stream: Stream) -> None:
+        """Stop rendering a stream; what it made before may still be delivered. Closing twice does no harm."""
+        thread = self._thread_of.pop(stream, None)
+        if thread is not None:
+            thread.close(stream)
+
+
+class AudioThread:
+    """Ticks its streams; `tick` is all that happens on it."""
+
+    def __init__(
+        self, post: Post, workers: Executor, *, number: int, is_real_time: bool, time_s: Callable[[], float]
+    ) -> None:
+        self._post = post
+        self._workers = workers
+        self._number = number
+        self._is_real_time = is_real_time
+        self._time_s = time_s
+        self._streams: dict[Stream, int] = {}
+        """With the phase of each."""
+        self._arrivals: deque[tuple[Stream, bool]] = deque()
+        self._origin_s: float | None = None
+        self._wake = threading.Event()
+        self._is_stopping = False
+        self._thread = threading.Thread(target=self._run, name=f"nafir-audio-{number}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._is_stopping = True
+        self._wake.set()
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def open(self, stream: Stream) -> None:
+        stream.attach(wake=self._wake.set, time_s=self._time_s)
+        self._arrivals.append((stream, True))
+        self._wake.set()
+
+    def close(self, stream: Stream) -> None:
+        self._arrivals.append((stream, False))
+        self._wake.set()
+
+    def tick(self) -> float | None:
+        """Heed what waits, render one block of every stream that is due one, and hand over what was made.
+
+        Seconds until the next is due, None without streams.
+        """
+        now_s = self._time_s()
+        self._admit(now_s)
+        made: dict[Stream, list[Outgoing]] = {}
+        due: dict[Stream, float] = {}  # with what its block has cost so far
+        for stream in tuple(self._streams):
+            is_due = stream.due_s <= now_s + _EARLY_S
+            if not is_due and not stream.has_news:
+                continue
+            with self._failing_alone(stream, made):
+                made[stream] = stream.take_in(self._workers)
+                if is_due:
+                    began_s = self._time_s()
+                    stream.session.begin_block()
+                    due[stream] = self._time_s() - began_s
+        if due:
+            self._render(due, made)
+        if made:
+            self._post(lambda: _deliver(made))
+        if not self._streams:
+            return None
+        return min(stream.due_s for stream in self._streams) - self._time_s()
+
+    def _render(self, due: dict[Stream, float], made: dict[Stream, list[Outgoing]]) -> None:
+        began_s = self._time_s()
+        clocks = [stream.session.sample_clock for stream in due]
+        try:
+            blocks = render_all([stream.session.renderer for stream in due])
+        except Exception:  # whose block it was shows when each is rendered alone
+            _logger.exception("%d blocks rendered together failed", len(due))
+            for stream, cost_s in due.items():
+                if len(due) == 1:
+                    self._fail(stream, made)
+                else:
+                    self._render({stream: cost_s}, made)
+            return
+        now_s = self._time_s()
+        share_s = (now_s - began_s) / len(due)
+        for (stream, cost_s), clock, samples in zip(due.items(), clocks, blocks, strict=True):
+            with self._failing_alone(stream, made):
+                made[stream] += stream.finish_block(clock, samples, cost_s=cost_s + share_s, now_s=now_s)
+
+    @contextmanager
+    def _failing_alone(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> Iterator[None]:
+        """The boundary between streams: one that breaks leaves the others sounding."""
+        try:
+            yield
+        except Exception:
+            _logger.exception("a stream failed and is closed")
+            self._fail(stream, made)
+
+    def _fail(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> None:
+        del self._streams[stream]
+        made.setdefault(stream, []).append(StreamFailed())
+
+    def _admit(self, now_s: float) -> None:
+        while self._arrivals:
+            stream, is_opening = self._arrivals.popleft()
+            if is_opening:
+                phase = self._freest_phase(stream.block_s)
+                stream.start(self._origin_of(phase, stream.block_s, now_s))
+                self._streams[stream] = phase
+            else:
+                self._streams.pop(stream, None)
+
+    def _freest_phase(self, block_s: float) -> int:
+        taken = Counter(phase for stream, phase in self._streams.items() if stream.block_s == block_s)
+        return min(range(PHASES), key=lambda phase: taken[phase])
+
+    def _origin_of(self, phase: int, block_s: float, now_s: float) -> float:
+        """The next instant of `phase` that lies a block ahead at least, so that the first has time to be rendered."""
+        if self._origin_s is None:
+            self._origin_s = now_s
+        first_s = self._origin_s + phase / PHASES * block_s
+        return first_s + math.ceil((now_s - first_s) / block_s + 1) * block_s
+
+    def _run(self) -> None:
+        if self._is_real_time and (reason := become_real_time()) is not None and self._number == 0:
+            _logger.warning("audio threads run at ordinary priority: %s", reason)
+        while not self._is_stopping:
+            wait_s = self.tick()
+            if wait_s is None or wait_s > 0:
+                self._wake.wait(wait_s)
+            self._wake.clear()
+
+
+def _deliver(made: dict[Stream, list[Outgoing]]) -> None:
+    for stream, outgoing in made.items():
+        stream.deliver(outgoing)

@@ -1,0 +1,88 @@
+"""What a session knows of one emitter: where it is, how it radiates, what it plays, and what is out of date."""
+
+from dataclasses import dataclass, field
+
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.geometry import Pose, Vector3
+from server.blocks import DryBlock
+from server.errors import RequestError
+from server.protocol import AddEmitter, LiveStatus, MoveEmitter
+from server.rendering.sources import LiveSource
+
+_LIVE_LEAD_BLOCKS = 2
+_LIVE_QUEUE_S = 0.5
+
+
+@dataclass
+class Emitter:
+    """Sounds from `pose`; `serial` tells it from others that had the same id before."""
+
+    serial: int
+    pose: Pose
+    directivity: Directivity = OMNIDIRECTIONAL
+    live: "LiveInput | None" = None
+    is_outdated: bool = True
+    """Whether its impulse response is of another pose."""
+    is_displaced: bool = True
+    """Whether its direct path is of another pose."""
+    token: int | None = None
+    """Pose id of the newest impulse response handed to the renderer; None before the first."""
+
+    @classmethod
+    def added_by(cls, message: AddEmitter, serial: int, live: "LiveInput | None") -> "Emitter":
+        pattern = message.directivity
+        return cls(serial, message.pose, OMNIDIRECTIONAL if pattern is None else pattern.directivity, live)
+
+    @property
+    def position(self) -> Vector3:
+        return self.pose.position
+
+    def move(self, message: MoveEmitter) -> None:
+        # A field knows no orientation of emitters: turning on the spot leaves the impulse response as it is.
+        self.is_outdated |= message.position != self.position
+        self.is_displaced = True
+        self.pose = message.pose if message.has_front else Pose(message.position, self.pose.orientation)
+
+
+@dataclass
+class LiveInput:
+    """The live source of emitter `id`, and which of its blocks came last."""
+
+    id: str
+    source: LiveSource
+    newest_sequence: int = -1
+    _gated_told: int = field(default=0, init=False)
+
+    @classmethod
+    def opened(cls, identifier: str, *, sample_rate: int, block_size: int) -> "LiveInput":
+        lead = _LIVE_LEAD_BLOCKS * block_size
+        capacity = max(round(_LIVE_QUEUE_S * sample_rate), 2 * lead)
+        return cls(identifier, LiveSource(capacity=capacity, lead=lead))
+
+    def push(self, block: DryBlock) -> None:
+        """Raises RequestError stale_block."""
+        if block.sequence <= self.newest_sequence:
+            problem = f"block {block.sequence} of emitter {self.id!r} is not newer than {self.newest_sequence}"
+            raise RequestError("stale_block", problem, field="sequence")
+        self.newest_sequence = block.sequence
+        self.source.push(block.samples)
+
+    @property
+    def status(self) -> LiveStatus:
+        source = self.source
+        return LiveStatus(
+            id=self.id,
+            samples_queued=source.queued,
+            samples_dropped=source.samples_dropped,
+            samples_gated=source.samples_gated,
+            underruns=source.underruns,
+        )
+
+    def complaint(self) -> RequestError | None:
+        """What was wrong with the samples that came since it was asked last."""
+        gated = self.source.samples_gated - self._gated_told
+        self._gated_told += gated
+        if not gated:
+            return None
+        problem = f"{gated} samples of emitter {self.id!r} were not audio (not finite, or beyond 1e6): silence now"
+        return RequestError("bad_samples", problem, field="samples")

@@ -1,0 +1,199 @@
+"""A session in time: when its blocks are due, what waits to go in, and how long things take.
+
+A `Stream` and its session belong to the audio thread that renders them; only `offer` may be called from any thread.
+"""
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from functools import partial
+
+from server.blocks import AudioBlock, FloatArray
+from server.durations import DurationHistogram
+from server.field.field import AcousticField
+from server.pacing import StreamClock
+from server.protocol import AddEmitter, ClientMessage, Durations, ListenerPose, MoveEmitter, ServerMessage, Status
+from server.session import IrRequest, IrResponse, Session, compute_irs
+
+MAX_WAITING_MESSAGES = 256
+_MAX_BEHIND_S = 0.5
+_LOAD_SMOOTHING = 0.02
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TimedBlock:
+    """A block on its way out; after `deadline_s` of the audio engine's clock it is late."""
+
+    block: AudioBlock
+    deadline_s: float
+
+
+@dataclass(frozen=True)
+class StreamFailed:
+    """Rendering raised: nothing more will come from this stream."""
+
+
+Outgoing = ServerMessage | TimedBlock | StreamFailed
+
+
+class PoseTimes:
+    """How long poses take from their arrival to the first block that has them, or a newer one."""
+
+    def __init__(self) -> None:
+        self.durations = DurationHistogram()
+        # Where a field fails, poses wait in vain; the oldest are forgotten.
+        self._waiting: deque[tuple[int, float]] = deque(maxlen=1024)
+
+    def arrive(self, pose_id: int, now_s: float) -> None:
+        self._waiting.append((pose_id, now_s))
+
+    def take_effect(self, pose_id: int, now_s: float) -> None:
+        while self._waiting and self._waiting[0][0] <= pose_id:
+            self.durations.add(now_s - self._waiting.popleft()[1])
+
+
+class Stream:
+    """`deliver` is called on the event loop with what the stream made, in order."""
+
+    def __init__(
+        self,
+        session: Session,
+        field: AcousticField,
+        *,
+        block_s: float,
+        lead: int,
+        deliver: Callable[[list[Outgoing]], None],
+    ) -> None:
+        self.session = session
+        self.block_s = block_s
+        self.deliver = deliver
+        self.blocks_late = 0
+        """Counted by whoever sends the blocks, since only it knows when they left."""
+        self.render_times = DurationHistogram()
+        self.latenesses = DurationHistogram()
+        self.ir_times = DurationHistogram()
+        self.pose_times = PoseTimes()
+        self.reverberation_times = PoseTimes()
+        self.next_block = 0
+        self.load = 0.0
+        """Share of a core that its blocks have taken of late."""
+        self._field = field
+        self._lead = lead
+        self._clock: StreamClock | None = None
+        self._wake: Callable[[], None] = lambda: None
+        self._time_s: Callable[[], float] = time.monotonic
+        self._messages: deque[tuple[float, ClientMessage]] = deque()
+        self._answers: deque[tuple[IrRequest, Future[tuple[IrResponse, float]]]] = deque()
+        self._next_status_s = 1.0
+
+    def attach(self, *, wake: Callable[[], None], time_s: Callable[[], float]) -> None:
+        """`wake` has the audio thread look at what waits; `time_s` is its clock."""
+        self._wake, self._time_s = wake, time_s
+
+    def offer(self, message: ClientMessage) -> bool:
+        """Leave a message for the audio thread; False, and the message refused, where too many wait already.
+
+        What may call for an impulse response is looked at now, anything else with the next block.
+        """
+        if len(self._messages) >= MAX_WAITING_MESSAGES:
+            return False
+        self._messages.append((self._time_s(), message))
+        # While one is computed, no other is asked for until its answer comes, and that wakes too.
+        if isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and not self.session.awaits_irs:
+            self._wake()
+        return True
+
+    def start(self, origin_s: float) -> None:
+        """Block 0 plays at `origin_s`."""
+        self._clock = StreamClock(origin_s=origin_s, block_s=self.block_s, lead=self._lead)
+
+    @property
+    def clock(self) -> StreamClock:
+        assert self._clock is not None, "the stream has not started"
+        return self._clock
+
+    @property
+    def due_s(self) -> float:
+        return self.clock.due_s(self.next_block)
+
+    @property
+    def has_news(self) -> bool:
+        return bool(self._messages or self._answers)
+
+    def take_in(self, workers: Executor) -> list[Outgoing]:
+        """Heed what waits and ask for impulse responses."""
+        outgoing: list[Outgoing] = []
+        while self._answers:
+            outgoing += self._take_answer(*self._answers.popleft())
+        for _ in range(len(self._messages)):
+            arrived_s, message = self._messages.popleft()
+            refused = self.session.receive(message)
+            if isinstance(message, ListenerPose | MoveEmitter) and not refused:
+                self.pose_times.arrive(message.pose_id, arrived_s)
+                self.reverberation_times.arrive(message.pose_id, arrived_s)
+            outgoing += refused
+        if (request := self.session.take_request()) is not None:
+            answer = workers.submit(_compute_timed, self._field, request, self.session)
+            answer.add_done_callback(partial(self._keep_answer, request))
+        return outgoing
+
+    def finish_block(self, sample_clock: int, samples: FloatArray, *, cost_s: float, now_s: float) -> list[Outgoing]:
+        """Pass on the block just rendered, which took `cost_s` and is ready `now_s`."""
+        outgoing: list[Outgoing] = []
+        block = self.session.finish_block(sample_clock, samples)
+        if block is not None:
+            outgoing.append(TimedBlock(block, self.clock.deadline_s(self.next_block)))
+            self.pose_times.take_effect(block.pose_id, now_s)
+            self.reverberation_times.take_effect(block.reverberation_pose_id, now_s)
+        self.load += _LOAD_SMOOTHING * (cost_s / self.block_s - self.load)
+        self.render_times.add(cost_s)
+        if self.next_block >= self._lead:  # the first were due before the stream was
+            self.latenesses.add(now_s - self.due_s)
+        if self.clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
+            self.clock.slip(self.next_block, now_s)
+        self.next_block += 1
+        if self.next_block * self.block_s >= self._next_status_s:
+            self._next_status_s += 1.0
+            outgoing += self.session.complaints()
+            outgoing.append(self._status(now_s))
+        return outgoing
+
+    def _keep_answer(self, request: IrRequest, answer: Future[tuple[IrResponse, float]]) -> None:
+        self._answers.append((request, answer))  # on the worker's thread
+        self._wake()
+
+    def _take_answer(self, request: IrRequest, answer: Future[tuple[IrResponse, float]]) -> list[ServerMessage]:
+        if (failure := answer.exception()) is not None:
+            _logger.error("no impulse response for pose %d", request.pose_id, exc_info=failure)
+            return self.session.give_up(request)
+        response, duration_s = answer.result()
+        self.ir_times.add(duration_s)
+        return self.session.accept(response)
+
+    def _status(self, now_s: float) -> Status:
+        session = self.session
+        return Status(
+            sample_clock=session.sample_clock,
+            blocks_sent=session.window.sent,
+            blocks_late=self.blocks_late,
+            blocks_dropped=session.blocks_dropped,
+            unacknowledged=session.window.unacknowledged,
+            buffer_ms=round(self.clock.ahead_s(self.next_block, now_s) * 1000, 3),
+            render_ms=Durations.of(self.render_times),
+            lateness_ms=Durations.of(self.latenesses),
+            ir_ms=Durations.of(self.ir_times),
+            pose_ms=Durations.of(self.pose_times.durations),
+            reverberation_ms=Durations.of(self.reverberation_times.durations),
+            ir_exchanges=session.ir_exchanges,
+            live=session.live_statuses(),
+        )
+
+
+def _compute_timed(field: AcousticField, request: IrRequest, session: Session) -> tuple[IrResponse, float]:
+    started_s = time.perf_counter()
+    response = compute_irs(field, request, session.prepare)
+    return response, time.perf_counter() - started_s

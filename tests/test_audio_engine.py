@@ -1,0 +1,419 @@
+"""Streams in time, ticked by hand with a clock that only a test moves; and once, for real."""
+
+import os
+import sys
+import threading
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from server import audio_engine
+from server.audio_engine import PHASES, AudioEngine
+from server.blocks import DryBlock
+from server.protocol import PROTOCOL, AddEmitter, EmitterAdded, Error, Hello, ListenerPose, Status
+from server.session import Session
+from server.stream import MAX_WAITING_MESSAGES, Stream, StreamFailed, TimedBlock
+
+BLOCK_S = 256 / 24_000
+
+
+class Clock:
+    """Time passes only when a test says so."""
+
+    now_s = 50.0
+
+    def __call__(self):
+        return self.now_s
+
+
+class Patient(Executor):
+    """Runs what it was given when told to."""
+
+    def __init__(self):
+        self.work = []
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        self.work.append((future, function, arguments))
+        return future
+
+    def run(self):
+        for future, function, arguments in self.work:
+            try:
+                future.set_result(function(*arguments))
+            except ValueError as exc:
+                future.set_exception(exc)
+        self.work.clear()
+
+
+class Stage:
+    """An engine that is not running, ticked by hand, and what its streams delivered."""
+
+    def __init__(self, field, filters):
+        self.clock, self.workers, self.field, self.filters = Clock(), Patient(), field, filters
+        self.engine = AudioEngine(lambda call: call(), self.workers, time_s=self.clock)
+        (self.thread,) = self.engine.threads
+
+    def open(self, *, lead=4, window=1_000):
+        clip = np.ones(64, np.float32)
+        hello = Hello(protocol=PROTOCOL, scene="flat")
+        session = Session(hello, self.field, self.filters, lambda _: clip, window=window)
+        delivered = []
+        stream = Stream(session, self.field, block_s=BLOCK_S, lead=lead, deliver=delivered.extend)
+        self.engine.open(stream)
+        return stream, delivered
+
+    def run(self, duration_s, step_s=BLOCK_S / 8):
+        end_s = self.clock.now_s + duration_s
+        while self.clock.now_s < end_s:
+            while (wait_s := self.thread.tick()) is not None and wait_s <= 0:
+                pass
+            self.clock.now_s += step_s
+
+
+@pytest.fixture
+def stage(field, filters):
+    return Stage(field, filters)
+
+
+def blocks(delivered):
+    return [item for item in delivered if isinstance(item, TimedBlock)]
+
+
+def add(stream):
+    # So near that its sound arrives within the first block.
+    assert stream.offer(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
+
+
+def test_nothing_to_do_without_streams(stage):
+    assert stage.thread.tick() is None
+
+
+def test_a_stream_starts_with_its_lead_and_then_keeps_the_pace_of_time(stage):
+    _, delivered = stage.open(lead=4)
+    stage.run(BLOCK_S / 2)
+    assert len(blocks(delivered)) == 4
+    stage.run(100 * BLOCK_S)
+    assert len(blocks(delivered)) == pytest.approx(104, abs=1)
+    assert [item.block.sequence for item in blocks(delivered)] == list(range(len(blocks(delivered))))
+
+
+def test_the_pace_does_not_depend_on_how_badly_the_thread_sleeps(stage):
+    _, delivered = stage.open(lead=8)
+    stage.run(600 * BLOCK_S, step_s=2.7 * BLOCK_S)
+    assert len(blocks(delivered)) == pytest.approx(608, abs=3)
+
+
+def test_streams_take_turns(stage):
+    (_, first), (_, second) = stage.open(lead=8), stage.open(lead=8)
+    for count in range(1, 8):
+        stage.thread.tick()
+        assert (len(blocks(first)), len(blocks(second))) == (count, count)
+
+
+def spy_on_batches(monkeypatch):
+    """How many blocks each call of the renderer made."""
+    batches = []
+
+    def render_all(renderers):
+        batches.append(len(renderers))
+        return rendered(renderers)
+
+    rendered = audio_engine.render_all
+    monkeypatch.setattr(audio_engine, "render_all", render_all)
+    return batches
+
+
+def test_streams_are_spread_over_the_block_and_those_of_an_instant_rendered_together(stage, monkeypatch):
+    streams = [stage.open(lead=1)[0] for _ in range(3 * PHASES)]
+    stage.run(3 * BLOCK_S)
+    due = sorted((stream.due_s - stage.clock.now_s) % BLOCK_S for stream in streams)
+    instants = np.unique(np.round(np.array(due) / BLOCK_S, 6))
+    np.testing.assert_allclose(np.diff(instants), 1 / PHASES, rtol=1e-4)
+    batches = spy_on_batches(monkeypatch)
+    stage.run(10 * BLOCK_S)
+    assert set(batches) == {3}
+
+
+def test_after_a_stall_streams_still_fall_due_apart(stage):
+    streams = [stage.open(lead=1)[0] for _ in range(PHASES)]
+    stage.run(3 * BLOCK_S)
+    stage.clock.now_s += 7.0
+    stage.run(3 * BLOCK_S)
+    due = np.sort([(stream.due_s - stage.clock.now_s) % BLOCK_S for stream in streams])
+    np.testing.assert_allclose(np.diff(due), BLOCK_S / PHASES, rtol=1e-3)
+
+
+def test_the_gap_that_a_stream_leaves_is_filled_first(stage):
+    streams = [stage.open(lead=1)[0] for _ in range(PHASES)]
+    stage.run(3 * BLOCK_S)
+    gap = (streams[2].due_s - stage.clock.now_s) % BLOCK_S
+    stage.engine.close(streams[2])
+    late, _ = stage.open(lead=1)
+    stage.run(3 * BLOCK_S)
+    assert (late.due_s - stage.clock.now_s) % BLOCK_S == pytest.approx(gap, abs=1e-6)
+
+
+def test_a_stream_goes_to_the_thread_that_is_least_busy(field, filters):
+    clock = Clock()
+    engine = AudioEngine(lambda call: call(), Patient(), threads=2, time_s=clock)
+
+    def opened(load=0.0):
+        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, lambda _: np.ones(64, np.float32))
+        stream = Stream(session, field, block_s=BLOCK_S, lead=1, deliver=lambda _: None)
+        engine.open(stream)
+        stream.load = load
+        return stream
+
+    def counts():
+        for thread in engine.threads:
+            thread.tick()
+        return [len(thread._streams) for thread in engine.threads]
+
+    heavy = opened(load=0.5)
+    for expected in ([1, 1], [1, 2], [1, 3]):
+        opened(load=0.1)
+        assert counts() == expected
+    engine.close(heavy)
+    newest = opened()
+    assert counts() == [1, 3]
+    assert len(engine.streams) == 4
+    assert engine.streams[-1] is newest
+
+
+def test_a_pose_asks_for_its_response_at_once_and_renders_nothing_early(stage):
+    stream, delivered = stage.open(lead=1)
+    add(stream)
+    stage.run(4 * BLOCK_S)
+    stage.workers.run()
+    stage.run(4 * BLOCK_S)
+    stage.clock.now_s = stream.due_s - 0.5 * BLOCK_S
+    count, woken = len(blocks(delivered)), []
+    stream.attach(wake=lambda: woken.append(True), time_s=stage.clock)
+    stream.offer(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)))
+    assert woken == [True]
+    stage.thread.tick()
+    assert len(stage.workers.work) == 1
+    assert len(blocks(delivered)) == count
+    # As long as no answer came, nothing more would be asked for, and nobody is woken.
+    stream.offer(ListenerPose(pose_id=2, position=(2.0, 2.1, 1.5)))
+    assert woken == [True]
+    stage.workers.run()
+    assert woken == [True, True]
+    stage.thread.tick()
+    assert [work[2][1].pose_id for work in stage.workers.work] == [2]
+    assert len(blocks(delivered)) == count
+
+
+def test_a_closed_stream_makes_no_more_sound_and_closing_twice_does_no_harm(stage):
+    stream, delivered = stage.open()
+    stage.run(10 * BLOCK_S)
+    stage.engine.close(stream)
+    stage.engine.close(stream)
+    count = len(delivered)
+    stage.run(10 * BLOCK_S)
+    assert len(delivered) == count
+
+
+def test_an_answer_takes_effect_with_the_next_block_and_no_block_waits_for_it(stage):
+    stream, delivered = stage.open(lead=1)
+    add(stream)
+    stage.run(5 * BLOCK_S)
+    assert len(blocks(delivered)) == pytest.approx(5, abs=1)
+    assert len(stage.workers.work) == 1
+    stage.workers.run()
+    stage.run(BLOCK_S)
+    (added,) = [item for item in delivered if isinstance(item, EmitterAdded)]
+    sounding = [item.block.sample_clock for item in blocks(delivered) if item.block.samples.any()]
+    assert sounding[0] == added.sample_clock
+    # The message leaves before the block it speaks of.
+    place = delivered.index(added)
+    assert delivered[place + 1].block.sample_clock == added.sample_clock
+
+
+def test_a_field_that_fails_costs_an_error_message_and_no_sound(stage):
+    stream, delivered = stage.open()
+    add(stream)
+    stage.run(BLOCK_S)
+    stage.workers.run()
+    stage.run(BLOCK_S)
+    works = stage.field.impulse_responses
+    stage.field.impulse_responses = lambda *_: np.full((1, 2, 100), np.inf, np.float32)
+    stream.offer(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)))
+    stage.run(2 * BLOCK_S)
+    stage.workers.run()
+    stage.run(3 * BLOCK_S)
+    assert [item.code for item in delivered if isinstance(item, Error)] == ["field_failure"]
+    assert blocks(delivered)[-1].block.samples.any()
+    stage.field.impulse_responses = works
+    stream.offer(ListenerPose(pose_id=2, position=(2.0, 2.0, 1.5)))
+    stage.run(2 * BLOCK_S)
+    stage.workers.run()
+    stage.run(2 * BLOCK_S)
+    assert blocks(delivered)[-1].block.pose_id == 2
+
+
+@pytest.mark.parametrize("step", ["receive", "take_request", "begin_block", "finish_block"])
+def test_a_stream_that_breaks_leaves_the_others_sounding(stage, step):
+    broken, complaints = stage.open()
+    _, delivered = stage.open()
+
+    def explode(*_):
+        raise ZeroDivisionError
+
+    add(broken)
+    setattr(broken.session, step, explode)
+    stage.run(20 * BLOCK_S)
+    assert complaints == [StreamFailed()]
+    assert [item.block.sequence for item in blocks(delivered)] == list(range(len(blocks(delivered))))
+    assert len(blocks(delivered)) > 20
+
+
+def test_a_renderer_that_breaks_is_found_among_those_it_was_rendered_with(stage, monkeypatch):
+    (broken, complaints), *others = [stage.open() for _ in range(2 * PHASES)]
+    stage.run(5 * BLOCK_S)
+    complaints.clear()
+    rendered = audio_engine.render_all
+
+    def render_all(renderers):
+        if broken.session.renderer in renderers:
+            raise ZeroDivisionError
+        return rendered(renderers)
+
+    monkeypatch.setattr(audio_engine, "render_all", render_all)
+    stage.run(20 * BLOCK_S)
+    assert complaints == [StreamFailed()]
+    for _, delivered in others:
+        clocks = [item.block.sample_clock for item in blocks(delivered)]
+        assert clocks == list(range(0, 256 * len(clocks), 256))
+        assert len(clocks) > 20
+
+
+def test_a_status_comes_once_a_second_and_tells_what_happened(stage):
+    stream, delivered = stage.open(lead=8)
+    add(stream)
+    stage.run(0.1)
+    stage.workers.run()
+    stage.run(2.95)
+    first, second, third = (item for item in delivered if isinstance(item, Status))
+    assert [round(status.sample_clock / 24_000) for status in (first, second, third)] == [1, 2, 3]
+    assert third.blocks_sent == pytest.approx(3 / BLOCK_S, abs=2)
+    assert first.buffer_ms == pytest.approx(8 * BLOCK_S * 1000, abs=12)
+    assert first.ir_ms.p50 is not None
+    assert third.lateness_ms.p99_9 is not None
+    assert third.unacknowledged == third.blocks_sent
+
+
+def test_a_status_tells_how_long_poses_take_to_be_heard(stage):
+    stream, delivered = stage.open(lead=1)
+    add(stream)
+    stage.run(5 * BLOCK_S)
+    stage.workers.run()
+    stage.run(5 * BLOCK_S)
+    for pose_id in range(1, 40):
+        stage.clock.now_s = stream.due_s - 0.001
+        stream.offer(ListenerPose(pose_id=pose_id, position=(2.0, 2.0 + pose_id / 100, 1.5)))
+        stage.thread.tick()
+        stage.clock.now_s += 0.001
+        stage.thread.tick()
+        stage.clock.now_s += 0.005
+        stage.workers.run()
+    stage.run(1.0)
+    status = [item for item in delivered if isinstance(item, Status)][-1]
+    assert status.pose_ms.p50 == pytest.approx(1.0, rel=0.03)
+    # The answer comes 6 ms after the pose and has to wait for the next block.
+    assert status.reverberation_ms.p50 == pytest.approx(1.0 + 1000 * BLOCK_S, rel=0.03)
+
+
+def test_a_full_window_costs_blocks_and_the_clock_runs_on(stage):
+    stream, delivered = stage.open(lead=2, window=5)
+    stage.run(20 * BLOCK_S)
+    assert len(blocks(delivered)) == 5
+    assert stream.session.blocks_dropped == pytest.approx(17, abs=1)
+    assert stream.session.sample_clock == pytest.approx(22 * 256, abs=256)
+
+
+def test_after_a_long_stall_sound_resumes_at_its_pace_instead_of_in_a_burst(stage):
+    _, delivered = stage.open(lead=4)
+    stage.run(1.0)
+    before = len(blocks(delivered))
+    stage.clock.now_s += 60.0
+    stage.run(1.0)
+    assert len(blocks(delivered)) - before == pytest.approx(1.0 / BLOCK_S, abs=6)
+    # The block that the stall held up is late, and says when it should have been there.
+    assert blocks(delivered)[before].deadline_s < stage.clock.now_s - 60.0
+
+
+def test_a_short_stall_is_made_up_for(stage):
+    _, delivered = stage.open(lead=4)
+    stage.run(1.0)
+    stage.clock.now_s += 0.2
+    stage.run(1.0)
+    assert len(blocks(delivered)) == pytest.approx(2.2 / BLOCK_S + 4, abs=2)
+
+
+def test_messages_beyond_the_limit_are_refused_until_the_next_block(stage):
+    stream, _ = stage.open()
+    accepted = [stream.offer(ListenerPose(pose_id=k + 1, position=(2.0, 2.0, 1.5))) for k in range(300)]
+    assert accepted == [True] * MAX_WAITING_MESSAGES + [False] * (300 - MAX_WAITING_MESSAGES)
+    stage.run(BLOCK_S)
+    assert stream.offer(ListenerPose(pose_id=900, position=(2.0, 2.0, 1.5)))
+
+
+def test_the_real_threads_keep_time_and_stop(field, filters):
+    arrived, enough = [], threading.Event()
+
+    def deliver(items):
+        arrived.extend(blocks(items))
+        if len(arrived) >= 60:
+            enough.set()
+
+    with ThreadPoolExecutor(1) as workers:
+        engine = AudioEngine(lambda call: call(), workers, threads=2)
+        hello = Hello(protocol=PROTOCOL, scene="flat")
+        session = Session(hello, field, filters, lambda _: np.ones(64, np.float32), window=1_000)
+        engine.start()
+        stream = Stream(session, field, block_s=BLOCK_S, lead=8, deliver=deliver)
+        engine.open(stream)
+        add(stream)
+        assert enough.wait(5)
+        engine.stop()
+    assert arrived[-1].block.samples.any()
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("nafir-audio")]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of single threads are Linux's")
+def test_where_real_time_is_refused_the_engine_says_so_once_and_runs(field, filters, monkeypatch, caplog):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    ticked = threading.Event()
+    with ThreadPoolExecutor(1) as workers:
+        engine = AudioEngine(lambda call: call(), workers, threads=3, is_real_time=True)
+        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, lambda _: np.ones(64, np.float32))
+        engine.start()
+        engine.open(Stream(session, field, block_s=BLOCK_S, lead=1, deliver=lambda _: ticked.set()))
+        assert ticked.wait(5)
+        engine.stop()
+    assert [record.getMessage() for record in caplog.records] == [
+        "audio threads run at ordinary priority: Operation not permitted"
+    ]
+
+
+def test_samples_that_are_no_audio_are_told_of_once_a_second_and_the_stream_goes_on(stage):
+    stream, delivered = stage.open()
+    stream.offer(AddEmitter(id="voice", live=True, position=(2.0, 3.0, 1.5)))
+    for sequence in range(3):
+        stream.offer(DryBlock("voice", sequence, np.full(512, np.nan, np.float32)))
+    stage.run(0.1)
+    stage.workers.run()
+    stage.run(2.5)
+    errors = [item for item in delivered if isinstance(item, Error)]
+    assert [(error.code, error.field) for error in errors] == [("bad_samples", "samples")]
+    assert "1536 samples" in errors[0].message
+    first, second = (item.live[0] for item in delivered if isinstance(item, Status))
+    assert (first.id, first.samples_gated, second.samples_gated) == ("voice", 1536, 1536)
+    assert second.underruns == 1
+    assert all(np.isfinite(item.block.samples).all() for item in blocks(delivered))

@@ -1,0 +1,36 @@
+import shutil
+
+import pytest
+
+from server.errors import NafirError, RequestError
+from server.hrtfs import HrtfLibrary
+from server.rendering.hrtf import KEMAR
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    bust = tmp_path_factory.mktemp("heads") / "bust.sofa"
+    shutil.copy(KEMAR, bust)
+    return HrtfLibrary([bust], [24_000, 16_000])
+
+
+def test_heads_are_named_by_their_files_beside_kemar(library):
+    assert library.names == ("bust", "kemar")
+
+
+def test_a_head_is_ready_for_every_rate(library):
+    assert library.filters("bust", 24_000) is library.filters("bust", 24_000)
+    assert library.filters("bust", 24_000) is not library.filters("bust", 16_000)
+
+
+def test_an_unknown_head_is_refused_by_name(library):
+    with pytest.raises(RequestError, match=r"'moomin'.* bust, kemar") as refusal:
+        library.filters("moomin", 24_000)
+    assert (refusal.value.code, refusal.value.field) == ("unknown_hrtf", "hrtf")
+
+
+def test_a_file_that_is_no_head_is_named(tmp_path):
+    broken = tmp_path / "broken.sofa"
+    broken.write_bytes(b"\x89HDF and then nothing")
+    with pytest.raises(NafirError, match=r"broken\.sofa"):
+        HrtfLibrary([broken], [24_000])
