@@ -5,8 +5,8 @@
 
 Connects to a Nafir server, puts a clip where the scene suggests, walks from the scene's starting place through its
 openings towards the clip while looking around, and writes two files: the sound as it arrived, and the path as it was
-heard: every pose with the sample from which on it was audible. Given to `nafir render`, that path makes the same sound
-again.
+heard: every pose with the sample from which on the direct sound was of it, and the one from which on the reverberation
+was, which follows a little later and skips poses. Given to `nafir render`, that path makes the same sound again.
 """
 
 import argparse
@@ -26,7 +26,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
 POSE = struct.Struct("<BBHI7f")  # kind 2, two paddings, pose id, position, orientation
-BLOCK = struct.Struct("<BBHIQII")  # kind 1, flags, channels, sequence, sample clock, pose id, frames
+BLOCK = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
+PROTOCOL = 2
 POSES_PER_SECOND = 30
 BLOCK_SIZE = 256
 
@@ -85,37 +86,48 @@ class Walk:
 
 @dataclass
 class Recording:
-    """Blocks by sample clock, from the moment the clip began."""
+    """Blocks by sample clock, and from which sample on each pose was heard."""
 
     sample_rate: int
     start: int | None = None
+    """Where the clip begins."""
     blocks: list[tuple[int, np.ndarray]] = field(default_factory=list)
-    heard: list[tuple[int, int]] = field(default_factory=list)
-    """Sample and pose id, one for each change."""
+    direct: dict[int, int] = field(default_factory=dict)
+    reverberation: dict[int, int] = field(default_factory=dict)
+    """First sample by pose id."""
     late: int = 0
 
     @property
-    def duration_s(self) -> float:
-        return (self.blocks[-1][0] + BLOCK_SIZE) / self.sample_rate if self.blocks else 0.0
+    def samples_heard(self) -> int:
+        return 0 if self.start is None or not self.blocks else self.blocks[-1][0] + BLOCK_SIZE - self.start
 
-    def add(self, data: bytes) -> tuple[int, int]:
-        """Keep a block; its sequence number and pose id."""
-        _, flags, channels, sequence, clock, pose_id, frames = BLOCK.unpack_from(data)
+    def add(self, data: bytes) -> tuple[int, int, int]:
+        """Keep a block; its sequence number and pose ids, of the direct sound and of the reverberation."""
+        _, flags, channels, sequence, clock, pose, reverberation_pose, frames = BLOCK.unpack_from(data)
+        self.blocks.append((clock, np.frombuffer(data, "<f4", offset=BLOCK.size).reshape(frames, channels)))
+        self.late += bool(flags & 2)
         if self.start is not None:
-            sample = clock - self.start
-            if not self.heard or self.heard[-1][1] != pose_id:
-                self.heard.append((sample, pose_id))
-            self.blocks.append((sample, np.frombuffer(data, "<f4", offset=BLOCK.size).reshape(frames, channels)))
-            self.late += bool(flags & 2)
-        return sequence, pose_id
+            self.direct.setdefault(pose, clock)
+            self.reverberation.setdefault(reverberation_pose, clock)
+        return sequence, pose, reverberation_pose
 
     def samples(self) -> np.ndarray:
-        """(frame, channel), with silence where the server skipped."""
+        """(frame, channel) from sample 0 on, with silence where the server skipped."""
         last, block = self.blocks[-1]
         samples = np.zeros((last + len(block), block.shape[1]), np.float32)
         for sample, block in self.blocks:
             samples[sample : sample + len(block)] = block
         return samples
+
+    def path(self) -> list[tuple[int, int, int | str]]:
+        """Pose id, sample of the direct sound, and of the reverberation or nothing, by rising sample."""
+        rows = []
+        for pose in sorted(self.direct.keys() | self.reverberation.keys()):
+            # A pose overtaken by a newer one within a block was never heard directly: written down with that one,
+            # which comes later and counts.
+            sample = self.direct.get(pose, min(at for newer, at in self.direct.items() if newer >= pose))
+            rows.append((pose, sample, self.reverberation.get(pose, "")))
+        return rows
 
 
 async def send_poses(socket: ClientConnection, walk: Walk, poses: dict[int, Pose], sent_s: dict[int, float]) -> None:
@@ -134,7 +146,13 @@ async def send_poses(socket: ClientConnection, walk: Walk, poses: dict[int, Pose
 async def listen(arguments: argparse.Namespace) -> None:
     # Compression off: audio does not shrink, and trying takes time.
     async with connect(arguments.url, compression=None, max_size=None) as socket:
-        hello = {"type": "hello", "protocol": 1, "scene": arguments.scene, "block_size": BLOCK_SIZE, "encoding": "f32"}
+        hello = {
+            "type": "hello",
+            "protocol": PROTOCOL,
+            "scene": arguments.scene,
+            "block_size": BLOCK_SIZE,
+            "encoding": "f32",
+        }
         await socket.send(json.dumps(hello))
         welcome = json.loads(await socket.recv())
         if welcome["type"] == "error":
@@ -149,13 +167,15 @@ async def listen(arguments: argparse.Namespace) -> None:
         await socket.send(json.dumps({"type": "add_emitter", **emitter}))
 
         sent_s: dict[int, float] = {}
-        arrived_s: dict[int, float] = {}
+        direct_s: dict[int, float] = {}
+        reverberation_s: dict[int, float] = {}
         walking = None
-        while recording.duration_s < arguments.seconds:
+        while recording.samples_heard < arguments.seconds * recording.sample_rate:
             message = await socket.recv()
             if isinstance(message, bytes):
-                sequence, pose_id = recording.add(message)
-                arrived_s.setdefault(pose_id, time.monotonic())
+                sequence, pose, reverberation_pose = recording.add(message)
+                direct_s.setdefault(pose, time.monotonic())
+                reverberation_s.setdefault(reverberation_pose, time.monotonic())
                 if sequence % 4 == 3:
                     await socket.send(json.dumps({"type": "acknowledge", "sequence": sequence}))
                 continue
@@ -170,27 +190,28 @@ async def listen(arguments: argparse.Namespace) -> None:
 
     write(arguments, recording, poses)
     x, y, z = scene["emitter"]["position"]
-    delays_ms = [1000 * (arrived_s[pose] - sent_s[pose]) for pose in arrived_s.keys() & sent_s.keys()]
-    if delays_ms:
-        print(
-            f"{len(recording.heard)} poses heard, each received {statistics.median(delays_ms):.0f} ms after it was sent"
-        )
+    for part, arrived_s in (("direct sound", direct_s), ("reverberation", reverberation_s)):
+        delays_ms = [1000 * (arrived_s[pose] - sent_s[pose]) for pose in arrived_s.keys() & sent_s.keys()]
+        if delays_ms:
+            print(
+                f"{part}: {len(delays_ms)} poses, each received {statistics.median(delays_ms):.0f} ms after it was sent"
+            )
     print(f"{recording.late} blocks late")
     print(
         f"Render it again:\n  nafir render {arguments.scene} --emitter {arguments.clip}@{x:g},{y:g},{z:g} --loop "
-        f"--path {arguments.path} --duration-s {recording.duration_s:.6f} -o again.wav"
+        f"--path {arguments.path} --duration-s {len(recording.samples()) / recording.sample_rate:.6f} -o again.wav"
     )
 
 
 def write(arguments: argparse.Namespace, recording: Recording, poses: dict[int, Pose]) -> None:
-    soundfile.write(arguments.output, recording.samples(), recording.sample_rate, subtype="FLOAT")
+    samples, path = recording.samples(), recording.path()
+    soundfile.write(arguments.output, samples, recording.sample_rate, subtype="FLOAT")
     with arguments.path.open("w", newline="") as stream:
         writer = csv.writer(stream)
-        writer.writerow(["sample", "x", "y", "z", "qx", "qy", "qz", "qw"])
-        for sample, pose_id in recording.heard:
-            pose = poses[pose_id]
-            writer.writerow([sample, *pose.position, *pose.orientation])
-    print(f"{arguments.output}: {recording.duration_s:.2f} s; {arguments.path}: {len(recording.heard)} poses")
+        writer.writerow(["sample", "reverberation_sample", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        for pose_id, *clocks in path:
+            writer.writerow([*clocks, *poses[pose_id].position, *poses[pose_id].orientation])
+    print(f"{arguments.output}: {len(samples) / recording.sample_rate:.2f} s; {arguments.path}: {len(path)} poses")
 
 
 def main() -> None:

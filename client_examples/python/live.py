@@ -1,0 +1,118 @@
+"""Send sound to a scene as it is made, and keep what comes back.
+
+    pip install numpy soundfile soxr websockets
+    python live.py --input voice.wav --url ws://127.0.0.1:8000/v1/stream -o wet.wav
+
+Connects to a Nafir server, puts a live emitter where the scene suggests, and sends it a recording block by block, as a
+microphone would; without one, claps. What comes back, the recording as heard from the scene's starting place, is
+written to a file.
+"""
+
+import argparse
+import asyncio
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import soxr
+from websockets.asyncio.client import connect
+from websockets.exceptions import WebSocketException
+
+DRY = struct.Struct("<BBHII")  # kind 3, encoding 0 (f32), bytes of the id, sequence, frames; then id and frames
+WET = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
+PROTOCOL = 2
+BLOCK_SIZE = 256
+EMITTER = "microphone"
+
+
+def dry_block(sequence: int, samples: np.ndarray) -> bytes:
+    identifier = EMITTER.encode()
+    padding = bytes(-len(identifier) % 4)
+    header = DRY.pack(3, 0, len(identifier), sequence, len(samples))
+    return header + identifier + padding + samples.astype("<f4").tobytes()
+
+
+def read(path: Path | None, sample_rate: int) -> np.ndarray:
+    """(n,) at `sample_rate`: a recording, or two seconds of claps."""
+    if path is None:
+        claps = np.random.default_rng(0).standard_normal((4, sample_rate // 2)) / 8
+        return (claps * np.exp(-np.arange(sample_rate // 2) / (0.01 * sample_rate))).ravel().astype(np.float32)
+    try:
+        samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
+    except soundfile.LibsndfileError as exc:
+        raise SystemExit(f"{path}: {exc.error_string}") from exc
+    return soxr.resample(samples.mean(axis=1), rate, sample_rate)
+
+
+async def perform(arguments: argparse.Namespace) -> None:
+    # Compression off: audio does not shrink, and trying takes time.
+    async with connect(arguments.url, compression=None, max_size=None) as socket:
+        hello = {"protocol": PROTOCOL, "scene": arguments.scene, "block_size": BLOCK_SIZE, "encoding": "f32"}
+        await socket.send(json.dumps({"type": "hello", **hello}))
+        welcome = json.loads(await socket.recv())
+        if welcome["type"] == "error":
+            raise SystemExit(f"{welcome['code']}: {welcome['message']}")
+        rate = welcome["sample_rate"]
+        dry = read(arguments.input, rate)
+        dry = np.pad(dry, (0, -len(dry) % BLOCK_SIZE)).reshape(-1, BLOCK_SIZE)
+        emitter = {"id": EMITTER, "live": True, "position": welcome["scene"]["emitter"]["position"]}
+        await socket.send(json.dumps({"type": "add_emitter", **emitter}))
+
+        # Until the last of it has been played and rung out.
+        length = dry.size + arguments.ahead * BLOCK_SIZE + welcome["ir_samples"] + rate // 2
+        wet: dict[int, np.ndarray] = {}
+        start, sent, state = None, 0, None
+        while start is None or max(wet, default=0) < start + length:
+            message = await socket.recv()
+            if isinstance(message, bytes):
+                _, _, channels, sequence, clock, _, _, frames = WET.unpack_from(message)
+                if sequence % 4 == 3:
+                    await socket.send(json.dumps({"type": "acknowledge", "sequence": sequence}))
+                if start is None:
+                    continue
+                wet[clock] = np.frombuffer(message, "<f4", offset=WET.size).reshape(frames, channels)
+                # One block up for each that comes down: the server's clock is the one that counts.
+                due = (clock - start) // BLOCK_SIZE + 1 + arguments.ahead
+                for block in dry[sent:due]:
+                    await socket.send(dry_block(sent, block))
+                    sent += 1
+                continue
+            event = json.loads(message)
+            if event["type"] == "emitter_added":
+                start = event["sample_clock"]
+            elif event["type"] == "status":
+                state = event["live"] and event["live"][0]
+            elif event["type"] == "error":
+                raise SystemExit(f"{event['code']}: {event['message']}")
+
+    samples = np.zeros((length, 2), np.float32)
+    for clock, block in wet.items():
+        at = clock - start
+        samples[at : at + len(block)] = block[: max(0, length - at)]
+    soundfile.write(arguments.output, samples, rate, subtype="FLOAT")
+    print(f"{arguments.output}: {length / rate:.2f} s, {dry.size / rate:.2f} s of them sent")
+    if state:
+        # The end of the recording is one more.
+        print(f"{max(0, state['underruns'] - 1)} underruns, {state['samples_dropped']} samples dropped")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Send sound to a scene as it is made, and keep what comes back.")
+    parser.add_argument("--url", default="ws://127.0.0.1:8000/v1/stream")
+    parser.add_argument("--scene", default="apartment")
+    parser.add_argument("--input", type=Path, help="audio file to send (default: claps)")
+    parser.add_argument(
+        "--ahead", type=int, default=4, help="blocks sent ahead: more survives a worse network, fewer are heard sooner"
+    )
+    parser.add_argument("-o", "--output", type=Path, default=Path("wet.wav"))
+    arguments = parser.parse_args()
+    try:
+        asyncio.run(perform(arguments))
+    except (OSError, WebSocketException) as exc:
+        raise SystemExit(f"{arguments.url}: {exc}") from exc
+
+
+if __name__ == "__main__":
+    main()
