@@ -40,8 +40,9 @@ export class JitterBuffer {
     this.started = false;
     this.headroomS = HEADROOM_S;
     this.nextClock = null;
-    this.marks = []; // {at, poseId, fill}: where a newer pose becomes audible
+    this.marks = []; // {at, poseId, reverberationPoseId, fill}: where a newer pose becomes audible
     this.newestPose = -1;
+    this.newestReverberationPose = -1;
     this.dips = []; // lowest fill of each of the last windows
     this.#openWindow();
   }
@@ -61,7 +62,7 @@ export class JitterBuffer {
     return Math.round((this.headroomS + RIPPLE_S) * this.sampleRate);
   }
 
-  push({ left, right, sampleClock, poseId, late }) {
+  push({ left, right, sampleClock, poseId, reverberationPoseId = poseId, late }) {
     const frames = left.length;
     this.counters.blocks += 1;
     if (late) this.counters.late += 1;
@@ -85,16 +86,17 @@ export class JitterBuffer {
       this.left[at] = gain * left[i];
       this.right[at] = gain * right[i];
     }
-    if (poseId > this.newestPose) {
+    if (poseId > this.newestPose || reverberationPoseId > this.newestReverberationPose) {
       this.newestPose = poseId;
-      this.marks.push({ at: this.written, poseId, fill: Math.max(0, this.fill) });
+      this.newestReverberationPose = reverberationPoseId;
+      this.marks.push({ at: this.written, poseId, reverberationPoseId, fill: Math.max(0, this.fill) });
     }
     this.written += frames;
   }
 
   /**
    * Fills both outputs (QUANTUM samples each) and returns the poses that became audible in them, as
-   * [{poseId, offset, fill}] with `offset` in samples from the start of the outputs.
+   * [{poseId, reverberationPoseId, offset, fill}] with `offset` in samples from the start of the outputs.
    */
   pull(left, right) {
     const frames = left.length;
@@ -208,8 +210,8 @@ export class JitterBuffer {
   #heard(frames) {
     const heard = [];
     while (this.marks.length > 0 && this.marks[0].at < this.read) {
-      const { at, poseId, fill } = this.marks.shift();
-      heard.push({ poseId, offset: Math.min(frames, Math.max(0, at - (this.read - frames))), fill });
+      const { at, ...mark } = this.marks.shift();
+      heard.push({ ...mark, offset: Math.min(frames, Math.max(0, at - (this.read - frames))) });
     }
     return heard;
   }

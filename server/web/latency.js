@@ -1,5 +1,5 @@
 // Pose-to-sound latency: from the moment a pose is set on the page until the first sample rendered with it, or with a newer one,
-// leaves the sound card. All times are epoch milliseconds.
+// leaves the sound card. The direct sound has one and the reverberation another. All times are epoch milliseconds.
 
 const WINDOW_MS = 4000;
 const MOST_PENDING = 2000;

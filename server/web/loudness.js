@@ -15,6 +15,11 @@ export function parseGrid({ levels_db: rows, origin, spacing_m: spacingM }) {
   return { levels: rows.map((row) => row.map((level) => level ?? NaN)), origin, spacingM };
 }
 
+/** The grid of an emitter that is `gainDb` louder. */
+export function raised(grid, gainDb) {
+  return { ...grid, levels: grid.levels.map((levels) => levels.map((level) => level + gainDb)) };
+}
+
 /** Energy sum of several emitters' grids over the same points. */
 export function combine(grids) {
   const [first, ...rest] = grids;

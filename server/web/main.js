@@ -3,7 +3,7 @@
 import { FloorPlan } from "./floorplan.js";
 import { PoseLedger } from "./latency.js";
 import { Legend } from "./legend.js";
-import { LoudnessField, combine, parseGrid, scaleOf } from "./loudness.js";
+import { LoudnessField, combine, parseGrid, raised, scaleOf } from "./loudness.js";
 import { Notices } from "./notices.js";
 import { exposeHook } from "./hook.js";
 import { onThemeChange } from "./palette.js";
@@ -30,6 +30,7 @@ class Page {
     this.legend = new Legend(find("legend"));
     this.player = new Player();
     this.ledger = new PoseLedger();
+    this.reverberationLedger = new PoseLedger();
     this.worker = new Worker(new URL("stream_worker.js", import.meta.url), { type: "module" });
     this.connection = "idle";
     this.playing = false;
@@ -127,6 +128,7 @@ class Page {
       this.map();
     });
     known = new Map(world.emitters);
+    world.addEventListener("gain", () => this.map());
     plan.addEventListener("dropped", () => this.map());
     plan.addEventListener("hover", ({ detail }) => {
       this.hovered = detail;
@@ -138,13 +140,19 @@ class Page {
     this.player.addEventListener("report", ({ detail }) => {
       if (!this.playing) return;
       this.steady = detail.playing;
-      this.plan.glow(...this.panel.report(detail, this.ledger.summary()));
+      this.plan.glow(...this.panel.report(detail, this.ledger.summary(), this.reverberationLedger.summary()));
     });
-    this.player.addEventListener("heard", ({ detail }) => this.ledger.heard(detail, this.steady));
+    this.player.addEventListener("heard", ({ detail }) => {
+      this.ledger.heard(detail, this.steady);
+      this.reverberationLedger.heard({ ...detail, poseId: detail.reverberationPoseId }, this.steady);
+    });
     this.player.addEventListener("interrupted", () => this.pause());
     const handlers = {
       state: (detail) => this.#streamState(detail),
-      posed: (detail) => this.ledger.posed(detail),
+      posed: (detail) => {
+        this.ledger.posed(detail);
+        this.reverberationLedger.posed(detail);
+      },
       status: (detail) => this.panel.status(detail),
       refused: ({ code, message }) => this.notices.show(code, message),
     };
@@ -173,8 +181,8 @@ class Page {
     return { position: [...position], yaw, at: epochNow() };
   }
 
-  #emitterNow({ id, clip, position }) {
-    return { id, clip, position: [...position], at: epochNow() };
+  #emitterNow({ id, clip, position, gainDb }) {
+    return { id, clip, position: [...position], gainDb, at: epochNow() };
   }
 
   #tell(type, detail, transfer = []) {
@@ -257,7 +265,7 @@ class Page {
     this.legend.note = "mapping";
     try {
       const grids = [];
-      for (const emitter of emitters) grids.push(await this.#grid(emitter, mapping.signal));
+      for (const emitter of emitters) grids.push(raised(await this.#grid(emitter, mapping.signal), emitter.gainDb));
       if (mapping.signal.aborted) return;
       const grid = combine(grids);
       this.field = new LoudnessField(grid, this.scene.corners);

@@ -64,8 +64,8 @@ export class Panel {
     this.#spark.draw();
   }
 
-  /** Takes a worklet report; returns the meters' lengths for both ears. */
-  report(report, latency) {
+  /** Takes a worklet report and the latencies of both parts; returns the meters' lengths for both ears. */
+  report(report, latency, reverberation) {
     const at = performance.now();
     const fillMs = 1000 * report.fillS;
     this.#fillMs = this.#fillMs === null ? fillMs : this.#fillMs + 0.1 * (fillMs - this.#fillMs);
@@ -75,12 +75,12 @@ export class Panel {
     const lengths = [this.#left.show(report.rms[0], report.peak[0]), this.#right.show(report.rms[1], report.peak[1])];
     if (at - this.#drawn >= DRAW_MS) {
       this.#drawn = at;
-      this.#print(report, latency);
+      this.#print(report, latency, reverberation);
     }
     return lengths;
   }
 
-  #print({ targetS, counters, started }, latency) {
+  #print({ targetS, counters, started }, latency, reverberation) {
     this.#left.print();
     this.#right.print();
     this.#spark.draw();
@@ -93,6 +93,7 @@ export class Panel {
       this.#find(id).classList.toggle("alarm", this.#find(id).textContent !== "0");
     }
     if (latency) this.#printLatency(latency);
+    if (reverberation) this.#find("latency-reverberation").textContent = milliseconds(reverberation.totalMs);
   }
 
   #printLatency({ totalMs, worstMs, serverMs, bufferMs, outputMs }) {

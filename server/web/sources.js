@@ -1,9 +1,11 @@
-// The list of emitters beside the plan: what each one plays, where it is as seen from the listener, and how to add or remove one.
+// The list of emitters beside the plan: what each one plays and how loud, where it is as seen from the listener, and how to add or
+// remove one.
 
 import { isVisible } from "./geometry.js";
 import { MOST_EMITTERS } from "./world.js";
 
 const AHEAD = Math.PI / 12;
+const GAIN_DB = { min: -24, max: 12 };
 
 function describe({ distanceM, bearing }, visible) {
   const degrees = Math.round((Math.abs(bearing) * 180) / Math.PI);
@@ -18,7 +20,7 @@ export class Sources {
   #clips;
   #list;
   #add;
-  #rows = new Map(); // id -> {row, select, remove, place}
+  #rows = new Map(); // id -> {row, select, remove, gain, place}
 
   constructor({ world, clips, list, add }) {
     this.#world = world;
@@ -62,11 +64,15 @@ export class Sources {
     remove.textContent = "×";
     remove.setAttribute("aria-label", `Remove source ${emitter.id}`);
     remove.addEventListener("click", () => this.#world.removeEmitter(emitter.id));
+    const gain = document.createElement("input");
+    Object.assign(gain, { type: "range", className: "gain", step: 1, ...GAIN_DB, value: emitter.gainDb });
+    gain.setAttribute("aria-label", `Gain of source ${emitter.id}, decibels`);
+    gain.addEventListener("input", () => this.#world.setGain(emitter.id, gain.valueAsNumber));
     const place = document.createElement("span");
     place.className = "place quiet";
-    row.append(badge, select, remove, place);
+    row.append(badge, select, remove, place, gain);
     this.#list.append(row);
-    return { row, select, remove, place };
+    return { row, select, remove, gain, place };
   }
 
   #sync() {
@@ -87,12 +93,15 @@ export class Sources {
 
   #describe() {
     const { listener, emitters, scene } = this.#world;
-    for (const [id, { place, select }] of this.#rows) {
+    for (const [id, { place, select, gain }] of this.#rows) {
       const emitter = emitters.get(id);
       if (!emitter) continue;
       const visible = isVisible(scene.corners, listener.position, emitter.position);
       place.textContent = describe(this.#world.bearing(emitter), visible);
       select.value = emitter.clip;
+      gain.value = emitter.gainDb;
+      gain.title = `${emitter.gainDb > 0 ? "+" : ""}${emitter.gainDb} dB`;
+      gain.style.setProperty("--value", `${(100 * (emitter.gainDb - GAIN_DB.min)) / (GAIN_DB.max - GAIN_DB.min)}%`);
       const clip = this.#clips.find(({ name }) => name === emitter.clip);
       select.title = [clip?.title, clip?.credit].filter(Boolean).join(". ");
     }

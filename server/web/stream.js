@@ -25,7 +25,7 @@ export class Stream {
   #poseId = 0;
   #lastError = null;
   #listener; // {position, yaw, at}
-  #emitters = new Map(); // id -> {clip, position, at}
+  #emitters = new Map(); // id -> {clip, position, gainDb, at}
   #dirty = new Set(); // "listener" and emitter ids that moved since they were last sent
   #sentAt = 0;
   #sending = 0;
@@ -50,13 +50,16 @@ export class Stream {
     this.#schedule();
   }
 
-  setEmitter({ id, clip, position, at }) {
+  setEmitter(emitter) {
+    const { id, clip, gainDb } = emitter;
     const known = this.#emitters.get(id);
-    this.#emitters.set(id, { id, clip, position, at });
+    this.#emitters.set(id, emitter);
     if (!this.#welcomed) return;
     if (!known || known.clip !== clip) {
       if (known) this.#send(message.removeEmitter(id));
-      this.#send(message.addEmitter({ id, clip, position }));
+      this.#send(message.addEmitter(emitter));
+    } else if (known.gainDb !== gainDb) {
+      this.#send(message.setGain(emitter));
     } else {
       this.#dirty.add(`emitter ${id}`);
       this.#schedule();

@@ -1,11 +1,11 @@
-// Wire format of /v1/stream, protocol version 1: parsers and serialisers side by side.
+// Wire format of /v1/stream, protocol version 2: parsers and serialisers side by side.
 // Units are metres and radians; everything binary is little endian.
 
-export const PROTOCOL = 1;
+export const PROTOCOL = 2;
 
 const AUDIO_BLOCK = 1;
 const LISTENER_POSE = 2;
-const BLOCK_HEADER_BYTES = 24;
+const BLOCK_HEADER_BYTES = 28;
 const POSE_BYTES = 36;
 
 export const FLAG_LATE = 2;
@@ -21,14 +21,17 @@ export function serializePose({ poseId, position, yaw }) {
   return buffer;
 }
 
-/** Audio block as {flags, sequence, sampleClock, poseId, frames, left, right}; the ears are Float32Array(frames). */
+/**
+ * Audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, left, right}; the ears are
+ * Float32Array(frames), the newest poses those of the direct sound and of what follows it.
+ */
 export function parseBlock(buffer) {
   const view = new DataView(buffer);
   if (buffer.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) {
     throw new TypeError("not an audio block");
   }
   const channels = view.getUint16(2, true);
-  const frames = view.getUint32(20, true);
+  const frames = view.getUint32(24, true);
   if (channels !== 2 || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * channels * 4) {
     throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${channels} channels`);
   }
@@ -43,6 +46,7 @@ export function parseBlock(buffer) {
     sequence: view.getUint32(4, true),
     sampleClock: Number(view.getBigUint64(8, true)),
     poseId: view.getUint32(16, true),
+    reverberationPoseId: view.getUint32(20, true),
     frames,
     left,
     right,
@@ -52,7 +56,8 @@ export function parseBlock(buffer) {
 export const message = {
   hello: ({ scene, sampleRate, listener }) =>
     JSON.stringify({ type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", listener }),
-  addEmitter: ({ id, clip, position }) => JSON.stringify({ type: "add_emitter", id, clip, position }),
+  addEmitter: ({ id, clip, position, gainDb }) => JSON.stringify({ type: "add_emitter", id, clip, position, gain_db: gainDb }),
+  setGain: ({ id, gainDb }) => JSON.stringify({ type: "set_gain", id, gain_db: gainDb }),
   moveEmitter: ({ id, position, poseId }) => JSON.stringify({ type: "move_emitter", id, position, pose_id: poseId }),
   removeEmitter: (id) => JSON.stringify({ type: "remove_emitter", id }),
   acknowledge: (sequence) => JSON.stringify({ type: "acknowledge", sequence }),

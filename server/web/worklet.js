@@ -43,8 +43,8 @@ class NafirPlayer extends AudioWorkletProcessor {
 
   process(_inputs, [output]) {
     const heard = this.buffer.pull(output[0], output[1]);
-    for (const { poseId, offset, fill } of heard) {
-      this.port.postMessage({ type: "heard", poseId, time: currentTime + offset / sampleRate, bufferedS: fill / sampleRate });
+    for (const { offset, fill, ...poses } of heard) {
+      this.port.postMessage({ type: "heard", ...poses, time: currentTime + offset / sampleRate, bufferedS: fill / sampleRate });
     }
     output.forEach((samples, ear) => this.#measure(samples, ear));
     this.tapped += output[0].length;

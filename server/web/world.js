@@ -1,5 +1,5 @@
 // What is in the scene: one listener and a few emitters, always in places where they may stand.
-// Events: "listener", "emitter" (detail: the emitter) and "emitters" (one came or went).
+// Events: "listener", "emitter" (detail: the emitter), "gain" (likewise) and "emitters" (one came or went).
 
 import { Floor, distance, wrapAngle } from "./geometry.js";
 
@@ -45,11 +45,19 @@ export class World extends EventTarget {
     this.#emit("emitter", emitter);
   }
 
+  /** Decibels beside the clip as it was recorded. */
+  setGain(id, gainDb) {
+    const emitter = this.emitters.get(id);
+    emitter.gainDb = gainDb;
+    this.#emit("emitter", emitter);
+    this.#emit("gain", emitter);
+  }
+
   /** Adds an emitter named by the first free letter, by default at the scene's place for it or else where there is most room. */
   addEmitter({ clip, position }) {
     const id = ["A", "B", "C", "D"].find((letter) => !this.emitters.has(letter));
     const height = this.scene.emitter.position[2];
-    const emitter = { id, clip, position: position ? [...position] : [...this.#roomiest(), height] };
+    const emitter = { id, clip, position: position ? [...position] : [...this.#roomiest(), height], gainDb: 0 };
     this.emitters.set(id, emitter);
     this.#emit("emitters");
     return emitter;
