@@ -1,13 +1,15 @@
 """`nafir bench`: what things cost on this host. Medians of several rounds; run it on an idle machine."""
 
 import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from server.bench.report import print_json, print_measures, print_rows
+from server.bench.report import print_json, print_measures, print_rows, show
 from server.errors import NafirError
 
 app = typer.Typer(help="Measure what things cost on this host.", no_args_is_help=True)
@@ -47,14 +49,7 @@ def convolver(
     from server.bench.convolver import FULL, QUICK, measure_convolver
 
     plan = QUICK if quick else FULL
-    # Redrawn between measurements only: a thread that redraws would be measured too.
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
-        task = progress.add_task("", total=plan.steps)
-
-        def advance(step: str) -> None:
-            progress.update(task, advance=1, description=step, refresh=True)
-
+    with _progress(plan.steps) as advance:
         measured = measure_convolver(plan, advance)
     if as_json:
         print_json(measured)
@@ -62,6 +57,29 @@ def convolver(
     if measured["peer"] is None:
         Console().print("pedalboard is not installed: there is nothing to compare with (pip install pedalboard)")
     _print_convolver(measured)
+
+
+@app.command()
+def stream(
+    emitters: Annotated[
+        list[int] | None, typer.Option(min=1, max=16, help="Of each session; repeatable. [default: 1, 4, 16]")
+    ] = None,
+    sessions: Annotated[
+        int | None, typer.Option(min=1, help="How many sessions. [default: finds how many there can be]")
+    ] = None,
+    duration_s: Annotated[float, typer.Option(min=1, help="How long the run is that counts.")] = 60.0,
+    as_json: AsJson = False,
+) -> None:
+    """How many sessions one core serves, with fewer than one block in a thousand late."""
+    from server.bench.sessions import Plan, measure_sessions
+
+    counts = tuple(emitters) if emitters else Plan.emitters
+    with _progress(total=None) as advance:
+        measured = measure_sessions(Plan(emitters=counts, sessions=sessions, duration_s=duration_s), advance)
+    if as_json:
+        print_json(measured)
+    else:
+        _print_sessions(measured)
 
 
 @app.command()
@@ -85,6 +103,15 @@ def listen(
     _report(as_json, f"One stream of {url}", measured)
 
 
+@contextmanager
+def _progress(total: int | None) -> Iterator[Callable[[str], None]]:
+    """Redrawn between measurements only: a thread that redraws would be measured too."""
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda step: progress.update(task, advance=1, description=step, refresh=True)
+
+
 def _report(as_json: bool, title: str, measured: dict[str, Any]) -> None:
     if as_json:
         print_json(measured)
@@ -94,7 +121,12 @@ def _report(as_json: bool, title: str, measured: dict[str, Any]) -> None:
 
 def _print_convolver(measured: dict[str, Any]) -> None:
     print_measures("Host", measured["host"])
-    print_rows("Source-seconds per CPU-second at 48 kHz, stereo IRs", map(_shortened, measured["cases"]))
+    cases = measured["cases"]
+    title = "Source-seconds per CPU-second: ours, pedalboard's (peer), oaconvolve's (SciPy)"
+    print_rows(title, [{head: case[name] for head, name in {**_CASE, **_ALONE}.items()} for case in cases])
+    if shared := [case for case in cases if case["sources"] > 1]:
+        columns = {**_CASE, **_SHARED}
+        print_rows("With a shared tail", [{head: case[name] for head, name in columns.items()} for case in shared])
     fades, splatter, drift = measured["fade_cost_ratio"], measured["splatter_db"], measured["drift"]
     print_measures(
         "Exchanges, drift, threads, start",
@@ -110,18 +142,33 @@ def _print_convolver(measured: dict[str, Any]) -> None:
     print_rows("Goals", measured["summary"])
 
 
-_SHORT = {
-    "block_size": "block",
-    "x_realtime": "ours",
-    "peer_x_realtime": "pedalboard",
-    "oaconvolve_x_realtime": "oaconvolve",
-    "max_error_db": "error dB",
-    "worst_to_mean_block": "worst / mean",
-    "shared_tail_x_realtime": "shared tail",
-    "shared_tail_ratio": "its ratio",
-    "shared_tail_worst_to_mean_block": "its worst / mean",
+def _print_sessions(measured: dict[str, Any]) -> None:
+    for case in measured["cases"]:
+        title = f"{case['emitters']} emitters"
+        rows = {name: value for name, value in case.items() if name not in {"emitters", "trials"}}
+        print_measures(
+            title,
+            {
+                name: " / ".join(map(show, value.values())) if isinstance(value, dict) else value
+                for name, value in rows.items()
+            },
+        )
+    Console().print("Of times: half of all, 99 % and 99.9 % took no longer.")
+    print_rows("Goals", measured["summary"])
+
+
+_CASE = {"block": "block_size", "ir s": "ir_s", "sources": "sources"}
+_ALONE = {
+    "ours": "x_realtime",
+    "peer": "peer_x_realtime",
+    "ratio": "ratio",
+    "SciPy": "oaconvolve_x_realtime",
+    "error dB": "max_error_db",
+    "worst / mean": "worst_to_mean_block",
 }
-
-
-def _shortened(case: dict[str, Any]) -> dict[str, Any]:
-    return {_SHORT.get(name, name): value for name, value in case.items()}
+_SHARED = {
+    "ours": "shared_tail_x_realtime",
+    "ratio": "shared_tail_ratio",
+    "worst / mean": "shared_tail_worst_to_mean_block",
+}
+"""Headings short enough for a terminal."""

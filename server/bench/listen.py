@@ -9,13 +9,13 @@ import numpy as np
 from websockets.asyncio.client import connect
 
 from server.acoustics.geometry import Vector3
+from server.blocks import AudioBlock
 from server.clips import ClipLibrary
 from server.errors import NafirError
 from server.protocol import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
-    AudioBlock,
     Error,
     Hello,
     ListenerPose,
@@ -60,7 +60,7 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
             await socket.send(emitter.serialize())
         blocks = blocks_skipped = exchanges = pose_id = next_clock = 0
         late_at_s: list[float] = []
-        to_block = _Waits()
+        to_block, to_reverberation = _Waits(), _Waits()
         errors: list[str] = []
         started_s = now_s = time.monotonic()
         while now_s - started_s < duration_s:
@@ -77,11 +77,13 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
             late_at_s += [round(now_s - started_s, 1)] if block.is_late else []
             exchanges += block.is_exchange
             to_block.hear(block.pose_id, now_s)
+            to_reverberation.hear(block.reverberation_pose_id, now_s)
             if blocks % _ACKNOWLEDGE_EVERY == 0:
                 await socket.send(Acknowledge(sequence=block.sequence).serialize())
             if now_s - started_s > pose_id / poses_per_second:
                 pose_id += 1
                 to_block.send(pose_id, now_s)
+                to_reverberation.send(pose_id, now_s)
                 await socket.send(
                     _walking(pose_id, answer.scene.listener.position, now_s - started_s).serialize_binary()
                 )
@@ -95,6 +97,7 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
         "ir_exchanges": exchanges,
         "poses": pose_id,
         **to_block.summary("pose_to_block"),
+        **to_reverberation.summary("pose_to_reverberation"),
         "errors": errors,
     }
 

@@ -1,0 +1,221 @@
+"""Many listeners of one server in one event loop, who walk in circles and listen to nothing but headers.
+
+A WebSocket client as small as can be, so that the load does not become what is measured: of a server that sends whole
+messages and no extensions, over the loopback interface.
+"""
+
+import asyncio
+import base64
+import itertools
+import json
+import math
+import struct
+import time
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from server.acoustics.geometry import Vector3
+from server.bench.gauge import POSE_IDS, Waiting
+from server.bench.scene import CLIP, SCENE
+from server.blocks import AudioBlock
+from server.durations import DurationHistogram
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+
+POSES_PER_S = 30.0
+
+_ACKNOWLEDGE_EVERY = 4
+_CENTRE: Vector3 = (2.0, 2.0, 1.5)
+_RADIUS_M = 1.0
+_TURN_S = 12.0
+_PLACES = (0.5, 0.5, 0.5), (7.5, 2.5, 2.3)
+_GOLDEN = 0.618
+"""Of a period, from one walker's poses to the next one's: any number of them is spread evenly."""
+_PATIENCE_S = 20.0
+_SEQUENCE = struct.Struct("<4xI")
+_TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
+_WHOLE, _MASKED = 0x80, 0x80
+
+
+def frame(opcode: int, payload: bytes) -> bytes:
+    """A message (n < 65536) as a client sends it, masked with zeros, which leave it as it is (RFC 6455, 5.3)."""
+    short = len(payload) < 126
+    length = bytes([_MASKED | len(payload)]) if short else struct.pack(">BH", _MASKED | 126, len(payload))
+    return bytes([_WHOLE | opcode]) + length + bytes(4) + payload
+
+
+class FrameReader:
+    """Cuts what a server sends into messages."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
+        """Opcode and payload of every message that is complete by now."""
+        self._data += data
+        messages = []
+        start, end = 0, len(self._data)
+        while end - start >= 2:
+            opcode, length, at = self._data[start] & 0x0F, self._data[start + 1], start + 2
+            if length == 126:
+                if end - at < 2:
+                    break
+                (length,) = struct.unpack_from(">H", self._data, at)
+                at += 2
+            elif length == 127:
+                if end - at < 8:
+                    break
+                (length,) = struct.unpack_from(">Q", self._data, at)
+                at += 8
+            if end - at < length:
+                break
+            messages.append((opcode, bytes(self._data[at : at + length])))
+            start = at + length
+        del self._data[:start]
+        return messages
+
+
+class Walker(asyncio.Protocol):
+    """One listener. `sounds` is done when all its emitters do, and fails with ConnectionError when it never will."""
+
+    def __init__(self, places: Sequence[Vector3], *, phase: float) -> None:
+        self.sounds: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.poses = Waiting()
+        self.blocks = 0
+        self.errors: list[str] = []
+        self._places = places
+        self._silent = len(places)
+        self._phase = phase
+        self._reader = FrameReader()
+        self._reply: bytearray | None = bytearray()
+        """To the request to upgrade, as far as it has come; None after it."""
+        self._transport: asyncio.Transport | None = None
+        self._next_pose: asyncio.TimerHandle | None = None
+        self._pose_ids = itertools.count(1)
+        self._is_closing = False
+        self.is_lost = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        key = base64.b64encode(bytes(16)).decode()
+        transport.write(
+            f"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+
+    def data_received(self, data: bytes) -> None:
+        if self._reply is not None:
+            self._reply += data
+            head, end, data = bytes(self._reply).partition(b"\r\n\r\n")
+            if not end:
+                return
+            if b" 101 " not in head.partition(b"\r\n")[0]:
+                self._fail(head.decode(errors="replace"))
+                return
+            self._reply = None
+            self._begin()
+        for opcode, payload in self._reader.feed(data):
+            if opcode == _BINARY:
+                self._hear(payload)
+            elif opcode == _TEXT:
+                self._read(payload)
+            elif opcode == _PING:
+                self._send(_PONG, payload)
+            elif opcode == _CLOSE:
+                self._fail(f"the server closed the stream: {payload[2:].decode(errors='replace')}")
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if not self._is_closing:
+            self._fail(f"the connection was lost: {exc}")
+
+    def begin(self) -> None:
+        """Count and time anew."""
+        self.poses.times = DurationHistogram()
+        self.errors = []
+
+    def close(self) -> None:
+        self._is_closing = True
+        self.sounds.cancel()
+        if self._next_pose is not None:
+            self._next_pose.cancel()
+        if self._transport is not None:
+            self._transport.abort()
+
+    def _begin(self) -> None:
+        self._send(_TEXT, Hello(protocol=PROTOCOL, scene=SCENE).serialize().encode())
+        for number, place in enumerate(self._places):
+            self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=place).serialize().encode())
+        self._next_pose = asyncio.get_running_loop().call_later(self._phase / POSES_PER_S, self._walk)
+
+    def _read(self, payload: bytes) -> None:
+        message = json.loads(payload)
+        if message["type"] == "emitter_added":
+            self._silent -= 1
+            if self._silent == 0 and not self.sounds.done():
+                self.sounds.set_result(None)
+        elif message["type"] == "error":
+            self.errors.append(message["code"])
+
+    def _hear(self, payload: bytes) -> None:
+        if payload[0] != AudioBlock.KIND:
+            return
+        self.blocks += 1
+        self.poses.leave(POSE_IDS.unpack_from(payload)[0], time.monotonic())
+        if self.blocks % _ACKNOWLEDGE_EVERY == 0:
+            (sequence,) = _SEQUENCE.unpack_from(payload)
+            self._send(_TEXT, Acknowledge(sequence=sequence).serialize().encode())
+
+    def _walk(self) -> None:
+        loop = asyncio.get_running_loop()
+        pose_id = next(self._pose_ids)
+        # From the first pose's time on, so that no delay adds up.
+        assert self._next_pose is not None
+        self._next_pose = loop.call_at(self._next_pose.when() + 1 / POSES_PER_S, self._walk)
+        angle = 2 * math.pi * ((pose_id + self._phase) / POSES_PER_S / _TURN_S + self._phase)
+        x, y, z = _CENTRE
+        position = x + _RADIUS_M * math.cos(angle), y + _RADIUS_M * math.sin(angle), z
+        pose = ListenerPose(pose_id=pose_id, position=position, yaw=math.remainder(angle, 2 * math.pi))
+        self.poses.enter(pose_id, time.monotonic())
+        self._send(_BINARY, pose.serialize_binary())
+
+    def _send(self, opcode: int, payload: bytes) -> None:
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.write(frame(opcode, payload))
+
+    def _fail(self, reason: str) -> None:
+        self.errors.append(reason)
+        self.is_lost = True
+        if self._next_pose is not None:
+            self._next_pose.cancel()
+        if not self.sounds.done():
+            self.sounds.set_exception(ConnectionError(reason))
+
+
+class Crowd:
+    """So many walkers of the server at `port`, each with `emitters` that sound in places of its own."""
+
+    def __init__(self, port: int, *, emitters: int) -> None:
+        self._port = port
+        self._emitters = emitters
+        self._rng = np.random.default_rng(0)
+        self.walkers: list[Walker] = []
+
+    async def resize(self, count: int) -> None:
+        """Have `count` walkers hear all their emitters. Raises ConnectionError and TimeoutError where that fails."""
+        kept = [walker for walker in self.walkers if not walker.is_lost][:count]
+        for walker in self.walkers:
+            if walker not in kept:
+                walker.close()
+        self.walkers = kept
+        loop = asyncio.get_running_loop()
+        for number in range(len(self.walkers), count):
+            places = [tuple(place) for place in self._rng.uniform(*_PLACES, (self._emitters, 3)).tolist()]
+            phase = number * _GOLDEN % 1
+            _, walker = await loop.create_connection(partial(Walker, places, phase=phase), "127.0.0.1", self._port)
+            self.walkers.append(walker)
+            await asyncio.wait_for(walker.sounds, _PATIENCE_S)
+
+    async def close(self) -> None:
+        await self.resize(0)

@@ -1,0 +1,163 @@
+"""Measures a server from within, at its edge: how long poses take from the moment the application is given one to the
+moment it has handed the socket the first audio block that follows it, or a newer one.
+
+`/bench/begin` begins a measurement of the streams that are open, and `/bench/report` tells what was measured since.
+"""
+
+import json
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from server.blocks import AudioBlock
+from server.durations import DurationHistogram
+from server.protocol import Durations, ListenerPose
+from server.stream import Stream
+from server.streaming import StreamHost
+
+POSE_ID = struct.Struct("<4xI")
+"""Where it stands in a binary pose of a listener."""
+POSE_IDS = struct.Struct("<16xII")
+"""Where they stand in an audio block: that of the direct paths, and that of the impulse responses."""
+
+
+@dataclass
+class Waiting:
+    """Poses on their way: how long each took until one came out that is not older."""
+
+    times: DurationHistogram = field(default_factory=DurationHistogram)
+    _since_s: deque[tuple[int, float]] = field(default_factory=deque)
+
+    def enter(self, pose_id: int, now_s: float) -> None:
+        self._since_s.append((pose_id, now_s))
+
+    def leave(self, pose_id: int, now_s: float) -> None:
+        while self._since_s and self._since_s[0][0] <= pose_id:
+            self.times.add(now_s - self._since_s.popleft()[1])
+
+
+class _Watch:
+    """The poses of one connection."""
+
+    def __init__(self) -> None:
+        self.direct, self.reverberation = Waiting(), Waiting()
+
+
+class _Counts:
+    """What a stream counted before the measurement began; what it times anew from there on."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.stream = stream
+        self._late, self._dropped, self._sent = self._now()
+        # Whoever times a block next finds the new ones; nobody else writes these.
+        stream.render_times, stream.latenesses = DurationHistogram(), DurationHistogram()
+        stream.ir_times = DurationHistogram()
+
+    def _now(self) -> tuple[int, int, int]:
+        session = self.stream.session
+        return self.stream.blocks_late, session.blocks_dropped, session.window.sent
+
+    @property
+    def since(self) -> tuple[int, int, int]:
+        """Blocks late, dropped and sent."""
+        late, dropped, sent = self._now()
+        return late - self._late, dropped - self._dropped, sent - self._sent
+
+
+class Gauge:
+    """An ASGI application around the server's; everything happens on its event loop."""
+
+    def __init__(self, app: ASGIApp, *, time_s: Callable[[], float] = time.monotonic) -> None:
+        self._app = app
+        self._time_s = time_s
+        self._watches: set[_Watch] = set()
+        self._counts: list[_Counts] = []
+        self._began_s = self._began_cpu_s = 0.0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        match scope["type"], scope.get("path"):
+            case "http", "/bench/begin":
+                self._begin(scope["state"]["host"])
+                await _answer({}, send)
+            case "http", "/bench/report":
+                await _answer(self._report(), send)
+            case "websocket", _:
+                await self._watch(scope, receive, send)
+            case _:
+                await self._app(scope, receive, send)
+
+    async def _watch(self, scope: Scope, receive: Receive, send: Send) -> None:
+        watch = _Watch()
+
+        async def receive_pose() -> Message:
+            message = await receive()
+            data = message.get("bytes")
+            if data and data[0] == ListenerPose.KIND:
+                (pose_id,) = POSE_ID.unpack_from(data)
+                now_s = self._time_s()
+                watch.direct.enter(pose_id, now_s)
+                watch.reverberation.enter(pose_id, now_s)
+            return message
+
+        async def send_block(message: Message) -> None:
+            await send(message)
+            data = message.get("bytes")
+            if data and data[0] == AudioBlock.KIND:
+                pose_id, reverberation_pose_id = POSE_IDS.unpack_from(data)
+                now_s = self._time_s()
+                watch.direct.leave(pose_id, now_s)
+                watch.reverberation.leave(reverberation_pose_id, now_s)
+
+        self._watches.add(watch)
+        try:
+            await self._app(scope, receive_pose, send_block)
+        finally:
+            self._watches.remove(watch)
+
+    def _begin(self, host: StreamHost) -> None:
+        self._counts = [_Counts(stream) for stream in host.audio.streams]
+        for watch in self._watches:
+            watch.direct.times, watch.reverberation.times = DurationHistogram(), DurationHistogram()
+        self._began_s, self._began_cpu_s = self._time_s(), time.process_time()
+
+    def _report(self) -> dict[str, Any]:
+        """Of streams that ended meanwhile only until then."""
+        duration_s = self._time_s() - self._began_s
+        blocks = [counts.since for counts in self._counts]
+        late, dropped, sent = (sum(column) for column in zip(*blocks, strict=True)) if blocks else (0, 0, 0)
+        due = sum(duration_s / counts.stream.block_s for counts in self._counts)
+        return {
+            "duration_s": duration_s,
+            "streams": len(self._counts),
+            "blocks_sent": sent,
+            "blocks_late": late,
+            "blocks_dropped": dropped,
+            # A stream that fell behind is moved to later; one block each may be on its way at either end.
+            "blocks_missing": max(0, round(due) - sent - dropped - len(self._counts)),
+            "block_ms": merged(counts.stream.render_times for counts in self._counts),
+            "lateness_ms": merged(counts.stream.latenesses for counts in self._counts),
+            "ir_ms": merged(counts.stream.ir_times for counts in self._counts),
+            "pose_to_audio_ms": merged(watch.direct.times for watch in self._watches),
+            "pose_to_reverberation_ms": merged(watch.reverberation.times for watch in self._watches),
+            "server_load": (time.process_time() - self._began_cpu_s) / duration_s,
+        }
+
+
+def merged(histograms: Iterable[DurationHistogram]) -> dict[str, float | None]:
+    """Milliseconds of all together, as in a status."""
+    together = DurationHistogram()
+    for histogram in histograms:
+        together.merge(histogram)
+    return Durations.of(together).model_dump()
+
+
+async def _answer(document: dict[str, Any], send: Send) -> None:
+    body = json.dumps(document).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    await send({"type": "http.response.start", "status": 200, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,59 @@
+"""A server of the bench's scene, in a process of its own, confined to one core: `python -m server.bench.host CORE`.
+
+It says in one line of JSON which port it listens on, and ends when its standard input does. Started by
+`server.bench.sessions`.
+"""
+
+import json
+import os
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import uvicorn
+
+_MAX_STREAMS = 1_000
+_CLIP_S = 10
+
+
+def main() -> None:
+    os.sched_setaffinity(0, {int(sys.argv[1])})
+    serve()  # imports what starts threads, and counts cores, only now
+
+
+def serve() -> None:
+    import socket
+
+    import soundfile
+    import uvicorn
+
+    from server.app import create_app
+    from server.bench.gauge import Gauge
+    from server.bench.rooms import noise
+    from server.bench.scene import CLIP, SAMPLE_RATE, SCENE, BankField
+    from server.cli import server_options
+    from server.settings import Settings
+
+    with tempfile.TemporaryDirectory() as folder, socket.socket() as listener:
+        clip = Path(folder) / f"{CLIP}.wav"
+        soundfile.write(clip, 0.05 * noise(0, _CLIP_S * SAMPLE_RATE), SAMPLE_RATE, subtype="FLOAT")
+        settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS)
+        app = Gauge(create_app(settings, fields={SCENE: BankField()}))
+        server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
+        listener.bind((settings.host, 0))
+        threading.Thread(target=_stop_with_input, args=(server,), daemon=True).start()
+        sys.stdout.write(json.dumps({"port": listener.getsockname()[1]}) + "\n")
+        sys.stdout.flush()
+        server.run(sockets=[listener])
+
+
+def _stop_with_input(server: "uvicorn.Server") -> None:
+    sys.stdin.read()
+    server.should_exit = True
+
+
+if __name__ == "__main__":
+    main()

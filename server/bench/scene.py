@@ -1,0 +1,66 @@
+"""A scene whose field costs next to nothing, so that rendering is what is measured: an L-shaped room whose impulse
+responses (IRs), a second long at 48 kHz, come from a small bank by the listener's and the emitter's pose."""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.bench.rooms import FloatArray, room
+from server.field.field import AcousticField
+from server.scene.bundle import Bundle
+from server.scene.geometry import Geometry, Material, Materials
+from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
+
+SCENE = "bench"
+CLIP = "noise"
+SAMPLE_RATE = 48_000
+IR_S = 1.0
+
+_BANK = 32
+_LEVEL = 0.01
+_POSES_PER_M = 50.0
+_PLAIN = Material(absorption=(0.2,) * len(OCTAVE_BANDS_HZ), scattering=(0.1,) * len(OCTAVE_BANDS_HZ))
+_SAMPLES = round(IR_S * SAMPLE_RATE)
+_CODEC = CodecParameters(
+    sample_rate=SAMPLE_RATE, n_fft=512, hop=128, samples=_SAMPLES, lead_samples=64, known_frames=4, log_floor=1e-3
+)
+_MANIFEST = Manifest(
+    id=SCENE,
+    name="Bench",
+    geometry=Geometry(
+        height_m=2.8,
+        corners=((0, 0), (8, 0), (8, 3), (4, 3), (4, 6), (0, 6)),
+        materials=Materials(walls=_PLAIN, floor=_PLAIN, ceiling=_PLAIN),
+    ),
+    bounds=Bounds(minimum=(0.2, 0.2, 0.2), maximum=(7.8, 5.8, 2.6)),
+    speed_of_sound=343.0,
+    start=Start(listener=(2.0, 2.0, 1.5), emitter=(6.0, 1.5, 1.5)),
+    codec=_CODEC,
+    fields={"bank": FieldFile(file="bank.onnx", architecture="bank", rank=1)},
+    levels=(QualityLevel(name="standard", field="bank"),),
+    files={"bank.onnx": "0" * 64, ARRAYS_FILE: "0" * 64},
+)
+
+
+class BankField(AcousticField):
+    """Looks IRs up instead of computing them: another one every two centimetres."""
+
+    def __init__(self) -> None:
+        self.bundle = Bundle(
+            folder=Path(),
+            manifest=_MANIFEST,
+            digest="",
+            models={},
+            frozen_noise=np.zeros((self.channels, _SAMPLES), np.float32),
+        )
+        self.level = _MANIFEST.levels[0]
+        self._codec = _CODEC.codec
+        self._bank = np.stack([_LEVEL * room(seed, _SAMPLES) for seed in range(_BANK)])
+
+    def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> FloatArray:
+        """As `AcousticField`'s, of poses that lie where they like."""
+        places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), np.atleast_1d(yaws)])
+        entry = np.floor(places @ np.arange(1, places.shape[1] + 1) * _POSES_PER_M).astype(np.int64)
+        return self._bank[entry % _BANK]

@@ -1,0 +1,227 @@
+"""How many listeners one core serves: a server of its own, confined to one core, and a crowd of listeners on the
+others, over the loopback interface.
+
+The scene costs next to nothing (`server.bench.scene`), the rest is what `nafir serve` does: blocks of 256 samples at
+48 kHz, impulse responses (IRs) of a second for each of the emitters, which play noise without end. Every listener sends
+30 poses a second; direct paths follow each, and all IRs follow as fast as the core has time for them.
+
+- A block is late where it reaches the socket later than a player needs it that keeps the usual 8 blocks in hand, or
+  where it is never made. `late_share` is theirs of all blocks that were due.
+- `sessions`: the largest number with fewer late than one in a thousand; steps of a few seconds find it, to within 5 %,
+  and a long one confirms it, or the next lower one.
+- `block_ms`: what a block costs, of blocks rendered together its share. `lateness_ms`: how long after it was due a
+  block was ready.
+- `pose_to_audio_ms`: from a pose's arrival at the server to the first block that follows it, handed to the socket;
+  `pose_to_reverberation_ms`: to the first block with IRs for it. `client_pose_to_audio_ms` is the former as a listener
+  sees it.
+- `server_load`, `client_load`: CPU time over wall time. Clients near 1 are the bottleneck, not the server.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import IO, Any
+
+from server.bench.crowd import POSES_PER_S, Crowd
+from server.bench.gauge import merged
+from server.bench.report import Goal, Judgement
+from server.bench.scene import IR_S, SAMPLE_RATE
+from server.errors import NafirError
+
+_LATE_SHARE = 0.001
+_SETTLE_S = 2.0
+_MOST = 512
+_PATIENCE_S = 20.0
+_READY_S = 120.0
+"""Machine code may have to be made first."""
+
+_SESSIONS = Goal("sessions per core, 16 emitters", 20, 40)
+_POSE_TO_AUDIO = Goal("pose to audio on the server, p99, ms", 15, 8, is_at_most=True)
+
+Advance = Callable[[str], None]
+"""Told what has just been measured."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """`sessions` is how many there are; by default as many as there can be."""
+
+    emitters: tuple[int, ...] = (1, 4, 16)
+    sessions: int | None = None
+    duration_s: float = 60.0
+    step_s: float = 8.0
+
+
+def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
+    """One case for each number of emitters. Raises NafirError where a process cannot be confined to a core, and where
+    the server does not start."""
+    if not hasattr(os, "sched_setaffinity"):
+        raise NafirError("this system cannot confine a process to one core")
+    usable = os.sched_getaffinity(0)
+    core = max(usable)
+    os.sched_setaffinity(0, usable - {core} or usable)
+    try:
+        with _serve(core) as port:
+            cases = asyncio.run(_measure(plan, port, advance))
+    finally:
+        os.sched_setaffinity(0, usable)
+    measured: dict[str, Any] = {
+        "block_size": 256,
+        "sample_rate": SAMPLE_RATE,
+        "ir_s": IR_S,
+        "poses_per_s": POSES_PER_S,
+        "duration_s": plan.duration_s,
+        "clients_have_other_cores": len(usable) > 1,
+        "cases": cases,
+    }
+    measured["summary"] = [asdict(judgement) for judgement in judge(cases)]
+    return measured
+
+
+def judge(cases: list[dict[str, Any]]) -> list[Judgement]:
+    """Beside the goals, which are for 16 emitters."""
+    sixteen: dict[str, Any] = next((case for case in cases if case["emitters"] == 16), {})
+    return [
+        _SESSIONS.judge(sixteen.get("sessions")),
+        _POSE_TO_AUDIO.judge(sixteen.get("pose_to_audio_ms", {}).get("p99")),
+    ]
+
+
+async def find_most(passes: Callable[[int], Awaitable[bool]], *, most: int) -> int:
+    """The largest number up to `most` that passes, to within 5 %, where all below a number that passes do; 0 if none
+    does."""
+    good, bad = 0, most + 1
+    while bad - good > max(1, good // 20):
+        number = min(max(4, 2 * good), most) if bad > most else (good + bad) // 2
+        if await passes(number):
+            good = number
+        else:
+            bad = number
+    return good
+
+
+async def _measure(plan: Plan, port: int, advance: Advance) -> list[dict[str, Any]]:
+    cases = []
+    for emitters in plan.emitters:
+        trial = _Trial(port, emitters, advance)
+        try:
+            cases.append({"emitters": emitters, **await _measure_case(plan, trial)})
+        finally:
+            await trial.crowd.close()
+    return cases
+
+
+async def _measure_case(plan: Plan, trial: "_Trial") -> dict[str, Any]:
+    if plan.sessions is not None:
+        return {**await trial.run(plan.sessions, plan.duration_s), "trials": trial.history}
+
+    async def passes(sessions: int) -> bool:
+        return _is_good(await trial.run(sessions, plan.step_s))
+
+    sessions = await find_most(passes, most=_MOST)
+    while sessions > 0:
+        confirmed = await trial.run(sessions, plan.duration_s)
+        if _is_good(confirmed):
+            return {**confirmed, "trials": trial.history}
+        sessions -= max(1, sessions // 20)
+    return {"sessions": 0, "trials": trial.history}
+
+
+def _is_good(measured: dict[str, Any]) -> bool:
+    return not measured["errors"] and measured["late_share"] < _LATE_SHARE
+
+
+class _Trial:
+    """Trials with one number of emitters; the listeners of one go on in the next."""
+
+    def __init__(self, port: int, emitters: int, advance: Advance) -> None:
+        self.crowd = Crowd(port, emitters=emitters)
+        self.history: list[dict[str, Any]] = []
+        self._url = f"http://127.0.0.1:{port}/bench"
+        self._emitters = emitters
+        self._advance = advance
+
+    async def run(self, sessions: int, duration_s: float) -> dict[str, Any]:
+        """Where the server cannot even open that many streams or tell of them, `late_share` is 1."""
+        try:
+            measured = await self._run(sessions, duration_s)
+        except (OSError, TimeoutError) as exc:
+            measured = {"sessions": sessions, "late_share": 1.0, "errors": [str(exc) or type(exc).__name__]}
+            await self.crowd.close()
+        self.history.append({name: measured[name] for name in ("sessions", "late_share", "errors")})
+        self._advance(f"{sessions} sessions of {self._emitters} emitters: {measured['late_share']:.2%} late")
+        return measured
+
+    async def _run(self, sessions: int, duration_s: float) -> dict[str, Any]:
+        await self.crowd.resize(sessions)
+        await asyncio.sleep(_SETTLE_S)
+        await asyncio.to_thread(_get, f"{self._url}/begin")
+        walkers = self.crowd.walkers
+        for walker in walkers:
+            walker.begin()
+        started_s, started_cpu_s = time.perf_counter(), time.process_time()
+        await asyncio.sleep(duration_s)
+        client_load = (time.process_time() - started_cpu_s) / (time.perf_counter() - started_s)
+        measured = await asyncio.to_thread(_get, f"{self._url}/report")
+        late = sum(measured[name] for name in ("blocks_late", "blocks_dropped", "blocks_missing"))
+        due = sum(measured[name] for name in ("blocks_sent", "blocks_dropped", "blocks_missing"))
+        return {
+            "sessions": sessions,
+            "late_share": late / due if due else 1.0,
+            **measured,
+            "client_pose_to_audio_ms": merged(walker.poses.times for walker in walkers),
+            "client_load": client_load,
+            "errors": sorted({error for walker in walkers for error in walker.errors}),
+        }
+
+
+@contextlib.contextmanager
+def _serve(core: int) -> Iterator[int]:
+    """The port of a server that is ready, on one core."""
+    command = [sys.executable, "-m", "server.bench.host", str(core)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            port = _read_port(process.stdout)
+            _wait_until_ready(port)
+            yield port
+        finally:
+            process.stdin.close()
+            process.wait()
+
+
+def _read_port(stdout: IO[str]) -> int:
+    line = stdout.readline()
+    if not line:
+        raise NafirError("the bench's server did not start")
+    return int(json.loads(line)["port"])
+
+
+def _wait_until_ready(port: int) -> None:
+    until_s = time.monotonic() + _READY_S
+    while time.monotonic() < until_s:
+        try:
+            _get(f"http://127.0.0.1:{port}/readyz")
+        except urllib.error.HTTPError as answer:
+            answer.close()
+        except OSError:
+            pass
+        else:
+            return
+        time.sleep(0.1)
+    raise NafirError(f"the bench's server was not ready after {_READY_S:.0f} s")
+
+
+def _get(url: str) -> dict[str, Any]:
+    with urllib.request.urlopen(url, timeout=_PATIENCE_S) as answer:
+        document: dict[str, Any] = json.load(answer)
+    return document

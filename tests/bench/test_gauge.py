@@ -1,0 +1,145 @@
+"""The gauge around an application that does what it is told, by a clock that tells what time it is."""
+
+import asyncio
+import json
+
+import numpy as np
+import pytest
+
+from server.bench.gauge import Gauge, Waiting
+from server.blocks import AudioBlock
+from server.protocol import ListenerPose
+
+
+def pose(pose_id):
+    return {
+        "type": "websocket.receive",
+        "bytes": ListenerPose(pose_id=pose_id, position=(1.0, 1.0, 1.0)).serialize_binary(),
+    }
+
+
+def block(pose_id, reverberation_pose_id):
+    samples = np.zeros((2, 8), np.float32)
+    data = AudioBlock(0, 0, pose_id=pose_id, reverberation_pose_id=reverberation_pose_id, samples=samples)
+    return {"type": "websocket.send", "bytes": data.serialize("f32")}
+
+
+class Clock:
+    now_s = 100.0
+
+    def __call__(self):
+        return self.now_s
+
+
+class Audio:
+    streams = ()
+
+
+class Host:
+    audio = Audio()
+
+
+def test_a_pose_is_followed_by_the_first_block_that_is_not_older():
+    waiting = Waiting()
+    for pose_id, arrived_s in ((1, 0.0), (2, 0.010), (3, 0.020)):
+        waiting.enter(pose_id, arrived_s)
+    waiting.leave(0, 0.025)
+    assert waiting.times.count == 0
+    waiting.leave(2, 0.030)  # the first waited 30 ms, the second 20
+    assert waiting.times.count == 2
+    assert waiting.times.quantile_s(1) == pytest.approx(0.030, rel=0.03)
+    assert waiting.times.quantile_s(0.5) == pytest.approx(0.020, rel=0.03)
+    waiting.leave(3, 0.040)
+    waiting.leave(3, 0.050)
+    assert waiting.times.count == 3
+
+
+def test_poses_are_timed_from_arrival_to_the_socket_and_messages_pass_unchanged():
+    clock = Clock()
+    seen, sent = [], []
+    script = [
+        (0.000, pose(1)),
+        (0.004, block(1, 0)),
+        (0.005, {"type": "websocket.send", "text": "status"}),
+        (0.030, block(1, 1)),
+    ]
+
+    async def receive():
+        return script.pop(0)[1]
+
+    async def send(message):
+        clock.now_s += 0.001  # what handing over takes
+        sent.append(message)
+
+    async def application(_, receive, send):
+        begun_s = clock.now_s
+        while script:
+            clock.now_s = begun_s + script[0][0]
+            if script[0][1]["type"] == "websocket.receive":
+                seen.append(await receive())
+            else:
+                await send(script.pop(0)[1])
+        answers.append(await ask(gauge, "/bench/report"))
+
+    async def scenario():
+        await ask(gauge, "/bench/begin")
+        await gauge({"type": "websocket", "path": "/v1/stream"}, receive, send)
+
+    gauge = Gauge(application, time_s=clock)
+    answers, messages = [], list(script)
+    asyncio.run(scenario())
+    assert [seen[0], *sent] == [message for _, message in messages]
+    (report,) = answers
+    assert report["pose_to_audio_ms"]["p99"] == pytest.approx(5, rel=0.03)
+    assert report["pose_to_reverberation_ms"]["p99"] == pytest.approx(31, rel=0.03)
+
+
+async def ask(gauge, path):
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    await gauge({"type": "http", "path": path, "state": {"host": Host()}}, None, send)
+    return json.loads(sent[1]["body"])
+
+
+class Window:
+    sent = 1_000
+
+
+class Session:
+    window = Window()
+    blocks_dropped = 5
+
+
+class Stream:
+    """Counts as the server's do."""
+
+    block_s = 0.01
+
+    def __init__(self):
+        self.session = Session()
+        self.blocks_late = 7
+        self.render_times = self.latenesses = self.ir_times = None
+
+
+def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_ones_found(monkeypatch):
+    stream, clock = Stream(), Clock()
+    monkeypatch.setattr(Audio, "streams", (stream,))
+    gauge = Gauge(None, time_s=clock)
+
+    async def scenario():
+        await ask(gauge, "/bench/begin")
+        stream.render_times.add(0.002)
+        stream.session.window.sent += 90
+        stream.session.blocks_dropped += 3
+        stream.blocks_late += 2
+        clock.now_s += 1.0  # a hundred blocks were due
+        return await ask(gauge, "/bench/report")
+
+    report = asyncio.run(scenario())
+    counts = {name: report[f"blocks_{name}"] for name in ("sent", "late", "dropped", "missing")}
+    assert counts == {"sent": 90, "late": 2, "dropped": 3, "missing": 6}
+    assert report["block_ms"]["p50"] == pytest.approx(2, rel=0.03)
+    assert report["lateness_ms"]["p50"] is None

@@ -1,0 +1,39 @@
+"""The bench of sessions with a server of its own. No time is asserted."""
+
+import json
+import os
+
+import pytest
+from typer.testing import CliRunner
+
+from server.bench import sessions
+from server.bench.cli import app
+from server.errors import NafirError
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be confined to a core")
+
+
+def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own():
+    usable = os.sched_getaffinity(0)
+    options = ["--emitters", "3", "--sessions", "2", "--duration-s", "2", "--json"]
+    outcome = CliRunner().invoke(app, ["stream", *options])
+    assert outcome.exit_code == 0, outcome.output
+    measured = json.loads(outcome.stdout)
+    (case,) = measured["cases"]
+    assert (case["emitters"], case["sessions"], case["streams"]) == (3, 2, 2)
+    assert case["errors"] == []
+    due = 2 * case["duration_s"] * 48_000 / 256
+    assert case["blocks_sent"] + case["blocks_dropped"] + case["blocks_missing"] == pytest.approx(due, rel=0.05)
+    assert 0 <= case["late_share"] <= 1
+    for name in ("block_ms", "lateness_ms", "pose_to_audio_ms", "pose_to_reverberation_ms", "client_pose_to_audio_ms"):
+        assert 0 < case[name]["p50"] <= case[name]["p99"] <= case[name]["p99_9"], name
+    assert case["pose_to_audio_ms"]["p50"] < case["client_pose_to_audio_ms"]["p50"]
+    assert case["server_load"] > 0
+    assert case["client_load"] > 0
+    assert case["trials"] == [{name: case[name] for name in ("sessions", "late_share", "errors")}]
+    assert os.sched_getaffinity(0) == usable
+
+
+def test_a_server_that_does_not_start_is_said_to():
+    with pytest.raises(NafirError, match="did not start"), sessions._serve(core=10_000):
+        pass
