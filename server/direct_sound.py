@@ -15,7 +15,6 @@ from server.acoustics.decibels import db_to_power
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import FloorPlan, Pose, Quaternion, Vector3
 from server.acoustics.sound_path import SoundPathFinder
-from server.rendering.direct_path import PathTarget
 from server.rendering.hrtf import HeadFilters
 from server.rendering.renderer import Renderer
 from server.scene.bundle import Bundle
@@ -74,14 +73,12 @@ class DirectSound:
             return
         places = np.asarray([emitter.pose.position for emitter in emitters.values()])
         paths = self._finder.find(np.asarray(listener.position), places)
-        gains_db = paths.screen_db.astype(np.float32)
-        lengths, arrivals, departures = paths.length_m.tolist(), paths.arrival.tolist(), paths.departure.tolist()
-        for number, (identifier, emitter) in enumerate(emitters.items()):
-            gain_db = gains_db[number]
+        gains_db = paths.screen_db
+        for number, emitter in enumerate(emitters.values()):
             if emitter.directivity != OMNIDIRECTIONAL:
-                departure = seen_from(emitter.pose.orientation, departures[number])
-                gain_db = gain_db + emitter.directivity.gain_db(departure).astype(np.float32)
-            renderer.set_path(identifier, PathTarget(lengths[number], tuple(arrivals[number]), gain_db))
+                departure = seen_from(emitter.pose.orientation, paths.departure[number].tolist())
+                gains_db[number] += emitter.directivity.gain_db(departure)
+        renderer.set_paths(list(emitters), paths.length_m, paths.arrival, gains_db)
 
 
 def seen_from(orientation: Quaternion, direction: Vector3) -> Vector3:

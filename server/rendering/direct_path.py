@@ -91,6 +91,21 @@ class DirectPath:
         record["arrival"] = target.arrival
         record["band_gain_db"] = target.band_gain_db
 
+    def set_targets(
+        self,
+        slots: Sequence[int],
+        lengths_m: npt.NDArray[np.floating],
+        arrivals: npt.NDArray[np.floating],
+        band_gains_db: npt.NDArray[np.floating],
+    ) -> None:
+        """`set_target` of several slots (n,) at once: lengths (n,), arrivals (n, 3), gains (n, band)."""
+        records = self.state.slots
+        records["present"][slots] = True
+        records["asked"][slots] = True
+        records["goal_m"][slots] = lengths_m
+        records["arrival"][slots] = arrivals
+        records["band_gain_db"][slots] = band_gains_db
+
     def set_orientation(self, quaternion: Sequence[float] | npt.NDArray[np.floating]) -> None:
         """(x, y, z, w), unit: turns the head's axes to where they are in the world. From the next block on."""
         x, y, z, w = (float(part) for part in quaternion)

@@ -91,6 +91,7 @@ class Renderer:
                 speed_of_sound=speed_of_sound,
                 air_db_per_m=air_db_per_m,
             )
+        self._orientation: Quaternion | None = None
         self._mixer = Mixer(self._convolver, self._direct)
         self._emitters: dict[str, _Emitter] = {}
         self._changed: list[_Emitter] = []  # since the last block
@@ -180,16 +181,31 @@ class Renderer:
 
     def set_path(self, emitter_id: str, target: PathTarget) -> None:
         """Have the direct sound come along a path from the next block on. Raises UnknownEmitterError."""
-        emitter = self._emitter(emitter_id)
-        if not emitter.has_path:
-            emitter.has_path = True
-            self._changed.append(emitter)
+        gains_db = np.asarray(target.band_gain_db)
+        self.set_paths(
+            [emitter_id], np.array([target.length_m]), np.asarray(target.arrival)[np.newaxis], gains_db[np.newaxis]
+        )
+
+    def set_paths(
+        self,
+        emitter_ids: Sequence[str],
+        lengths_m: npt.NDArray[np.floating],
+        arrivals: npt.NDArray[np.floating],
+        band_gains_db: npt.NDArray[np.floating],
+    ) -> None:
+        """`set_path` of several emitters at once: lengths (n,), unit vectors of arrival (n, 3), gains (n, band)."""
+        emitters = [self._emitter(emitter_id) for emitter_id in emitter_ids]
+        for emitter in emitters:
+            if not emitter.has_path:
+                emitter.has_path = True
+                self._changed.append(emitter)
         if self._direct is not None:
-            self._direct.set_target(emitter.slot, target)
+            self._direct.set_targets([emitter.slot for emitter in emitters], lengths_m, arrivals, band_gains_db)
 
     def set_orientation(self, orientation: Quaternion) -> None:
         """Turn the listener's head: the direct sound follows with the next block."""
-        if self._direct is not None:
+        if self._direct is not None and orientation != self._orientation:
+            self._orientation = orientation
             self._direct.set_orientation(orientation)
 
     def process(self) -> FloatArray:
@@ -203,6 +219,7 @@ class Renderer:
         self._convolver.reset()
         if self._direct is not None:
             self._direct.reset()
+            self._orientation = None
         self._emitters.clear()
         self._changed.clear()
         self._leaving.clear()
