@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from server.bench.report import print_json, print_measures, print_rows, show
+from server.bench.report import print_json, print_measures, print_rows
 from server.errors import NafirError
 
 app = typer.Typer(help="Measure what things cost on this host.", no_args_is_help=True)
@@ -144,16 +144,8 @@ def _print_convolver(measured: dict[str, Any]) -> None:
 
 def _print_sessions(measured: dict[str, Any]) -> None:
     for case in measured["cases"]:
-        title = f"{case['emitters']} emitters"
         rows = {name: value for name, value in case.items() if name not in {"emitters", "trials"}}
-        print_measures(
-            title,
-            {
-                name: " / ".join(map(show, value.values())) if isinstance(value, dict) else value
-                for name, value in rows.items()
-            },
-        )
-    Console().print("Of times: half of all, 99 % and 99.9 % took no longer.")
+        print_measures(f"{case['emitters']} emitters", rows)
     print_rows("Goals", measured["summary"])
 
 

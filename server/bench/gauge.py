@@ -6,6 +6,7 @@ moment it has handed the socket the first audio block that follows it, or a newe
 
 import json
 import struct
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -78,6 +79,7 @@ class Gauge:
         self._watches: set[_Watch] = set()
         self._counts: list[_Counts] = []
         self._began_s = self._began_cpu_s = 0.0
+        self._began_thread_cpu_s: dict[threading.Thread, float] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         match scope["type"], scope.get("path"):
@@ -124,6 +126,7 @@ class Gauge:
         for watch in self._watches:
             watch.direct.times, watch.reverberation.times = DurationHistogram(), DurationHistogram()
         self._began_s, self._began_cpu_s = self._time_s(), time.process_time()
+        self._began_thread_cpu_s = {thread: _thread_cpu_s(thread) for thread in threading.enumerate()}
 
     def _report(self) -> dict[str, Any]:
         """Of streams that ended meanwhile only until then."""
@@ -145,7 +148,21 @@ class Gauge:
             "pose_to_audio_ms": merged(watch.direct.times for watch in self._watches),
             "pose_to_reverberation_ms": merged(watch.reverberation.times for watch in self._watches),
             "server_load": (time.process_time() - self._began_cpu_s) / duration_s,
+            "server_load_by_thread": self._loads_by_thread(duration_s),
         }
+
+    def _loads_by_thread(self, duration_s: float) -> dict[str, float]:
+        """Of those that were there at the beginning and still are, by name."""
+        return {
+            thread.name: (_thread_cpu_s(thread) - began_s) / duration_s
+            for thread, began_s in self._began_thread_cpu_s.items()
+            if thread.is_alive()
+        }
+
+
+def _thread_cpu_s(thread: threading.Thread) -> float:
+    assert thread.ident is not None
+    return time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
 
 
 def merged(histograms: Iterable[DurationHistogram]) -> dict[str, float | None]:

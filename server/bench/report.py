@@ -71,4 +71,6 @@ def show(value: object) -> str:
     """As short as it can be told apart."""
     if value is None:
         return "–"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {show(part)}" for name, part in value.items())
     return f"{value:.4g}" if isinstance(value, float) else str(value)

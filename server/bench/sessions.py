@@ -14,7 +14,8 @@ The scene costs next to nothing (`server.bench.scene`), the rest is what `nafir 
 - `pose_to_audio_ms`: from a pose's arrival at the server to the first block that follows it, handed to the socket;
   `pose_to_reverberation_ms`: to the first block with IRs for it. `client_pose_to_audio_ms` is the former as a listener
   sees it.
-- `server_load`, `client_load`: CPU time over wall time. Clients near 1 are the bottleneck, not the server.
+- `server_load`, `client_load`: CPU time over wall time, the server's also by thread: audio, impulse responses, and the
+  event loop (`MainThread`). Clients near 1 are the bottleneck, not the server.
 """
 
 import asyncio

@@ -28,7 +28,10 @@ def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own():
     for name in ("block_ms", "lateness_ms", "pose_to_audio_ms", "pose_to_reverberation_ms", "client_pose_to_audio_ms"):
         assert 0 < case[name]["p50"] <= case[name]["p99"] <= case[name]["p99_9"], name
     assert case["pose_to_audio_ms"]["p50"] < case["client_pose_to_audio_ms"]["p50"]
-    assert case["server_load"] > 0
+    loads = case["server_load_by_thread"]
+    assert all(load > 0 for name, load in loads.items() if name.startswith("nafir-") or name == "MainThread")
+    assert any(name.startswith("nafir-audio") for name in loads)
+    assert 0 < sum(loads.values()) <= case["server_load"] * 1.05
     assert case["client_load"] > 0
     assert case["trials"] == [{name: case[name] for name in ("sessions", "late_share", "errors")}]
     assert os.sched_getaffinity(0) == usable
