@@ -15,18 +15,17 @@ Compiled where numba is installed (`server.rendering.convolver_kernel`), NumPy e
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from server.compiled import HAS_NUMBA
-from server.rendering.numpy_convolver import NumpyConvolver
 from server.rendering.partitions import Partitioning
 
 FloatArray = npt.NDArray[np.float32]
 
-if HAS_NUMBA:
+if TYPE_CHECKING:
     from server.rendering.compiled_convolver import CompiledConvolver
 
 
@@ -73,7 +72,7 @@ class Convolver:
         self.channels = channels
         self.block_size = block_size
         self.ir_samples = ir_samples
-        kind = CompiledConvolver if is_compiled else NumpyConvolver
+        kind = _compiled_convolver() if is_compiled else _numpy_convolver()
         self._engine: Any = kind(self._partitioning, sources, channels, has_shared_tail=self._has_shared_tail)
         self._layout = self._partitioning, channels, is_compiled
         self._irs: list[PartitionedIr | None] = [None] * sources
@@ -179,3 +178,16 @@ class Convolver:
         self._irs = [None] * self.sources
         self._retired.clear()
         self._tail = None
+
+
+# Either takes a third of a second to import, and is wanted without the other.
+def _compiled_convolver() -> Any:
+    from server.rendering.compiled_convolver import CompiledConvolver
+
+    return CompiledConvolver
+
+
+def _numpy_convolver() -> Any:
+    from server.rendering.numpy_convolver import NumpyConvolver
+
+    return NumpyConvolver
