@@ -180,7 +180,8 @@ class CompiledConvolver:
         self._tail_wanted[0] = filters.address
 
     def process(self, blocks: FloatArray, output: FloatArray) -> None:
-        process_block(self.address, blocks, output)
+        if not process_block(self.address, blocks, output):
+            raise ValueError(f"expected a block {self.input.shape} and room {self.output.shape} for the mix")
 
     def clear(self, source: int) -> None:
         self._wanted[source] = 0

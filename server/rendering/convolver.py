@@ -139,7 +139,8 @@ class Convolver:
         if out is None:
             out = np.empty((self.channels, self.block_size), np.float32)
         self._engine.process(blocks, out)
-        self.release()
+        if self._retired:
+            self.release()
         return out
 
     @property

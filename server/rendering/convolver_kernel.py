@@ -137,13 +137,19 @@ def process_convolver(address: int) -> None:
 
 
 @compiled
-def process_block(address: int, blocks: npt.NDArray[np.float32], output: npt.NDArray[np.float32]) -> None:
-    """`process_convolver` of one block (source, block_size), its mix left in `output` (channel, block_size)."""
+def process_block(address: int, blocks: npt.NDArray[np.float32], output: npt.NDArray[np.float32]) -> bool:
+    """`process_convolver` of one block (source, block_size), its mix left in `output` (channel, block_size). False, and
+    nothing done, for other shapes."""
     convolver = carray(pointer(address), (1,), CONVOLVER)[0]
-    samples = carray(pointer(convolver.input), blocks.shape, np.float32)
+    taken = (convolver.sources, convolver.block_size)
+    made = (convolver.channels, convolver.block_size)
+    if blocks.shape != taken or output.shape != made:
+        return False
+    samples = carray(pointer(convolver.input), taken, np.float32)
     samples[:] = blocks
     process_convolver(address)
-    output[:] = carray(pointer(convolver.output), output.shape, np.float32)
+    output[:] = carray(pointer(convolver.output), made, np.float32)
+    return True
 
 
 @compiled

@@ -59,6 +59,9 @@ class NumpyConvolver:
         self._tail_wanted[0] = filters
 
     def process(self, blocks: FloatArray, output: FloatArray) -> None:
+        shape = self.silent.size, self._partitioning.block_size
+        if blocks.shape != shape:
+            raise ValueError(f"expected a block {shape}, got {blocks.shape}")
         quiet = self._partitioning.quiet_blocks
         self.silent[:] = np.where(blocks.any(axis=1), 0, self.silent + 1)
         sounds = np.array([filters is not None for filters in self._wanted]) & (self.silent < quiet)

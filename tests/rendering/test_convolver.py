@@ -507,6 +507,25 @@ def test_blocks_handed_out_belong_to_the_caller(is_compiled):
     assert first.flags.c_contiguous
 
 
+def test_blocks_and_room_for_the_mix_may_lie_in_memory_as_they_like(is_compiled):
+    ir = decaying_ir(47, 500)
+    dry = noise(48, 2, 64)
+
+    def wet(blocks, out=None):
+        convolver = Convolver(sources=2, channels=2, block_size=64, ir_samples=500, is_compiled=is_compiled)
+        for source in range(2):
+            convolver.set_ir(source, ir)
+        return convolver.process(blocks, out)
+
+    expected = wet(dry)
+    np.testing.assert_array_equal(wet(np.asfortranarray(dry)), expected)
+    np.testing.assert_array_equal(wet(np.repeat(dry, 2, axis=1)[:, ::2]), expected)
+    np.testing.assert_array_equal(wet(dry, np.empty((64, 2), np.float32).T), expected)
+    for wrong in (dry[:1], dry[:, :32]):
+        with pytest.raises(ValueError):
+            wet(wrong)
+
+
 @pytest.mark.parametrize("shape", [(2,), (1, 100), (3, 100), (2, 0), (2, 101), (1, 2, 100)])
 def test_an_ir_of_another_shape_is_refused(is_compiled, shape):
     convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=100, is_compiled=is_compiled)
