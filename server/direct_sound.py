@@ -56,7 +56,9 @@ class DirectSound:
             filters=filters,
         )
 
-    def renderer(self, *, block_size: int, ir_samples: int, sample_rate: int, max_emitters: int) -> Renderer:
+    def renderer(
+        self, *, block_size: int, ir_samples: int, sample_rate: int, max_emitters: int, shared_tail: bool = False
+    ) -> Renderer:
         return Renderer(
             block_size=block_size,
             ir_samples=ir_samples,
@@ -65,6 +67,7 @@ class DirectSound:
             speed_of_sound=self._speed_of_sound,
             air_db_per_m=self._air_db_per_m,
             max_emitters=max_emitters,
+            shared_tail=shared_tail,
         )
 
     def aim(self, renderer: Renderer, listener: Pose, emitters: Mapping[str, Placed]) -> None:

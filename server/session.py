@@ -98,6 +98,7 @@ class Session:
         load_clip: Callable[[str], FloatArray],
         *,
         max_emitters: int = 16,
+        shared_tail: bool = False,
         window: int = 40,
     ) -> None:
         if hello.protocol != PROTOCOL:
@@ -124,6 +125,7 @@ class Session:
             ir_samples=field.ir_samples,
             sample_rate=field.sample_rate,
             max_emitters=max_emitters,
+            shared_tail=shared_tail,
         )
         self.prepare = self.renderer.prepare
         self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose

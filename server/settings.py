@@ -42,6 +42,9 @@ class Settings(BaseSettings):
     ir_workers: Annotated[int, Field(ge=1)] = max(1, _usable_cores() - 1)
     """Threads that compute impulse responses, behind all others. One core is left to the audio threads."""
     max_streams: Annotated[int, Field(ge=1)] = 64
+    shared_tail: bool = False
+    """Let all emitters of a stream share one late tail, each at the level of its own: many cost less, and only what
+    comes after 32 blocks is another's."""
     max_emitters: Annotated[int, Field(ge=1, le=64)] = 16
     """Of one stream."""
     window_blocks: Annotated[int, Field(ge=1)] = 32

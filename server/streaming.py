@@ -146,6 +146,7 @@ class Connection:
                 self._host.hrtfs.filters(hrtf, field.sample_rate),
                 lambda name: load_clip(self._host.clips[hello.scene], name),
                 max_emitters=settings.max_emitters,
+                shared_tail=settings.shared_tail,
                 window=window,
             )
         except RequestError as refusal:

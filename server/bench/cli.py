@@ -68,6 +68,7 @@ def stream(
         int | None, typer.Option(min=1, help="How many sessions. [default: finds how many there can be]")
     ] = None,
     duration_s: Annotated[float, typer.Option(min=1, help="How long the run is that counts.")] = 60.0,
+    poses_per_second: Annotated[float, typer.Option(min=0, help="Of each listener; 0 to stand still.")] = 30.0,
     as_json: AsJson = False,
 ) -> None:
     """How many sessions one core serves, with fewer than one block in a thousand late."""
@@ -75,7 +76,9 @@ def stream(
 
     counts = tuple(emitters) if emitters else Plan.emitters
     with _progress(total=None) as advance:
-        measured = measure_sessions(Plan(emitters=counts, sessions=sessions, duration_s=duration_s), advance)
+        measured = measure_sessions(
+            Plan(emitters=counts, sessions=sessions, duration_s=duration_s, poses_per_s=poses_per_second), advance
+        )
     if as_json:
         print_json(measured)
     else:

@@ -23,8 +23,6 @@ from server.blocks import AudioBlock
 from server.durations import DurationHistogram
 from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
 
-POSES_PER_S = 30.0
-
 _ACKNOWLEDGE_EVERY = 4
 _CENTRE: Vector3 = (2.0, 2.0, 1.5)
 _RADIUS_M = 1.0
@@ -79,7 +77,7 @@ class FrameReader:
 class Walker(asyncio.Protocol):
     """One listener. `sounds` is done when all its emitters do, and fails with ConnectionError when it never will."""
 
-    def __init__(self, places: Sequence[Vector3], *, phase: float) -> None:
+    def __init__(self, places: Sequence[Vector3], *, phase: float, poses_per_s: float) -> None:
         self.sounds: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.poses = Waiting()
         self.blocks = 0
@@ -87,6 +85,7 @@ class Walker(asyncio.Protocol):
         self._places = places
         self._silent = len(places)
         self._phase = phase
+        self._poses_per_s = poses_per_s
         self._reader = FrameReader()
         self._reply: bytearray | None = bytearray()
         """To the request to upgrade, as far as it has come; None after it."""
@@ -147,7 +146,8 @@ class Walker(asyncio.Protocol):
         self._send(_TEXT, Hello(protocol=PROTOCOL, scene=SCENE).serialize().encode())
         for number, place in enumerate(self._places):
             self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=place).serialize().encode())
-        self._next_pose = asyncio.get_running_loop().call_later(self._phase / POSES_PER_S, self._walk)
+        if self._poses_per_s > 0:
+            self._next_pose = asyncio.get_running_loop().call_later(self._phase / self._poses_per_s, self._walk)
 
     def _read(self, payload: bytes) -> None:
         message = json.loads(payload)
@@ -172,8 +172,8 @@ class Walker(asyncio.Protocol):
         pose_id = next(self._pose_ids)
         # From the first pose's time on, so that no delay adds up.
         assert self._next_pose is not None
-        self._next_pose = loop.call_at(self._next_pose.when() + 1 / POSES_PER_S, self._walk)
-        angle = 2 * math.pi * ((pose_id + self._phase) / POSES_PER_S / _TURN_S + self._phase)
+        self._next_pose = loop.call_at(self._next_pose.when() + 1 / self._poses_per_s, self._walk)
+        angle = 2 * math.pi * ((pose_id + self._phase) / self._poses_per_s / _TURN_S + self._phase)
         x, y, z = _CENTRE
         position = x + _RADIUS_M * math.cos(angle), y + _RADIUS_M * math.sin(angle), z
         pose = ListenerPose(pose_id=pose_id, position=position, yaw=math.remainder(angle, 2 * math.pi))
@@ -194,11 +194,13 @@ class Walker(asyncio.Protocol):
 
 
 class Crowd:
-    """So many walkers of the server at `port`, each with `emitters` that sound in places of its own."""
+    """So many walkers of the server at `port`, each with `emitters` that sound in places of its own. Without poses they
+    stand still."""
 
-    def __init__(self, port: int, *, emitters: int) -> None:
+    def __init__(self, port: int, *, emitters: int, poses_per_s: float) -> None:
         self._port = port
         self._emitters = emitters
+        self._poses_per_s = poses_per_s
         self._rng = np.random.default_rng(0)
         self.walkers: list[Walker] = []
 
@@ -213,7 +215,8 @@ class Crowd:
         for number in range(len(self.walkers), count):
             places = [tuple(place) for place in self._rng.uniform(*_PLACES, (self._emitters, 3)).tolist()]
             phase = number * _GOLDEN % 1
-            _, walker = await loop.create_connection(partial(Walker, places, phase=phase), "127.0.0.1", self._port)
+            make = partial(Walker, places, phase=phase, poses_per_s=self._poses_per_s)
+            _, walker = await loop.create_connection(make, "127.0.0.1", self._port)
             self.walkers.append(walker)
             await asyncio.wait_for(walker.sounds, _PATIENCE_S)
 

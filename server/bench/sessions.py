@@ -3,7 +3,7 @@ others, over the loopback interface.
 
 The scene costs next to nothing (`server.bench.scene`), the rest is what `nafir serve` does: blocks of 256 samples at
 48 kHz, impulse responses (IRs) of a second for each of the emitters, which play noise without end. Every listener sends
-30 poses a second; direct paths follow each, and all IRs follow as fast as the core has time for them.
+30 poses a second unless told otherwise; direct paths follow each, and all IRs as fast as the core has time for them.
 
 - A block is late where it reaches the socket later than a player needs it that keeps the usual 8 blocks in hand, or
   where it is never made. `late_share` is theirs of all blocks that were due.
@@ -31,7 +31,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import IO, Any
 
-from server.bench.crowd import POSES_PER_S, Crowd
+from server.bench.crowd import Crowd
 from server.bench.gauge import merged
 from server.bench.report import Goal, Judgement
 from server.bench.scene import IR_S, SAMPLE_RATE
@@ -59,6 +59,8 @@ class Plan:
     sessions: int | None = None
     duration_s: float = 60.0
     step_s: float = 8.0
+    poses_per_s: float = 30.0
+    """Of each listener; none at 0, who stand still."""
 
 
 def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
@@ -78,7 +80,7 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
         "block_size": 256,
         "sample_rate": SAMPLE_RATE,
         "ir_s": IR_S,
-        "poses_per_s": POSES_PER_S,
+        "poses_per_s": plan.poses_per_s,
         "duration_s": plan.duration_s,
         "clients_have_other_cores": len(usable) > 1,
         "cases": cases,
@@ -112,7 +114,7 @@ async def find_most(passes: Callable[[int], Awaitable[bool]], *, most: int) -> i
 async def _measure(plan: Plan, port: int, advance: Advance) -> list[dict[str, Any]]:
     cases = []
     for emitters in plan.emitters:
-        trial = _Trial(port, emitters, advance)
+        trial = _Trial(port, emitters, plan.poses_per_s, advance)
         try:
             cases.append({"emitters": emitters, **await _measure_case(plan, trial)})
         finally:
@@ -143,8 +145,8 @@ def _is_good(measured: dict[str, Any]) -> bool:
 class _Trial:
     """Trials with one number of emitters; the listeners of one go on in the next."""
 
-    def __init__(self, port: int, emitters: int, advance: Advance) -> None:
-        self.crowd = Crowd(port, emitters=emitters)
+    def __init__(self, port: int, emitters: int, poses_per_s: float, advance: Advance) -> None:
+        self.crowd = Crowd(port, emitters=emitters, poses_per_s=poses_per_s)
         self.history: list[dict[str, Any]] = []
         self._url = f"http://127.0.0.1:{port}/bench"
         self._emitters = emitters
