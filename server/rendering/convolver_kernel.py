@@ -298,10 +298,12 @@ def _product_ns(stage, source, is_fading) -> int:
 
 @compiled
 def _work(convolver, stage, until) -> None:
-    """Do jobs in order until the cost of those done reaches `until`."""
+    """Do jobs in order until the cost of those done reaches `until`, or all are: a source cleared meanwhile costs less
+    than was counted on."""
+    jobs_and_inverses = stage.jobs + convolver.channels
     tiles = stage.size // 8
     job_source, job_old = _ints(stage.job_source, stage.sources), _ints(stage.job_old, stage.sources)
-    while stage.cost_done < until:
+    while stage.cost_done < until and stage.cursor < jobs_and_inverses:
         if stage.cursor < stage.jobs:
             job = stage.cursor
             if stage.step == 0:

@@ -412,6 +412,28 @@ def test_sources_join_and_leave_without_touching_the_others(is_compiled, seed):
     assert error_db(np.concatenate(wet, axis=1), expected) < -120
 
 
+@pytest.mark.parametrize("cleared_at", range(32, 48))
+def test_a_source_cleared_while_it_fades_touches_no_other(is_compiled, cleared_at):
+    """At every block of a window of the last stage in which its IR is being exchanged, and with it what that costs."""
+    size, samples = 64, 12_000
+    dry = noise(70, 2, 320 * size)
+    irs = [decaying_ir(seed, samples) for seed in (71, 72, 73)]
+    convolver = Convolver(sources=2, channels=2, block_size=size, ir_samples=samples, is_compiled=is_compiled)
+    convolver.set_ir(0, irs[0])
+    convolver.set_ir(1, irs[1])
+    wet = []
+    for block in range(320):
+        if block == 20:
+            convolver.set_ir(0, irs[2])
+            convolver.set_ir(1, irs[2])
+        if block == cleared_at:
+            convolver.clear(1)
+        wet.append(convolver.process(dry[:, block * size : (block + 1) * size]))
+    gone = (cleared_at + 48) * size  # what the source had in work by then has come out
+    expected = convolve(dry[0], irs[2])
+    assert error_db(np.concatenate(wet, axis=1)[:, gone:], expected[:, gone:]) < -115
+
+
 def test_reset_is_as_good_as_new(is_compiled):
     dry = noise(29, 2, 70 * 64)
     ir = decaying_ir(30, 2_900)
