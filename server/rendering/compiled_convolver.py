@@ -7,7 +7,8 @@ import numpy.typing as npt
 
 from server.compiled import compiled
 from server.rendering import right_angle
-from server.rendering.convolver_kernel import CONVOLVER, PROGRESS, STAGE, process_block
+from server.rendering.convolver_kernel import process_block
+from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
 from server.rendering.partitions import Partitioning, Stage
 from server.rendering.simd import LANES, load, store
