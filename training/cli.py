@@ -40,12 +40,10 @@ def simulate(
 ) -> None:
     """Simulate all pairs of probes of a scene. Run again after an interruption to go on."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from training import simulate as simulation
+    from training.simulation.run import simulate as simulate_scene
 
     with _progress() as progress:
-        dataset = simulation.simulate(
-            scene, output, seed=seed, workers=workers or os.cpu_count() or 1, progress=progress
-        )
+        dataset = simulate_scene(scene, output, seed=seed, workers=workers or os.cpu_count() or 1, progress=progress)
     trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
     typer.echo(f"{output}: {trained} pairs to train on and {held_out} held out, {len(dataset.yaws)} orientations each")
 
@@ -100,8 +98,8 @@ def evaluate(
 
     from server.scene.bundle import Bundle
     from training.dataset import Dataset
-    from training.evaluate import report
-    from training.held_out import evaluate_bundle, record_accuracy
+    from training.evaluation.evaluate import report
+    from training.evaluation.held_out import evaluate_bundle, record_accuracy
 
     console = Console(stderr=True)
     loaded = Bundle.load(bundle)

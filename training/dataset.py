@@ -1,5 +1,6 @@
 """The dataset folder: `scene.toml`, and in `pairs.h5` the reflected sound of all pairs of probes, which is what follows
-the direct sound. That one is not stored: `training.references` computes it from the scene whenever it is needed.
+the direct sound. That one is not stored: `training.simulation.references` computes it from the scene whenever it is
+needed.
 
 Axes: emitter, listener, yaw, ear, sample. The pair of a probe with itself is absent (zeros). Samples are float16:
 eleven bits beneath the level of each sample, 66 dB under the signal at every point of its decay down to 6e-5. Smaller

@@ -15,11 +15,11 @@ from server.field.field import INPUTS, OUTPUTS
 from server.field.runtime import open_session
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel
-from training.cells import Cells
 from training.dataset import SPEED_OF_SOUND, Dataset
-from training.frozen_noise import even_noise
-from training.model import ExportedField
-from training.targets import LEAD_SAMPLES
+from training.models.cells import Cells
+from training.models.factorised import ExportedField
+from training.models.frozen_noise import even_noise
+from training.models.targets import LEAD_SAMPLES
 from training.train import load_field
 
 MODEL_FILE = "factorised.onnx"

@@ -19,10 +19,10 @@ from rich.progress import Progress
 from torch import Tensor
 
 from server.errors import NafirError
-from training.cells import Cells
 from training.dataset import Dataset
-from training.model import FactorisedField, FieldShape
-from training.targets import Targets, codec_of, load_targets
+from training.models.cells import Cells
+from training.models.factorised import FactorisedField, FieldShape
+from training.models.targets import Targets, codec_of, load_targets
 
 # What a target differs by from the best possible prediction (ln magnitude of one noisy bin, of a pooled cell; unit
 # phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its

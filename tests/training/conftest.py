@@ -13,9 +13,9 @@ from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from training.dataset import Dataset
 from training.export import export
-from training.model import FieldShape
+from training.models.factorised import FieldShape
 from training.scene_file import SceneFile
-from training.simulate import simulate
+from training.simulation.run import simulate
 from training.train import Configuration, train
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation

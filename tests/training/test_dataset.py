@@ -7,7 +7,7 @@ import pytest
 from rich.progress import Progress
 
 from training.dataset import Dataset, DatasetError
-from training.simulate import simulate
+from training.simulation.run import simulate
 
 
 class Impatient(Progress):

@@ -9,7 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 from server.field.runtime import open_session
 from training import export as export_module
 from training.export import INPUTS, MODEL_FILE, OUTPUTS, ExportError, export, halve_weights
-from training.model import ExportedField
+from training.models.factorised import ExportedField
 from training.train import load_field
 
 

@@ -17,8 +17,8 @@ from server.rendering.direct_path import DirectPath, PathTarget
 from server.scene.bundle import BUNDLED, Bundle
 from server.whole_field import WholeField, kemar
 from training.dataset import SPEED_OF_SOUND
-from training.synthesis import BinauralSynthesis
-from training.tracing import RoomTracer, sphere_directions
+from training.simulation.synthesis import BinauralSynthesis
+from training.simulation.tracing import RoomTracer, sphere_directions
 
 YAWS = 2 * np.pi * np.arange(3) / 3 + 0.2
 RATE = 24_000

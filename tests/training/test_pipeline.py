@@ -16,9 +16,9 @@ from server.app import create_app
 from server.field.field import AcousticField
 from server.settings import Settings
 from server.whole_field import WholeField
+from training.evaluation.held_out import evaluate_bundle
 from training.export import export
-from training.held_out import evaluate_bundle
-from training.simulate import simulate
+from training.simulation.run import simulate
 from training.train import train
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from rich.progress import Progress
 
-from training.cells import Cells
-from training.targets import codec_of, load_targets
+from training.models.cells import Cells
+from training.models.targets import codec_of, load_targets
 from training.train import Configuration, RunError, dataset_folder, load_field, train
 
 

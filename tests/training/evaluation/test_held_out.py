@@ -11,8 +11,8 @@ from server.field.field import AcousticField
 from server.scene.bundle import Bundle
 from server.whole_field import WholeField
 from training.dataset import DatasetError
-from training.held_out import HeldOut, evaluate_bundle, record_accuracy
-from training.references import References
+from training.evaluation.held_out import HeldOut, evaluate_bundle, record_accuracy
+from training.simulation.references import References
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ frequency, frame), `instantaneous_frequency` and `phase_certainty` (B, 2, freque
 normalisation) lives in the graph.
 
 Inside, four heads share the coefficients: log-magnitude of the fine frames and of the late cells, mean phasors of the
-known frames, and mean interaural phasors of all cells (see `training.cells`).
+known frames, and mean interaural phasors of all cells (see `training.models.cells`).
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from server.acoustics.geometry import FloorPlan
-from training.cells import Cells
-from training.propagation import Propagation
+from training.models.cells import Cells
+from training.models.propagation import Propagation
 
 _NEAREST_M = 0.25
 _AZIMUTH_HARMONICS = 5

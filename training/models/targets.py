@@ -15,8 +15,8 @@ from rich.progress import Progress
 from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.codec import Codec
-from training.cells import Cells
 from training.dataset import Dataset
+from training.models.cells import Cells
 
 LEAD_SAMPLES = 64
 N_FFT = 256

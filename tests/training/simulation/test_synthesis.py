@@ -5,8 +5,8 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.whole_field import kemar as kemar_at
-from training.synthesis import BinauralSynthesis, rotate_into_head
-from training.tracing import HISTOGRAM_BIN_S, Arrivals, sphere_directions
+from training.simulation.synthesis import BinauralSynthesis, rotate_into_head
+from training.simulation.tracing import HISTOGRAM_BIN_S, Arrivals, sphere_directions
 
 RATE = 24_000
 SAMPLES = 6000

@@ -4,7 +4,7 @@ from scipy.signal import stft
 from scipy.stats import kurtosis
 
 from server.acoustics.codec import Codec
-from training.frozen_noise import even_noise
+from training.models.frozen_noise import even_noise
 
 CODEC = Codec(24_000, 256, 64, 14_400, 1e-5)
 # Of the log magnitude of Gaussian noise: pi / sqrt(24).

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from server.acoustics.geometry import FloorPlan
-from training.propagation import Propagation
+from training.models.propagation import Propagation
 
 PLANS = {
     "apartment": FloorPlan(

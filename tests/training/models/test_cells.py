@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.codec import Codec
-from training.cells import Cells
+from training.models.cells import Cells
 
 CELLS = Cells(Codec(24_000, 256, 64, 16_800, 1e-5))
 AXES = [CELLS.bands, CELLS.late_frames, CELLS.all_frames]

@@ -7,7 +7,13 @@ from server.acoustics.decibels import power_to_db
 from server.scene.geometry import Geometry, Material, Materials
 from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
-from training.tracing import HISTOGRAM_BIN_S, RoomTracer, counted_twice, free_field_amplitude, sphere_directions
+from training.simulation.tracing import (
+    HISTOGRAM_BIN_S,
+    RoomTracer,
+    counted_twice,
+    free_field_amplitude,
+    sphere_directions,
+)
 
 SIZE_M = np.array([4.0, 3.0, 2.5])
 CORNERS = ((0, 0), (4, 0), (4, 3), (0, 3))

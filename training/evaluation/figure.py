@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from server.acoustics.room_parameters import energy_decay_db
-from training.evaluate import FLOOR, METRICS, Evaluation, PairSource
+from training.evaluation.evaluate import FLOOR, METRICS, Evaluation, PairSource
 
 _COLOURS = ("#0b6e99", "#d1495b", "#edae49", "#8d6a9f", "#66a182")
 _REFERENCE_COLOUR = "#222222"

@@ -8,7 +8,7 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.rendering.hrtf import KEMAR, Hrtf
-from training.references import DirectSound, References
+from training.simulation.references import DirectSound, References
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The held-out pairs of a dataset, answered by a bundle's field and by the baselines, for `training.evaluate`."""
+"""The held-out pairs of a dataset, answered by a bundle's field and by the baselines."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -11,11 +11,11 @@ from server.field.field import AcousticField
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy
 from server.whole_field import WholeField
-from training.baselines import TrainingPairs, linear, linear_aligned, nearest
 from training.dataset import Dataset, DatasetError
-from training.evaluate import FIELD, FLOOR, Evaluation, Responses, evaluate
-from training.evaluation_figure import draw_figure
-from training.references import References
+from training.evaluation.baselines import TrainingPairs, linear, linear_aligned, nearest
+from training.evaluation.evaluate import FIELD, FLOOR, Evaluation, Responses, evaluate
+from training.evaluation.figure import draw_figure
+from training.simulation.references import References
 
 
 class HeldOut:

@@ -16,8 +16,8 @@ from rich.progress import Progress
 
 from server.whole_field import kemar
 from training.dataset import Dataset, DatasetError
-from training.synthesis import BinauralSynthesis
-from training.tracing import RoomTracer, sphere_directions
+from training.simulation.synthesis import BinauralSynthesis
+from training.simulation.tracing import RoomTracer, sphere_directions
 
 
 def simulate(scene_path: Path, folder: Path, *, seed: int, workers: int, progress: Progress) -> Dataset:

@@ -3,7 +3,7 @@ import numpy.typing as npt
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from training.baselines import TrainingPairs, linear, linear_aligned, linear_weights, nearest, nearest_pair
+from training.evaluation.baselines import TrainingPairs, linear, linear_aligned, linear_weights, nearest, nearest_pair
 
 RATE = 24_000
 SPEED_OF_SOUND = 343.0

@@ -4,9 +4,9 @@ from rich.progress import Progress
 from scipy.signal.windows import hann
 
 from server.acoustics.codec import Codec
-from training.cells import Cells
-from training.model import Heads
-from training.targets import LEAD_SAMPLES, align, codec_of, flat_targets, load_targets
+from training.models.cells import Cells
+from training.models.factorised import Heads
+from training.models.targets import LEAD_SAMPLES, align, codec_of, flat_targets, load_targets
 
 CODEC = Codec(16_000, 256, 64, 4_000, 1e-5)
 CELLS = Cells(CODEC, known_frames=12)

@@ -4,8 +4,8 @@ import torch
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
-from training.cells import Cells
-from training.model import ExportedField, FactorisedField, FeatureGrid, FieldShape, Heads, PoseEncoder
+from training.models.cells import Cells
+from training.models.factorised import ExportedField, FactorisedField, FeatureGrid, FieldShape, Heads, PoseEncoder
 
 PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
 CELLS = Cells(Codec(16_000, 256, 64, 4_000, 1e-5), known_frames=12)

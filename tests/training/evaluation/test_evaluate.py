@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from training.evaluate import METRICS, Evaluation, MetricRow, evaluate, report
-from training.evaluation_figure import draw_figure
+from training.evaluation.evaluate import METRICS, Evaluation, MetricRow, evaluate, report
+from training.evaluation.figure import draw_figure
 
 RATE = 8_000
 SAMPLES = 4_000
