@@ -93,11 +93,34 @@ class CodecParameters(Strict):
 
 
 class FieldFile(Strict):
-    """One trained network: an ONNX file, and the rank of its output basis."""
+    """One trained network: an ONNX file, the rank of its output basis where it has one, and its own `codec` where that
+    differs from the bundle's."""
 
     file: FileName
     architecture: str
-    rank: Annotated[int, Field(ge=1)]
+    rank: Annotated[int, Field(ge=1)] | None = None
+    codec: CodecParameters | None = None
+
+
+class Phase(Strict):
+    """Where the phase comes from that a field does not know.
+
+    frozen: noise that stands still, one per scene, mixed to the predicted interaural coherence. integrated: the
+    predicted instantaneous frequency, summed up over all frames it was predicted for. griffin_lim: `iterations` of
+    Griffin and Lim's, from zero phase or, `warm`, from the phase last found near the pose.
+    """
+
+    kind: Literal["frozen", "integrated", "griffin_lim"] = "frozen"
+    iterations: Annotated[int, Field(ge=0, le=256)] = 0
+    warm: bool = False
+
+    @model_validator(mode="after")
+    def _iterates_where_that_means_something(self) -> "Phase":
+        if (self.kind == "griffin_lim") != (self.iterations > 0):
+            raise ValueError("iterations: griffin_lim has one at least, any other kind none")
+        if self.warm and self.kind != "griffin_lim":
+            raise ValueError("warm: only griffin_lim starts from somewhere")
+        return self
 
 
 class Accuracy(Strict):
@@ -110,12 +133,35 @@ class Accuracy(Strict):
     floor: dict[str, Finite]
 
 
-class QualityLevel(Strict):
-    """A point on the accuracy-cost frontier; `accuracy` is absent until it was measured."""
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
-    name: str
+
+class Cost(Strict):
+    """What one binaural impulse response takes on one core of `host`, phase included; `storage_mb` is that of the
+    field's file, `memory_mb` what serving it adds to a process."""
+
+    ms_p50: Positive
+    ms_p99: Positive
+    storage_mb: Positive
+    memory_mb: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    host: str
+
+
+class QualityLevel(Strict):
+    """A point on the accuracy-cost frontier; `accuracy` and `cost` are absent until they were measured.
+
+    Of the response only the first `frames` are computed, or all; an emitter gets `ir_rate_hz` responses per second at
+    most, or one with every pose; with `shared_tail` all emitters of a listener share one late tail.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
     field: str
+    phase: Phase = Phase()
+    frames: Annotated[int, Field(ge=1)] | None = None
+    ir_rate_hz: Positive | None = None
+    shared_tail: bool = False
     accuracy: Accuracy | None = None
+    cost: Cost | None = None
 
 
 class Manifest(Strict):
