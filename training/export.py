@@ -11,7 +11,7 @@ import torch
 from onnx import numpy_helper
 
 from server.errors import NafirError
-from server.field.field import INPUTS, OUTPUTS
+from server.field.graph import INPUTS, OUTPUTS
 from server.field.runtime import open_session
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel

@@ -6,36 +6,19 @@ Reflected sound is all that follows the direct sound, which is not in here: it i
 Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians, seconds.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.phase import FrozenNoise, correlated_noise, delayed, separate
 from server.errors import BundleError
-from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
+from server.field.graph import FieldGraph, Spectrograms, open_graph
 from server.scene.bundle import Bundle
 from server.scene.manifest import QualityLevel
 
 Float32 = npt.NDArray[np.float32]
 
-INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
-"""Inputs of a graph, and their shapes after the batch axis."""
-OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
 _RISE_S = 0.0003
 _CHUNK = 32
-_TENSOR = "tensor(float)"
-
-
-@dataclass(frozen=True)
-class Spectrograms:
-    """What the network says: `log_magnitude` (B, 2, frequency, frame); `instantaneous_frequency` and `certainty` of
-    the first frames (B, 2, frequency, known frame); `coherence` (B, frequency, frame), complex, between the ears."""
-
-    log_magnitude: Float32
-    instantaneous_frequency: Float32
-    certainty: Float32
-    coherence: npt.NDArray[np.complex64]
 
 
 class AcousticField:
@@ -43,11 +26,11 @@ class AcousticField:
 
     channels = 2
 
-    def __init__(self, bundle: Bundle, level: QualityLevel, session: InferenceSession) -> None:
+    def __init__(self, bundle: Bundle, level: QualityLevel, graph: FieldGraph) -> None:
         self.bundle = bundle
         self.level = level
-        self._session = session
-        parameters = bundle.manifest.codec
+        self._graph = graph
+        parameters = graph.parameters
         self._codec = parameters.codec
         self._lead = parameters.lead_samples
         self._noise = FrozenNoise.from_signal(self._codec, bundle.frozen_noise)
@@ -61,20 +44,8 @@ class AcousticField:
         chosen = next((entry for entry in manifest.levels if level in (None, entry.name)), None)
         if chosen is None:
             raise BundleError(bundle.folder, "levels", f"there is no quality level {level!r}")
-        name = manifest.fields[chosen.field].file
-        try:
-            session = open_session(bundle.models[name], threads=threads)
-        except ValueError as exc:
-            raise BundleError(bundle.folder / name, "graph", f"cannot be loaded: {exc}") from exc
-        inputs = {entry.name: entry.shape[1:] for entry in session.get_inputs()}
-        if inputs != INPUTS:
-            raise BundleError(bundle.folder / name, "inputs", f"are {inputs}, expected {INPUTS} after the batch axis")
-        outputs = {entry.name: entry.type for entry in session.get_outputs()}
-        if any(outputs.get(output) != _TENSOR for output in OUTPUTS):
-            raise BundleError(bundle.folder / name, "outputs", f"are {outputs}, expected {_TENSOR} {OUTPUTS}")
-        field = cls(bundle, chosen, session)
-        field._check_outputs(name)
-        return field
+        session = open_graph(bundle, manifest.fields[chosen.field].file, threads=threads)
+        return cls(bundle, chosen, FieldGraph(bundle, chosen.field, session))
 
     @property
     def sample_rate(self) -> int:
@@ -86,17 +57,7 @@ class AcousticField:
 
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
         """Network outputs for B poses; positions (B, 3), yaws (B,)."""
-        log_magnitude, frequency, certainty, coherence = self._session.run(
-            OUTPUTS,
-            {
-                "listener": np.asarray(listeners, dtype=np.float32),
-                "emitter": np.asarray(emitters, dtype=np.float32),
-                # Whole turns come off in double precision: in single, large angles lose their heading, or overflow.
-                "yaw": np.remainder(np.asarray(yaws, dtype=np.float64) + np.pi, 2 * np.pi).astype(np.float32)
-                - np.float32(np.pi),
-            },
-        )
-        return Spectrograms(log_magnitude, frequency, certainty, coherence[:, 0] + 1j * coherence[:, 1])
+        return self._graph.spectrograms(listeners, emitters, yaws)
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
         """(B, 2, ir_samples) without the direct sound; sample 0 is the moment of emission, unit pressure at one
@@ -143,29 +104,6 @@ class AcousticField:
         rise = round(_RISE_S * self.sample_rate)
         opens = np.sin(np.pi / 2 * (np.arange(rise) + 0.5) / rise)
         return np.concatenate([np.zeros(self._lead), opens]).astype(np.float32)
-
-    def _check_outputs(self, name: str) -> None:
-        """Runs the graph once, in the middle of the bounds."""
-        bounds = self.bundle.manifest.bounds
-        middle = ((np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2).astype(np.float32)
-        poses = {"listener": middle, "emitter": middle, "yaw": np.zeros(1, np.float32)}
-        try:
-            outputs = dict(zip(OUTPUTS, self._session.run(OUTPUTS, poses), strict=True))
-        except SESSION_ERRORS as exc:
-            raise BundleError(self.bundle.folder / name, "outputs", f"cannot be computed: {exc}") from exc
-        bins, frames, known = self._codec.bins, self._codec.frames, self.bundle.manifest.codec.known_frames
-        expected = {
-            "log_magnitude": (1, 2, bins, frames),
-            "instantaneous_frequency": (1, 2, bins, known),
-            "phase_certainty": (1, 2, bins, known),
-            "interaural_coherence": (1, 2, bins, frames),
-        }
-        for output, shape in expected.items():
-            found = outputs[output]
-            if found.shape != shape or not np.isfinite(found).all():
-                raise BundleError(
-                    self.bundle.folder / name, output, f"has shape {found.shape}, expected {shape} and finite"
-                )
 
 
 def _add(part: Float32, response: Float32, at: int) -> None:

@@ -1,0 +1,131 @@
+"""The network of a field: one ONNX graph, opened and checked against the manifest.
+
+A graph answers in one of two ways. Most give spectrograms, to be decoded; some give impulse responses outright. Either
+is aligned: sample `lead_samples` of the coded response is the earliest arrival.
+
+Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from server.errors import BundleError
+from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
+from server.scene.bundle import Bundle
+from server.scene.manifest import CodecParameters
+
+Float32 = npt.NDArray[np.float32]
+
+INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
+"""Inputs of a graph, and their shapes after the batch axis."""
+OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
+"""Outputs of a graph that gives spectrograms."""
+RESPONSE = "impulse_response"
+"""The output of one that gives responses."""
+_TENSOR = "tensor(float)"
+
+
+@dataclass(frozen=True)
+class Spectrograms:
+    """What the network says: `log_magnitude` (B, 2, frequency, frame); `instantaneous_frequency` and `certainty` of
+    the first frames (B, 2, frequency, known frame); `interaural` (B, 2, frequency, frame) the coherence between the
+    ears, real part and imaginary."""
+
+    log_magnitude: Float32
+    instantaneous_frequency: Float32
+    certainty: Float32
+    interaural: Float32
+
+    @property
+    def coherence(self) -> npt.NDArray[np.complex64]:
+        """(B, frequency, frame)"""
+        return np.asarray(self.interaural[:, 0] + 1j * self.interaural[:, 1], dtype=np.complex64)
+
+
+def open_graph(bundle: Bundle, file: str, *, threads: int = 1) -> InferenceSession:
+    """A session for one of the bundle's files. Raises BundleError for one that is no graph."""
+    try:
+        return open_session(bundle.models[file], threads=threads)
+    except KeyError as exc:
+        raise BundleError(bundle.folder / file, "file", "is not a graph: its name does not end in .onnx") from exc
+    except ValueError as exc:
+        raise BundleError(bundle.folder / file, "graph", f"cannot be loaded: {exc}") from exc
+
+
+class FieldGraph:
+    """The graph of field `name` of a bundle, in a session that others may share. Thread-safe.
+
+    Raises BundleError for a graph that does not fit the manifest.
+    """
+
+    def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
+        entry = bundle.manifest.fields[name]
+        self.name = name
+        self.parameters: CodecParameters = entry.codec or bundle.manifest.codec
+        self._session = session
+        self._path = bundle.folder / entry.file
+        inputs = {given.name: given.shape[1:] for given in session.get_inputs()}
+        if inputs != INPUTS:
+            raise BundleError(self._path, "inputs", f"are {inputs}, expected {INPUTS} after the batch axis")
+        outputs = {output.name: output.type for output in session.get_outputs()}
+        expected = (RESPONSE,) if self.gives_responses else OUTPUTS
+        if any(outputs.get(output) != _TENSOR for output in expected):
+            raise BundleError(
+                self._path, "outputs", f"are {outputs}, expected {_TENSOR} {OUTPUTS}, or {RESPONSE} alone"
+            )
+        self._check_outputs(bundle)
+
+    @cached_property
+    def gives_responses(self) -> bool:
+        """Impulse responses and not spectrograms."""
+        return RESPONSE in {output.name for output in self._session.get_outputs()}
+
+    @property
+    def path(self) -> Path:
+        return self._path
+
+    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+        """Of B poses; positions (B, 3), yaws (B,). Not of a graph that gives responses."""
+        return Spectrograms(*self._session.run(OUTPUTS, _feed(listeners, emitters, yaws)))
+
+    def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
+        """(B, 2, samples), aligned. Only of a graph that gives responses."""
+        (responses,) = self._session.run((RESPONSE,), _feed(listeners, emitters, yaws))
+        return np.asarray(responses)
+
+    def _check_outputs(self, bundle: Bundle) -> None:
+        """Runs the graph once, in the middle of the bounds."""
+        bounds = bundle.manifest.bounds
+        middle = (np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2
+        expected = self._shapes
+        try:
+            found = self._session.run(tuple(expected), _feed(middle, middle, np.zeros(1)))
+        except SESSION_ERRORS as exc:
+            raise BundleError(self._path, "outputs", f"cannot be computed: {exc}") from exc
+        for (output, shape), values in zip(expected.items(), found, strict=True):
+            if values.shape != shape or not np.isfinite(values).all():
+                raise BundleError(self._path, output, f"has shape {values.shape}, expected {shape} and finite")
+
+    @property
+    def _shapes(self) -> Mapping[str, tuple[int, ...]]:
+        """Of the outputs for one pose."""
+        if self.gives_responses:
+            return {RESPONSE: (1, 2, self.parameters.samples)}
+        codec, known = self.parameters.codec, self.parameters.known_frames
+        every, first = (1, 2, codec.bins, codec.frames), (1, 2, codec.bins, known)
+        return dict(zip(OUTPUTS, (every, first, first, every), strict=True))
+
+
+def _feed(listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> dict[str, Float32]:
+    return {
+        "listener": np.asarray(listeners, dtype=np.float32),
+        "emitter": np.asarray(emitters, dtype=np.float32),
+        # Whole turns come off in double precision: in single, large angles lose their heading, or overflow.
+        "yaw": np.remainder(np.asarray(yaws, dtype=np.float64) + np.pi, 2 * np.pi).astype(np.float32)
+        - np.float32(np.pi),
+    }

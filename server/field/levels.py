@@ -1,0 +1,92 @@
+"""All quality levels of a scene: one field each, and one session per graph between them."""
+
+import statistics
+import time
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from server.errors import RequestError
+from server.field.field import AcousticField
+from server.field.graph import FieldGraph, open_graph
+from server.field.runtime import InferenceSession
+from server.scene.bundle import Bundle
+
+_CALIBRATION_POSES = 5
+
+
+class Levels(Mapping[str, AcousticField]):
+    """Quality levels by name, in the manifest's order; the first is the default."""
+
+    def __init__(self, fields: Sequence[AcousticField]) -> None:
+        """`fields` of one bundle, one at least."""
+        self._fields = {field.level.name: field for field in fields}
+
+    @classmethod
+    def load(cls, bundle: Bundle, threads: int = 1) -> "Levels":
+        """Raises BundleError for a graph that does not fit the manifest."""
+        sessions: dict[str, InferenceSession] = {}
+        graphs: dict[str, FieldGraph] = {}
+        for name in dict.fromkeys(level.field for level in bundle.manifest.levels):
+            file = bundle.manifest.fields[name].file
+            if file not in sessions:
+                sessions[file] = open_graph(bundle, file, threads=threads)
+            graphs[name] = FieldGraph(bundle, name, sessions[file])
+        return cls([AcousticField(bundle, level, graphs[level.field]) for level in bundle.manifest.levels])
+
+    def __getitem__(self, name: str) -> AcousticField:
+        return self._fields[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+    @property
+    def default(self) -> AcousticField:
+        return next(iter(self._fields.values()))
+
+    @property
+    def bundle(self) -> Bundle:
+        return self.default.bundle
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Cheapest first, by the cost that was measured for each; where one was not, the manifest's order reversed."""
+        costs = {name: field.level.cost for name, field in self._fields.items()}
+        measured = {name: cost.ms_p50 for name, cost in costs.items() if cost is not None}
+        if len(measured) < len(costs):
+            return tuple(reversed(costs))
+        return tuple(sorted(measured, key=measured.__getitem__))
+
+    def choose(self, name: str | None) -> AcousticField:
+        """The level a client named, or the default. Raises RequestError `unknown_level` with the names there are."""
+        if name is None:
+            return self.default
+        try:
+            return self[name]
+        except KeyError:
+            known = ", ".join(self)
+            problem = f"scene {self.bundle.id} has no quality level {name!r}, but {known}"
+            raise RequestError("unknown_level", problem, field="level") from None
+
+    def calibrate(self, poses: int = _CALIBRATION_POSES) -> dict[str, float]:
+        """What an impulse response takes here and now, by level: the median of `poses`, milliseconds.
+
+        Levels take turns, so that what else runs meanwhile slows all of them.
+        """
+        places = self._places(poses)
+        times_ms: dict[str, list[float]] = {name: [] for name in self}
+        for number in range(-1, poses):  # the first round warms up
+            listener, emitter = places[number], places[number - 1]
+            for name, field in self.items():
+                started_s = time.perf_counter()
+                field.impulse_responses([listener], [emitter], [float(number)])
+                times_ms[name].append((time.perf_counter() - started_s) * 1000)
+        return {name: statistics.median(times[1:]) for name, times in times_ms.items()}
+
+    def _places(self, count: int) -> list[tuple[float, ...]]:
+        """Between the two places a visitor starts from, along a line."""
+        start = self.bundle.manifest.start
+        return [tuple(place) for place in np.linspace(start.listener, start.emitter, count)]
