@@ -73,6 +73,14 @@ class HeldOut:
         return linear_aligned(self._training, int(self.flat[index]), delays, self.dataset.sample_rate)
 
 
+def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
+    """Raises DatasetError if the dataset is of another scene than the bundle."""
+    codec = bundle.manifest.codec.codec
+    of_bundle = bundle.manifest.geometry, codec.sample_rate, codec.samples
+    if of_bundle != (dataset.scene.geometry, dataset.sample_rate, dataset.samples):
+        raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
+
+
 def evaluate_bundle(
     bundle: Bundle,
     dataset: Dataset,
@@ -85,10 +93,8 @@ def evaluate_bundle(
 
     Raises DatasetError if the dataset is of another scene than the bundle.
     """
+    require_same_scene(bundle, dataset)
     codec = bundle.manifest.codec.codec
-    of_bundle = bundle.manifest.geometry, codec.sample_rate, codec.samples
-    if of_bundle != (dataset.scene.geometry, dataset.sample_rate, dataset.samples):
-        raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
     field = WholeField.through_kemar(AcousticField.load(bundle))
     with h5py.File(dataset.folder / "pairs.h5", "r") as file:
         held_out = HeldOut(dataset, field, file)
