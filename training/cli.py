@@ -11,8 +11,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from server.errors import NafirError
+from training.importers.cli import importing
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app.add_typer(importing, name="import")
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
@@ -87,31 +89,87 @@ def export(
 
 @app.command()
 def evaluate(
-    bundle: Annotated[Path, typer.Argument(help="Scene bundle.")],
-    data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's field was trained on.")],
+    places: Annotated[
+        list[Path], typer.Argument(metavar="BUNDLE... DATA", help="Scene bundles, and last the dataset folder.")
+    ],
+    methods: Annotated[
+        str, typer.Option(help="What to compare with, comma by comma; an empty string for nothing.")
+    ] = "nearest,linear,linear-aligned",
+    pairs: Annotated[int | None, typer.Option(min=1, help="Held-out pairs to draw; all if not given.")] = None,
+    yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
     figure: Annotated[Path | None, typer.Option(help="Draw decays and errors to this PNG.")] = None,
-    record: Annotated[bool, typer.Option(help="Write the measured errors into the bundle.")] = False,
+    record: Annotated[bool, typer.Option(help="Write the measured errors of every level into the bundle.")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
+    seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Errors on the held-out pairs beside the baselines and the repeatability floor."""
+    """Errors on the held-out pairs, storage and time of fields, beside baselines and the repeatability floor."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # times are of one core
     from rich.progress import track
 
     from server.scene.bundle import Bundle
-    from training.dataset import Dataset
-    from training.evaluation.evaluate import report
-    from training.evaluation.held_out import evaluate_bundle, record_accuracy
+    from training.evaluation.fields import record_accuracy
+    from training.evaluation.report import markdown, report
+    from training.evaluation.run import evaluate_bundles
 
+    if record and len(places) != 2:
+        raise typer.BadParameter("takes one bundle", param_hint="--record")
     console = Console(stderr=True)
-    loaded = Bundle.load(bundle)
-    evaluation = evaluate_bundle(
-        loaded, Dataset.open(data), figure=figure, track=lambda pairs: track(pairs, "evaluating", console=console)
+    bundles = [Bundle.load(place) for place in places[:-1]]
+    evaluation, published = evaluate_bundles(
+        bundles,
+        places[-1],
+        methods=[name.strip() for name in methods.split(",") if name.strip()],
+        pairs=pairs,
+        yaws=yaws,
+        seed=seed,
+        figure=figure,
+        track=lambda indices: track(indices, "evaluating", console=console),
     )
     if record:
-        record_accuracy(loaded, evaluation)
+        record_accuracy(bundles[0], evaluation)
     if as_json:
         typer.echo(json.dumps(evaluation.to_json(), indent=2))
+    elif as_markdown:
+        typer.echo(markdown(evaluation, published))
     else:
-        Console(width=None if console.is_terminal else 140).print(report(evaluation))
+        Console(width=None if console.is_terminal else 170).print(report(evaluation, published))
+
+
+@app.command()
+def frontier(
+    bundle: Annotated[Path, typer.Argument(help="Scene bundle; its fields are swept.")],
+    data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's fields were trained on.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for frontier.json and frontier.png.")],
+    pairs: Annotated[int, typer.Option(min=2, help="Held-out pairs to measure.")] = 40,
+    yaws: Annotated[int, typer.Option(min=1, help="Head orientations of each.")] = 3,
+    rounds: Annotated[int, typer.Option(min=3, help="Responses timed of each level.")] = 200,
+    phases_of: Annotated[list[str] | None, typer.Option(help="Fields to sweep over phases; all if not given.")] = None,
+    default_ms: Annotated[float, typer.Option(help="The default level takes no longer.")] = 1.0,
+    record: Annotated[bool, typer.Option(help="Write the Pareto-optimal levels into the bundle.")] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Measure accuracy against time for everything a bundle could offer. Run again after an interruption to go on."""
+    from server.scene.bundle import Bundle
+    from training.dataset import Dataset
+    from training.frontier.candidates import candidates
+    from training.frontier.figure import draw_frontier
+    from training.frontier.sweep import Effort, offered_levels, sweep, with_levels
+    from training.frontier.table import report
+
+    loaded = Bundle.load(bundle)
+    effort = Effort(pairs=pairs, yaws=yaws, rounds=rounds, default_ms=default_ms, seed=seed)
+    with _progress() as progress:
+        measured = sweep(loaded, Dataset.open(data), candidates(loaded, phases_of), output, effort, progress)
+    (output / "frontier.json").write_text(json.dumps(measured.to_json(), indent=2) + "\n")
+    draw_frontier(measured, output / "frontier.png")
+    if record:
+        with_levels(loaded, offered_levels(measured), bundle)
+    if as_json:
+        typer.echo(json.dumps(measured.to_json(), indent=2))
+    else:
+        Console(width=None if Console().is_terminal else 170).print(report(measured))
 
 
 def main() -> None:

@@ -1,0 +1,124 @@
+"""Errors of a quality level on a sample of the held-out pairs.
+
+Axes: entries are (pair, yaw); responses (yaw, ear, sample).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.audibility import in_jnd
+from server.acoustics.codec import Codec
+from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_loss
+from server.acoustics.room_parameters import RoomParameters, measure
+from training.dataset import Dataset
+from training.simulation.references import References
+
+_Floats = npt.NDArray[np.float64]
+_Responses = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One held-out pair and the head orientations it is heard at."""
+
+    emitter: npt.NDArray[np.float64]
+    listener: npt.NDArray[np.float64]
+    yaws: npt.NDArray[np.float64]
+    visible: bool
+    reference: _Responses
+    reflected: _Responses
+    """The reference without its direct sound."""
+    repeat: _Responses
+    parameters: RoomParameters
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mean errors by metric in their units, the same in JND, and the mean of those in JND pair by pair (pair,).
+
+    `missing` is the share of audible errors that could not be measured; they are in no mean.
+    """
+
+    errors: dict[str, float]
+    audible: dict[str, float]
+    by_pair: _Floats
+    missing: float
+
+
+class HeldOutSample:
+    """`pairs` held-out pairs at `yaws` orientations each, spread evenly; all where there are no more."""
+
+    def __init__(self, dataset: Dataset, codec: Codec, *, pairs: int, yaws: int, seed: int) -> None:
+        self._codec = codec
+        self._sample_rate = dataset.sample_rate
+        rng = np.random.default_rng([seed, 7])
+        held_out = dataset.pairs(held_out=True)
+        chosen = held_out[np.sort(rng.choice(len(held_out), min(pairs, len(held_out)), replace=False))]
+        turns = np.unique(np.linspace(0, len(dataset.yaws), yaws, endpoint=False).astype(int))
+        with h5py.File(Path(dataset.folder) / "pairs.h5", "r") as file:
+            first, second = References(dataset, file), References(dataset, file, "repeats")
+            self.entries = []
+            for emitter, listener in chosen:
+                pair = int(emitter) * len(dataset.probes) + int(listener)
+                ends = dataset.probes[emitter], dataset.probes[listener]
+                reference = first[pair][turns]
+                entry = Entry(
+                    *ends,
+                    yaws=dataset.yaws[turns],
+                    visible=bool(dataset.plan.is_visible(*ends)),
+                    reference=reference,
+                    reflected=file["reflected"][emitter, listener][turns].astype(np.float32),
+                    repeat=second[pair][turns],
+                    parameters=measure(reference, self._sample_rate),
+                )
+                self.entries.append(entry)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Pairs, and orientations of each."""
+        return len(self.entries), len(self.entries[0].yaws)
+
+    def errors_of(self, estimate: Callable[[Entry], _Responses]) -> Errors:
+        """`estimate` gives (yaw, ear, sample) of an entry, direct sound included."""
+        by_entry: list[dict[str, _Floats]] = []
+        audible_by_entry: list[dict[str, _Floats]] = []
+        for entry in self.entries:
+            errors, audible = self._compare(entry, estimate(entry))
+            by_entry.append(errors)
+            audible_by_entry.append(audible)
+        everything = np.concatenate([values.ravel() for entry in audible_by_entry for values in entry.values()])
+        missing = float(np.mean(np.isnan(everything)))
+        return Errors(_means(by_entry), _means(audible_by_entry), _pair_means(audible_by_entry), missing)
+
+    def floor(self) -> Errors:
+        """What a second simulation of the same pairs differs by."""
+        return self.errors_of(lambda entry: entry.repeat)
+
+    def _compare(self, entry: Entry, estimate: _Responses) -> tuple[dict[str, _Floats], dict[str, _Floats]]:
+        onset = np.round(np.nan_to_num(entry.parameters.onset_s) * self._sample_rate).astype(np.int64)
+        errors = parameter_errors(entry.parameters, measure(estimate, self._sample_rate, onset=onset))
+        if not entry.visible:
+            errors["drr"] = np.full_like(errors["drr"], np.nan)
+            errors["itd"] = np.full_like(errors["itd"], np.nan)
+        spectrograms = (self._codec.log_magnitude(self._codec.transform(ir)) for ir in (entry.reference, estimate))
+        errors[SPECTRAL_LOSS.name] = spectral_loss(*spectrograms)
+        return errors, in_jnd(errors, entry.parameters)
+
+
+def _means(entries: list[dict[str, _Floats]]) -> dict[str, float]:
+    """Means over all that could be measured; a metric that never could is left out."""
+    stacked = {name: np.concatenate([entry[name].ravel() for entry in entries]) for name in entries[0]}
+    return {name: float(np.nanmean(values)) for name, values in stacked.items() if np.isfinite(values).any()}
+
+
+def _pair_means(entries: list[dict[str, _Floats]]) -> _Floats:
+    means = []
+    for entry in entries:
+        values = np.stack([np.ravel(errors) for errors in entry.values()])
+        means.append(float(np.nanmean(values)) if np.isfinite(values).any() else np.nan)
+    return np.array(means)

@@ -1,0 +1,28 @@
+"""How good a field's levels would be with the phase of the reference: a bound for every way of finding one."""
+
+import numpy as np
+import numpy.typing as npt
+
+from server.field.field import AcousticField
+from training.frontier.accuracy import Entry
+from training.models.targets import align
+
+
+class TruePhase:
+    """Whole responses (yaw, ear, sample): predicted magnitudes, the reference's phase and direct sound."""
+
+    def __init__(self, field: AcousticField) -> None:
+        manifest = field.bundle.manifest
+        parameters = manifest.fields[field.level.field].codec or manifest.codec
+        self._field = field
+        self._codec = parameters.codec
+        self._lead = parameters.lead_samples
+
+    def __call__(self, entry: Entry) -> npt.NDArray[np.float32]:
+        listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
+        codec = self._codec
+        delay = float(self._field.onset_s(listeners[:1], emitters[:1])[0]) * codec.sample_rate - self._lead
+        phase = np.angle(codec.transform(align(entry.reflected, delay)))
+        predicted = self._field.spectrograms(listeners, emitters, entry.yaws)
+        aligned = codec.synthesise(codec.magnitude(predicted.log_magnitude) * np.exp(1j * phase))
+        return np.asarray(align(aligned, -delay) + entry.reference - entry.reflected, dtype=np.float32)

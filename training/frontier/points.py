@@ -1,0 +1,72 @@
+"""Points of the frontier: what a quality level gets wrong, what it costs, and which levels are worth their time."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.scene.manifest import Accuracy, Cost, QualityLevel
+
+_Floats = npt.NDArray[np.float64]
+_MISSING_ALLOWANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Point:
+    """A level with its measured `accuracy` and `cost`; `audible` are its mean errors in JND by metric, `by_pair`
+    (pair,) the mean of them for each held-out pair.
+
+    A level that no server can offer, such as the true phase, is a `bound`: drawn for orientation only. So is one whose
+    responses cannot be measured as often as the references can (`missing`, a share): it must not win by leaving the
+    hard ones out.
+    """
+
+    level: QualityLevel
+    audible: Mapping[str, float]
+    by_pair: _Floats
+    missing: float = 0.0
+    bound: bool = False
+
+    @property
+    def accuracy(self) -> Accuracy:
+        assert self.level.accuracy is not None
+        return self.level.accuracy
+
+    @property
+    def cost(self) -> Cost:
+        assert self.level.cost is not None
+        return self.level.cost
+
+    @property
+    def audible_error(self) -> float:
+        """Mean over metrics, JND."""
+        return math.fsum(self.audible.values()) / len(self.audible)
+
+
+def pareto(points: Sequence[Point], *, missing: float = 0.0) -> list[Point]:
+    """Those that no quicker one equals, quickest first, of all that miss hardly more than `missing`.
+
+    Each is more accurate than the one before it by more than one standard error of their difference over the held-out
+    pairs, so that what is called better is not the luck of the draw.
+    """
+    best: list[Point] = []
+    eligible = [point for point in points if not point.bound and point.missing <= missing + _MISSING_ALLOWANCE]
+    for point in sorted(eligible, key=lambda point: point.cost.ms_p50):
+        if not best or _is_better(point.by_pair, best[-1].by_pair):
+            best.append(point)
+    return best
+
+
+def _is_better(ours: _Floats, theirs: _Floats) -> bool:
+    gain = theirs - ours
+    gain = gain[np.isfinite(gain)]
+    if len(gain) < 2:
+        return bool(np.mean(gain) > 0)
+    return bool(np.mean(gain) > np.std(gain, ddof=1) / math.sqrt(len(gain)))
+
+
+def default_point(best: Sequence[Point], *, ms: float) -> Point:
+    """The most accurate of Pareto-optimal points whose median is at most `ms`, or else the quickest."""
+    return next((point for point in reversed(best) if point.cost.ms_p50 <= ms), best[0])

@@ -1,0 +1,193 @@
+"""The sweep: every candidate level measured, the Pareto-optimal ones written into the bundle.
+
+Accuracy comes level by level and is kept in a file as it comes, so that an interrupted sweep goes on where it stopped.
+Cost is measured at the end, of all levels in one run.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.progress import Progress
+
+from server.field.field import AcousticField
+from server.field.levels import Levels
+from server.scene.bundle import Bundle, write_bundle
+from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, QualityLevel
+from server.whole_field import WholeField
+from training.dataset import Dataset
+from training.evaluation.held_out import require_same_scene
+from training.frontier.accuracy import Entry, Errors, HeldOutSample
+from training.frontier.bound import TruePhase
+from training.frontier.cost import cost_of, measure_ms, memory_mb, one_core
+from training.frontier.points import Point, default_point, pareto
+
+_STEP_M = 0.05
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """All points measured, the Pareto-optimal ones quickest first, which of them is the default, and the floor."""
+
+    scene: str
+    pairs: int
+    yaws: int
+    points: tuple[Point, ...]
+    best: tuple[Point, ...]
+    default: Point
+    floor: Errors
+    block_ms: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for `json.dumps`."""
+        best = {point.level.name for point in self.best}
+        return {
+            "scene": self.scene,
+            "pairs": self.pairs,
+            "yaws": self.yaws,
+            "default": self.default.level.name,
+            "block_ms": self.block_ms,
+            "floor": {"errors": self.floor.errors, "errors_jnd": self.floor.audible},
+            "points": [
+                {
+                    **point.level.model_dump(mode="json", exclude={"accuracy", "cost"}),
+                    **point.cost.model_dump(mode="json"),
+                    "errors": point.accuracy.errors,
+                    "errors_jnd": dict(point.audible),
+                    "audible_error_jnd": point.audible_error,
+                    "missing": point.missing,
+                    "is_pareto_optimal": point.level.name in best,
+                    "is_bound": point.bound,
+                }
+                for point in sorted(self.points, key=lambda point: point.cost.ms_p50)
+            ],
+        }
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured: held-out `pairs` at `yaws` each; `rounds` of timing, at most `budget_s` per level; the
+    default level is the most accurate below `default_ms`."""
+
+    pairs: int = 40
+    yaws: int = 3
+    rounds: int = 200
+    budget_s: float = 10.0
+    default_ms: float = 1.0
+    seed: int = 0
+
+
+def sweep(
+    bundle: Bundle, dataset: Dataset, levels: Sequence[QualityLevel], folder: Path, effort: Effort, progress: Progress
+) -> Frontier:
+    """Measures `levels` of the bundle on the dataset's held-out pairs; what is done is kept in `folder`.
+
+    Raises DatasetError if the dataset is of another scene than the bundle.
+    """
+    require_same_scene(bundle, dataset)
+    folder.mkdir(parents=True, exist_ok=True)
+    trial = with_levels(bundle, levels, folder / "trial")
+    sample = HeldOutSample(dataset, trial.manifest.codec.codec, pairs=effort.pairs, yaws=effort.yaws, seed=effort.seed)
+    floor = sample.floor()
+    errors = _accuracies(trial, sample, levels, folder / "accuracy.json", effort, progress)
+    task = progress.add_task("timing", total=effort.rounds)
+    with one_core():
+        times = measure_ms(
+            Levels.load(trial), rounds=effort.rounds, budget_s=effort.budget_s, advance=lambda: progress.advance(task)
+        )
+    first_of_field = {level.field: level.name for level in reversed(levels)}
+    memory = memory_mb(trial.folder, list(first_of_field.values()))
+    points = []
+    for level in levels:
+        cost = cost_of(trial, level, times[level.name], memory[first_of_field[level.field]])
+        points.append(_point(level, cost, errors[level.name], floor, sample))
+    points.append(_true_phase(trial, points[0], sample, floor))
+    best = pareto(points, missing=floor.missing)
+    codec = trial.manifest.codec
+    return Frontier(
+        bundle.id,
+        *sample.size,
+        tuple(points),
+        tuple(best),
+        default_point(best, ms=effort.default_ms),
+        floor,
+        block_ms=256 / codec.sample_rate * 1000,
+    )
+
+
+def with_levels(bundle: Bundle, levels: Sequence[QualityLevel], folder: Path) -> Bundle:
+    """The bundle written to `folder` with these levels in place of its own, and without the fields none of them
+    needs."""
+    manifest = bundle.manifest
+    fields = {name: file for name, file in manifest.fields.items() if name in {level.field for level in levels}}
+    names = {ARRAYS_FILE, *(file.file for file in fields.values())}
+    files = {name: (bundle.folder / name).read_bytes() for name in manifest.files if name in names}
+    offered = manifest.model_copy(
+        update={"levels": tuple(levels), "fields": fields, "files": {name: manifest.files[name] for name in files}}
+    )
+    return write_bundle(folder, offered, files)
+
+
+def offered_levels(frontier: Frontier) -> list[QualityLevel]:
+    """What a bundle should offer: the Pareto-optimal levels with what was measured, the default first."""
+    others = [point.level for point in frontier.best if point is not frontier.default]
+    return [frontier.default.level, *others]
+
+
+def _point(level: QualityLevel, cost: Cost, errors: Errors, floor: Errors, sample: HeldOutSample) -> Point:
+    pairs, yaws = sample.size
+    accuracy = Accuracy(pairs=pairs, yaws=yaws, errors=errors.errors, floor=floor.errors)
+    measured = level.model_copy(update={"accuracy": accuracy, "cost": cost})
+    return Point(measured, errors.audible, errors.by_pair, errors.missing)
+
+
+def _true_phase(trial: Bundle, like: Point, sample: HeldOutSample, floor: Errors) -> Point:
+    """What the first level would be if it knew the phase of every bin: drawn at its cost."""
+    errors = sample.errors_of(TruePhase(AcousticField.load(trial, level=like.level.name)))
+    level = like.level.model_copy(update={"name": f"{like.level.name}-true-phase"})
+    return dataclasses.replace(_point(level, like.cost, errors, floor, sample), bound=True)
+
+
+def _accuracies(
+    trial: Bundle, sample: HeldOutSample, levels: Sequence[QualityLevel], path: Path, effort: Effort, progress: Progress
+) -> dict[str, Errors]:
+    """By level; those that `path` holds already, of the same graph and sample, are not measured again."""
+    kept: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    task = progress.add_task("accuracy", total=len(levels))
+    errors = {}
+    for level in levels:
+        progress.update(task, description=f"accuracy  {level.name}")
+        key = _key(trial, level, effort)
+        if key not in kept:
+            field = AcousticField.load(trial, level=level.name)
+            kept[key] = asdict(sample.errors_of(_Estimate(field)))
+            kept[key]["by_pair"] = kept[key]["by_pair"].tolist()
+            path.write_text(json.dumps(kept))
+        errors[level.name] = Errors(**{**kept[key], "by_pair": np.array(kept[key]["by_pair"])})
+        progress.advance(task)
+    return errors
+
+
+def _key(trial: Bundle, level: QualityLevel, effort: Effort) -> str:
+    graph = hashlib.sha256(trial.models[trial.manifest.fields[level.field].file]).hexdigest()
+    return json.dumps([level.model_dump(mode="json"), graph, effort.pairs, effort.yaws, effort.seed])
+
+
+class _Estimate:
+    """Whole responses of a field. Where it starts warm, each is asked for a step after its neighbour, as on a walk."""
+
+    def __init__(self, field: AcousticField) -> None:
+        self._whole = WholeField.through_kemar(field)
+        self._walks = field.level.phase.warm
+
+    def __call__(self, entry: Entry) -> npt.NDArray[np.float32]:
+        listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
+        if self._walks:
+            self._whole.impulse_responses(listeners + np.array([_STEP_M, 0.0, 0.0]), emitters, entry.yaws)
+        return self._whole.impulse_responses(listeners, emitters, entry.yaws)
