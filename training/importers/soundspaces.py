@@ -1,0 +1,105 @@
+"""SoundSpaces 1.0: binaural responses between the points of a scene, heads turned to a few azimuths.
+
+A scene's `points.txt` has a row "index, x, y, z" for each point, in the mesh's coordinates: metres, x right, y forward,
+z up, the height that of the ears. (Habitat's y-up coordinates are derived from them, and not used here.)
+`<azimuth>/<receiver>_<source>.wav` are the responses. The azimuth is the heading in degrees, 0 along +y and clockwise
+seen from above, so 90 is +x: yaw = 90 degrees - azimuth. Files that are empty or cannot be read stand for zeros there
+(Chen et al., "SoundSpaces: audio-visual navigation in 3D environments", ECCV 2020; `azimuth_angle` and
+`load_metadata` in https://github.com/facebookresearch/sound-spaces); here they are missing.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from training.importers.audio import UnreadableError, read_response
+from training.importers.conditioning import SourceError
+from training.importers.report import ImportReport
+from training.responses import Measurement
+
+_PAIR = re.compile(r"\d+_\d+\.wav")
+_Point = tuple[float, float, float]
+
+
+def read(
+    folder: Path,
+    report: ImportReport,
+    *,
+    points: Path | None = None,
+    track: Callable[[list[Path]], Iterable[Path]] = iter,
+) -> Iterator[tuple[str, Measurement]]:
+    """Reads the scene folder that holds the azimuths. Without `points`, points.txt is looked for in it, and in the
+    place it has in a SoundSpaces download (`metadata` beside `binaural_rirs`).
+
+    Raises SourceError for missing or malformed points, or a folder without azimuths.
+    """
+    positions = read_points(points or _points_file(folder))
+    azimuths = sorted((path for path in folder.iterdir() if path.is_dir() and path.name.isdigit()), key=_azimuth)
+    if not azimuths:
+        raise SourceError(folder, "azimuths", "no folder is named by an azimuth in degrees")
+    by_azimuth: dict[Path, set[str]] = {}
+    for azimuth in azimuths:
+        names = {path.name for path in azimuth.iterdir()}
+        by_azimuth[azimuth] = {name for name in names if _PAIR.fullmatch(name)}
+        for name in sorted(names - by_azimuth[azimuth]):
+            report.skip(f"{azimuth.name}/{name}", "not named <receiver>_<source>.wav")
+    everywhere = set().union(*by_azimuth.values())
+    for azimuth, names in by_azimuth.items():
+        for name in sorted(everywhere - names):
+            report.skip(f"{azimuth.name}/{name}", "missing at this azimuth")
+    for path in track([azimuth / name for azimuth, names in by_azimuth.items() for name in sorted(names)]):
+        name = f"{path.parent.name}/{path.name}"
+        receiver, source = (int(index) for index in path.stem.split("_"))
+        if receiver not in positions or source not in positions:
+            report.skip(name, "a point that points.txt does not have")
+            continue
+        try:
+            response, rate = read_response(path, channels=2)
+        except UnreadableError as exc:
+            report.skip(name, str(exc))
+            continue
+        yaw = heading_to_yaw(_azimuth(path.parent))
+        yield name, Measurement(positions[receiver], positions[source], response, rate, yaw)
+
+
+def heading_to_yaw(azimuth_deg: float) -> float:
+    """Clockwise from +y in degrees to counter-clockwise from +x in radians, within [-pi, pi)."""
+    return math.radians((90.0 - azimuth_deg + 180.0) % 360.0 - 180.0)
+
+
+def read_points(path: Path) -> dict[int, _Point]:
+    """Positions by index. Raises SourceError naming the line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as exc:
+        raise SourceError(path, "file", f"cannot be read ({exc})") from exc
+    points: dict[int, _Point] = {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            index, x, y, z = line.split()
+            key, point = int(index), (float(x), float(y), float(z))
+        except ValueError as exc:
+            raise SourceError(path, f"line {number}", f"{line!r} is not an index and three numbers") from exc
+        if not all(math.isfinite(value) for value in point):
+            raise SourceError(path, f"line {number}", "has numbers that are not finite")
+        if key in points:
+            raise SourceError(path, f"line {number}", f"index {key} is there twice")
+        points[key] = point
+    if not points:
+        raise SourceError(path, "points", "none")
+    return points
+
+
+def _azimuth(folder: Path) -> int:
+    return int(folder.name)
+
+
+def _points_file(folder: Path) -> Path:
+    beside = folder / "points.txt"
+    parts = folder.resolve().parts
+    if beside.is_file() or "binaural_rirs" not in parts:
+        return beside
+    return Path(*("metadata" if part == "binaural_rirs" else part for part in parts)) / "points.txt"
