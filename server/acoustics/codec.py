@@ -54,10 +54,25 @@ class Codec:
         """(frequency, 1) radians by which a bin-centred tone advances per frame."""
         return np.asarray(2 * np.pi * self.hop / self.n_fft * np.arange(self.bins, dtype=np.float64)[:, None])
 
+    @property
+    def window(self) -> npt.NDArray[np.float64]:
+        """(n_fft,)"""
+        return np.asarray(self._transform.win)
+
+    @property
+    def dual_window(self) -> npt.NDArray[np.float64]:
+        """(n_fft,) with which slices are weighted before they are added up again."""
+        return np.asarray(self._transform.dual_win.real)
+
+    @property
+    def frame_lead_samples(self) -> int:
+        """Samples of the first frame that lie before the signal."""
+        return self.n_fft // 2 - int(self._transform.p_min) * self.hop
+
     @cached_property
     def window_energy(self) -> float:
         """Mean of |S|**2 for white noise of unit variance."""
-        return float(np.sum(self._transform.win**2))
+        return float(np.sum(self.window**2))
 
     def transform(self, signal: Array) -> npt.NDArray[np.complex128]:
         """(..., sample) to complex (..., frequency, frame)."""
@@ -98,11 +113,11 @@ class Codec:
         Equals `ShortTimeFFT.istft`, with all frames transformed at once; the precision is that of the input.
         """
         slices = irfft(np.swapaxes(spectrogram, -1, -2), self.n_fft, axis=-1)
-        slices *= self._transform.dual_win.real.astype(slices.dtype)
+        slices *= self.dual_window.astype(slices.dtype)
         frames, shifts = spectrogram.shape[-1], self.n_fft // self.hop
         parts = slices.reshape(*slices.shape[:-1], shifts, self.hop)
         total = np.zeros((*slices.shape[:-2], frames + shifts - 1, self.hop), dtype=slices.dtype)
         for shift in range(shifts):
             total[..., shift : shift + frames, :] += parts[..., shift, :]
-        start = self.n_fft // 2 - int(self._transform.p_min) * self.hop
+        start = self.frame_lead_samples
         return np.asarray(total.reshape(*total.shape[:-2], -1)[..., start : start + self.samples])

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.simd import LANES, load, store
 from server.compiled import compiled
 from server.rendering import right_angle
 from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
 from server.rendering.partitions import Partitioning, Stage
-from server.rendering.simd import LANES, load, store
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]

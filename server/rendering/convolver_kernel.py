@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
+from server.acoustics.simd import add, broadcast, load, load_int, multiply_add, pointer, store
 from server.compiled import compiled
 from server.rendering import products, right_angle
 from server.rendering.convolver_records import CONVOLVER, STAGE
-from server.rendering.simd import add, broadcast, load, load_int, multiply_add, pointer, store
 
 _CHUNK_NS = 2500
 """A list of products is cut into jobs of about this length."""

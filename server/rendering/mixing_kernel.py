@@ -6,11 +6,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
+from server.acoustics.simd import broadcast, load, multiply, multiply_add, pointer, store
 from server.compiled import compiled
 from server.rendering.by_reference import Reference, reference_at
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
-from server.rendering.simd import broadcast, load, multiply, multiply_add, pointer, store
 
 MIXER = np.dtype(
     [

@@ -6,10 +6,7 @@ Outputs of `filter_block` are a multiple of `TILE` long: accumulators stay in re
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import compiled
-from server.rendering import right_angle
-from server.rendering.fractional_delay import PHASES, TAPS
-from server.rendering.simd import (
+from server.acoustics.simd import (
     add,
     broadcast,
     load,
@@ -22,6 +19,9 @@ from server.rendering.simd import (
     subtract,
     transpose,
 )
+from server.compiled import compiled
+from server.rendering import right_angle
+from server.rendering.fractional_delay import PHASES, TAPS
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]

@@ -6,8 +6,8 @@ over the partitions per tile of eight bins, in the order in which filter and spe
 
 import numpy as np
 
+from server.acoustics.simd import broadcast, load, load_int, multiply, multiply_add, multiply_subtract, store
 from server.compiled import compiled
-from server.rendering.simd import broadcast, load, load_int, multiply, multiply_add, multiply_subtract, store
 
 
 @compiled

@@ -6,7 +6,7 @@ ordinary complex FFT of size n (Nussbaumer 1981; the "right-angle" convolution o
 roots give the conjugates. So 2 n real samples need n complex bins, all alike: no bin is real, and nothing has to be
 untangled as after a real FFT. Overlap-save does not mind the sign with which products wrap: it drops what wrapped.
 
-The FFT splits n = 8 m: m-point transforms in every lane (radix 4, decimation in frequency), twiddles, then 8 points
+The FFT splits n = 8 m: m-point transforms in every lane (`lane_fft`), twiddles, then 8 points
 across the lanes after a transposition of eight vectors. Bins stay where that leaves them, since only products of bins
 follow, and the inverse undoes the steps in reverse.
 """
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import compiled
-from server.rendering.simd import (
+from server.acoustics.lane_fft import first_span, order, transform_lanes, twiddles
+from server.acoustics.simd import (
     LANES,
     add,
     broadcast,
@@ -32,6 +32,7 @@ from server.rendering.simd import (
     subtract,
     transpose,
 )
+from server.compiled import compiled
 
 SMALLEST = LANES * LANES
 
@@ -56,29 +57,9 @@ def tables(size: int) -> Tables:
     if size < SMALLEST or size & (size - 1):
         raise ValueError(f"the transform has a size of {SMALLEST} or more, a power of two, not {size}")
     vectors = size // LANES
-    passes, order = [np.zeros(0)], np.arange(1)
-    if vectors.bit_length() % 2 == 0:  # an odd power of two: one pass of radix 2 first
-        turn = np.exp(-2j * np.pi * np.arange(vectors // 2) / vectors)
-        passes.append(np.stack([turn.real, turn.imag], axis=-1).ravel())
-    span = _first_span(vectors)
-    while span:
-        turn = np.exp(-2j * np.pi * np.arange(span)[:, None] * np.arange(1, 4) / (4 * span))
-        passes.append(np.stack([turn.real, turn.imag], axis=-1).ravel())
-        span //= 4
-    # order[position] is the bin that the lanes' transforms leave there: digits reversed.
-    length = 1
-    while length < vectors:
-        radix = 2 if length * 2 == vectors and vectors.bit_length() % 2 == 0 else 4
-        order = np.concatenate([order * radix + digit for digit in range(radix)])
-        length *= radix
-    lanes = np.exp(-2j * np.pi * order[:, None] * np.arange(LANES) / size).ravel()
+    lanes = np.exp(-2j * np.pi * order(vectors)[:, None] * np.arange(LANES) / size).ravel()
     twist = np.exp(-0.5j * np.pi * np.arange(size) / size)
-    return Tables(size, _parts(twist), np.concatenate(passes).astype(np.float32), _parts(lanes))
-
-
-def _first_span(vectors: int) -> int:
-    """Of the radix-4 passes: a quarter of what is left to transform after the pass of radix 2, where there is one."""
-    return vectors // 8 if vectors.bit_length() % 2 == 0 else vectors // 4
+    return Tables(size, _parts(twist), twiddles(vectors), _parts(lanes))
 
 
 def _parts(values: npt.NDArray[np.complex128]) -> npt.NDArray[np.float32]:
@@ -94,48 +75,7 @@ def forward(first: int, second: int, bins: int, size: int, twist: int, passes: i
         c, s = load(twist, n), load(twist, size + n)
         store(bins, n, multiply_add(b, s, multiply(a, c)))  # (a - i b)(c + i s)
         store(bins, size + n, multiply_subtract(b, c, multiply(a, s)))
-    table = 0
-    span = vectors // 4
-    if _is_odd_power(vectors):
-        span = vectors // 8
-        half = vectors // 2
-        for j in range(half):
-            at, to = 8 * j, 8 * (j + half)
-            ar, ai, br, bi = load(bins, at), load(bins, size + at), load(bins, to), load(bins, size + to)
-            store(bins, at, add(ar, br))
-            store(bins, size + at, add(ai, bi))
-            dr, di = subtract(ar, br), subtract(ai, bi)
-            c, s = load_broadcast(passes, table + 2 * j), load_broadcast(passes, table + 2 * j + 1)
-            store(bins, to, multiply_subtract(di, s, multiply(dr, c)))
-            store(bins, size + to, multiply_add(di, c, multiply(dr, s)))
-        table += 2 * half
-    while span > 0:
-        for j in range(span):
-            t = table + 6 * j
-            c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
-            c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
-            c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
-            for group in range(j, vectors, 4 * span):
-                p0, p1 = 8 * group, 8 * (group + span)
-                p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
-                ar, ai, br, bi = load(bins, p0), load(bins, size + p0), load(bins, p1), load(bins, size + p1)
-                cr, ci, dr, di = load(bins, p2), load(bins, size + p2), load(bins, p3), load(bins, size + p3)
-                er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
-                gr, gi = add(br, dr), add(bi, di)
-                hr, hi = subtract(bi, di), subtract(dr, br)  # -i (b - d)
-                store(bins, p0, add(er, gr))
-                store(bins, size + p0, add(ei, gi))
-                yr, yi = add(fr, hr), add(fi, hi)
-                store(bins, p1, multiply_subtract(yi, s1, multiply(yr, c1)))
-                store(bins, size + p1, multiply_add(yi, c1, multiply(yr, s1)))
-                yr, yi = subtract(er, gr), subtract(ei, gi)
-                store(bins, p2, multiply_subtract(yi, s2, multiply(yr, c2)))
-                store(bins, size + p2, multiply_add(yi, c2, multiply(yr, s2)))
-                yr, yi = subtract(fr, hr), subtract(fi, hi)
-                store(bins, p3, multiply_subtract(yi, s3, multiply(yr, c3)))
-                store(bins, size + p3, multiply_add(yi, c3, multiply(yr, s3)))
-        table += 6 * span
-        span //= 4
+    transform_lanes(bins, vectors, passes)
     for at in range(0, size, 64):
         re, im = _load_8(bins, at), _load_8(bins, size + at)
         cos, sin = _load_8(lanes, at), _load_8(lanes, size + at)
@@ -156,8 +96,8 @@ def inverse(bins: int, size: int, passes: int, lanes: int) -> None:
         re, im = _multiply_conjugate_8(re, im, cos, sin)
         _store_8(bins, at, re)
         _store_8(bins, size + at, im)
-    is_odd = _is_odd_power(vectors)
-    largest = vectors // 8 if is_odd else vectors // 4
+    largest = first_span(vectors)
+    is_odd = 4 * largest != vectors
     span = 1
     while span <= largest:
         # Before the twiddles of this span lie those of all larger ones, six floats per butterfly.
@@ -210,15 +150,6 @@ def second_half(bins: int, size: int, twist: int, out: int) -> None:
         # -Im((re + i im)(c - i s))
         part = multiply_subtract(load(bins, n), load(twist, size + n), multiply(load(bins, size + n), load(twist, n)))
         store(out, n, multiply(part, scale))
-
-
-@compiled
-def _is_odd_power(value: int) -> bool:
-    power = 0
-    while value > 1:
-        value >>= 1
-        power += 1
-    return power % 2 == 1
 
 
 @compiled

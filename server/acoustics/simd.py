@@ -1,12 +1,13 @@
 """Vectors of eight float32 for compiled code: what a loop over contiguous samples becomes when it must.
 
 LLVM vectorises simple loops by itself, but keeps no accumulators in registers and gives up where it cannot prove that
-arrays do not overlap. The convolver's two inner loops, transform and multiplication, decide what a host can carry, so
-they say what they mean. `Float32x8` is one LLVM vector: one register with AVX, two with SSE or NEON.
+arrays do not overlap. The inner loops of the convolver, and of decoding, decide what a host can carry, so they say
+what they mean. `Float32x8` is one LLVM vector: one register with AVX, two with SSE or NEON.
 
 Memory is addressed as (byte address, index of a float32): inside a compiled function, of an array, by `.ctypes.data`.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,11 @@ LANES = 8
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
 _INT32 = ir.IntType(32)
 _INT64 = ir.IntType(64)
+_INTEGERS = ir.VectorType(_INT32, LANES)
+
+# Split so that small multiples of the first parts are exact (Cody and Waite 1980).
+_LN_2 = (0.693359375, math.log(2) - 0.693359375)
+_QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
 # Lanes of two vectors, 0-7 and 8-15, that the steps of a transposition bring together.
 _LOW_1, _HIGH_1 = [0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]
@@ -127,6 +133,7 @@ def _binary(instruction: str) -> Callable[..., Any]:
 add = _binary("fadd")
 subtract = _binary("fsub")
 multiply = _binary("fmul")
+divide = _binary("fdiv")
 
 
 def _fused(negate_product: bool) -> Callable[..., Any]:
@@ -147,6 +154,105 @@ multiply_add = _fused(negate_product=False)
 """a b + c, rounded once."""
 multiply_subtract = _fused(negate_product=True)
 """c - a b, rounded once."""
+
+
+def _constant(value: float) -> Any:
+    return ir.Constant(_VECTOR, [value] * LANES)
+
+
+def _call(builder: Any, name: str, *args: Any) -> Any:
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(args))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), args)
+
+
+def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
+    """The highest power first."""
+    value = _constant(coefficients[0])
+    for coefficient in coefficients[1:]:
+        value = _call(builder, "fma", value, x, _constant(coefficient))
+    return value
+
+
+def _nearest_multiple(builder: Any, x: Any, parts: tuple[float, ...], inverse: float) -> tuple[Any, Any]:
+    """How often the period, a sum of `parts`, goes into x, as integers modulo 2**22, and the remainder."""
+    # Added to 1.5 * 2**23, a number is rounded to an integer, which then is in the low bits.
+    shifted = _call(builder, "fma", x, _constant(inverse), _constant(12582912.0))
+    times = builder.fneg(builder.fsub(shifted, _constant(12582912.0)))
+    for part in parts:
+        x = _call(builder, "fma", times, _constant(part), x)
+    return builder.bitcast(shifted, _INTEGERS), x
+
+
+@intrinsic
+def at_least(_context: Any, _x: Any, _limit: Any) -> Any:
+    """max(x, limit); what is not a number stays so."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        x, limit = args
+        return builder.select(builder.fcmp_ordered("<", x, limit), limit, x)
+
+    return float32x8(float32x8, float32x8), generate
+
+
+@intrinsic
+def choose_below(_context: Any, _x: Any, _limit: Any, _below: Any, _else: Any) -> Any:
+    """`below` in lanes where x < limit, `else` in the others."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        x, limit, below, otherwise = args
+        return builder.select(builder.fcmp_ordered("<", x, limit), below, otherwise)
+
+    return float32x8(float32x8, float32x8, float32x8, float32x8), generate
+
+
+@intrinsic
+def square_root(_context: Any, _x: Any) -> Any:
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return _call(builder, "sqrt", *args)
+
+    return float32x8(float32x8), generate
+
+
+@intrinsic
+def exponential(_context: Any, _x: Any) -> Any:
+    """exp(x) to 2e-7; of less than -87 or more than 88 that of these."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        low, high = _constant(-87.0), _constant(88.0)
+        x = builder.select(builder.fcmp_ordered("<", args[0], low), low, args[0])
+        x = builder.select(builder.fcmp_ordered(">", x, high), high, x)
+        halvings, rest = _nearest_multiple(builder, x, _LN_2, 1 / math.log(2))
+        # Taylor's, within half of ln 2; the next term is below 3e-8.
+        value = _polynomial(builder, rest, [1 / math.factorial(power) for power in range(7, -1, -1)])
+        bits = builder.shl(halvings, ir.Constant(_INTEGERS, [23] * LANES))
+        scale = builder.add(bits, ir.Constant(_INTEGERS, [127 << 23] * LANES))
+        return builder.fmul(value, builder.bitcast(scale, _VECTOR))
+
+    return float32x8(float32x8), generate
+
+
+@intrinsic
+def cosine_sine(_context: Any, _x: Any) -> Any:
+    """cos(x) and sin(x) to 2e-7, of x within some hundred turns."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        quarters, rest = _nearest_multiple(builder, args[0], _QUARTER_TURN, 2 / math.pi)
+        square = builder.fmul(rest, rest)
+        even = _polynomial(builder, square, [1 / 40320, -1 / 720, 1 / 24, -0.5, 1.0])
+        odd = builder.fmul(_polynomial(builder, square, [1 / 362880, -1 / 5040, 1 / 120, -1 / 6, 1.0]), rest)
+        one, two = ir.Constant(_INTEGERS, [1] * LANES), ir.Constant(_INTEGERS, [2] * LANES)
+        zero = ir.Constant(_INTEGERS, [0] * LANES)
+        is_odd = builder.icmp_signed("!=", builder.and_(quarters, one), zero)
+
+        def signed(value: Any, quarters: Any) -> Any:
+            is_negative = builder.icmp_signed("!=", builder.and_(quarters, two), zero)
+            return builder.select(is_negative, builder.fneg(value), value)
+
+        cosine = signed(builder.select(is_odd, odd, even), builder.add(quarters, one))
+        sine = signed(builder.select(is_odd, even, odd), quarters)
+        return context.make_tuple(builder, signature.return_type, (cosine, sine))
+
+    return types.UniTuple(float32x8, 2)(float32x8), generate
 
 
 @intrinsic
