@@ -57,7 +57,14 @@ class DirectSound:
         )
 
     def renderer(
-        self, *, block_size: int, ir_samples: int, sample_rate: int, max_emitters: int, shared_tail: bool = False
+        self,
+        *,
+        block_size: int,
+        ir_samples: int,
+        sample_rate: int,
+        max_emitters: int,
+        shared_tail: bool = False,
+        switches_tail: bool = False,
     ) -> Renderer:
         return Renderer(
             block_size=block_size,
@@ -68,6 +75,7 @@ class DirectSound:
             air_db_per_m=self._air_db_per_m,
             max_emitters=max_emitters,
             shared_tail=shared_tail,
+            switches_tail=switches_tail,
         )
 
     def aim(self, renderer: Renderer, listener: Pose, emitters: Mapping[str, Placed]) -> None:

@@ -104,9 +104,18 @@ class CompiledConvolver:
     """Owns the arrays; see `server.rendering.convolver.Convolver` for what they mean to a user.
 
     `wanted` (source,) holds the address of each source's filter, 0 for none; `silent` (source,) its blocks of silence.
+    The last stage is there once per source, once for the tail they share, or both.
     """
 
-    def __init__(self, partitioning: Partitioning, sources: int, channels: int, *, has_shared_tail: bool) -> None:
+    def __init__(
+        self,
+        partitioning: Partitioning,
+        sources: int,
+        channels: int,
+        *,
+        has_shared_tail: bool,
+        has_own_tails: bool,
+    ) -> None:
         block_size, history = partitioning.block_size, partitioning.history_blocks
         stages = partitioning.stages
         self._partitioning = partitioning
@@ -117,26 +126,26 @@ class CompiledConvolver:
         self.tail_gain = _zeros(2, sources)
         self._history = _zeros(sources, history * block_size)
         self._wanted: IntArray = np.zeros(sources, np.int64)
+        # Apart from the other stages' only where both kinds of tail exist.
+        self._own_tails_wanted: IntArray = np.zeros(sources, np.int64)
         self._tail_history = _zeros(1, history * block_size)
         self._tail_wanted: IntArray = np.zeros(1, np.int64)
         self._tail_silent: IntArray = np.zeros(1, np.int64)
         self._scratch = _zeros(2, stages[-1].size)
         self._fade_in = raised_cosine(block_size)
-        self._stages = np.zeros(len(stages), STAGE)
+        last = len(stages) - 1
+        kinds = [(number, False) for number in range(len(stages)) if number < last or has_own_tails]
+        kinds += [(last, True)] if has_shared_tail else []
+        self._stages = np.zeros(len(kinds), STAGE)
         self._stage_arrays = [
-            _StageArrays(
-                stage,
-                1 if has_shared_tail and number == len(stages) - 1 else sources,
-                channels,
-            )
-            for number, stage in enumerate(stages)
+            _StageArrays(stages[number], 1 if is_shared else sources, channels) for number, is_shared in kinds
         ]
-        for number, arrays in enumerate(self._stage_arrays):
-            is_shared = has_shared_tail and number == len(stages) - 1
-            record = self._stages[number : number + 1]
+        for place, ((number, is_shared), arrays) in enumerate(zip(kinds, self._stage_arrays, strict=True)):
+            wanted = self._own_tails_wanted if has_shared_tail and number == last else self._wanted
+            record = self._stages[place : place + 1]
             record["number"] = number
             record["history"] = _address(self._tail_history if is_shared else self._history)
-            record["wanted"] = _address(self._tail_wanted if is_shared else self._wanted)
+            record["wanted"] = _address(self._tail_wanted if is_shared else wanted)
             record["silent"] = _address(self._tail_silent if is_shared else self.silent)
             arrays.enter(record)
         self._record = np.zeros(1, CONVOLVER)
@@ -146,7 +155,7 @@ class CompiledConvolver:
             "block_size": block_size,
             "history_blocks": history,
             "quiet_blocks": partitioning.quiet_blocks,
-            "stages": len(stages),
+            "stages": len(kinds),
             "has_shared_tail": has_shared_tail,
         }.items():
             self._record[name] = value
@@ -175,7 +184,11 @@ class CompiledConvolver:
         return pack(ir, self._partitioning)
 
     def want(self, source: int, filters: PackedFilter) -> None:
-        self._wanted[source] = filters.address
+        self._wanted[source] = self._own_tails_wanted[source] = filters.address
+
+    def want_own_tail(self, source: int, filters: PackedFilter) -> None:
+        """After `want`, another filter for a source's last stage."""
+        self._own_tails_wanted[source] = filters.address
 
     def want_tail(self, filters: PackedFilter) -> None:
         self._tail_wanted[0] = filters.address
@@ -185,7 +198,7 @@ class CompiledConvolver:
             raise ValueError(f"expected a block {self.input.shape} and room {self.output.shape} for the mix")
 
     def clear(self, source: int) -> None:
-        self._wanted[source] = 0
+        self._wanted[source] = self._own_tails_wanted[source] = 0
         self._history[source] = 0
         self.silent[source] = 0
         self.tail_gain[:, source] = 0

@@ -45,7 +45,8 @@ class Convolver:
 
     `block_size` is a power of two from 64 on. With `shared_tail` the last stage convolves one mix of all sources with
     one tail, that of the first source that has any, each source at the level of its own: later than twice the longest
-    partition, tails differ little but in level. It makes many sources cheaper.
+    partition, tails differ little but in level. It makes many sources cheaper. With `switches_tail` it begins without,
+    and `share_tail` has it share its tail or not: fades like those of an exchange lead from one to the other.
 
     One thread at a time may use it, except `prepare`, which any thread may call. Raises ValueError for sizes it cannot
     have.
@@ -59,6 +60,7 @@ class Convolver:
         block_size: int,
         ir_samples: int,
         shared_tail: bool = False,
+        switches_tail: bool = False,
         is_compiled: bool = HAS_NUMBA,
     ) -> None:
         if sources < 1 or channels not in {1, 2}:
@@ -66,16 +68,27 @@ class Convolver:
         self._partitioning = Partitioning(block_size, ir_samples)
         stages = self._partitioning.stages
         # A tail that starts with the IR is no tail.
-        self._has_shared_tail = shared_tail and len(stages) > 1
+        self._has_shared_tail = (shared_tail or switches_tail) and len(stages) > 1
+        self._switches_tail = self._has_shared_tail and not shared_tail
+        self._shares_tail = self._has_shared_tail and shared_tail
         self._tail_start = stages[-1].start if self._has_shared_tail else ir_samples
         self.sources = sources
         self.channels = channels
         self.block_size = block_size
         self.ir_samples = ir_samples
         kind = _compiled_convolver() if is_compiled else _numpy_convolver()
-        self._engine: Any = kind(self._partitioning, sources, channels, has_shared_tail=self._has_shared_tail)
+        self._engine: Any = kind(
+            self._partitioning,
+            sources,
+            channels,
+            has_shared_tail=self._has_shared_tail,
+            has_own_tails=self._switches_tail or not self._has_shared_tail,
+        )
+        # What a stage that is not to be heard convolves with: no partition of it but in the head.
+        self._silence = self._engine.prepare(np.zeros((channels, 1), np.float32)) if self._switches_tail else None
         self._layout = self._partitioning, channels, is_compiled
         self._irs: list[PartitionedIr | None] = [None] * sources
+        self._tail_energy = np.zeros(sources)
         self._retired: deque[tuple[int, PartitionedIr]] = deque()
         # Compiled code holds addresses: an IR that was replaced is in use until the third window after it was made.
         self._retires_after = 4 * stages[-1].ticks
@@ -108,9 +121,24 @@ class Convolver:
         if previous is not None:
             self._retire(previous)
         self._irs[source] = prepared
+        self._tail_energy[source] = prepared.tail_energy
         self._engine.want(source, prepared.filters)
+        if self._shares_tail and self._switches_tail:
+            self._engine.want_own_tail(source, self._silence)
         if self._has_shared_tail:
             self._share_tail(None if previous is not None else source)
+
+    def share_tail(self, is_shared: bool) -> None:
+        """Have all sources share a tail, or none; only of a convolver that switches tails. Nothing happens where its
+        IRs are too short to have any."""
+        if not self._switches_tail or is_shared == self._shares_tail:
+            return
+        self._shares_tail = is_shared
+        for source, ir in enumerate(self._irs):
+            if ir is not None:
+                self._engine.want_own_tail(source, self._silence if is_shared else ir.filters)
+        if self._tail is not None:
+            self._engine.want_tail(self._tail.filters if is_shared else self._silence)
 
     def _retire(self, ir: PartitionedIr) -> None:
         self._retired.append((self._engine.blocks + self._retires_after, ir))
@@ -124,10 +152,8 @@ class Convolver:
         if self._tail is not None and self._tail is not tail:
             self._retire(self._tail)
         self._tail = tail
-        self._engine.want_tail(tail.filters)
-        for source, ir in enumerate(self._irs):
-            if ir is not None:
-                self._engine.tail_gain[1, source] = (ir.tail_energy / tail.tail_energy) ** 0.5
+        self._engine.want_tail(tail.filters if self._shares_tail else self._silence)
+        self._engine.tail_gain[1] = np.sqrt(self._tail_energy / tail.tail_energy)
         if newcomer is not None:
             self._engine.tail_gain[0, newcomer] = self._engine.tail_gain[1, newcomer]
 
@@ -169,6 +195,7 @@ class Convolver:
             return
         self._retire(ir)
         self._irs[source] = None
+        self._tail_energy[source] = 0
         self._engine.clear(source)
         if self._has_shared_tail:
             self._share_tail(None)
@@ -177,6 +204,7 @@ class Convolver:
         """Forget everything, as if just constructed."""
         self._engine.reset()
         self._irs = [None] * self.sources
+        self._tail_energy.fill(0)
         self._retired.clear()
         self._tail = None
 

@@ -26,22 +26,34 @@ class SpectralFilter:
 class NumpyConvolver:
     """See `server.rendering.convolver.Convolver`."""
 
-    def __init__(self, partitioning: Partitioning, sources: int, channels: int, *, has_shared_tail: bool) -> None:
+    def __init__(
+        self,
+        partitioning: Partitioning,
+        sources: int,
+        channels: int,
+        *,
+        has_shared_tail: bool,
+        has_own_tails: bool,
+    ) -> None:
         self._partitioning = partitioning
-        self._has_shared_tail = has_shared_tail
         block_size, stages = partitioning.block_size, partitioning.stages
         self.silent = np.zeros(sources, np.int64)
         self.exchanged = np.zeros(sources, np.int64)
         self.tail_gain = np.zeros((2, sources), np.float32)
         self.blocks = 0
         self._wanted: list[SpectralFilter | None] = [None] * sources
+        self._own_tails_wanted: list[SpectralFilter | None] = [None] * sources
         self._tail_wanted: list[SpectralFilter | None] = [None]
         self._tail_silent = np.zeros(1, np.int64)
         self._fade_in = raised_cosine(block_size)
+        last = len(stages) - 1
         self._stages = [
-            _StageState(stage, number, 1 if has_shared_tail and number == len(stages) - 1 else sources, channels)
+            _StageState(stage, number, sources, channels)
             for number, stage in enumerate(stages)
+            if number < last or has_own_tails
         ]
+        self._own_tails = self._stages[-1] if has_own_tails else None
+        self._shared_tail = _StageState(stages[last], last, 1, channels) if has_shared_tail else None
 
     def prepare(self, ir: FloatArray) -> SpectralFilter:
         spectra = []
@@ -53,7 +65,11 @@ class NumpyConvolver:
         return SpectralFilter(tuple(spectra))
 
     def want(self, source: int, filters: SpectralFilter) -> None:
-        self._wanted[source] = filters
+        self._wanted[source] = self._own_tails_wanted[source] = filters
+
+    def want_own_tail(self, source: int, filters: SpectralFilter) -> None:
+        """After `want`, another filter for a source's last stage."""
+        self._own_tails_wanted[source] = filters
 
     def want_tail(self, filters: SpectralFilter) -> None:
         self._tail_wanted[0] = filters
@@ -68,25 +84,24 @@ class NumpyConvolver:
         samples = np.where(sounds[:, np.newaxis], blocks, np.float32(0))
         self._tail_silent[0] = 0 if sounds.any() else self._tail_silent[0] + 1
         output.fill(0)
-        for number, stage in enumerate(self._stages):
-            if self._has_shared_tail and number == len(self._stages) - 1:
-                now, then = self.tail_gain[:, :, np.newaxis]
-                tail = np.sum((now + (then - now) * self._fade_in) * samples, axis=0, keepdims=True)
-                self.tail_gain[0, sounds] = self.tail_gain[1, sounds]
-                tail_sounds = np.array([self._tail_wanted[0] is not None]) & (self._tail_silent < quiet)
-                stage.process(tail, tail_sounds, self._tail_wanted, output, self.blocks)
-            else:
-                stage.process(samples, sounds, self._wanted, output, self.blocks)
+        for stage in self._stages:
+            wanted = self._own_tails_wanted if stage is self._own_tails else self._wanted
+            stage.process(samples, sounds, wanted, output, self.blocks)
+        if self._shared_tail is not None:
+            now, then = self.tail_gain[:, :, np.newaxis]
+            tail = np.sum((now + (then - now) * self._fade_in) * samples, axis=0, keepdims=True)
+            self.tail_gain[0, sounds] = self.tail_gain[1, sounds]
+            tail_sounds = np.array([self._tail_wanted[0] is not None]) & (self._tail_silent < quiet)
+            self._shared_tail.process(tail, tail_sounds, self._tail_wanted, output, self.blocks)
         self.exchanged[:] = self._stages[0].exchanged
         self.blocks += 1
 
     def clear(self, source: int) -> None:
-        self._wanted[source] = None
+        self._wanted[source] = self._own_tails_wanted[source] = None
         self.silent[source] = 0
         self.tail_gain[:, source] = 0
         for stage in self._stages:
-            if stage.sources == len(self._wanted):
-                stage.clear(source)
+            stage.clear(source)
 
     def reset(self) -> None:
         for source in range(len(self._wanted)):
@@ -95,7 +110,7 @@ class NumpyConvolver:
         self._tail_silent.fill(0)
         self.exchanged.fill(0)
         self.blocks = 0
-        for stage in self._stages:
+        for stage in (*self._stages, *([self._shared_tail] if self._shared_tail else [])):
             stage.reset()
 
 

@@ -72,6 +72,7 @@ class Renderer:
         air_db_per_m: npt.NDArray[np.floating],
         max_emitters: int = 16,
         shared_tail: bool = False,
+        switches_tail: bool = False,
     ) -> None:
         self.block_size = block_size
         self.ir_samples = ir_samples
@@ -79,7 +80,12 @@ class Renderer:
         # As many slots again for removed emitters, which hold theirs until their reverberation has rung out.
         slots = 2 * max_emitters
         self._convolver = Convolver(
-            sources=slots, channels=2, block_size=block_size, ir_samples=ir_samples, shared_tail=shared_tail
+            sources=slots,
+            channels=2,
+            block_size=block_size,
+            ir_samples=ir_samples,
+            shared_tail=shared_tail,
+            switches_tail=switches_tail,
         )
         self._direct = None
         if filters is not None:
@@ -178,6 +184,10 @@ class Renderer:
         emitter.next_token = token
         emitter.has_ir = True
         self._changed.append(emitter)
+
+    def share_tail(self, is_shared: bool) -> None:
+        """Have all emitters share one late tail, or none; only of a renderer that switches tails."""
+        self._convolver.share_tail(is_shared)
 
     def set_path(self, emitter_id: str, target: PathTarget) -> None:
         """Have the direct sound come along a path from the next block on. Raises UnknownEmitterError."""

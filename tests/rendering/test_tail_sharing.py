@@ -1,0 +1,108 @@
+"""A late tail that all sources share, or none, changed while they sound."""
+
+import numpy as np
+import pytest
+
+from server.compiled import HAS_NUMBA
+from server.rendering.convolver import Convolver
+from server.rendering.partitions import Partitioning
+
+SIZE, SAMPLES, SOURCES = 64, 4_000, 3
+SETTLED = SAMPLES + 4 * 16 * SIZE
+
+
+@pytest.fixture(params=[True, False], ids=["compiled", "numpy"])
+def is_compiled(request):
+    if request.param and not HAS_NUMBA:
+        pytest.skip("numba is not installed")
+    return request.param
+
+
+def make(is_compiled, **kind):
+    return Convolver(sources=SOURCES, channels=2, block_size=SIZE, ir_samples=SAMPLES, is_compiled=is_compiled, **kind)
+
+
+def rooms(seed):
+    rng = np.random.default_rng(seed)
+    decay = np.exp(-np.arange(SAMPLES) / 900)
+    return [(0.1 * decay * rng.standard_normal((2, SAMPLES))).astype(np.float32) for _ in range(SOURCES)]
+
+
+def stream(convolver, dry, switches=(), irs=()):
+    """`switches` and `irs` by block: whether to share from there on; a source and its next IR."""
+    switches, irs, output = dict(switches), dict(irs), []
+    for block in range(dry.shape[1] // SIZE):
+        if block in switches:
+            convolver.share_tail(switches[block])
+        if block in irs:
+            convolver.set_ir(*irs[block])
+        output.append(convolver.process(dry[:, block * SIZE : (block + 1) * SIZE]))
+    return np.concatenate(output, axis=1).astype(float)
+
+
+def error_db(actual, expected):
+    return 20 * np.log10(np.max(np.abs(actual - expected)) / np.max(np.abs(expected)) + 1e-30)
+
+
+def test_before_and_after_a_switch_it_is_as_if_it_had_always_been_so(is_compiled):
+    dry = np.random.default_rng(1).standard_normal((SOURCES, 400 * SIZE)).astype(np.float32)
+    own, shared, switched = (
+        make(is_compiled),
+        make(is_compiled, shared_tail=True),
+        make(is_compiled, switches_tail=True),
+    )
+    for convolver in (own, shared, switched):
+        for source, ir in enumerate(rooms(2)):
+            convolver.set_ir(source, ir)
+    alone, together = stream(own, dry), stream(shared, dry)
+    heard = stream(switched, dry, [(100, True), (250, False)])
+    first, second = slice(None, 100 * SIZE), slice(100 * SIZE + SETTLED, 250 * SIZE)
+    last = slice(250 * SIZE + SETTLED, None)
+    assert error_db(heard[:, first], alone[:, first]) < -115
+    assert error_db(heard[:, second], together[:, second]) < -115
+    assert error_db(heard[:, last], alone[:, last]) < -115
+    assert error_db(heard[:, second], alone[:, second]) > -60  # or there would be nothing to switch
+
+
+def test_both_kinds_switch_alike_while_irs_change(is_compiled):
+    rng = np.random.default_rng(3)
+    pair = [make(kind, switches_tail=True) for kind in (is_compiled, False)]
+    outputs = [[], []]
+    for block in range(400):
+        dry = rng.standard_normal((SOURCES, SIZE)).astype(np.float32)
+        source, ir = int(rng.integers(SOURCES)), rooms(int(rng.integers(1_000)))[0]
+        action = rng.random()
+        for convolver, output in zip(pair, outputs, strict=True):
+            if action < 0.05:
+                convolver.set_ir(source, ir)
+            elif action < 0.08:
+                convolver.share_tail(bool(block % 2))
+            output.append(convolver.process(dry))
+    assert error_db(np.concatenate(outputs[0], axis=1), np.concatenate(outputs[1], axis=1)) < -115
+
+
+def test_switching_does_not_splatter(is_compiled):
+    sample_rate = 24_000
+    time_s = np.arange(500 * SIZE) / sample_rate
+    dry = np.tile(np.sin(2 * np.pi * 500 * time_s), (SOURCES, 1)).astype(np.float32)
+    convolver = make(is_compiled, switches_tail=True)
+    for source, ir in enumerate(rooms(4)):
+        convolver.set_ir(source, ir)
+    wet = stream(convolver, dry, [(block, block % 80 == 0) for block in range(120, 480, 40)])
+    middle = wet[:, SETTLED:] * np.blackman(wet.shape[1] - SETTLED)
+    spectrum = np.abs(np.fft.rfft(middle)) ** 2
+    frequency = np.fft.rfftfreq(middle.shape[1], 1 / sample_rate)
+    assert 10 * np.log10(spectrum[:, frequency > 4_000].sum() / spectrum.sum()) < -90
+
+
+def test_responses_without_a_tail_have_none_to_share(is_compiled):
+    short = Partitioning(SIZE, 400)
+    assert len(short.stages) == 1
+    convolver = Convolver(
+        sources=1, channels=2, block_size=SIZE, ir_samples=400, switches_tail=True, is_compiled=is_compiled
+    )
+    convolver.set_ir(0, rooms(5)[0][:, :400])
+    convolver.share_tail(True)
+    dry = np.zeros((1, 20 * SIZE), np.float32)
+    dry[0, 0] = 1
+    assert error_db(stream(convolver, dry)[:, :400], rooms(5)[0][:, :400].astype(float)) < -115
