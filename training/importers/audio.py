@@ -13,12 +13,14 @@ class UnreadableError(Exception):
 
 def read_response(path: Path, channels: int) -> tuple[npt.NDArray[np.float32], int]:
     """(channel, sample) and the rate. Raises UnreadableError."""
+    if not path.is_file():
+        raise UnreadableError("no such file")
+    if path.stat().st_size == 0:
+        raise UnreadableError("empty file")
     try:
         samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
-    except FileNotFoundError as exc:
-        raise UnreadableError("no such file") from exc
     except (OSError, soundfile.SoundFileError) as exc:
-        raise UnreadableError("empty file" if path.stat().st_size == 0 else "unreadable") from exc
+        raise UnreadableError("unreadable") from exc
     if samples.shape[1] != channels:
         raise UnreadableError(f"not {channels} channel{'s' if channels > 1 else ''}")
     return samples.T, int(rate)
