@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
@@ -224,18 +225,25 @@ class ImportedDataset:
         """
         if (folder / "pairs.h5").exists():
             raise DatasetError(f"{folder}: holds a simulated dataset; choose another folder")
+        remaining = iter(measurements)
+        first = next(remaining, None)  # before a folder is made: a bad source leaves none behind
+        if first is None:
+            reasons = "; ".join(f"{skipped.count} {reason}" for reason, skipped in report.skipped.items())
+            raise ResponsesError(Path(source), "responses", f"none could be read ({reasons or 'none found'})")
         folder.mkdir(parents=True, exist_ok=True)
         path, partial = folder / FILE, folder / "responses.partial"
         listener, emitter, yaw = [], [], []
-        first: Measurement | None = None
         with h5py.File(partial, "w") as file:
-            for row, measurement in enumerate(measurements):
+            channels, samples = first.response.shape
+            responses = file.create_dataset(
+                "responses",
+                (0, channels, 0),
+                np.float32,
+                maxshape=(None, channels, None),
+                chunks=(1, channels, samples),
+            )
+            for row, measurement in enumerate(chain([first], remaining)):
                 channels, samples = measurement.response.shape
-                if first is None:
-                    first = measurement
-                    unlimited = (None, channels, None)
-                    chunks = (1, channels, max(samples, 1))
-                    file.create_dataset("responses", (0, channels, 0), np.float32, maxshape=unlimited, chunks=chunks)
                 if measurement.sample_rate != first.sample_rate:
                     problem = (
                         f"{measurement.sample_rate} Hz in row {row} after {first.sample_rate} Hz; ask for one rate"
@@ -244,16 +252,12 @@ class ImportedDataset:
                 if channels != len(first.response):
                     problem = f"{channels} in row {row} after {len(first.response)}"
                     raise ResponsesError(Path(source), "channels", problem)
-                responses = file["responses"]
                 responses.resize((row + 1, channels, max(samples, responses.shape[2])))
                 responses[row, :, :samples] = measurement.response
                 listener.append(measurement.listener)
                 emitter.append(measurement.emitter)
                 yaw.append(measurement.yaw)
                 report.read += 1
-            if first is None:
-                reasons = "; ".join(f"{skipped.count} {reason}" for reason, skipped in report.skipped.items())
-                raise ResponsesError(Path(source), "responses", f"none could be read ({reasons or 'none found'})")
             file["listener"], file["emitter"], file["yaw"] = np.array(listener), np.array(emitter), np.array(yaw)
             file["held_out"] = choose_held_out(np.array(emitter), np.array(listener), held_out_share, seed)
             file.attrs.update(
