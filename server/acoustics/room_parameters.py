@@ -52,9 +52,9 @@ class UnmeasurableError(ValueError):
 
 @dataclass(frozen=True)
 class RoomParameters:
-    """Parameters of a batch of binaural responses. NaN marks an entry that cannot be measured; `missing` counts them.
+    """Parameters of a batch of responses. NaN marks an entry that cannot be measured; `missing` counts them.
 
-    Shapes: `(..., channel)`, and `(...)` for the last three.
+    Shapes: `(..., channel)`, and `(...)` for the last three, which compare two ears and are missing of one channel.
     """
 
     onset_s: _Floats
@@ -74,13 +74,17 @@ class RoomParameters:
 def measure(
     ir: npt.ArrayLike, sample_rate: float, *, decay_db: float = 30.0, onset: npt.ArrayLike | None = None
 ) -> RoomParameters:
-    """All parameters of binaural responses `(..., 2, sample)`.
+    """All parameters of responses to one microphone or to two ears, `(..., channel, sample)`.
 
-    `onset` `(..., 2)`, samples: where the direct sound is expected within 3 ms (from geometry or from a reference), for
-    the direct-to-reverberant ratio and the interaural time difference; detected where it is not given.
-    Raises ValueError for responses that are not binaural or not finite.
+    `onset` `(..., channel)`, samples: where the direct sound is expected within 3 ms (from geometry or from a
+    reference), for the direct-to-reverberant ratio and the interaural time difference; detected where it is not given.
+    Raises ValueError for responses of other channels or not finite.
     """
-    responses = _binaural(ir)
+    responses = np.asarray(ir)
+    if responses.ndim < 2 or responses.shape[-2] not in {1, 2}:
+        raise ValueError(f"a response has one channel or is binaural, not {responses.shape}")
+    binaural = responses.shape[-2] == 2
+    between_ears = np.full(responses.shape[:-2], np.nan)
     decay = energy_decay(responses, sample_rate)
     direct = _direct_sample(responses, decay.onset if onset is None else onset, sample_rate)
     return RoomParameters(
@@ -90,9 +94,13 @@ def measure(
         early_decay_time_s=_decay_time_s(decay, sample_rate, 0.0, -10.0),
         clarity_db=_clarity_db(decay, sample_rate, 0.050),
         direct_to_reverberant_db=_direct_to_reverberant_db(responses, decay, direct, sample_rate, DIRECT_SOUND_S),
-        interaural_cross_correlation=_iacc(responses, decay.onset, sample_rate, 0.0, None),
-        early_interaural_cross_correlation=_iacc(responses, decay.onset, sample_rate, 0.0, _EARLY_S),
-        interaural_time_difference_s=_itd_s(responses, direct, sample_rate),
+        interaural_cross_correlation=(
+            _iacc(responses, decay.onset, sample_rate, 0.0, None) if binaural else between_ears
+        ),
+        early_interaural_cross_correlation=(
+            _iacc(responses, decay.onset, sample_rate, 0.0, _EARLY_S) if binaural else between_ears
+        ),
+        interaural_time_difference_s=_itd_s(responses, direct, sample_rate) if binaural else between_ears,
     )
 
 

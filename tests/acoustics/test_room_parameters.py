@@ -116,6 +116,28 @@ class TestReverberationTime:
         assert_allclose(reverberation_time_s(ir.astype(np.float16), RATE), reverberation_time_s(ir, RATE), rtol=1e-3)
 
 
+class TestEarlyDecayTime:
+    @pytest.mark.parametrize("t60_s", [0.2, 0.5, 1.2])
+    def test_of_an_exponential_is_its_reverberation_time(self, t60_s: float) -> None:
+        ir = np.tile(envelope(t60_s, 1.5 * t60_s), (2, 1))
+        assert_allclose(early_decay_time_s(ir, RATE), t60_s, rtol=2e-3)
+
+    def test_of_a_decay_that_begins_fast_is_the_fast_one(self) -> None:
+        """Two slopes that cross far below -10 dB: 20 dB of the first are seen before the second takes over."""
+        time_s = np.arange(round(1.2 * RATE)) / RATE
+        energy = 10.0 ** (-6.0 * time_s / 0.2) + 1e-4 * 10.0 ** (-6.0 * time_s / 0.8)
+        ir = np.tile(np.sqrt(energy), (2, 1))
+        assert_allclose(early_decay_time_s(ir, RATE), 0.2, rtol=0.01)
+        assert_allclose(reverberation_time_s(ir[:, RATE // 4 :], RATE), 0.8, rtol=0.05)
+
+    def test_is_refused_where_the_direct_sound_is_all_there_is_above_10_db(self) -> None:
+        """Ten times the energy of the rest in one sample: the curve leaps past -10 dB and has no slope."""
+        ir = np.tile(envelope(0.5), (2, 1))
+        ir[:, 0] = np.sqrt(11.0 * np.square(ir[0, 1:]).sum())
+        with pytest.raises(UnmeasurableError):
+            early_decay_time_s(ir, RATE)
+
+
 class TestClarity:
     @pytest.mark.parametrize("t60_s", [0.2, 0.5, 1.0])
     @pytest.mark.parametrize("early_s", [0.050, 0.080])
@@ -305,6 +327,16 @@ class TestMeasure:
         assert missing["interaural_cross_correlation"] == 1
         assert np.isfinite(parameters.reverberation_time_s[[0, 2]]).all()
 
+    def test_one_microphone_has_all_but_what_compares_two_ears(self) -> None:
+        ir = decaying_noise(0.4, shape=(3, 2))
+        both, left = measure(ir, RATE), measure(ir[:, :1], RATE)
+        for name, values in vars(left).items():
+            if name.startswith(("inter", "early_inter")):
+                assert values.shape == (3,)
+                assert np.isnan(values).all()
+            else:
+                assert_array_equal(values, getattr(both, name)[:, :1])
+
     @given(st.integers(0, 2**32 - 1), st.floats(-60.0, 60.0))
     @settings(max_examples=20, deadline=None)
     def test_gain_changes_the_level_only(self, seed: int, gain_db: float) -> None:
@@ -348,9 +380,14 @@ class TestBadInput:
         with pytest.raises(ValueError, match="not finite"):
             measure(ir, RATE)
 
-    def test_mono_is_not_binaural(self) -> None:
+    @pytest.mark.parametrize("channels", [0, 3])
+    def test_other_than_one_or_two_channels_are_refused(self, channels: int) -> None:
         with pytest.raises(ValueError, match="binaural"):
-            measure(decaying_noise(0.3, shape=(1,)), RATE)
+            measure(np.zeros((channels, 4_800)), RATE)
+
+    def test_ears_are_not_compared_where_there_is_one(self) -> None:
+        with pytest.raises(ValueError, match="binaural"):
+            interaural_cross_correlation(decaying_noise(0.3, shape=(1,)), RATE)
 
     def test_empty_response(self) -> None:
         with pytest.raises(ValueError, match="at least one sample"):

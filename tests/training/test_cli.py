@@ -100,4 +100,11 @@ def test_evaluating_prints_json_and_records(nafir_train, dataset, tiny_bundle, t
     printed = json.loads(out)
     recorded = json.loads((bundle / "scene.json").read_text())["levels"][0]["accuracy"]
     assert printed["pairs"] == recorded["pairs"] == len(dataset.pairs(held_out=True))
-    assert {row["name"] for row in printed["rows"]} >= recorded["errors"].keys()
+    errors = {name: entry["mean"] for name, entry in printed["columns"]["standard"]["metrics"].items()}
+    assert {name: error for name, error in errors.items() if error is not None} == recorded["errors"]
+
+
+def test_evaluating_needs_one_bundle_to_record_into(nafir_train, dataset):
+    code, _, err = nafir_train("evaluate", dataset.folder, "--record")
+    assert code == 2
+    assert "--record" in err

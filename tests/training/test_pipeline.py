@@ -14,10 +14,12 @@ from starlette.testclient import TestClient
 from server.acoustics.decibels import power_to_db
 from server.app import create_app
 from server.field.field import AcousticField
+from server.field.levels import Levels
 from server.settings import Settings
 from server.whole_field import WholeField
-from training.evaluation.held_out import evaluate_bundle
+from training.evaluation.run import evaluate_bundles
 from training.export import export
+from training.responses import SimulatedResponses
 from training.simulation.run import simulate
 from training.train import train
 
@@ -82,21 +84,23 @@ def test_a_field_of_a_room_without_reflections_is_silent(tiny_scene, configurati
     scene.write_text(re.sub(r"absorption = .*", f"absorption = {[1.0] * 7}", tiny_scene.read_text()))
     progress = Progress(disable=True)
     dataset = simulate(scene, tmp_path / "data", seed=0, workers=1, progress=progress)
-    train(dataset, tmp_path / "run", dataclasses.replace(configuration, epochs=1), progress)
-    field = AcousticField.load(export(dataset, tmp_path / "run", tmp_path / "bundle"))
+    responses = SimulatedResponses(dataset)
+    train(responses, tmp_path / "run", dataclasses.replace(configuration, epochs=1), progress)
+    field = AcousticField.load(export(responses, [tmp_path / "run"], tmp_path / "bundle"))
     ends = np.random.default_rng(0).uniform((0.5, 0.5, 1.2), (3.5, 2.5, 1.8), (2, 20, 3))
     assert (level_db(field.impulse_responses(*ends, np.zeros(20))) < -60).all()
 
 
 def test_evaluation_reports_every_metric(tiny_field, dataset):
-    evaluation = evaluate_bundle(tiny_field.bundle, dataset)
+    evaluation, _ = evaluate_bundles([tiny_field.bundle], dataset.folder)
     assert evaluation.pairs == len(dataset.pairs(held_out=True))
-    assert all(row.columns["field"].mean is not None for row in evaluation.rows if row.name.startswith(("t60", "c50")))
+    summaries = evaluation.of("standard").summaries
+    assert all(summaries[name].mean is not None for name in ("t60", "c50"))
 
 
 def test_the_server_serves_it(tiny_field):
     query = {"listener": "2,1,1.5", "emitter": "2,2.4,1.5", "yaw_deg": 90}
-    with TestClient(create_app(Settings(ir_workers=1), fields={"tiny": tiny_field})) as client:
+    with TestClient(create_app(Settings(ir_workers=1), scenes={"tiny": Levels([tiny_field])})) as client:
         for _ in range(200):
             if client.get("/readyz").status_code == 200:
                 break

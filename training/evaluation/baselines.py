@@ -4,8 +4,10 @@ Axes: one pair's impulse responses are `(yaw, channel, sample)`; every baseline 
 data, so none has to interpolate orientation.
 """
 
+import threading
+from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -15,10 +17,14 @@ from scipy.spatial import Delaunay
 
 _Floats = npt.NDArray[np.float64]
 _Responses = npt.NDArray[np.float32]
+Turns = npt.NDArray[np.integer] | slice
+"""Which of a pair's yaws are asked for."""
+ALL_TURNS = slice(None)
 
 _KERNEL_REACH = 32  # samples on either side
 _KERNEL_BETA = 8.0
 _WEIGHT_TOLERANCE = 1e-9
+_REMEMBERED = 32  # pairs: the neighbours of one are asked for by several methods
 
 
 class PairResponses(Protocol):
@@ -41,19 +47,29 @@ class TrainingPairs:
     listener_positions: _Floats
     emitter_positions: _Floats
     training: npt.NDArray[np.bool_]
+    _read: OrderedDict[int, _Responses] = field(default_factory=OrderedDict, init=False, repr=False, compare=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not np.any(self.training):
             raise ValueError("no pair is left for training")
 
     def response(self, pair: int) -> _Responses:
-        return np.asarray(self.responses[pair], dtype=np.float32)
+        """Not to be written to: the last few are kept."""
+        with self._lock:
+            if pair in self._read:
+                self._read.move_to_end(pair)
+                return self._read[pair]
+        response = np.asarray(self.responses[pair], dtype=np.float32)
+        with self._lock:
+            self._read[pair] = response
+            while len(self._read) > _REMEMBERED:
+                self._read.popitem(last=False)
+        return response
 
-    def weighted(self, pairs: Sequence[int], weights: Sequence[float]) -> _Responses:
-        return np.asarray(
-            sum(np.float32(weight) * self.response(pair) for pair, weight in zip(pairs, weights, strict=True)),
-            dtype=np.float32,
-        )
+    def weighted(self, pairs: Sequence[int], weights: Sequence[float], turns: Turns) -> _Responses:
+        parts = (np.float32(weight) * self.response(pair)[turns] for pair, weight in zip(pairs, weights, strict=True))
+        return np.asarray(sum(parts), dtype=np.float32)
 
 
 def nearest_pair(pairs: TrainingPairs, pair: int) -> int:
@@ -82,17 +98,21 @@ def linear_weights(pairs: TrainingPairs, pair: int) -> tuple[list[int], list[flo
     return [int(candidates[corner]) for corner in corners], [float(weight) for weight in weights]
 
 
-def nearest(pairs: TrainingPairs, pair: int) -> _Responses:
-    return pairs.response(nearest_pair(pairs, pair))
+def nearest(pairs: TrainingPairs, pair: int, turns: Turns = ALL_TURNS) -> _Responses:
+    return pairs.response(nearest_pair(pairs, pair))[turns]
 
 
-def linear(pairs: TrainingPairs, pair: int) -> _Responses:
+def linear(pairs: TrainingPairs, pair: int, turns: Turns = ALL_TURNS) -> _Responses:
     """Weighted sum of the waveforms, as in Luo et al. (NeurIPS 2022): early sound combs, levels sag between probes."""
-    return pairs.weighted(*linear_weights(pairs, pair))
+    return pairs.weighted(*linear_weights(pairs, pair), turns)
 
 
 def linear_aligned(
-    pairs: TrainingPairs, pair: int, delays_s: npt.NDArray[np.floating], sample_rate: float
+    pairs: TrainingPairs,
+    pair: int,
+    delays_s: npt.NDArray[np.floating],
+    sample_rate: float,
+    turns: Turns = ALL_TURNS,
 ) -> _Responses:
     """Linear interpolation of waveforms whose direct sounds are moved on top of each other first.
 
@@ -103,7 +123,7 @@ def linear_aligned(
     shifts = [(float(delays_s[pair]) - float(delays_s[neighbour])) * sample_rate for neighbour in neighbours]
     total: _Responses | None = None
     for neighbour, weight, shift in zip(neighbours, weights, shifts, strict=True):
-        part = np.float32(weight) * _shifted(pairs.response(neighbour), shift)
+        part = np.float32(weight) * _shifted(pairs.response(neighbour)[turns], shift)
         total = part if total is None else total + part
     assert total is not None  # weights are never empty
     return total

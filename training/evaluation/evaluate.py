@@ -1,17 +1,20 @@
-"""Evaluation of a field on held-out pairs, beside the baselines and the repeatability floor.
+"""Evaluation of any number of methods on held-out pairs: errors entry by entry, storage, and time per response.
 
 Axes: one held-out pair's impulse responses are `(yaw, channel, sample)`. Errors are those of
 `server.acoustics.metrics`, entry by entry `(pair, yaw)`.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from rich.table import Table
 
+from server.acoustics.codec import Codec
 from server.acoustics.metrics import (
     PARAMETER_METRICS,
     SPECTRAL_LOSS,
@@ -22,172 +25,227 @@ from server.acoustics.metrics import (
     summarise,
 )
 from server.acoustics.room_parameters import measure
+from training.evaluation.held_out import EvaluationError, HeldOut, Responses
 
-FIELD = "field"
 FLOOR = "floor"
-METRICS = (*PARAMETER_METRICS[:5], SPECTRAL_LOSS, *PARAMETER_METRICS[5:])
-# A field that cannot be measured where a baseline can must not win by leaving those entries out.
+METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS)
+# A method that cannot be measured where another can must not win by leaving those entries out.
 _MISSING_ALLOWANCE = 0.01
+_TIMED_PAIRS = 7
+_TIMED_S = 5.0
+_SPECTRAL_WINDOW_S = 0.0107
+_SPECTRAL_FLOOR = 1e-5
 
-Responses = npt.NDArray[np.floating]
-PairSource = Callable[[int], Responses]  # held-out index -> (yaw, 2, sample)
+Kind = Literal["field", "baseline", "floor"]
+Source = Callable[[int, npt.NDArray[np.integer]], Responses | None]
+"""Held-out index and orientations (n,), indices into the yaws of the data, to (n, channel, sample); None where the
+method has no answer. Called from several threads."""
 _Errors = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class MetricRow:
-    """One metric: a summary per column, and the verdict.
-
-    beats_baselines: the field's mean error is below that of each baseline over the entries both could be measured in.
-    above_floor: the best baseline's mean error exceeds the repeatability floor, so there is something to win.
-    """
+class Column:
+    """One method. storage_bytes: what it has to keep of the scene; method: its name in published tables;
+    extra_ms: time per response that `source` does not spend because it was spent beforehand."""
 
     name: str
-    label: str
-    unit: str
-    columns: Mapping[str, Summary]
-    beats_baselines: bool
-    above_floor: bool
+    source: Source
+    kind: Kind
+    storage_bytes: int | None = None
+    method: str = ""
+    extra_ms: float = 0.0
 
-    @property
-    def passes(self) -> bool:
-        return self.beats_baselines or not self.above_floor
+
+@dataclass(frozen=True)
+class Result:
+    """A column measured. ms: of one response on one core, everything included; beats: baselines whose mean error is
+    larger over the entries both could be measured in, by metric."""
+
+    name: str
+    kind: Kind
+    method: str
+    storage_bytes: int | None
+    ms: float | None
+    summaries: Mapping[str, Summary]
+    beats: Mapping[str, tuple[str, ...]]
+    errors: Mapping[str, _Errors] = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What `nafir-train evaluate` reports. `errors[column][metric]` is `(pair, yaw)`, NaN where missing."""
+    """What `nafir-train evaluate` reports; `held_out` is how many pairs there are, `pairs` how many were measured."""
 
+    data: str
     pairs: int
+    held_out: int
     visible_pairs: int
     yaws: int
-    baselines: tuple[str, ...]
-    rows: tuple[MetricRow, ...]
-    errors: Mapping[str, Mapping[str, _Errors]] = field(repr=False, compare=False)
+    channels: int
+    left_out: int
+    results: tuple[Result, ...]
+
+    def of(self, name: str) -> Result:
+        return next(result for result in self.results if result.name == name)
+
+    @property
+    def baselines(self) -> tuple[str, ...]:
+        return tuple(result.name for result in self.results if result.kind == "baseline")
+
+    @property
+    def floor(self) -> Result | None:
+        return next((result for result in self.results if result.kind == "floor"), None)
 
     def to_json(self) -> dict[str, object]:
         """Plain values for `json.dumps`; entry-wise errors are left out."""
-        rows = [{**asdict(row), "passes": row.passes} for row in self.rows]
+        floor = self.floor
+        columns = {}
+        for result in self.results:
+            columns[result.name] = {
+                "kind": result.kind,
+                "storage_bytes": result.storage_bytes,
+                "ms": result.ms,
+                "metrics": {
+                    metric.name: {
+                        **asdict(result.summaries[metric.name]),
+                        "times_floor": _ratio(result.summaries[metric.name], floor, metric),
+                        "beats": list(result.beats[metric.name]),
+                    }
+                    for metric in METRICS
+                },
+            }
         return {
+            "data": self.data,
             "pairs": self.pairs,
+            "held_out_pairs": self.held_out,
             "visible_pairs": self.visible_pairs,
+            "left_out_pairs": self.left_out,
             "yaws": self.yaws,
-            "baselines": list(self.baselines),
-            "rows": rows,
+            "channels": self.channels,
+            "metrics": [{"name": metric.name, "label": metric.label, "unit": metric.unit} for metric in METRICS],
+            "columns": columns,
         }
 
 
 def evaluate(
-    references: PairSource,
+    held_out: HeldOut,
+    columns: Sequence[Column],
     *,
-    field: PairSource,
-    baselines: Mapping[str, PairSource],
-    repeats: PairSource,
-    visible: npt.NDArray[np.bool_],
-    sample_rate: float,
-    log_magnitude: Callable[[Responses], npt.NDArray[np.floating]],
-    informational: Mapping[str, PairSource] | None = None,
+    of: int | None = None,
     decay_db: float = 30.0,
     threads: int = 2,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
-    """Measures every held-out pair at every yaw in every column.
+    """Measures every held-out pair at every orientation that is heard, in every column.
 
-    `visible` (pair,): whether the emitter is in sight; without sight there is no direct sound, and metrics that need
-    one are missing. The direct sound is sought within 3 ms of where the reference has it. `repeats` is a second
-    independent simulation of the references. `log_magnitude` maps `(yaw, 2, sample)` to the codec's spectrogram.
-    The sources are called from several `threads`; `track` may wrap the loop over pairs in a progress bar.
+    Where the emitter is not in sight there is no direct sound, and metrics that need one are missing; what a method
+    does not answer is missing in all of them. The direct sound is sought within 3 ms of where the reference has it.
+    `of`: the held-out pairs that these were drawn from. Sources are called from several `threads` for errors, and one
+    at a time for what they take. `track` may wrap the loop over pairs in a progress bar.
     """
-    if len(visible) == 0:
-        raise ValueError("no pair is held out")
-    if not baselines:
-        raise ValueError("a field is judged against baselines: give at least one")
-    sources = {FIELD: field, **baselines, **(informational or {}), FLOOR: repeats}
-    if len(sources) != 2 + len(baselines) + len(informational or {}):
-        raise ValueError("two columns have the same name")
+    codec = spectral_codec(held_out.sample_rate, held_out.samples)
+    names = [column.name for column in columns]
+    if len(set(names)) < len(names):
+        raise EvaluationError(f"two columns have the same name among {', '.join(names)}")
 
-    def pair_errors(pair: int) -> dict[str, dict[str, _Errors]]:
-        reference = np.asarray(references(pair), dtype=np.float32)  # stored as float16, which is slow to compute with
-        reference_parameters = measure(reference, sample_rate, decay_db=decay_db)
-        onset = np.round(np.nan_to_num(reference_parameters.onset_s, nan=0.0) * sample_rate).astype(np.int64)
-        reference_spectrogram = log_magnitude(reference)
-        errors: dict[str, dict[str, _Errors]] = {}
-        for column, source in sources.items():
-            estimate = np.asarray(source(pair), dtype=np.float32)
+    def pair_errors(pair: int) -> list[dict[str, _Errors]]:
+        reference = np.asarray(held_out.reference(pair), dtype=np.float32)
+        parameters = measure(reference, held_out.sample_rate, decay_db=decay_db)
+        onset = np.round(np.nan_to_num(parameters.onset_s, nan=0.0) * held_out.sample_rate).astype(np.int64)
+        spectrogram = codec.log_magnitude(codec.transform(reference))
+
+        def errors_of(column: Column) -> dict[str, _Errors]:
+            answer = column.source(pair, held_out.heard)
+            if answer is None:
+                return {metric.name: np.full(len(reference), np.nan) for metric in METRICS}
+            estimate = np.asarray(answer, dtype=np.float32)
             if estimate.shape != reference.shape:
-                raise ValueError(f"{column}: responses of {estimate.shape} where the reference has {reference.shape}")
-            parameters = measure(estimate, sample_rate, decay_db=decay_db, onset=onset)
-            errors[column] = parameter_errors(reference_parameters, parameters)
-            errors[column][SPECTRAL_LOSS.name] = spectral_loss(reference_spectrogram, log_magnitude(estimate))
+                raise EvaluationError(
+                    f"{column.name}: responses of {estimate.shape} where the data have {reference.shape}"
+                )
+            estimated = measure(estimate, held_out.sample_rate, decay_db=decay_db, onset=onset)
+            errors = parameter_errors(parameters, estimated)
+            errors[SPECTRAL_LOSS.name] = spectral_loss(spectrogram, codec.log_magnitude(codec.transform(estimate)))
             for metric in METRICS:
-                if metric.needs_direct_sound and not visible[pair]:
-                    errors[column][metric.name] = np.full_like(errors[column][metric.name], np.nan)
-        return errors
+                if metric.needs_direct_sound and not held_out.visible[pair]:
+                    errors[metric.name] = np.full(len(reference), np.nan)
+            return errors
+
+        return [errors_of(column) for column in columns]
 
     pool = ThreadPoolExecutor(threads)
     try:
-        pairs = range(len(visible))
+        pairs = range(len(held_out))
         by_pair = [errors for _, errors in zip(track(pairs), pool.map(pair_errors, pairs), strict=True)]
     finally:
         pool.shutdown(cancel_futures=True)
-    errors_by_column = {
-        column: {metric.name: np.stack([errors[column][metric.name] for errors in by_pair]) for metric in METRICS}
-        for column in sources
+    errors = {
+        name: {metric.name: np.stack([entry[number][metric.name] for entry in by_pair]) for metric in METRICS}
+        for number, name in enumerate(names)
     }
+    baselines = [column.name for column in columns if column.kind == "baseline"]
     return Evaluation(
-        pairs=len(visible),
-        visible_pairs=int(np.count_nonzero(visible)),
-        yaws=errors_by_column[FIELD][METRICS[0].name].shape[1],
-        baselines=tuple(baselines),
-        rows=tuple(_row(metric, errors_by_column, tuple(baselines)) for metric in METRICS),
-        errors=errors_by_column,
+        data=held_out.name,
+        pairs=len(held_out),
+        held_out=of or len(held_out),
+        visible_pairs=int(np.count_nonzero(held_out.visible)),
+        yaws=len(held_out.heard),
+        channels=held_out.channels,
+        left_out=held_out.left_out,
+        results=tuple(_result(column, held_out, errors, baselines) for column in columns),
     )
 
 
-def report(evaluation: Evaluation) -> Table:
-    """The table for people: mean (median) per column; the best of field and baselines is bold."""
-    in_sight = f"{evaluation.visible_pairs} in sight"
-    table = Table(
-        title=f"{evaluation.pairs} held-out pairs ({in_sight}), {evaluation.yaws} orientations each",
-        caption="mean (median) error; n missing = entries that could not be measured or have no direct sound",
+def spectral_codec(sample_rate: int, samples: int) -> Codec:
+    """Of spectral losses, the same for every method: windows of about 11 ms (256 at 24 kHz), a quarter of one apart,
+    and a floor under magnitudes 100 dB below a unit impulse. The paper's windows are twice as long and its floor 40 dB
+    higher, which hides all of our late tails."""
+    n_fft = 2 ** round(np.log2(_SPECTRAL_WINDOW_S * sample_rate))
+    return Codec(sample_rate, n_fft, n_fft // 4, samples, _SPECTRAL_FLOOR)
+
+
+def milliseconds_per_response(column: Column, held_out: HeldOut) -> float | None:
+    """Median time of one response, asked for alone in this thread after a first time that does not count: what a
+    method reads from disk is in memory by then. None if the method has no answer to any pair."""
+    times_s = []
+    began = time.perf_counter()
+    for number, pair in enumerate(np.linspace(0, len(held_out) - 1, min(_TIMED_PAIRS, len(held_out))).astype(int)):
+        turn = held_out.heard[[number % len(held_out.heard)]]
+        if column.source(int(pair), turn) is None:
+            continue
+        start = time.perf_counter()
+        column.source(int(pair), turn)
+        times_s.append(time.perf_counter() - start)
+        if time.perf_counter() - began > _TIMED_S:
+            break
+    return 1e3 * statistics.median(times_s) + column.extra_ms if times_s else None
+
+
+def _result(
+    column: Column, held_out: HeldOut, errors: Mapping[str, Mapping[str, _Errors]], baselines: Sequence[str]
+) -> Result:
+    ours = errors[column.name]
+    beats = {
+        metric.name: tuple(
+            name for name in baselines if name != column.name and _beats(ours[metric.name], errors[name][metric.name])
+        )
+        for metric in METRICS
+    }
+    return Result(
+        name=column.name,
+        kind=column.kind,
+        method=column.method,
+        storage_bytes=column.storage_bytes,
+        ms=None if column.kind == "floor" else milliseconds_per_response(column, held_out),
+        summaries={metric.name: summarise(ours[metric.name]) for metric in METRICS},
+        beats=beats,
+        errors=ours,
     )
-    table.add_column("metric")
-    for column in evaluation.errors:
-        table.add_column(column, justify="right")
-    table.add_column("verdict")
-    for row in evaluation.rows:
-        judged = {name: row.columns[name].mean for name in (FIELD, *evaluation.baselines)}
-        best = min((mean for mean in judged.values() if mean is not None), default=None)
-        cells = [
-            _cell(summary, bold=name in judged and best is not None and summary.mean == best)
-            for name, summary in row.columns.items()
-        ]
-        table.add_row(f"{row.label} ({row.unit})" if row.unit else row.label, *cells, _verdict(row))
-    return table
 
 
-def _cell(summary: Summary, *, bold: bool) -> str:
-    if summary.mean is None or summary.median is None:
-        return f"none, {summary.missing} missing"
-    text = f"{summary.mean:.3g} ({summary.median:.3g})"
-    missing = f"\n[dim]{summary.missing} missing[/dim]" if summary.missing else ""
-    return (f"[bold]{text}[/bold]" if bold else text) + missing
-
-
-def _verdict(row: MetricRow) -> str:
-    if row.beats_baselines:
-        return "[green]beats both[/green]" if len(row.columns) > 3 else "[green]beats it[/green]"
-    return "[red]does not beat[/red]" if row.above_floor else "[yellow]at the floor[/yellow]"
-
-
-def _row(metric: Metric, errors: Mapping[str, Mapping[str, _Errors]], baselines: tuple[str, ...]) -> MetricRow:
-    columns = {column: summarise(by_metric[metric.name]) for column, by_metric in errors.items()}
-    ours = errors[FIELD][metric.name]
-    beats = all(_beats(ours, errors[baseline][metric.name]) for baseline in baselines)
-    best = min((mean for name in baselines if (mean := columns[name].mean) is not None), default=None)
-    floor = columns[FLOOR].mean
-    above = best is not None and (floor is None or best > floor)
-    return MetricRow(metric.name, metric.label, metric.unit, columns, beats, above)
+def _ratio(summary: Summary, floor: Result | None, metric: Metric) -> float | None:
+    """Mean error over that of the floor."""
+    least = None if floor is None else floor.summaries[metric.name].mean
+    return None if summary.mean is None or not least else summary.mean / least
 
 
 def _beats(ours: _Errors, theirs: _Errors) -> bool:

@@ -1,76 +1,102 @@
-"""The held-out pairs of a dataset, answered by a bundle's field and by the baselines."""
+"""The held-out pairs of a dataset, simulated or measured: what every method is asked for and may look at.
 
-from collections.abc import Callable, Iterable
+Axes: one pair's impulse responses are `(yaw, channel, sample)`, whole, the direct sound included. Metres, radians.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
-from server.field.field import AcousticField
-from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import Accuracy
-from server.whole_field import WholeField
+from server.errors import NafirError
+from server.scene.bundle import Bundle
 from training.dataset import Dataset, DatasetError
-from training.evaluation.baselines import TrainingPairs, linear, linear_aligned, nearest
-from training.evaluation.evaluate import FIELD, FLOOR, Evaluation, Responses, evaluate
-from training.evaluation.figure import draw_figure
+from training.evaluation.baselines import PairResponses, TrainingPairs
+from training.responses import ImportedDataset, SimulatedResponses, open_responses
 from training.simulation.references import References
 
+Responses = npt.NDArray[np.floating]
+_Floats = npt.NDArray[np.float64]
+_Integers = npt.NDArray[np.integer]
 
+
+class EvaluationError(NafirError):
+    """What was asked to be evaluated cannot be."""
+
+
+@dataclass(frozen=True)
 class HeldOut:
-    """Held-out pairs by index; every method takes one and gives (yaw, ear, sample)."""
+    """Held-out pairs by index, counted from 0.
 
-    def __init__(self, dataset: Dataset, field: WholeField, file: h5py.File) -> None:
-        probes = len(dataset.probes)
-        emitter, listener = np.divmod(np.arange(probes**2), probes)
-        self.dataset = dataset
-        self.flat = np.flatnonzero(dataset.held_out.ravel())
-        self._field = field
-        self._responses = References(dataset, file)
-        self._repeats = References(dataset, file, "repeats")
-        self._training = TrainingPairs(
-            self._responses,
-            listener,
-            emitter,
-            dataset.probes,
-            dataset.probes,
-            ~dataset.held_out.ravel() & (emitter != listener),
-        )
+    pairs: all pairs of the dataset, and which a method may look at; held_out: (index,) their numbers among those;
+    repeats: a second independent take of each pair, if there is one; delays_s: (pair,) when sound can first arrive;
+    yaws: (yaw,) of all responses, and heard: (n,) those that are measured, indices into yaws; visible: (index,).
+    """
+
+    folder: Path
+    name: str
+    sample_rate: int
+    samples: int
+    channels: int
+    pairs: TrainingPairs
+    held_out: _Integers
+    repeats: PairResponses | None
+    delays_s: _Floats
+    yaws: _Floats
+    heard: _Integers
+    visible: npt.NDArray[np.bool_]
+    simulated: Dataset | None
+    left_out: int = 0
+    """Pairs that could not be used: without a response at every orientation that the others have."""
+
+    def __post_init__(self) -> None:
+        if not len(self.held_out):
+            raise EvaluationError(f"{self.name}: no pair is held out")
+
+    def __len__(self) -> int:
+        return len(self.held_out)
 
     @property
-    def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """(pair, 3) emitters and listeners."""
-        emitter, listener = np.divmod(self.flat, len(self.dataset.probes))
-        return self.dataset.probes[emitter], self.dataset.probes[listener]
+    def emitters(self) -> _Floats:
+        """(index, 3)"""
+        return self.pairs.emitter_positions[self.pairs.pair_emitter[self.held_out]]
 
     @property
-    def visible(self) -> npt.NDArray[np.bool_]:
-        return self.dataset.plan.is_visible(*self.ends)
+    def listeners(self) -> _Floats:
+        """(index, 3)"""
+        return self.pairs.listener_positions[self.pairs.pair_listener[self.held_out]]
 
     def reference(self, index: int) -> Responses:
-        return self._responses[self.flat[index]]
+        """At the orientations that are heard."""
+        return self.pairs.response(int(self.held_out[index]))[self.heard]
 
-    def repeat(self, index: int) -> Responses:
-        return self._repeats[self.flat[index]]
+    def sample(self, *, pairs: int | None, yaws: int | None, seed: int) -> "HeldOut":
+        """A random subset of as many pairs, and as many orientations spread evenly, or all where there are no more."""
+        chosen = np.arange(len(self))
+        if pairs is not None and pairs < len(self):
+            chosen = np.sort(np.random.default_rng([seed, 11]).choice(len(self), pairs, replace=False))
+        heard = self.heard
+        if yaws is not None and yaws < len(heard):
+            heard = heard[np.linspace(0, len(heard), yaws, endpoint=False).astype(int)]
+        return replace(self, held_out=self.held_out[chosen], heard=heard, visible=self.visible[chosen])
 
-    def predicted(self, index: int) -> Responses:
-        emitters, listeners = self.ends
-        yaws = self.dataset.yaws
-        shape = (len(yaws), 3)
-        return self._field.impulse_responses(
-            np.broadcast_to(listeners[index], shape), np.broadcast_to(emitters[index], shape), yaws
-        )
 
-    def nearest(self, index: int) -> Responses:
-        return nearest(self._training, int(self.flat[index]))
+@contextmanager
+def open_held_out(folder: Path) -> Iterator[HeldOut]:
+    """The held-out pairs of a dataset folder of either kind, its responses read from disk as they are asked for.
 
-    def linear(self, index: int) -> Responses:
-        return linear(self._training, int(self.flat[index]))
-
-    def linear_aligned(self, index: int) -> Responses:
-        delays = self.dataset.onset_s.ravel()
-        return linear_aligned(self._training, int(self.flat[index]), delays, self.dataset.sample_rate)
+    Raises DatasetError or ResponsesError if the folder holds no dataset, EvaluationError if none of it is held out.
+    """
+    responses = open_responses(folder)
+    if isinstance(responses, SimulatedResponses):
+        with h5py.File(folder / "pairs.h5", "r") as file:
+            yield _of_simulation(responses.dataset, file)
+    else:
+        yield _of_measurement(responses)
 
 
 def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
@@ -81,67 +107,71 @@ def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
         raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
 
 
-def evaluate_bundle(
-    bundle: Bundle,
-    dataset: Dataset,
-    *,
-    figure: Path | None = None,
-    track: Callable[[range], Iterable[int]] = iter,
-) -> Evaluation:
-    """Every held-out pair at every yaw, in the time domain, as the server would render it; optionally with a figure
-    (PNG).
-
-    Raises DatasetError if the dataset is of another scene than the bundle.
-    """
-    require_same_scene(bundle, dataset)
-    codec = bundle.manifest.codec.codec
-    field = WholeField.through_kemar(AcousticField.load(bundle))
-    with h5py.File(dataset.folder / "pairs.h5", "r") as file:
-        held_out = HeldOut(dataset, field, file)
-        evaluation = evaluate(
-            held_out.reference,
-            field=held_out.predicted,
-            baselines={"nearest": held_out.nearest, "linear": held_out.linear},
-            informational={"linear, aligned": held_out.linear_aligned},
-            repeats=held_out.repeat,
-            visible=held_out.visible,
-            sample_rate=dataset.sample_rate,
-            log_magnitude=lambda responses: codec.log_magnitude(codec.transform(responses)),
-            track=track,
-        )
-        if figure is not None:
-            draw_figure(
-                evaluation,
-                figure,
-                references=held_out.reference,
-                columns={FIELD: held_out.predicted, "nearest": held_out.nearest},
-                examples=_examples(held_out),
-                sample_rate=dataset.sample_rate,
-            )
-    return evaluation
+def _of_simulation(dataset: Dataset, file: h5py.File) -> HeldOut:
+    probes = dataset.probes
+    emitter, listener = np.divmod(np.arange(len(probes) ** 2), len(probes))
+    held_out = np.flatnonzero(dataset.held_out.ravel())
+    training = ~dataset.held_out.ravel() & (emitter != listener)
+    return HeldOut(
+        folder=dataset.folder,
+        name=f"{dataset.scene.id} (simulated)",
+        sample_rate=dataset.sample_rate,
+        samples=dataset.samples,
+        channels=2,
+        pairs=TrainingPairs(References(dataset, file), listener, emitter, probes, probes, training),
+        held_out=held_out,
+        repeats=References(dataset, file, "repeats"),
+        delays_s=dataset.onset_s.ravel(),
+        yaws=dataset.yaws,
+        heard=np.arange(len(dataset.yaws)),
+        visible=dataset.plan.is_visible(probes[emitter[held_out]], probes[listener[held_out]]),
+        simulated=dataset,
+    )
 
 
-def record_accuracy(bundle: Bundle, evaluation: Evaluation) -> Bundle:
-    """Writes the measured errors of the bundle's first quality level into its manifest."""
-    columns = {
-        column: {row.name: mean for row in evaluation.rows if (mean := row.columns[column].mean) is not None}
-        for column in (FIELD, FLOOR)
-    }
-    accuracy = Accuracy(pairs=evaluation.pairs, yaws=evaluation.yaws, errors=columns[FIELD], floor=columns[FLOOR])
-    first, *others = bundle.manifest.levels
-    levels = (first.model_copy(update={"accuracy": accuracy}), *others)
-    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
-    return write_bundle(bundle.folder, bundle.manifest.model_copy(update={"levels": levels}), files)
+@dataclass(frozen=True)
+class _MeasuredPairs:
+    """rows: (pair, yaw) rows of the dataset."""
+
+    dataset: ImportedDataset
+    rows: _Integers
+
+    def __getitem__(self, pair: int) -> npt.NDArray[np.float32]:
+        return self.dataset.read(self.rows[pair])
 
 
-def _examples(held_out: HeldOut) -> list[tuple[int, str]]:
-    """Held-out pairs worth looking at: the closest and farthest in sight, and out of sight."""
-    emitters, listeners = held_out.ends
-    distance = np.linalg.norm(emitters - listeners, axis=-1)
-    examples = []
-    for visible, label in ((True, "in sight"), (False, "round the corner")):
-        chosen = np.flatnonzero(held_out.visible == visible)
-        ordered = chosen[np.argsort(distance[chosen])]
-        ends = dict.fromkeys([*ordered[:1], *ordered[-1:]])
-        examples += [(int(index), f"{label}, {distance[index]:.1f} m") for index in ends]
-    return examples
+def _of_measurement(dataset: ImportedDataset) -> HeldOut:
+    """Of a measurement no walls are known: every pair counts as in sight. A pair without a response at every
+    orientation is left out and counted."""
+    whole_turn = np.round(2 * np.pi, 6)
+    yaws, turn = np.unique(np.round(dataset.yaw % (2 * np.pi), 6) % whole_turn, return_inverse=True)
+    rows = np.full((int(dataset.pair.max()) + 1, len(yaws)), -1)
+    rows[dataset.pair, turn.reshape(-1)] = np.arange(len(dataset.pair))
+    complete = (rows >= 0).all(axis=1)
+    rows = rows[complete]
+    if not len(rows):
+        raise EvaluationError(f"{dataset.folder}: no pair was measured at all of the {len(yaws)} orientations")
+    emitters, pair_emitter = _points(dataset.emitter[rows[:, 0]])
+    listeners, pair_listener = _points(dataset.listener[rows[:, 0]])
+    held_out = dataset.held_out[rows[:, 0]]
+    return HeldOut(
+        folder=dataset.folder,
+        name=f"{dataset.folder.name} (measured, {dataset.layout})",
+        sample_rate=dataset.sample_rate,
+        samples=dataset.samples,
+        channels=dataset.channels,
+        pairs=TrainingPairs(_MeasuredPairs(dataset, rows), pair_listener, pair_emitter, listeners, emitters, ~held_out),
+        held_out=np.flatnonzero(held_out),
+        repeats=None,
+        delays_s=dataset.onset_s[rows[:, 0]],
+        yaws=yaws,
+        heard=np.arange(len(yaws)),
+        visible=np.ones(int(held_out.sum()), dtype=bool),
+        simulated=None,
+        left_out=int((~complete).sum()),
+    )
+
+
+def _points(positions: _Floats) -> tuple[_Floats, _Integers]:
+    points, index = np.unique(positions, axis=0, return_inverse=True)
+    return points, index.reshape(-1)

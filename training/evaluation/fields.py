@@ -1,0 +1,98 @@
+"""Fields of scene bundles as columns of an evaluation, and what was measured of them written back."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from server.field.field import AcousticField
+from server.field.levels import Levels
+from server.scene.bundle import Bundle, write_bundle
+from server.scene.manifest import Accuracy
+from server.whole_field import WholeField
+from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
+from training.evaluation.held_out import EvaluationError, HeldOut, Responses, require_same_scene
+
+
+def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
+    """Every quality level of every bundle, named by level, or by bundle folder where there are several bundles.
+
+    Raises DatasetError or EvaluationError for a bundle of other data.
+    """
+    columns = []
+    for bundle in bundles:
+        if held_out.simulated is not None:
+            require_same_scene(bundle, held_out.simulated)
+        levels = Levels.load(bundle)
+        for level, field in levels.items():
+            file = bundle.manifest.fields[field.level.field]
+            columns.append(
+                Column(
+                    _name(bundle, level, several=len(bundles) > 1, levels=len(levels)),
+                    field_source(field, held_out),
+                    "field",
+                    storage_bytes=len(bundle.models[file.file]) + bundle.frozen_noise.nbytes,
+                    method="naf" if file.architecture.startswith("naf") else "",
+                )
+            )
+    return columns
+
+
+def field_source(field: AcousticField, held_out: HeldOut) -> Source:
+    """Whole responses as the server renders them: of a simulated scene the direct sound is joined to what the field
+    says; a field of measured responses has it in them."""
+    codec = field.bundle.manifest.codec.codec
+    if codec.sample_rate != held_out.sample_rate:
+        raise EvaluationError(
+            f"{field.bundle.folder}: is for {codec.sample_rate} Hz, {held_out.name} for {held_out.sample_rate} Hz"
+        )
+    whole = WholeField.through_kemar(field) if held_out.simulated is not None else field
+    listeners, emitters = held_out.listeners, held_out.emitters
+
+    def source(index: int, turns: npt.NDArray[np.integer]) -> Responses:
+        shape = (len(turns), 3)
+        responses = whole.impulse_responses(
+            np.broadcast_to(listeners[index], shape), np.broadcast_to(emitters[index], shape), held_out.yaws[turns]
+        )
+        return _of_length(responses, held_out.samples)
+
+    return source
+
+
+def record_accuracy(bundle: Bundle, evaluation: Evaluation) -> Bundle:
+    """Writes the measured errors of every quality level into the bundle's manifest; `evaluation` is of it alone."""
+    floor = {} if evaluation.floor is None else _means(evaluation, evaluation.floor.name)
+    levels = tuple(
+        level.model_copy(
+            update={
+                "accuracy": Accuracy(
+                    pairs=evaluation.pairs,
+                    yaws=evaluation.yaws,
+                    errors=_means(evaluation, level.name),
+                    floor=floor,
+                )
+            }
+        )
+        for level in bundle.manifest.levels
+    )
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    return write_bundle(bundle.folder, bundle.manifest.model_copy(update={"levels": levels}), files)
+
+
+def _means(evaluation: Evaluation, column: str) -> dict[str, float]:
+    summaries = evaluation.of(column).summaries
+    return {metric.name: mean for metric in METRICS if (mean := summaries[metric.name].mean) is not None}
+
+
+def _name(bundle: Bundle, level: str, *, several: bool, levels: int) -> str:
+    if not several:
+        return level
+    folder = Path(bundle.folder).resolve().name
+    return folder if levels == 1 else f"{folder} {level}"
+
+
+def _of_length(responses: npt.NDArray[np.float32], samples: int) -> npt.NDArray[np.float32]:
+    """Cut, or ended with zeros: a measurement may be longer than what was trained on."""
+    kept = responses[..., :samples]
+    return np.pad(kept, ((0, 0), (0, 0), (0, samples - kept.shape[-1])))

@@ -1,0 +1,102 @@
+"""Methods by name: what a field is compared with."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from training.evaluation.baselines import linear, linear_aligned, nearest
+from training.evaluation.coded import AAC, AudioCodec, CodedResponses, Track, opus
+from training.evaluation.evaluate import FLOOR, Column, Source
+from training.evaluation.held_out import EvaluationError, HeldOut, Responses
+
+DEFAULT_METHODS = ("nearest", "linear", "linear-aligned")
+Answer = Callable[[int, npt.NDArray[np.integer]], Responses | None]
+
+_BYTES_PER_SAMPLE = 2  # float16, as simulated datasets keep their responses
+
+
+def method_columns(names: Sequence[str], held_out: HeldOut, track: Track = lambda steps, _: steps) -> list[Column]:
+    """A column per name; `track` may wrap what takes long before anything is measured in a progress bar.
+
+    Raises EvaluationError for an unknown name, or a method that these data do not allow.
+    """
+    for name in names:
+        if name not in METHODS:
+            raise EvaluationError(f"--methods: there is no {name!r}, but {', '.join(METHODS)}")
+    prepared = _Prepared(held_out, track)
+    return [METHODS[name](name, prepared) for name in names]
+
+
+def floor_column(held_out: HeldOut) -> Column | None:
+    """What a second take of the same pairs differs by; None where there is none."""
+    repeats = held_out.repeats
+    if repeats is None:
+        return None
+    return Column(FLOOR, lambda index, turns: repeats[int(held_out.held_out[index])][turns], "floor")
+
+
+class _Prepared:
+    """What methods share, made when the first of them asks for it."""
+
+    def __init__(self, held_out: HeldOut, track: Track) -> None:
+        self.held_out = held_out
+        self._track = track
+        self._coded: dict[str, CodedResponses] = {}
+
+    def coded(self, codec: AudioCodec) -> CodedResponses:
+        if codec.name not in self._coded:
+            self._coded[codec.name] = CodedResponses(codec, self.held_out, track=self._track)
+        return self._coded[codec.name]
+
+
+def _plain(name: str, prepared: _Prepared) -> Column:
+    interpolate = {"nearest": nearest, "linear": linear}[name]
+    pairs = prepared.held_out.pairs
+    return _of_stored(name, prepared.held_out, lambda pair, turns: interpolate(pairs, pair, turns))
+
+
+def _aligned(name: str, prepared: _Prepared) -> Column:
+    held_out = prepared.held_out
+    pairs, delays_s, rate = held_out.pairs, held_out.delays_s, held_out.sample_rate
+    return _of_stored(name, held_out, lambda pair, turns: linear_aligned(pairs, pair, delays_s, rate, turns))
+
+
+def _of_stored(name: str, held_out: HeldOut, answer: Answer) -> Column:
+    """A method that keeps the training responses as they are."""
+    stored = int(held_out.pairs.training.sum()) * len(held_out.yaws) * held_out.channels * held_out.samples
+    return Column(name, at_pairs(held_out, answer), "baseline", stored * _BYTES_PER_SAMPLE, name)
+
+
+def _coded(name: str, prepared: _Prepared) -> Column:
+    codec_name, way = name.split("-")
+    coded = prepared.coded(AAC if codec_name == "aac" else opus())
+    interpolate = {"nearest": nearest, "linear": linear}[way]
+    held_out = prepared.held_out
+    pairs = replace(held_out.pairs, responses=coded)
+    return Column(
+        name,
+        at_pairs(held_out, lambda pair, turns: interpolate(pairs, pair, turns)),
+        "baseline",
+        coded.storage_bytes,
+        name,
+        # Inside a plan's triangulation three responses are decoded for one.
+        extra_ms=coded.decoding_ms() * {"nearest": 1, "linear": 3}[way],
+    )
+
+
+def at_pairs(held_out: HeldOut, answer: Answer) -> Source:
+    """The source of a method that knows the pairs of the dataset by number."""
+    return lambda index, turns: answer(int(held_out.held_out[index]), turns)
+
+
+METHODS: dict[str, Callable[[str, _Prepared], Column]] = {
+    "nearest": _plain,
+    "linear": _plain,
+    "linear-aligned": _aligned,
+    "aac-nearest": _coded,
+    "aac-linear": _coded,
+    "opus-nearest": _coded,
+    "opus-linear": _coded,
+}

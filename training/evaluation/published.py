@@ -1,0 +1,56 @@
+"""Figures that others published for the methods of our tables, each with the data it was measured on.
+
+None is of our scenes: rooms, source-listener distances and definitions differ, so they are for orientation beside a
+row and never an oracle. What the authors did not print is absent.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PublishedTable:
+    """errors: by method, then by metric of `server.acoustics.metrics`, in its unit."""
+
+    data: str
+    source: str
+    errors: Mapping[str, Mapping[str, float]]
+
+
+def _t60_c50_edt(t60: float, c50: float, edt_ms: float) -> dict[str, float]:
+    return {"t60": t60, "c50": c50, "edt": edt_ms}
+
+
+SOUNDSPACES = PublishedTable(
+    "SoundSpaces, mean of six simulated scenes",
+    "Su, Chen and Shlizerman, INRAS, NeurIPS 2022; repeated by Liang et al., AV-NeRF, NeurIPS 2023; MiNAF: Si et al., "
+    "arXiv 2509.15210; NeRAF: Brunetto et al., ICLR 2025",
+    {
+        "opus-nearest": _t60_c50_edt(10.10, 3.58, 115.0),
+        "opus-linear": _t60_c50_edt(8.64, 3.13, 97.0),
+        "aac-nearest": _t60_c50_edt(9.35, 1.67, 59.0),
+        "aac-linear": _t60_c50_edt(7.88, 1.68, 57.0),
+        "naf": _t60_c50_edt(3.18, 1.06, 31.0),
+        "inras": _t60_c50_edt(3.14, 0.60, 19.0),
+        "neraf": _t60_c50_edt(2.04, 0.39, 11.0),
+        "minaf": _t60_c50_edt(1.59, 0.41, 2.2),
+    },
+)
+MESHRIR = PublishedTable(
+    "MeshRIR S1-M3969, measured, first 0.1 s",
+    "Lan et al., Acoustic Volume Rendering, NeurIPS 2024, table 1",
+    {
+        "opus-nearest": _t60_c50_edt(5.2, 1.26, 35.7),
+        "opus-linear": _t60_c50_edt(6.9, 1.83, 49.3),
+        "aac-nearest": _t60_c50_edt(8.6, 2.20, 58.8),
+        "aac-linear": _t60_c50_edt(8.2, 2.29, 58.9),
+        "naf": _t60_c50_edt(4.2, 1.25, 39.0),
+        "inras": _t60_c50_edt(3.4, 1.47, 40.7),
+        "avr": _t60_c50_edt(3.9, 0.92, 35.1),
+    },
+)
+
+
+def published_table(*, simulated: bool) -> PublishedTable:
+    """The table whose data are of the same kind."""
+    return SOUNDSPACES if simulated else MESHRIR

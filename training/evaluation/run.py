@@ -1,0 +1,72 @@
+"""`nafir-train evaluate`: fields, baselines and the repeatability floor on one dataset."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from server.scene.bundle import Bundle
+from training.evaluation.coded import Track
+from training.evaluation.evaluate import Column, Evaluation, evaluate
+from training.evaluation.fields import field_columns
+from training.evaluation.figure import draw_figure
+from training.evaluation.held_out import HeldOut, open_held_out
+from training.evaluation.methods import DEFAULT_METHODS, floor_column, method_columns
+from training.evaluation.published import PublishedTable, published_table
+
+_DRAWN = 2  # columns whose decays are drawn
+
+
+def evaluate_bundles(
+    bundles: Sequence[Bundle],
+    data: Path,
+    *,
+    methods: Sequence[str] = DEFAULT_METHODS,
+    pairs: int | None = None,
+    yaws: int | None = None,
+    seed: int = 0,
+    figure: Path | None = None,
+    track: Track = lambda steps, _: steps,
+) -> tuple[Evaluation, PublishedTable]:
+    """Every quality level of every bundle beside `methods` and the floor, on the same pairs and orientations: all that
+    are held out, or as many as asked for. Optionally with a figure (PNG).
+
+    Raises EvaluationError, or DatasetError if the dataset is of another scene than a bundle.
+    """
+    with open_held_out(data) as everything:
+        held_out = everything.sample(pairs=pairs, yaws=yaws, seed=seed)
+        columns = [*field_columns(bundles, held_out), *method_columns(methods, held_out, track)]
+        floor = floor_column(held_out)
+        evaluation = evaluate(
+            held_out,
+            columns if floor is None else [*columns, floor],
+            of=len(everything),
+            track=lambda steps: track(steps, "evaluating"),
+        )
+        if figure is not None:
+            _draw(evaluation, figure, held_out, columns)
+        return evaluation, published_table(simulated=held_out.simulated is not None)
+
+
+def _draw(evaluation: Evaluation, path: Path, held_out: HeldOut, columns: Sequence[Column]) -> None:
+    draw_figure(
+        evaluation,
+        path,
+        references=held_out.reference,
+        columns={column.name: column.source for column in columns[:_DRAWN]},
+        turn=held_out.heard[:1],
+        examples=_examples(held_out),
+        sample_rate=held_out.sample_rate,
+    )
+
+
+def _examples(held_out: HeldOut) -> list[tuple[int, str]]:
+    """Held-out pairs worth looking at: the closest and farthest in sight, and out of sight."""
+    distance = np.linalg.norm(held_out.emitters - held_out.listeners, axis=-1)
+    examples = []
+    for visible, label in ((True, "in sight"), (False, "round the corner")):
+        chosen = np.flatnonzero(held_out.visible == visible)
+        ordered = chosen[np.argsort(distance[chosen])]
+        ends = dict.fromkeys([*ordered[:1], *ordered[-1:]])
+        examples += [(int(index), f"{label}, {distance[index]:.1f} m") for index in ends]
+    return examples
