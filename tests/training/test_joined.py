@@ -17,8 +17,9 @@ from server.rendering.direct_path import DirectPath, PathTarget
 from server.scene.bundle import BUNDLED, Bundle
 from server.whole_field import WholeField, kemar
 from training.dataset import SPEED_OF_SOUND
+from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
-from training.simulation.tracing import RoomTracer, sphere_directions
+from training.simulation.tracing import RoomTracer
 
 YAWS = 2 * np.pi * np.arange(3) / 3 + 0.2
 RATE = 24_000
@@ -65,7 +66,7 @@ def pairs(apartment):
     rng = np.random.default_rng(0)
     takes = []
     for seed in (1, 2):
-        arrivals = tracer.trace(emitter, rays=settings.rays, seed=seed)
+        arrivals = tracer.trace(emitter, rays=settings.rays, rng=np.random.default_rng(seed))
         onsets = np.linalg.norm(away, axis=-1) / SPEED_OF_SOUND
         takes.append([synthesis.render(*what, rng) for what in zip(arrivals, listeners, onsets, strict=True)])
     return [

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from server.whole_field import kemar
 from training.dataset import Dataset
+from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
-from training.simulation.tracing import sphere_directions
 
 _Responses = npt.NDArray[np.float32]
 

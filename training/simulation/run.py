@@ -16,8 +16,9 @@ from rich.progress import Progress
 
 from server.whole_field import kemar
 from training.dataset import Dataset, DatasetError
+from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
-from training.simulation.tracing import RoomTracer, sphere_directions
+from training.simulation.tracing import RoomTracer
 
 
 def simulate(scene_path: Path, folder: Path, *, seed: int, workers: int, progress: Progress) -> Dataset:
@@ -87,7 +88,7 @@ def _responses(dataset: Dataset, emitter: int, listeners: npt.NDArray[np.int64],
     )
     synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
     rng = np.random.default_rng([dataset.seed, 2, emitter, take])
-    arrivals = tracer.trace(dataset.probes[emitter], rays=settings.rays, seed=int(rng.integers(2**31)))
+    arrivals = tracer.trace(dataset.probes[emitter], rays=settings.rays, rng=rng)
     return np.stack(
         [
             synthesis.render(arrival, dataset.probes[listener], dataset.onset_s[emitter, listener], rng).astype(

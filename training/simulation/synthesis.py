@@ -22,7 +22,8 @@ from server.acoustics.minimum_phase import folded_cepstrum
 from server.rendering.hrtf import HeadFilters
 from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
-from training.simulation.tracing import HISTOGRAM_BIN_S, Arrivals, free_field_amplitude
+from training.simulation.rays import HISTOGRAM_BIN_S
+from training.simulation.tracing import Arrivals, free_field_amplitude
 
 _WINDOW_S = 0.010
 _DIFFUSE_RISE_S = 0.002

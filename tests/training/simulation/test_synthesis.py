@@ -5,8 +5,9 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.whole_field import kemar as kemar_at
+from training.simulation.rays import HISTOGRAM_BIN_S, sphere_directions
 from training.simulation.synthesis import BinauralSynthesis, rotate_into_head
-from training.simulation.tracing import HISTOGRAM_BIN_S, Arrivals, sphere_directions
+from training.simulation.tracing import Arrivals
 
 RATE = 24_000
 SAMPLES = 6000
