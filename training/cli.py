@@ -52,39 +52,70 @@ def simulate(
 
 @app.command()
 def train(
-    data: Annotated[Path, typer.Argument(help="Dataset folder from simulate.")],
+    data: Annotated[Path, typer.Argument(help="Dataset folder from simulate or import.")],
     output: Folder,
+    field: Annotated[
+        str, typer.Option(help="factorised, naf, naf-dual, naf-no-grid or naf-time-domain.")
+    ] = "factorised",
+    rank: Annotated[
+        int | None, typer.Option(min=16, max=256, help="Size of a factorised field's basis; 128 if not given.")
+    ] = None,
     seed: Seed = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the training set.")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.001, help="Time to train for, in place of epochs.")] = None,
+    share: Annotated[float, typer.Option(min=0.001, max=1, help="Share of the training pairs to use.")] = 1.0,
+    patience: Annotated[
+        int | None, typer.Option(min=1, help="Stop after so many rounds (epochs, or twentieths of the time) in vain.")
+    ] = None,
+    learning_rate: Annotated[float | None, typer.Option(min=1e-7, help="The field's own if not given.")] = None,
+    points: Annotated[
+        int | None, typer.Option(min=1, help="Points of a response a naf sees per step; 2000 if not given.")
+    ] = None,
 ) -> None:
-    """Train a field on a dataset. Run again after an interruption to go on."""
-    from dataclasses import replace
-
-    from training.dataset import Dataset
-    from training.train import Configuration
+    """Train a field on a dataset. Run again after an interruption to go on; with torchrun, in several processes."""
+    from training.responses import open_responses
+    from training.runs import configure
     from training.train import train as train_field
 
-    configuration = replace(Configuration(seed=seed), **({} if epochs is None else {"epochs": epochs}))
+    given = {"epochs": epochs, "minutes": minutes, "patience": patience, "learning_rate": learning_rate}
+    configuration = configure(
+        field,
+        rank=rank,
+        points=points,
+        seed=seed,
+        share=share,
+        **{name: value for name, value in given.items() if value is not None},
+    )
     with _progress() as progress:
-        train_field(Dataset.open(data), output, configuration, progress)
-    typer.echo(f"{output}: trained for {configuration.epochs} epochs")
+        train_field(open_responses(data), output, configuration, progress)
+    typer.echo(f"{output}: {configuration.name} is trained")
 
 
 @app.command()
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder from train.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders from train, all of one scene; the default first.")],
     output: Folder,
     data: Annotated[Path | None, typer.Option(help="Dataset folder, if it has moved since training.")] = None,
+    precision: Annotated[str, typer.Option(help="float32 or int8, or both, comma by comma.")] = "float32",
+    exact_tables: Annotated[
+        bool, typer.Option("--exact-tables", help="Add every naf once more, with less arithmetic for the same numbers.")
+    ] = False,
 ) -> None:
-    """Write the scene bundle of a finished run, after checking the graph against torch."""
-    from training.dataset import Dataset
+    """Write finished runs as the fields of a scene bundle, after checking every graph against torch."""
+    from training.export import PRECISIONS
     from training.export import export as export_bundle
-    from training.train import dataset_folder
+    from training.responses import open_responses
+    from training.runs import dataset_folder
 
+    chosen = [known for name in precision.split(",") for known in PRECISIONS if known == name.strip()]
+    if len(chosen) != len(precision.split(",")):
+        raise typer.BadParameter(f"knows {', '.join(PRECISIONS)}", param_hint="--precision")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    bundle = export_bundle(Dataset.open(data or dataset_folder(run)), run, output)
+    responses = open_responses(data or dataset_folder(runs[0]))
+    bundle = export_bundle(responses, runs, output, precisions=chosen, exact_tables=exact_tables)
     size = sum(path.stat().st_size for path in output.iterdir())
-    typer.echo(f"{output}: scene {bundle.id}, {size / 1e6:.1f} MB, digest {bundle.digest[:12]}")
+    fields = ", ".join(bundle.manifest.fields)
+    typer.echo(f"{output}: scene {bundle.id}, {fields}, {size / 1e6:.1f} MB, digest {bundle.digest[:12]}")
 
 
 @app.command()
@@ -124,7 +155,7 @@ def evaluate(
         yaws=yaws,
         seed=seed,
         figure=figure,
-        track=lambda indices: track(indices, "evaluating", console=console),
+        track=lambda steps, doing: track(steps, doing, console=console),
     )
     if record:
         record_accuracy(bundles[0], evaluation)

@@ -1,130 +1,248 @@
-"""A trained field to a scene bundle. The graph is checked against torch before anything is written."""
+"""Trained fields to a scene bundle. Every graph is checked against torch before anything is written."""
 
 import io
-import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 import onnx
 import torch
-from onnx import numpy_helper
+from torch import nn
 
 from server.errors import NafirError
-from server.field.graph import INPUTS, OUTPUTS
+from server.field.graph import INPUTS, OUTPUTS, RESPONSE
 from server.field.runtime import open_session
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel
-from training.dataset import SPEED_OF_SOUND, Dataset
-from training.models.cells import Cells
+from training.dataset import SPEED_OF_SOUND
+from training.graphs import halve_weights, pose_by_pose, to_int8, to_onnx
+from training.learning.factorised import FactorisedLearner
+from training.learning.naf import NafLearner
 from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
+from training.models.naf_graph import NafGraph
 from training.models.targets import LEAD_SAMPLES
-from training.train import load_field
+from training.responses import ResponseSet, SimulatedResponses
+from training.runs import Configuration
+from training.train import load_learner
 
+Precision = Literal["float32", "int8"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 MODEL_FILE = "factorised.onnx"
+DEFAULT_LEVEL = "standard"
 
-_OPSET = 18
-_HALVE_ABOVE_BYTES = 16_384
-_CHECK_POSES = 64
-# float16 weights are the only difference; phases of uncertain bins may turn, so frequency is compared where it matters.
-_TOLERANCE = {"log_magnitude": 0.05, "phase_certainty": 0.02, "interaural_coherence": 0.02}
-_PHASE_TOLERANCE = 0.05
+_CHECK_POSES = {"factorised": 64, "naf": 2}
+_INT8_LEAST_WEIGHTS = 100_000
+# Rounded weights are the only difference; phases of uncertain bins may turn, so frequency is compared where it matters.
+# Largest differences for float32 (float16 weights), root mean squares for int8.
+_TOLERANCES: dict[Precision, dict[str, float]] = {
+    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, RESPONSE: 1e-4},
+    "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, RESPONSE: 0.05},
+}
+_PHASE_TOLERANCE: dict[Precision, float] = {"float32": 0.05, "int8": 0.2}
+TABLED_TOLERANCE = 1e-4
+"""Largest difference in log-magnitude between the plain graph of a `naf` and the tabled one."""
 
 
 class ExportError(NafirError):
-    """An exported graph that does not compute what the trained field computes."""
+    """A field that fits into no bundle, or an exported graph that does not compute what the trained field computes."""
 
 
-def export(dataset: Dataset, run: Path, folder: Path) -> Bundle:
-    """Writes the bundle of a finished run. Raises RunError for an unfinished one and ExportError for a graph that
-    disagrees."""
-    field, cells, configuration = load_field(dataset, run)
-    module = ExportedField(field, cells).eval()
-    model = halve_weights(to_onnx(module, dataset))
-    _check(model, module, dataset, configuration.seed)
-    noise = even_noise(cells.codec, np.random.default_rng([configuration.seed, 6]))
+@dataclass(frozen=True)
+class _Exported:
+    name: str
+    model: onnx.ModelProto
+    architecture: str
+    rank: int | None
+    codec: CodecParameters
+
+
+def export(
+    responses: ResponseSet,
+    runs: Sequence[Path],
+    folder: Path,
+    *,
+    precisions: Sequence[Precision] = ("float32",),
+    exact_tables: bool = False,
+) -> Bundle:
+    """Writes finished runs on one scene as the fields of one bundle, each in every precision; the first field is the
+    default. With `exact_tables` a `naf` is also written with less arithmetic for the same numbers.
+
+    Raises RunError for an unfinished run, and ExportError for a graph that disagrees and for data that are no simulated
+    scene: a bundle's fields are binaural, in rooms of known geometry, and leave the direct sound to the server.
+    """
+    if not isinstance(responses, SimulatedResponses):
+        raise ExportError("the data are measured responses: no scene bundle holds those; evaluate the run instead")
+    exported: list[_Exported] = []
+    for run in runs:
+        exported += _graphs(responses, run, precisions, exact_tables=exact_tables)
+    names = [each.name for each in exported]
+    if doubled := {name for name in names if names.count(name) > 1}:
+        raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
+    codec = exported[0].codec
+    noise = even_noise(codec.codec, np.random.default_rng([Configuration.read(runs[0]).seed, 6]))
     arrays = io.BytesIO()
     np.savez(arrays, frozen_noise=noise)
-    files = {MODEL_FILE: model.SerializeToString(), ARRAYS_FILE: arrays.getvalue()}
-    return write_bundle(folder, _manifest(dataset, cells, configuration.shape.rank, files), files)
-
-
-def to_onnx(module: ExportedField, dataset: Dataset) -> onnx.ModelProto:
-    """The graph with a free batch axis, and nothing in it but the graph."""
-    poses = tuple(torch.from_numpy(array) for array in _poses(dataset, 2, seed=0))
-    batch = torch.export.Dim("batch")
-    with warnings.catch_warnings():
-        # PyTorch's exporter about its own pytrees, and about the one name that all three batch axes share.
-        warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
-        warnings.filterwarnings("ignore", r"# The axis name: batch will not be used", UserWarning)
-        program = torch.onnx.export(
-            module,
-            poses,
-            input_names=list(INPUTS),
-            output_names=list(OUTPUTS),
-            dynamic_shapes={name: {0: batch} for name in INPUTS},
-            opset_version=_OPSET,
-            dynamo=True,
-            verbose=False,
+    # The default field is called by its kind alone, whatever its rank and precision.
+    kind = exported[0].architecture
+    titles = [kind, *(name if name != kind else f"{name}-plain" for name in names[1:])]
+    files = {f"{title}.onnx": each.model.SerializeToString() for title, each in zip(titles, exported, strict=True)}
+    fields = {
+        title: FieldFile(
+            file=f"{title}.onnx",
+            architecture=each.architecture,
+            rank=each.rank,
+            codec=None if each.codec == codec else each.codec,
         )
-    model = program.model_proto
-    graph = model.graph
-    for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
-        # The exporter notes call stacks, with paths of the machine it ran on: no scene should carry those.
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
-    return model
+        for title, each in zip(titles, exported, strict=True)
+    }
+    levels = tuple(
+        QualityLevel(name=title if number else DEFAULT_LEVEL, field=title) for number, title in enumerate(titles)
+    )
+    files[ARRAYS_FILE] = arrays.getvalue()
+    return write_bundle(folder, _manifest(responses, codec, fields, levels, files), files)
 
 
-def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Stores large float32 constants as float16, cast back as the graph is loaded: half the bundle, the same
-    arithmetic."""
-    graph = model.graph
-    casts = []
-    for tensor in graph.initializer:
-        values = numpy_helper.to_array(tensor)
-        if values.dtype != np.float32 or values.nbytes < _HALVE_ABOVE_BYTES:
-            continue
-        name = tensor.name
-        tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
-        casts.append(onnx.helper.make_node("Cast", [f"{name}_half"], [name], to=onnx.TensorProto.FLOAT))
-    for position, node in enumerate(casts):
-        graph.node.insert(position, node)
-    onnx.checker.check_model(model)
-    return model
+def _graphs(
+    responses: SimulatedResponses, run: Path, precisions: Sequence[Precision], *, exact_tables: bool
+) -> list[_Exported]:
+    """All graphs of a run, each checked."""
+    learner = load_learner(responses, run)
+    configuration = Configuration.read(run)
+    if isinstance(learner, FactorisedLearner):
+        return _factorised(learner, configuration, precisions)
+    if isinstance(learner, NafLearner):
+        return _naf(learner, configuration, precisions, exact_tables=exact_tables)
+    raise TypeError(f"{type(learner)} has no graph")
 
 
-def _poses(dataset: Dataset, count: int, seed: int) -> tuple[npt.NDArray[np.float32], ...]:
-    """Random listener, emitter and yaw among the probes' neighbourhoods."""
+def _factorised(
+    learner: FactorisedLearner, configuration: Configuration, precisions: Sequence[Precision]
+) -> list[_Exported]:
+    cells, rank = learner.cells, learner.field.basis.shape[0]
+    module = ExportedField(learner.field, cells).eval()
+    poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
+    codec = _codec_parameters(learner, cells.known_frames)
+    exported = []
+    for precision in precisions:
+        model = to_onnx(module, _tensors(poses, 2), OUTPUTS)
+        if precision == "int8":
+            model = to_int8(model, least_weights=min(_INT8_LEAST_WEIGHTS, learner.field.basis.numel()))
+        model = halve_weights(model)
+        _check(model, module, poses, OUTPUTS, precision)
+        exported.append(_Exported(f"factorised-r{rank}{_suffix(precision)}", model, "factorised", rank, codec))
+    return exported
+
+
+def _naf(
+    learner: NafLearner, configuration: Configuration, precisions: Sequence[Precision], *, exact_tables: bool
+) -> list[_Exported]:
+    field = learner.field
+    time_domain = field.shape.domain == "time"
+    outputs = (RESPONSE,) if time_domain else OUTPUTS
+    codec = _codec_parameters(learner, 0 if time_domain else learner.codec.frames)
+    poses = _poses(learner.responses, _CHECK_POSES["naf"], configuration.seed)
+    exported = []
+    for tabled in (False, True)[: 1 + exact_tables]:
+        module = NafGraph(field, learner.codec, tabled=tabled).eval()
+        for precision in precisions:
+            model = to_onnx(module, _tensors(poses, 1), outputs, free_batch=False)
+            if precision == "int8":
+                model = to_int8(model, least_weights=field.shape.width**2)
+            model = pose_by_pose(model)
+            _check(model, module, poses, outputs, precision)
+            name = f"{configuration.name}{'-tables' if tabled else ''}{_suffix(precision)}"
+            exported.append(_Exported(name, model, configuration.name, None, codec))
+    if exact_tables:
+        _check_tables(learner, poses)
+    return exported
+
+
+def _suffix(precision: Precision) -> str:
+    return "" if precision == "float32" else f"-{precision}"
+
+
+def _codec_parameters(learner: FactorisedLearner | NafLearner, known_frames: int) -> CodecParameters:
+    codec = learner.cells.codec if isinstance(learner, FactorisedLearner) else learner.codec
+    return CodecParameters(
+        sample_rate=codec.sample_rate,
+        n_fft=codec.n_fft,
+        hop=codec.hop,
+        samples=codec.samples,
+        lead_samples=LEAD_SAMPLES,
+        known_frames=known_frames,
+        log_floor=codec.log_floor,
+    )
+
+
+def _poses(responses: ResponseSet, count: int, seed: int) -> tuple[npt.NDArray[np.float32], ...]:
+    """Random listener, emitter and yaw in the neighbourhoods of those measured."""
     rng = np.random.default_rng(seed)
-    chosen = rng.integers(0, len(dataset.probes), (2, count))
-    listener, emitter = (dataset.probes[side] + rng.uniform(-0.05, 0.05, (count, 3)) for side in chosen)
+    listener, emitter = (
+        end[rng.integers(0, len(end), count)] + rng.uniform(-0.05, 0.05, (count, 3))
+        for end in (responses.listener, responses.emitter)
+    )
     yaw = rng.uniform(-np.pi, np.pi, count)
     return listener.astype(np.float32), emitter.astype(np.float32), yaw.astype(np.float32)
 
 
-def _check(model: onnx.ModelProto, module: ExportedField, dataset: Dataset, seed: int) -> None:
+def _tensors(poses: tuple[npt.NDArray[np.float32], ...], count: int) -> tuple[torch.Tensor, ...]:
+    return tuple(torch.from_numpy(part[:count]) for part in poses)
+
+
+def _check(
+    model: onnx.ModelProto,
+    module: nn.Module,
+    poses: tuple[npt.NDArray[np.float32], ...],
+    outputs: tuple[str, ...],
+    precision: Precision,
+) -> None:
     session = open_session(model.SerializeToString())
-    poses = _poses(dataset, _CHECK_POSES, seed)
-    found = dict(zip(OUTPUTS, session.run(list(OUTPUTS), dict(zip(INPUTS, poses, strict=True))), strict=True))
+    found = dict(zip(outputs, session.run(list(outputs), dict(zip(INPUTS, poses, strict=True))), strict=True))
     with torch.no_grad():
-        expected = dict(zip(OUTPUTS, (out.numpy() for out in module(*map(torch.from_numpy, poses))), strict=True))
-    for name, tolerance in _TOLERANCE.items():
-        difference = float(np.max(np.abs(found[name] - expected[name])))
+        # One at a time: a batch of `naf` would not fit into memory.
+        rows = [module(*(torch.from_numpy(part[row : row + 1]) for part in poses)) for row in range(len(poses[0]))]
+    expected = {name: np.concatenate([row[number] for row in rows]) for number, name in enumerate(outputs)}
+    for name, tolerance in _TOLERANCES[precision].items():
+        if name not in outputs:
+            continue
+        error = np.abs(found[name] - expected[name])
+        scale = np.std(expected[name]) if name == RESPONSE else 1.0
+        difference = float(np.max(error) if precision == "float32" else np.sqrt(np.mean(error**2))) / scale
         if not difference < tolerance:
             raise ExportError(
                 f"{name}: the exported graph differs from torch by {difference:.3g}, more than {tolerance}"
             )
-    phases = [np.cumsum(outputs["instantaneous_frequency"], axis=-1) for outputs in (found, expected)]
+    if "instantaneous_frequency" not in outputs:
+        return
+    phases = [np.cumsum(values["instantaneous_frequency"], axis=-1) for values in (found, expected)]
     weight = np.minimum(found["phase_certainty"], expected["phase_certainty"]) ** 2
     difference = float(np.mean(np.abs(np.exp(1j * phases[0]) - np.exp(1j * phases[1])) * weight))
-    if not difference < _PHASE_TOLERANCE:
+    if not difference < _PHASE_TOLERANCE[precision]:
         raise ExportError(f"instantaneous_frequency: the exported graph's phase differs from torch by {difference:.3g}")
 
 
-def _manifest(dataset: Dataset, cells: Cells, rank: int, files: dict[str, bytes]) -> Manifest:
-    scene, codec = dataset.scene, cells.codec
+def _check_tables(learner: NafLearner, poses: tuple[npt.NDArray[np.float32], ...]) -> None:
+    with torch.no_grad():
+        plain, tabled = (
+            NafGraph(learner.field, learner.codec, tabled=tabled)(*_tensors(poses, 1))[0] for tabled in (False, True)
+        )
+    difference = float((plain - tabled).abs().max())
+    if not difference < TABLED_TOLERANCE:
+        raise ExportError(f"exact tables: differ from the plain network by {difference:.3g}")
+
+
+def _manifest(
+    responses: SimulatedResponses,
+    codec: CodecParameters,
+    fields: dict[str, FieldFile],
+    levels: tuple[QualityLevel, ...],
+    files: dict[str, bytes],
+) -> Manifest:
+    scene = responses.dataset.scene
     low, high = np.min(scene.geometry.corners, axis=0), np.max(scene.geometry.corners, axis=0)
     return Manifest(
         id=scene.id,
@@ -138,16 +256,8 @@ def _manifest(dataset: Dataset, cells: Cells, rank: int, files: dict[str, bytes]
         speed_of_sound=SPEED_OF_SOUND,
         air=scene.air,
         start=scene.start,
-        codec=CodecParameters(
-            sample_rate=codec.sample_rate,
-            n_fft=codec.n_fft,
-            hop=codec.hop,
-            samples=codec.samples,
-            lead_samples=LEAD_SAMPLES,
-            known_frames=cells.known_frames,
-            log_floor=codec.log_floor,
-        ),
-        fields={"factorised": FieldFile(file=MODEL_FILE, architecture="factorised", rank=rank)},
-        levels=(QualityLevel(name="standard", field="factorised"),),
+        codec=codec,
+        fields=fields,
+        levels=levels,
         files=dict.fromkeys(files, "0" * 64),
     )

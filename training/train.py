@@ -1,272 +1,308 @@
-"""Training of a factorised field: resumable epoch by epoch, the same for the same seed and number of threads.
+"""The one training loop: for every kind of field, on one processor or several, on a GPU where there is one.
 
-The run folder holds `run.json` (configuration), `dataset.json` (what the data are and where they lie), `checkpoint.pt`
-(everything needed to go on), `log.csv` and the cached targets.
+A run can be interrupted anywhere and goes on when it is started again; with the same seed and number of threads it ends
+at the same field as one that was not, where its length is given in epochs. Given in minutes, the length counts time
+spent computing, over all pieces.
 """
 
-import csv
 import dataclasses
-import json
+import time
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from rich.progress import Progress
 from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
 
 from server.errors import NafirError
-from training.dataset import Dataset
-from training.models.cells import Cells
-from training.models.factorised import FactorisedField, FieldShape
-from training.models.targets import Targets, codec_of, load_targets
+from training.learning.kinds import learner_of
+from training.learning.learner import Learner, Rows
+from training.learning.pairs import split
+from training.learning.precision import autocast, bfloat16_gains
+from training.learning.processes import Processes
+from training.responses import ResponseSet
+from training.runs import (
+    CHECKPOINT,
+    Configuration,
+    RunError,
+    append_log,
+    claim,
+    load_checkpoint,
+    require_same_data,
+    save_checkpoint,
+)
 
-# What a target differs by from the best possible prediction (ln magnitude of one noisy bin, of a pooled cell; unit
-# phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its
-# floor.
-_SPREADS = {"fine": 0.64, "late": 0.25, "phasor": 1.0, "interaural": 1.0}
-_HEAD_WEIGHTS = {"fine": 1.0, "late": 1.0, "phasor": 2.0, "interaural": 1.0}
-_SAMPLE_ROWS = 3000
-_VALIDATION_SHARE = 0.05
-
-
-class RunError(NafirError):
-    """A run folder that holds another configuration, or no trained field."""
-
-
-@dataclass(frozen=True)
-class Configuration:
-    """All that decides a run's outcome besides the dataset."""
-
-    seed: int = 0
-    epochs: int = 14
-    batch: int = 128
-    learning_rate: float = 2e-3
-    weight_decay: float = 1e-2
-    shape: FieldShape = dataclasses.field(default_factory=FieldShape)
-
-    @classmethod
-    def read(cls, run: Path) -> "Configuration":
-        """Raises RunError if the folder holds no run."""
-        values = _read_json(run, "run.json")
-        try:
-            return cls(**{**values, "shape": FieldShape(**values["shape"])})
-        except (KeyError, TypeError) as exc:
-            raise RunError(f"{run / 'run.json'}: not a configuration: {exc}") from exc
+_CHECKPOINT_S = 60.0
+_ROUNDS = 20
+_BATCHES_AHEAD = 2
+_PROBE_ROWS = 2
+_LARGEST_GRADIENT = 1.0
 
 
-def dataset_folder(run: Path) -> Path:
-    """The dataset a run was trained on. Raises RunError if the folder holds no run."""
-    return Path(_read_json(run, "dataset.json")["folder"])
+class DivergedError(NafirError):
+    """A loss or gradient that is not finite."""
 
 
-def train(dataset: Dataset, run: Path, configuration: Configuration, progress: Progress) -> FactorisedField:
-    """Trains to the end, from the last finished epoch if the run was interrupted.
+def train(responses: ResponseSet, run: Path, configuration: Configuration, progress: Progress) -> None:
+    """Trains to the end, from where it was if the run was interrupted. Under `torchrun`, all processes together.
 
-    Raises RunError if the folder holds a run of another configuration or on another dataset.
+    Raises RunError if the folder holds a run of another configuration or on other data, RecipeError if the
+    configuration does not fit the data, and DivergedError if the loss stops being finite; the last checkpoint stays.
     """
-    run.mkdir(parents=True, exist_ok=True)
-    if (run / "run.json").exists():
-        if Configuration.read(run) != configuration:
-            raise RunError(f"{run}: holds a run of another configuration; choose an empty folder")
-        _require_same_data(dataset, run)
-    identity = {"folder": str(dataset.folder.resolve()), **_identity(dataset)}
-    (run / "dataset.json").write_text(json.dumps(identity, indent=2) + "\n")
-    (run / "run.json").write_text(json.dumps(asdict(configuration), indent=2) + "\n")
-    cells = Cells(codec_of(dataset))
-    targets = load_targets(dataset, cells, run, progress)
-    torch.manual_seed(configuration.seed)
-    field = FactorisedField(dataset.plan, cells, configuration.shape)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    field.to(device)
-    training_rows, validation_rows = _split(targets, configuration.seed)
-    optimiser = torch.optim.AdamW(
-        field.parameters(), configuration.learning_rate, weight_decay=configuration.weight_decay
-    )
-    steps = configuration.epochs * (len(training_rows) // _batch_size(configuration, training_rows))
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, configuration.learning_rate, steps, pct_start=0.1)
-    checkpoint = run / "checkpoint.pt"
-    first_epoch = 0
-    if checkpoint.exists():
-        state = torch.load(checkpoint, map_location=device, weights_only=True)
-        field.load_state_dict(state["field"])
-        optimiser.load_state_dict(state["optimiser"])
-        schedule.load_state_dict(state["schedule"])
-        first_epoch = state["epoch"]
-    else:
-        _initialise(field, targets, training_rows, configuration.seed)
-    task = progress.add_task("training", total=configuration.epochs, completed=first_epoch)
-    for epoch in range(first_epoch, configuration.epochs):
-        losses = _train_epoch(field, optimiser, schedule, targets, training_rows, configuration, epoch)
-        validation = _validate(field, targets, validation_rows, configuration.batch)
-        if epoch + 1 == configuration.epochs:
-            field.level_correction.copy_(_level_correction(field, targets, training_rows))
-        _save(
-            checkpoint,
-            {
-                "field": field.state_dict(),
-                "optimiser": optimiser.state_dict(),
-                "schedule": schedule.state_dict(),
-                "epoch": epoch + 1,
-            },
+    with Processes.joined() as processes:
+        if processes.first:
+            claim(run, responses, configuration)
+        processes.wait()
+        torch.manual_seed(configuration.seed)
+        learner = learner_of(responses, configuration)
+        # The first process computes what is missing, the others find it.
+        if processes.first:
+            learner.prepare(run, progress)
+        processes.wait()
+        if not processes.first:
+            learner.prepare(run, progress)
+        learner.field.to(processes.device)
+        loop = _Loop(
+            learner, run, configuration, processes, split(responses, share=configuration.share, seed=configuration.seed)
         )
-        _log(run / "log.csv", {"epoch": epoch + 1, "training": losses, **validation})
-        summary = " ".join(f"{name} {value:.4f}" for name, value in validation.items())
-        progress.update(task, advance=1, description=f"training  held back: {summary}")
-    return field
+        loop.run_to_the_end(progress)
 
 
-def load_field(dataset: Dataset, run: Path) -> tuple[FactorisedField, Cells, Configuration]:
-    """The trained field of a finished run. Raises RunError if the run is missing, unfinished or of other data."""
+def load_learner(responses: ResponseSet, run: Path) -> Learner:
+    """The learner of a finished run, its trained field on the CPU. Raises RunError if the run is missing, unfinished or
+    of other data."""
     configuration = Configuration.read(run)
-    _require_same_data(dataset, run)
-    cells = Cells(codec_of(dataset))
-    field = FactorisedField(dataset.plan, cells, configuration.shape)
-    try:
-        state = torch.load(run / "checkpoint.pt", map_location="cpu", weights_only=True)
-    except OSError as exc:
-        raise RunError(f"{run}: holds no checkpoint: {exc.strerror}") from exc
-    if state["epoch"] < configuration.epochs:
-        raise RunError(f"{run}: {state['epoch']} of {configuration.epochs} epochs are trained; run train again")
-    field.load_state_dict(state["field"])
-    return field.eval(), cells, configuration
+    require_same_data(responses, run)
+    learner = learner_of(responses, configuration)
+    state = load_checkpoint(run, torch.device("cpu"))
+    if not state["finished"]:
+        length = (
+            f"{state['epochs']:.3g} of {configuration.epochs} epochs"
+            if configuration.minutes is None
+            else f"{state['seconds'] / 60:.1f} of {configuration.minutes:g} minutes"
+        )
+        raise RunError(f"{run}: {length} are trained; run train again")
+    learner.field.load_state_dict(state["field"])
+    learner.field.eval()
+    return learner
 
 
-def _read_json(run: Path, name: str) -> dict[str, Any]:
-    try:
-        return dict(json.loads((run / name).read_text()))
-    except OSError as exc:
-        raise RunError(f"{run}: not a run folder: {name}: {exc.strerror}") from exc
-    except ValueError as exc:
-        raise RunError(f"{run / name}: not JSON: {exc}") from exc
+@dataclass
+class _State:
+    """Where a run is: steps taken, seconds they took, what the current round's losses add up to, the smallest error on
+    what is held back with the rounds since, and the field to keep so far."""
+
+    step: int = 0
+    epochs: float = 0.0
+    seconds: float = 0.0
+    rounds: int = 0
+    round_loss: float = 0.0
+    round_steps: int = 0
+    best_loss: float = float("inf")
+    kept: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+    stale: int = 0
+    bfloat16: bool = False
+    finished: bool = False
 
 
-def _identity(dataset: Dataset) -> dict[str, Any]:
-    """What makes data the same wherever they lie."""
-    return {"seed": dataset.seed, "scene": dataset.scene.model_dump(mode="json")}
+class _Loop:
+    def __init__(
+        self,
+        learner: Learner,
+        run: Path,
+        configuration: Configuration,
+        processes: Processes,
+        rows: tuple[Rows, Rows],
+    ) -> None:
+        self._learner, self._run, self._configuration, self._processes = learner, run, configuration, processes
+        self._rows, held_back = rows
+        self._held_back = learner.validation(held_back)
+        self._optimiser = torch.optim.AdamW(learner.parameter_groups(), configuration.learning_rate)
+        visited = len(self._order(0))
+        # Small scenes have fewer rows than a batch; processes have equal shares of one.
+        size = min(configuration.batch, visited)
+        self._batch = max(size - size % processes.count, processes.count)
+        self._steps_per_epoch = max(1, visited // self._batch)
+        if (run / CHECKPOINT).exists():
+            state = load_checkpoint(run, processes.device)
+            learner.field.load_state_dict(state.pop("field"))
+            self._optimiser.load_state_dict(state.pop("optimiser"))
+            self._state = _State(**state)
+        else:
+            learner.initialise(self._rows, configuration.seed)
+            self._state = _State(bfloat16=self._choose_precision())
 
+    def run_to_the_end(self, progress: Progress) -> None:
+        state, configuration = self._state, self._configuration
+        if state.finished:
+            return
+        parallel = self._processes.parallel(self._learner.field)
+        timed = configuration.minutes is not None
+        total = _ROUNDS if timed else configuration.epochs
+        task = progress.add_task("training", total=total, completed=state.rounds)
+        writer = SummaryWriter(self._run / "tensorboard", purge_step=state.step) if self._processes.first else None
+        saved_s = state.seconds
+        batches = self._batches(state.step)
+        try:
+            while self._fraction() < 1 and not self._stopped():
+                start = time.perf_counter()
+                self._step(parallel, *next(batches))
+                (state.seconds,) = self._processes.agreed(state.seconds + time.perf_counter() - start)
+                ended = self._round_ended()
+                if ended:
+                    summary = self._end_round(writer)
+                    state.rounds += 1
+                if ended or state.seconds - saved_s > _CHECKPOINT_S:
+                    self._save()
+                    saved_s = state.seconds
+                if ended:
+                    progress.update(task, advance=1, description=f"training  held back: {summary}")
+        finally:
+            batches.close()
+            if writer is not None:
+                writer.close()
+        self._finish()
 
-def _require_same_data(dataset: Dataset, run: Path) -> None:
-    recorded = _read_json(run, "dataset.json")
-    if {name: recorded.get(name) for name in ("seed", "scene")} != _identity(dataset):
-        raise RunError(f"{run}: was trained on another scene or seed than that of {dataset.folder}")
+    def _fraction(self) -> float:
+        """Of the training that is done."""
+        configuration, state = self._configuration, self._state
+        if configuration.minutes is not None:
+            return state.seconds / (60 * configuration.minutes)
+        return state.step / (configuration.epochs * self._steps_per_epoch)
 
+    def _stopped(self) -> bool:
+        patience = self._configuration.patience
+        return patience is not None and self._state.stale >= patience
 
-def _split(targets: Targets, seed: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Rows to train on, and rows of a few pairs held back to watch for overfitting (not the held-out pairs of the
-    evaluation)."""
-    pairs = int(targets.pair.max()) + 1
-    chosen = np.random.default_rng([seed, 3]).choice(pairs, max(1, round(_VALIDATION_SHARE * pairs)), replace=False)
-    held_back = np.isin(targets.pair, chosen)
-    return np.flatnonzero(~held_back), np.flatnonzero(held_back)
+    def _round_ended(self) -> bool:
+        if self._configuration.minutes is None:
+            return self._state.step % self._steps_per_epoch == 0
+        return self._fraction() >= min(1.0, (self._state.rounds + 1) / _ROUNDS)
 
-
-def _batches(
-    targets: Targets, rows: npt.NDArray[np.int64], size: int, device: torch.device
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Listener, emitter, yaw and flat target of consecutive batches of the rows; a last, smaller one is included."""
-    for start in range(0, len(rows), size):
-        chosen = np.sort(rows[start : start + size])
-        parts = (targets.listener, targets.emitter, targets.yaw, targets.flat)
-        listener, emitter, yaw, flat = (torch.from_numpy(part[chosen]).to(device) for part in parts)
-        yield listener, emitter, yaw, flat.float()
-
-
-@torch.no_grad()
-def _initialise(field: FactorisedField, targets: Targets, rows: npt.NDArray[np.int64], seed: int) -> None:
-    """Normalisation, and a basis that starts from the principal components of the training spectrograms."""
-    sample = np.sort(np.random.default_rng([seed, 4]).choice(rows, min(_SAMPLE_ROWS, len(rows)), replace=False))
-    flat = torch.from_numpy(targets.flat[sample]).float()
-    field.mean.copy_(flat.mean(dim=0))
-    for name, part in field.heads.slices.items():
-        field.spread[part] = _SPREADS[name]
-    normalised = (flat.to(field.mean.device) - field.mean) / field.spread
-    rank = field.basis.shape[0]
-    _, singular, basis = torch.svd_lowrank(normalised, q=min(rank, len(sample)), niter=2)
-    field.basis[: basis.shape[1]] = basis.T * (singular / len(sample) ** 0.5)[:, None]
-
-
-def _loss(field: FactorisedField, prediction: Tensor, flat: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    residual = prediction - (flat - field.mean) / field.spread
-    parts = {name: residual[:, part].square().mean() for name, part in field.heads.slices.items()}
-    return torch.stack([_HEAD_WEIGHTS[name] * value for name, value in parts.items()]).sum(), parts
-
-
-def _train_epoch(
-    field: FactorisedField,
-    optimiser: torch.optim.Optimizer,
-    schedule: torch.optim.lr_scheduler.LRScheduler,
-    targets: Targets,
-    rows: npt.NDArray[np.int64],
-    configuration: Configuration,
-    epoch: int,
-) -> float:
-    field.train()
-    order = np.random.default_rng([configuration.seed, 5, epoch]).permutation(rows)
-    size = _batch_size(configuration, rows)
-    order = order[: len(order) // size * size]
-    total = 0.0
-    for listener, emitter, yaw, flat in _batches(targets, order, size, field.mean.device):
-        loss, _ = _loss(field, field(listener, emitter, yaw), flat)
-        optimiser.zero_grad(set_to_none=True)
+    def _step(self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...]) -> None:
+        state, configuration = self._state, self._configuration
+        beta, share = self._learner.momentum_and_rate(self._fraction())
+        for group in self._optimiser.param_groups:
+            group["lr"], group["betas"] = configuration.learning_rate * share, (beta, 0.999)
+        loss = self._loss(parallel, inputs, targets, bfloat16=state.bfloat16)
+        self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        total += float(loss.detach())
-    return total / (len(order) // size)
+        norm = torch.nn.utils.clip_grad_norm_(self._learner.field.parameters(), _LARGEST_GRADIENT)
+        mean_loss, mean_norm = (float(value) for value in self._processes.mean(torch.stack([loss.detach(), norm])))
+        if not np.isfinite(mean_loss) or not np.isfinite(mean_norm):
+            raise DivergedError(
+                f"{self._run}: the loss is {mean_loss:g} and its gradient {mean_norm:g} in step {state.step + 1}; the "
+                f"last checkpoint is kept. Train with a lower learning rate than {configuration.learning_rate:g}"
+            )
+        self._optimiser.step()
+        state.step += 1
+        state.epochs = state.step / self._steps_per_epoch
+        state.round_loss += mean_loss
+        state.round_steps += 1
 
+    def _loss(
+        self, model: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, bfloat16: bool
+    ) -> Tensor:
+        model.train()
+        with autocast(self._processes.device, bfloat16=bfloat16):
+            prediction = model(*inputs)
+        return torch.stack(list(self._learner.losses(prediction.float(), targets).values())).sum()
 
-def _batch_size(configuration: Configuration, rows: npt.NDArray[np.int64]) -> int:
-    """Small scenes have fewer rows than a batch."""
-    return min(configuration.batch, len(rows))
+    def _end_round(self, writer: SummaryWriter | None) -> str:
+        """Looks at what is held back, remembers the field to keep, writes the logs; one line for people."""
+        state = self._state
+        parts = self._validate() if self._processes.first else {}
+        (held_back,) = self._processes.agreed(sum(parts.values()))
+        if held_back < state.best_loss:
+            state.best_loss, state.stale = held_back, 0
+        else:
+            state.stale += 1
+        if self._configuration.patience is None or not state.stale:
+            state.kept = {name: value.detach().clone() for name, value in self._learner.field.state_dict().items()}
+        training = state.round_loss / max(1, state.round_steps)
+        state.round_loss, state.round_steps = 0.0, 0
+        if writer is not None:
+            append_log(self._run, {"epoch": state.epochs, "seconds": state.seconds, "training": training, **parts})
+            rate = self._optimiser.param_groups[0]["lr"]
+            writer.add_scalar("training/loss", training, state.step)
+            writer.add_scalar("training/learning_rate", rate, state.step)
+            for name, value in {**parts, "sum": held_back}.items():
+                writer.add_scalar(f"held_back/{name}", value, state.step)
+        return " ".join(f"{name} {value:.4f}" for name, value in parts.items())
 
+    @torch.no_grad()
+    def _validate(self) -> dict[str, float]:
+        field = self._learner.field.eval()
+        totals: dict[str, float] = {}
+        for start in range(0, len(self._held_back), self._configuration.batch):
+            rows = self._held_back[start : start + self._configuration.batch]
+            inputs, targets = self._on_device(*self._learner.batch(rows, None))
+            for name, value in self._learner.losses(field(*inputs), targets).items():
+                totals[name] = totals.get(name, 0.0) + float(value) * len(rows) / len(self._held_back)
+        return totals
 
-@torch.no_grad()
-def _validate(field: FactorisedField, targets: Targets, rows: npt.NDArray[np.int64], batch: int) -> dict[str, float]:
-    field.eval()
-    totals = dict.fromkeys(field.heads.slices, 0.0)
-    for listener, emitter, yaw, flat in _batches(targets, rows, batch, field.mean.device):
-        _, parts = _loss(field, field(listener, emitter, yaw), flat)
-        for name, value in parts.items():
-            totals[name] += float(value) * len(yaw) / len(rows)
-    return totals
+    def _finish(self) -> None:
+        state = self._state
+        self._learner.field.load_state_dict(state.kept)
+        self._learner.field.eval()
+        self._learner.finish(self._rows)
+        state.finished, state.kept = True, {}
+        self._save()
+        self._processes.wait()
 
+    def _save(self) -> None:
+        if self._processes.first:
+            state: dict[str, Any] = vars(self._state) | {
+                "field": self._learner.field.state_dict(),
+                "optimiser": self._optimiser.state_dict(),
+            }
+            save_checkpoint(self._run, state)
 
-@torch.no_grad()
-def _level_correction(field: FactorisedField, targets: Targets, rows: npt.NDArray[np.int64]) -> Tensor:
-    """What to add to predicted log-magnitudes so that their power is right on average over the training set.
+    def _choose_precision(self) -> bool:
+        processes = self._processes
+        inputs, targets = self._on_device(*self._learner.batch(self._order(0)[:_PROBE_ROWS], None))
+        gains = processes.first and bfloat16_gains(
+            lambda bfloat16: self._loss(self._learner.field, inputs, targets, bfloat16=bfloat16).backward(),
+            processes.device,
+        )
+        self._optimiser.zero_grad(set_to_none=True)
+        return bool(processes.agreed(float(gains))[0])
 
-    A regression on log-magnitude predicts the mean of the log, 2.5 dB below the log of the mean power for noise.
-    Residuals say by how much, output by output.
-    """
-    field.eval()
-    power = torch.zeros_like(field.mean)
-    sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
-    for listener, emitter, yaw, flat in _batches(targets, sample, 256, field.mean.device):
-        residual = flat - field.in_physical_units(field(listener, emitter, yaw))
-        power += torch.exp(2 * residual).sum(dim=0) / len(sample)
-    correction = torch.zeros_like(field.mean)
-    for name in ("fine", "late"):
-        part = field.heads.slices[name]
-        correction[part] = 0.5 * torch.log(power[part])
-    return correction
+    def _order(self, epoch: int) -> Rows:
+        return self._learner.epoch(self._rows, np.random.default_rng([self._configuration.seed, 5, epoch]))
 
+    def _on_device(
+        self, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...]
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        device = self._processes.device
+        return tuple(part.to(device) for part in inputs), tuple(part.to(device) for part in targets)
 
-def _save(path: Path, state: dict[str, object]) -> None:
-    """An interrupt in the middle of writing leaves the previous checkpoint whole."""
-    partial = path.with_suffix(".partial")
-    torch.save(state, partial)
-    partial.replace(path)
+    def _batches(self, first_step: int) -> Iterator[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
+        """This process's share of every batch from a step on, without end, made ready a little ahead of its use."""
+        processes, seed = self._processes, self._configuration.seed
+        orders: dict[int, Rows] = {}
 
+        def make(step: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+            epoch, number = divmod(step, self._steps_per_epoch)
+            if epoch not in orders:
+                orders.clear()
+                orders[epoch] = self._order(epoch)
+            start = number * self._batch
+            rows = orders[epoch][start + processes.rank : start + self._batch : processes.count]
+            return self._learner.batch(rows, np.random.default_rng([seed, 8, step, processes.rank]))
 
-def _log(path: Path, row: dict[str, float]) -> None:
-    fresh = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
-        if fresh:
-            writer.writeheader()
-        writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
+        with ThreadPoolExecutor(1) as pool:
+            ahead: deque[Future[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]] = deque(
+                pool.submit(make, first_step + number) for number in range(_BATCHES_AHEAD)
+            )
+            step = first_step + _BATCHES_AHEAD
+            while True:
+                yield self._on_device(*ahead.popleft().result())
+                ahead.append(pool.submit(make, step))
+                step += 1

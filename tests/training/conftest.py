@@ -16,7 +16,9 @@ from training.export import export
 from training.models.factorised import FieldShape
 from training.scene_file import SceneFile
 from training.simulation.run import simulate
-from training.train import Configuration, train
+from training.responses import SimulatedResponses
+from training.runs import Configuration
+from training.train import train
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation
 
@@ -64,10 +66,10 @@ def dataset(tmp_path_factory) -> Dataset:
 @pytest.fixture(scope="session")
 def run(dataset, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("tiny") / "run"
-    train(dataset, folder, CONFIGURATION, Progress(disable=True))
+    train(SimulatedResponses(dataset), folder, CONFIGURATION, Progress(disable=True))
     return folder
 
 
 @pytest.fixture(scope="session")
 def tiny_bundle(dataset, run, tmp_path_factory) -> Bundle:
-    return export(dataset, run, tmp_path_factory.mktemp("tiny") / "bundle")
+    return export(SimulatedResponses(dataset), [run], tmp_path_factory.mktemp("tiny") / "bundle")

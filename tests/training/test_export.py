@@ -8,9 +8,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from server.field.runtime import open_session
 from training import export as export_module
-from training.export import INPUTS, MODEL_FILE, OUTPUTS, ExportError, export, halve_weights
+from training.export import INPUTS, MODEL_FILE, OUTPUTS, ExportError, export
+from training.graphs import halve_weights
 from training.models.factorised import ExportedField
-from training.train import load_field
+from training.responses import SimulatedResponses
+from training.train import load_learner
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +31,12 @@ def answer(session, arrays):
 
 
 def test_the_graph_computes_what_torch_does(session, dataset, run):
-    field, cells, _ = load_field(dataset, run)
+    learner = load_learner(SimulatedResponses(dataset), run)
     arrays = poses(40)
     with torch.no_grad():
-        expected = [out.numpy() for out in ExportedField(field, cells).eval()(*map(torch.from_numpy, arrays))]
+        expected = [
+            out.numpy() for out in ExportedField(learner.field, learner.cells).eval()(*map(torch.from_numpy, arrays))
+        ]
     found = answer(session, arrays)
     np.testing.assert_allclose(found["log_magnitude"], expected[0], atol=0.03)
     np.testing.assert_allclose(found["phase_certainty"], expected[2], atol=0.01)
@@ -108,9 +112,9 @@ def scaled_up(data, name):
 
 def test_a_graph_that_disagrees_is_not_written(dataset, run, tiny_bundle, tmp_path, monkeypatch):
     damaged = scaled_up(tiny_bundle.models[MODEL_FILE], "_field.basis")
-    monkeypatch.setattr(export_module, "to_onnx", lambda *_: damaged)
+    monkeypatch.setattr(export_module, "to_onnx", lambda *_, **__: damaged)
     with pytest.raises(ExportError, match="differs from torch"):
-        export(dataset, run, tmp_path / "bundle")
+        export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
 
 
@@ -120,9 +124,9 @@ def test_a_field_of_numbers_too_large_for_float16_is_not_written(dataset, run, t
     values = numpy_helper.to_array(tensor).astype(np.float32)
     values[0] = np.inf
     tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), tensor.name))
-    monkeypatch.setattr(export_module, "to_onnx", lambda *_: model)
+    monkeypatch.setattr(export_module, "to_onnx", lambda *_, **__: model)
     with pytest.raises(ExportError):
-        export(dataset, run, tmp_path / "bundle")
+        export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
 
 

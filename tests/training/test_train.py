@@ -9,7 +9,9 @@ from rich.progress import Progress
 
 from training.models.cells import Cells
 from training.models.targets import codec_of, load_targets
-from training.train import Configuration, RunError, dataset_folder, load_field, train
+from training.responses import SimulatedResponses
+from training.runs import Configuration, RunError, dataset_folder
+from training.train import load_learner, train
 
 
 class Impatient(Progress):
@@ -31,22 +33,27 @@ def losses(run, column):
         return [float(row[column]) for row in csv.DictReader(file)]
 
 
-def test_an_interrupted_run_goes_on_to_the_same_field(dataset, run, configuration, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        train(dataset, tmp_path, configuration, Impatient(7))
-    with pytest.raises(RunError, match=f"7 of {configuration.epochs} epochs"):
-        load_field(dataset, tmp_path)
-    train(dataset, tmp_path, configuration, Progress(disable=True))
+def trained(dataset, run):
+    return load_learner(SimulatedResponses(dataset), run)
 
-    whole, pieced = (load_field(dataset, folder)[0].state_dict() for folder in (run, tmp_path))
+
+def test_an_interrupted_run_goes_on_to_the_same_field(dataset, run, configuration, tmp_path):
+    responses = SimulatedResponses(dataset)
+    with pytest.raises(KeyboardInterrupt):
+        train(responses, tmp_path, configuration, Impatient(7))
+    with pytest.raises(RunError, match=f"7 of {configuration.epochs} epochs"):
+        load_learner(responses, tmp_path)
+    train(responses, tmp_path, configuration, Progress(disable=True))
+
+    whole, pieced = (trained(dataset, folder).field.state_dict() for folder in (run, tmp_path))
     for name, values in whole.items():
         assert torch.equal(pieced[name], values), name
-    assert losses(tmp_path, "training")[:7] == losses(run, "training")[:7]
+    assert losses(tmp_path, "training") == losses(run, "training")
 
 
 def test_a_finished_run_is_left_as_it_is(dataset, run, configuration):
     before = (run / "checkpoint.pt").read_bytes()
-    train(dataset, run, configuration, Progress(disable=True))
+    train(SimulatedResponses(dataset), run, configuration, Progress(disable=True))
     assert (run / "checkpoint.pt").read_bytes() == before
 
 
@@ -57,8 +64,9 @@ def test_the_loss_falls(run, configuration):
 
 
 def test_learning_beats_the_mean_of_all_poses(dataset, run, tmp_path):
-    field, cells, _ = load_field(dataset, run)
-    targets = load_targets(dataset, cells, tmp_path, Progress(disable=True))
+    learner = trained(dataset, run)
+    field, responses = learner.field, SimulatedResponses(dataset)
+    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True))
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
         poses = (torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw))
@@ -71,8 +79,9 @@ def test_learning_beats_the_mean_of_all_poses(dataset, run, tmp_path):
 
 def test_corrected_levels_carry_the_power_of_the_training_set(dataset, run, tmp_path):
     """Pooled over the whole set, predicted power is the targets' where the field's log would be too low."""
-    field, cells, _ = load_field(dataset, run)
-    targets = load_targets(dataset, cells, tmp_path, Progress(disable=True))
+    learner = trained(dataset, run)
+    field, responses = learner.field, SimulatedResponses(dataset)
+    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True))
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
         poses = (torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw))
@@ -90,15 +99,15 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, run, tmp_
 @pytest.mark.parametrize("change", [{"seed": 1}, {"epochs": 21}, {"learning_rate": 1e-3}])
 def test_a_run_keeps_to_its_configuration(dataset, run, configuration, change):
     with pytest.raises(RunError, match="another configuration"):
-        train(dataset, run, dataclasses.replace(configuration, **change), Progress(disable=True))
+        train(SimulatedResponses(dataset), run, dataclasses.replace(configuration, **change), Progress(disable=True))
 
 
 def test_a_run_keeps_to_its_data(dataset, run, configuration):
-    other = dataclasses.replace(dataset, seed=dataset.seed + 1)
+    other = SimulatedResponses(dataclasses.replace(dataset, seed=dataset.seed + 1))
     with pytest.raises(RunError, match="another scene or seed"):
         train(other, run, configuration, Progress(disable=True))
     with pytest.raises(RunError, match="another scene or seed"):
-        load_field(other, run)
+        load_learner(other, run)
 
 
 def test_a_run_knows_where_its_data_lie(dataset, run):

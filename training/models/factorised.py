@@ -6,7 +6,8 @@ frequency, frame), `instantaneous_frequency` and `phase_certainty` (B, 2, freque
 normalisation) lives in the graph.
 
 Inside, four heads share the coefficients: log-magnitude of the fine frames and of the late cells, mean phasors of the
-known frames, and mean interaural phasors of all cells (see `training.models.cells`).
+known frames, and mean interaural phasors of all cells (see `training.models.cells`). A field of one channel (a
+microphone in place of a head) has no interaural head and no such output.
 """
 
 from dataclasses import dataclass
@@ -126,15 +127,16 @@ def _harmonics(unit: Tensor, count: int) -> Tensor:
 class Heads(nn.Module):
     """Slices of the basis: where each head's numbers lie in the flat output."""
 
-    def __init__(self, cells: Cells) -> None:
+    def __init__(self, cells: Cells, channels: int = 2) -> None:
         super().__init__()
         codec = cells.codec
         self.shapes = {
-            "fine": (2, codec.bins, cells.fine_frames),
-            "late": (2, cells.bands.cells, cells.late_frames.cells),
-            "phasor": (2, 2, codec.bins, cells.known_frames),
-            "interaural": (2, cells.bands.cells, cells.all_frames.cells),
+            "fine": (channels, codec.bins, cells.fine_frames),
+            "late": (channels, cells.bands.cells, cells.late_frames.cells),
+            "phasor": (2, channels, codec.bins, cells.known_frames),
         }
+        if channels == 2:
+            self.shapes["interaural"] = (2, cells.bands.cells, cells.all_frames.cells)
         sizes = [int(np.prod(shape)) for shape in self.shapes.values()]
         bounds = np.concatenate([[0], np.cumsum(sizes)])
         self.slices = {
@@ -146,9 +148,9 @@ class Heads(nn.Module):
 class FactorisedField(nn.Module):
     """Flat predictions (B, heads.size), in units of each output's spread about its mean over the training set."""
 
-    def __init__(self, plan: FloorPlan, cells: Cells, shape: FieldShape) -> None:
+    def __init__(self, plan: FloorPlan, cells: Cells, shape: FieldShape, channels: int = 2) -> None:
         super().__init__()
-        self.heads = Heads(cells)
+        self.heads = Heads(cells, channels)
         self.encoder = PoseEncoder(plan, shape)
         self._inputs = nn.Linear(self.encoder.size, shape.width)
         self._hidden = nn.ModuleList(nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1))
@@ -186,7 +188,7 @@ class ExportedField(nn.Module):
         self.register_buffer("_nominal_advance", nominal, persistent=False)
         self._silence = float(np.log(cells.codec.log_floor))
 
-    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
         field, heads = self._field, self._field.heads
         flat = field.in_physical_units(field(listener, emitter, yaw)) + field.level_correction
 
@@ -197,8 +199,9 @@ class ExportedField(nn.Module):
         log_magnitude = torch.clamp(torch.cat([head("fine"), late], dim=-1), min=self._silence)
         phasor = head("phasor")
         frequency, certainty = self._phase(phasor[:, 0], phasor[:, 1])
-        coherence = self._bands @ head("interaural") @ self._all_frames
-        return log_magnitude, frequency, certainty, coherence
+        if "interaural" not in heads.shapes:
+            return log_magnitude, frequency, certainty
+        return log_magnitude, frequency, certainty, self._bands @ head("interaural") @ self._all_frames
 
     def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
         """Instantaneous frequency and certainty of mean phasors (B, ear, frequency, frame)."""

@@ -1,4 +1,4 @@
-"""Training targets: what a field should say of each simulated pair, in the heads' layout.
+"""Training targets of the factorised field: what it should say of each response, in the heads' layout.
 
 Responses are aligned first: the moment sound can first arrive (path length over the speed of sound) is moved to a
 fixed sample. Reflections follow it at once wherever the two ends are, so the field is smooth. Aligning the earliest
@@ -15,16 +15,16 @@ from rich.progress import Progress
 from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.codec import Codec
-from training.dataset import Dataset
 from training.models.cells import Cells
+from training.responses import ResponseSet, SimulatedResponses
 
 LEAD_SAMPLES = 64
 N_FFT = 256
 LOG_FLOOR = 1e-5
 
 
-def codec_of(dataset: Dataset) -> Codec:
-    return Codec(dataset.sample_rate, N_FFT, N_FFT // 4, dataset.samples, LOG_FLOOR)
+def codec_of(responses: ResponseSet, n_fft: int = N_FFT) -> Codec:
+    return Codec(responses.sample_rate, n_fft, n_fft // 4, responses.samples, LOG_FLOOR)
 
 
 def align(responses: npt.NDArray[np.floating], delay_samples: float) -> npt.NDArray[np.float64]:
@@ -37,7 +37,8 @@ def align(responses: npt.NDArray[np.floating], delay_samples: float) -> npt.NDAr
 
 
 def flat_targets(aligned: npt.NDArray[np.floating], cells: Cells) -> npt.NDArray[np.float16]:
-    """(..., ear, sample) aligned responses to (..., heads.size): fine, late, phasor, interaural, in `Heads` order."""
+    """(..., channel, sample) aligned responses to (..., heads.size): fine, late, phasor and, for two channels,
+    interaural, in `Heads` order."""
     codec = cells.codec
     spectrogram = codec.transform(aligned)
     fine = codec.log_magnitude(spectrogram[..., : cells.fine_frames])
@@ -46,11 +47,13 @@ def flat_targets(aligned: npt.NDArray[np.floating], cells: Cells) -> npt.NDArray
     late = codec.log_magnitude(np.sqrt(bands.T @ np.abs(spectrogram[..., cells.fine_frames :]) ** 2 @ late_frames))
     known = spectrogram[..., : cells.known_frames]
     phasor = known / np.maximum(np.abs(known), 1e-12)
-    power = bands.T @ np.abs(spectrogram) ** 2 @ all_frames
-    cross = bands.T @ (spectrogram[..., 0, :, :] * np.conj(spectrogram[..., 1, :, :])) @ all_frames
-    interaural = cross / np.maximum(np.sqrt(power[..., 0, :, :] * power[..., 1, :, :]), 1e-20)
+    parts = [fine, late, _complex_parts(phasor, -4)]
+    if aligned.shape[-2] == 2:
+        power = bands.T @ np.abs(spectrogram) ** 2 @ all_frames
+        cross = bands.T @ (spectrogram[..., 0, :, :] * np.conj(spectrogram[..., 1, :, :])) @ all_frames
+        interaural = cross / np.maximum(np.sqrt(power[..., 0, :, :] * power[..., 1, :, :]), 1e-20)
+        parts.append(_complex_parts(interaural, -3))
     lead = aligned.shape[:-2]
-    parts = [fine, late, _complex_parts(phasor, -4), _complex_parts(interaural, -3)]
     return np.concatenate([part.reshape(*lead, -1) for part in parts], axis=-1).astype(np.float16)
 
 
@@ -60,40 +63,48 @@ def _complex_parts(values: npt.NDArray[np.complexfloating], axis: int) -> npt.ND
 
 @dataclass(frozen=True)
 class Targets:
-    """Poses and flat targets of a set of pairs, one row per pair and yaw; `flat` is a memory map."""
+    """Poses and flat targets, one row per response that is not held out; `flat` is a memory map."""
 
     listener: npt.NDArray[np.float32]
     emitter: npt.NDArray[np.float32]
     yaw: npt.NDArray[np.float32]
-    pair: npt.NDArray[np.int64]
     flat: npt.NDArray[np.float16]
 
 
-def load_targets(dataset: Dataset, cells: Cells, folder: Path, progress: Progress) -> Targets:
-    """Targets of all pairs that are not held out, computed once and kept in `folder`."""
-    pairs = dataset.pairs(held_out=False)
-    yaws = len(dataset.yaws)
-    key = {"cells": asdict(cells), "simulated": (dataset.folder / "pairs.h5").stat().st_mtime}
+def load_targets(responses: ResponseSet, cells: Cells, folder: Path, progress: Progress) -> Targets:
+    """Targets of all responses that are not held out, computed once and kept in `folder`."""
+    rows = np.flatnonzero(~responses.held_out)
+    key = json.dumps({"cells": asdict(cells), "rows": len(rows), "written": _written(responses)})
     path, key_path = folder / "targets.npy", folder / "targets.json"
-    if not (key_path.exists() and json.loads(key_path.read_text()) == json.loads(json.dumps(key))):
+    if not (key_path.exists() and key_path.read_text() == key):
         key_path.unlink(missing_ok=True)
-        _compute(dataset, cells, pairs, path, progress)
-        key_path.write_text(json.dumps(key))
-    flat = np.load(path, mmap_mode="r").reshape(len(pairs) * yaws, -1)
-    emitter, listener = (np.repeat(dataset.probes[pairs[:, side]], yaws, axis=0).astype(np.float32) for side in (0, 1))
-    yaw = np.tile(dataset.yaws, len(pairs)).astype(np.float32)
-    return Targets(listener, emitter, yaw, np.repeat(np.arange(len(pairs)), yaws), flat)
+        _compute(responses, cells, rows, path, progress)
+        key_path.write_text(key)
+    poses = (part[rows].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw))
+    return Targets(*poses, np.load(path, mmap_mode="r"))
 
 
-def _compute(dataset: Dataset, cells: Cells, pairs: npt.NDArray[np.int64], path: Path, progress: Progress) -> None:
-    task = progress.add_task("targets", total=len(pairs))
-    flat = None
-    for row, (emitter, listener) in enumerate(pairs):
-        delay = dataset.onset_s[emitter, listener] * dataset.sample_rate - LEAD_SAMPLES
-        target = flat_targets(align(dataset.read(pairs[row : row + 1])[0], delay), cells)
+def _written(responses: ResponseSet) -> float:
+    file = responses.dataset.folder / "pairs.h5" if isinstance(responses, SimulatedResponses) else None
+    return 0.0 if file is None else file.stat().st_mtime
+
+
+def delay_samples(responses: ResponseSet, row: int) -> float:
+    """How much earlier than emitted an aligned response starts."""
+    return float(responses.onset_s[row]) * responses.sample_rate - LEAD_SAMPLES
+
+
+def _compute(responses: ResponseSet, cells: Cells, rows: npt.NDArray[np.int64], path: Path, progress: Progress) -> None:
+    """Row by row into a file; those of one pair, which are stored together, are read together."""
+    starts = np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))
+    task = progress.add_task("targets", total=len(starts))
+    flat: npt.NDArray[np.float16] | None = None
+    for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
+        some = rows[start:stop]
+        target = flat_targets(align(responses.read(some), delay_samples(responses, some[0])), cells)
         if flat is None:
-            flat = np.lib.format.open_memmap(path, "w+", np.float16, (len(pairs), *target.shape))
-        flat[row] = target
+            flat = np.lib.format.open_memmap(path, "w+", np.float16, (len(rows), target.shape[-1]))
+        flat[start:stop] = target
         progress.advance(task)
     if flat is not None:
         flat.flush()

@@ -7,6 +7,7 @@ from server.acoustics.codec import Codec
 from training.models.cells import Cells
 from training.models.factorised import Heads
 from training.models.targets import LEAD_SAMPLES, align, codec_of, flat_targets, load_targets
+from training.responses import SimulatedResponses
 
 CODEC = Codec(16_000, 256, 64, 4_000, 1e-5)
 CELLS = Cells(CODEC, known_frames=12)
@@ -105,7 +106,7 @@ def test_an_earlier_left_ear_leads_in_phase():
 
 def test_rows_belong_to_their_poses(dataset, tmp_path):
     cells = Cells(codec_of(dataset))
-    targets = load_targets(dataset, cells, tmp_path, Progress(disable=True))
+    targets = load_targets(SimulatedResponses(dataset), cells, tmp_path, Progress(disable=True))
     assert len(targets.flat) == len(dataset.pairs(held_out=False)) * len(dataset.yaws)
     for row in (0, 7, len(targets.flat) - 1):
         emitter, listener = (
@@ -121,9 +122,11 @@ def test_rows_belong_to_their_poses(dataset, tmp_path):
 
 def test_targets_are_computed_once(dataset, tmp_path):
     cells = Cells(codec_of(dataset))
-    load_targets(dataset, cells, tmp_path, Progress(disable=True))
+    load_targets(SimulatedResponses(dataset), cells, tmp_path, Progress(disable=True))
     before = (tmp_path / "targets.npy").stat().st_mtime_ns
-    load_targets(dataset, cells, tmp_path, Progress(disable=True))
+    load_targets(SimulatedResponses(dataset), cells, tmp_path, Progress(disable=True))
     assert (tmp_path / "targets.npy").stat().st_mtime_ns == before
-    load_targets(dataset, Cells(codec_of(dataset), fine_frames=16), tmp_path, Progress(disable=True))
+    load_targets(
+        SimulatedResponses(dataset), Cells(codec_of(dataset), fine_frames=16), tmp_path, Progress(disable=True)
+    )
     assert (tmp_path / "targets.npy").stat().st_mtime_ns != before

@@ -1,0 +1,126 @@
+"""Trained fields as ONNX graphs: made from torch, stored smaller, quantised, and run pose by pose."""
+
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import nn
+
+from server.field.graph import INPUTS
+
+_OPSET = 18
+_HALVE_ABOVE_BYTES = 16_384
+
+
+def to_onnx(
+    module: nn.Module, poses: tuple[torch.Tensor, ...], outputs: tuple[str, ...], *, free_batch: bool = True
+) -> onnx.ModelProto:
+    """The graph, and nothing in it but the graph; its batch axis is free, or as long as that of the poses."""
+    batch = torch.export.Dim("batch")
+    with warnings.catch_warnings():
+        # PyTorch's exporter about its own pytrees, and about the one name that all three batch axes share.
+        warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
+        warnings.filterwarnings("ignore", r"# The axis name: batch will not be used", UserWarning)
+        program = torch.onnx.export(
+            module,
+            poses,
+            input_names=list(INPUTS),
+            output_names=list(outputs),
+            dynamic_shapes={name: {0: batch} for name in INPUTS} if free_batch else None,
+            opset_version=_OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    model = program.model_proto
+    graph = model.graph
+    for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        # The exporter notes call stacks, with paths of the machine it ran on: no scene should carry those.
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    return model
+
+
+def pose_by_pose(model: onnx.ModelProto) -> onnx.ModelProto:
+    """A graph of one pose as the body of a scan over a free batch axis, so that memory does not grow with the batch:
+    one response of `naf` takes a third of a gigabyte of intermediate values."""
+    body = model.graph
+    shapes = {name: list(INPUTS[name]) for name in INPUTS}
+    given, taken, nodes_before, nodes_after = [], [], [], []
+    for name, shape in shapes.items():
+        given.append(helper.make_tensor_value_info(f"{name}_of_pose", TensorProto.FLOAT, shape))
+        nodes_before.append(helper.make_node("Unsqueeze", [f"{name}_of_pose", "batch_axis"], [name]))
+    for output in body.output:
+        shape = [dimension.dim_value for dimension in output.type.tensor_type.shape.dim][1:]
+        taken.append(helper.make_tensor_value_info(f"{output.name}_of_pose", TensorProto.FLOAT, shape))
+        nodes_after.append(helper.make_node("Squeeze", [output.name, "batch_axis"], [f"{output.name}_of_pose"]))
+    of_pose = helper.make_graph(
+        [*nodes_before, *body.node, *nodes_after],
+        "pose",
+        given,
+        taken,
+        [*body.initializer, numpy_helper.from_array(np.zeros(1, np.int64), "batch_axis")],
+        value_info=body.value_info,
+    )
+    # Names inside the body hide those outside, where the same names are the whole batch's.
+    names = [output.name for output in body.output]
+    scan = helper.make_node("Scan", list(shapes), names, body=of_pose, num_scan_inputs=len(shapes))
+    results = [
+        helper.make_tensor_value_info(
+            name, TensorProto.FLOAT, ["batch", *(axis.dim_value for axis in value.type.tensor_type.shape.dim)]
+        )
+        for name, value in zip(names, taken, strict=True)
+    ]
+    inputs = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]) for name, shape in shapes.items()
+    ]
+    whole = helper.make_graph([scan], "poses", inputs, results)
+    wrapped = helper.make_model(whole, opset_imports=model.opset_import, ir_version=model.ir_version)
+    onnx.checker.check_model(wrapped)
+    return wrapped
+
+
+def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Stores large float32 constants as float16, cast back as the graph is loaded: half the bundle, the same
+    arithmetic."""
+    graph = model.graph
+    casts = []
+    for tensor in graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if values.dtype != np.float32 or values.nbytes < _HALVE_ABOVE_BYTES:
+            continue
+        name = tensor.name
+        tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
+        casts.append(helper.make_node("Cast", [f"{name}_half"], [name], to=TensorProto.FLOAT))
+    for position, node in enumerate(casts):
+        graph.node.insert(position, node)
+    onnx.checker.check_model(model)
+    return model
+
+
+def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
+    """Products with at least so many constant weights in 8-bit integers: weights per column, the other factor as it
+    comes, per call. Smaller ones take no time, and what they compute is needed exactly."""
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    constants = {tensor.name: int(np.prod(tensor.dims)) for tensor in model.graph.initializer}
+    kept = [
+        node.name
+        for node in model.graph.node
+        if node.op_type in {"MatMul", "Gemm"} and constants.get(node.input[1], 0) < least_weights
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
+        onnx.save(model, source)
+        quantize_dynamic(
+            source,
+            target,
+            per_channel=True,
+            weight_type=QuantType.QInt8,
+            nodes_to_exclude=kept,
+            op_types_to_quantize=["MatMul", "Gemm"],
+        )
+        return onnx.load(target)

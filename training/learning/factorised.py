@@ -1,0 +1,141 @@
+"""The factorised field and its loss."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import Progress
+from torch import Tensor
+
+from server.errors import NafirError
+from training.learning.learner import Losses, Rows
+from training.learning.schedule import one_cycle
+from training.models.cells import Cells
+from training.models.factorised import FactorisedField, FieldShape
+from training.models.site import Site
+from training.models.targets import Targets, codec_of, load_targets
+from training.responses import ResponseSet, SimulatedResponses
+from training.runs import Configuration, FactorisedRecipe
+
+# What a target differs by from the best possible prediction (ln magnitude of one noisy bin, of a pooled cell; unit
+# phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its
+# floor.
+_SPREADS = {"fine": 0.64, "late": 0.25, "phasor": 1.0, "interaural": 1.0}
+_HEAD_WEIGHTS = {"fine": 1.0, "late": 1.0, "phasor": 2.0, "interaural": 1.0}
+_WEIGHT_DECAY = 1e-2
+_SAMPLE_ROWS = 3000
+# A measured response starts with the direct sound, whose phase can be learned; reflections have hardly one.
+_KNOWN_FRAMES_OF_WHOLE_RESPONSES = 12
+
+
+class RecipeError(NafirError):
+    """A way of training that does not fit the data."""
+
+
+class FactorisedLearner:
+    """Learns from targets that are computed once and kept in the run folder."""
+
+    def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
+        shape, recipe = configuration.shape, configuration.recipe
+        if not isinstance(shape, FieldShape) or not isinstance(recipe, FactorisedRecipe):
+            raise TypeError(f"{configuration.kind} is no factorised field")
+        if recipe.swap and responses.channels == 2:
+            raise RecipeError(
+                "swap: a head is no loudspeaker, so binaural responses differ with their ends exchanged; leave it off"
+            )
+        self.responses = responses
+        self.recipe = recipe
+        known = 1 if isinstance(responses, SimulatedResponses) else _KNOWN_FRAMES_OF_WHOLE_RESPONSES
+        codec = codec_of(responses)
+        self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), min(known, recipe.fine_frames))
+        self.site = Site.of(responses)
+        self.field = FactorisedField(self.site.plan, self.cells, shape, responses.channels)
+        self._targets: Targets | None = None
+
+    def prepare(self, folder: Path, progress: Progress) -> None:
+        self._targets = load_targets(self.responses, self.cells, folder, progress)
+
+    @property
+    def targets(self) -> Targets:
+        if self._targets is None:
+            raise RuntimeError("prepare comes first")
+        return self._targets
+
+    @torch.no_grad()
+    def initialise(self, rows: Rows, seed: int) -> None:
+        """Normalisation, and a basis that starts from the principal components of the training spectrograms."""
+        field = self.field
+        sample = np.sort(np.random.default_rng([seed, 4]).choice(rows, min(_SAMPLE_ROWS, len(rows)), replace=False))
+        flat = torch.from_numpy(self.targets.flat[sample]).float()
+        field.mean.copy_(flat.mean(dim=0))
+        for name, part in field.heads.slices.items():
+            field.spread[part] = _SPREADS[name]
+        normalised = (flat.to(field.mean.device) - field.mean) / field.spread
+        rank = field.basis.shape[0]
+        _, singular, basis = torch.svd_lowrank(normalised, q=min(rank, *normalised.shape), niter=2)
+        field.basis[: basis.shape[1]] = basis.T * (singular / len(sample) ** 0.5)[:, None]
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        return [{"params": list(self.field.parameters()), "weight_decay": _WEIGHT_DECAY}]
+
+    def momentum_and_rate(self, fraction: float) -> tuple[float, float]:
+        return one_cycle(fraction)
+
+    def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
+        return rng.permutation(rows)
+
+    def validation(self, rows: Rows) -> Rows:
+        return rows
+
+    def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        rows = np.sort(rows)
+        targets = self.targets
+        listener, emitter, yaw, flat = (
+            torch.from_numpy(part[rows]) for part in (targets.listener, targets.emitter, targets.yaw, targets.flat)
+        )
+        if self.recipe.swap and rng is not None:
+            swapped = torch.from_numpy(rng.random(len(rows)) < 0.5)[:, None]
+            listener, emitter = torch.where(swapped, emitter, listener), torch.where(swapped, listener, emitter)
+        return (listener, emitter, yaw), (flat,)
+
+    def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
+        field, flat = self.field, targets[0].float()
+        residual = prediction - (flat - field.mean) / field.spread
+        losses = {
+            name: _HEAD_WEIGHTS[name] * residual[:, part].square().mean() for name, part in field.heads.slices.items()
+        }
+        if self.recipe.decay_weight:
+            difference = self._decay(field.in_physical_units(prediction)) - self._decay(flat)
+            losses["decay"] = self.recipe.decay_weight * difference.abs().mean()
+        return losses
+
+    def _decay(self, flat: Tensor) -> Tensor:
+        """(B, channel, band, step) natural logarithm of the energy from each fine frame or late cell on."""
+        heads, cells = self.field.heads, self.cells
+        shapes = {name: flat[:, heads.slices[name]].unflatten(1, heads.shapes[name]) for name in ("fine", "late")}
+        pool = torch.tensor(cells.bands.pool(), device=flat.device)
+        fine = pool.T @ torch.exp(2 * shapes["fine"])
+        widths = torch.tensor(cells.late_frames.widths, device=flat.device)
+        energy = torch.cat([fine, torch.exp(2 * shapes["late"]) * widths], dim=-1)
+        return torch.log(energy.flip(-1).cumsum(-1).flip(-1))
+
+    @torch.no_grad()
+    def finish(self, rows: Rows) -> None:
+        """What to add to predicted log-magnitudes so that their power is right on average over the training set.
+
+        A regression on log-magnitude predicts the mean of the log, 2.5 dB below the log of the mean power for noise.
+        Residuals say by how much, output by output.
+        """
+        if not self.recipe.level_correction:
+            return
+        field = self.field
+        power = torch.zeros_like(field.mean)
+        sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
+        for start in range(0, len(sample), 256):
+            poses, (flat,) = self.batch(sample[start : start + 256], None)
+            predicted = field.in_physical_units(field(*(pose.to(power.device) for pose in poses)))
+            power += torch.exp(2 * (flat.to(power.device).float() - predicted)).sum(dim=0) / len(sample)
+        for name in ("fine", "late"):
+            part = field.heads.slices[name]
+            field.level_correction[part] = 0.5 * torch.log(power[part])

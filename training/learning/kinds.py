@@ -1,0 +1,11 @@
+"""Which learner a configuration asks for."""
+
+from training.learning.factorised import FactorisedLearner
+from training.learning.naf import NafLearner
+from training.responses import ResponseSet
+from training.runs import Configuration
+
+
+def learner_of(responses: ResponseSet, configuration: Configuration) -> FactorisedLearner | NafLearner:
+    """With fresh parameters, drawn from torch's generator."""
+    return (NafLearner if configuration.kind == "naf" else FactorisedLearner)(responses, configuration)

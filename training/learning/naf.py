@@ -1,0 +1,145 @@
+"""The paper's network and its loss: random points of a few whole responses per step."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from rich.progress import Progress
+from scipy.ndimage import uniform_filter1d
+from torch import Tensor
+
+from training.learning.learner import Losses, Rows
+from training.learning.schedule import decay_to_a_tenth
+from training.models.naf import Naf, NafShape
+from training.models.site import Site
+from training.models.targets import align, codec_of, delay_samples
+from training.responses import ResponseSet
+from training.runs import Configuration, NafRecipe
+
+N_FFT = 512
+_GRID_DECAY = 1e-2
+_SIGMAS = 3.0
+_LEAST_SIGMA = 0.1
+_STATISTICS_ROWS = 600
+_VALIDATION_ROWS = 24
+_ENVELOPE_SAMPLES = 65
+
+
+class NafLearner:
+    """Computes targets as they are needed: a step takes seconds, they take milliseconds."""
+
+    def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
+        shape, recipe = configuration.shape, configuration.recipe
+        if not isinstance(shape, NafShape) or not isinstance(recipe, NafRecipe):
+            raise TypeError(f"{configuration.kind} is no naf")
+        self.responses = responses
+        self.recipe = recipe
+        self.codec = codec_of(responses, N_FFT)
+        self.site = Site.of(responses)
+        sizes = (self.codec.bins, self.codec.frames) if shape.domain == "spectrogram" else (responses.samples,)
+        self.field = Naf(self.site, sizes, responses.channels, shape)
+        self._trainable = np.flatnonzero(~responses.held_out)
+
+    def prepare(self, folder: Path, progress: Progress) -> None:
+        """Nothing to do."""
+
+    @torch.no_grad()
+    def initialise(self, rows: Rows, seed: int) -> None:
+        """Mean and three standard deviations of every point over responses and ears, and mean interaural coherence."""
+        field = self.field
+        sample = np.random.default_rng([seed, 4]).permutation(rows)[:_STATISTICS_ROWS]
+        count, total, squares = 0, np.zeros(()), np.zeros(())
+        cross, power = np.zeros(field.axes, complex), np.zeros((2, *field.axes))
+        for row in self._trainable[np.sort(sample)]:
+            aligned = self._aligned(row)
+            values = self._values(aligned)
+            count += len(values)
+            total, squares = total + values.sum(axis=0), squares + (values**2).sum(axis=0)
+            if hasattr(field, "coherence"):
+                spectrogram = self.codec.transform(aligned)
+                cross += spectrogram[0] * np.conj(spectrogram[1])
+                power += np.abs(spectrogram) ** 2
+        mean = total / count
+        sigma = np.sqrt(np.maximum(squares / count - mean**2, 0))
+        if field.shape.domain == "time":
+            # A waveform has no mean, and its level is a smooth function of time.
+            mean, envelope = 0 * mean, np.sqrt(uniform_filter1d(squares / count, _ENVELOPE_SAMPLES, axis=0))
+            sigma = np.maximum(envelope, 1e-4 * envelope.max())
+        else:
+            # Bins that hardly vary (silence before the onset) would turn rounding into targets.
+            sigma = np.maximum(sigma, _LEAST_SIGMA)
+        field.mean.copy_(torch.from_numpy(mean))
+        field.spread.copy_(torch.from_numpy(_SIGMAS * sigma))
+        if hasattr(field, "coherence"):
+            coherence = cross / np.maximum(np.sqrt(power[0] * power[1]), 1e-20)
+            field.coherence.copy_(torch.from_numpy(np.stack([coherence.real, coherence.imag])))
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Only what the grids hold decays."""
+        grids = [grid.features for grid in self.field.grids]
+        others = [part for part in self.field.parameters() if not any(part is held for held in grids)]
+        groups: list[dict[str, Any]] = [{"params": others, "weight_decay": 0.0}]
+        return groups + ([{"params": grids, "weight_decay": _GRID_DECAY}] if grids else [])
+
+    def momentum_and_rate(self, fraction: float) -> tuple[float, float]:
+        return decay_to_a_tenth(fraction)
+
+    def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
+        """Every pair once, in a random orientation."""
+        shuffled = rng.permutation(rows)
+        _, first = np.unique(self.responses.pair[self._trainable[shuffled]], return_index=True)
+        return shuffled[np.sort(first)]
+
+    def validation(self, rows: Rows) -> Rows:
+        return rows[:: max(1, len(rows) // _VALIDATION_ROWS)][:_VALIDATION_ROWS]
+
+    def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        validating = rng is None
+        rng = np.random.default_rng(0) if rng is None else rng
+        field, recipe, chosen = self.field, self.recipe, self._trainable[rows]
+        indices = np.empty((len(field.axes), len(rows), recipe.points), dtype=np.int64)
+        values = np.empty((len(rows), field.channels, recipe.points, field.shape.outputs), dtype=np.float32)
+        for number, row in enumerate(chosen):
+            *across, frames = field.axes
+            padded = validating or rng.random() < recipe.padding
+            reach = frames if padded else min(frames, self._sounding(row))
+            points = [rng.integers(0, size, recipe.points) for size in (*across, reach)]
+            indices[:, number] = points
+            values[number] = self._values(self._aligned(row))[:, *points]
+        poses = [part[chosen] for part in (self.responses.listener, self.responses.emitter, self.responses.yaw)]
+        if not validating:
+            for position in poses[:2]:
+                position += rng.normal(0, recipe.noise_m, position.shape)
+        inputs = *(torch.from_numpy(pose.astype(np.float32)) for pose in poses), *map(torch.from_numpy, indices)
+        return inputs, (torch.from_numpy(values), torch.from_numpy(indices))
+
+    def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
+        values, indices = targets
+        at = tuple(indices)
+        mean, spread = self.field.mean[at][:, None], self.field.spread[at][:, None]
+        squared = (prediction - (values - mean) / spread).square()
+        if self.field.shape.domain == "time":
+            return {"waveform": squared.mean()}
+        return {"magnitude": squared[..., 0].mean(), "phase": self.recipe.phase_weight * squared[..., 1].mean()}
+
+    def finish(self, rows: Rows) -> None:
+        """Nothing to do."""
+
+    def _aligned(self, row: int) -> npt.NDArray[np.float64]:
+        """(ear, sample)"""
+        return align(self.responses.read([row])[0], delay_samples(self.responses, row))
+
+    def _values(self, aligned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(ear, *axes, outputs)"""
+        if self.field.shape.domain == "time":
+            return aligned[..., None]
+        return np.stack(self.codec.encode(aligned), axis=-1)
+
+    def _sounding(self, row: int) -> int:
+        """Frames, or samples, before an aligned response ends in silence because the recording did."""
+        left = self.responses.samples - delay_samples(self.responses, row)
+        if self.field.shape.domain == "time":
+            return max(1, int(left))
+        return int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left))

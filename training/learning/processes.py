@@ -1,0 +1,70 @@
+"""Data parallel training: as many processes as `torchrun` started, or one.
+
+Every process computes an equal share of each batch, and gradients are averaged. The first one alone reads and writes
+the run folder beyond its targets, and decides what the clock decides.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Processes:
+    """`rank` of this process among `count`, and the device it computes on."""
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @classmethod
+    @contextmanager
+    def joined(cls) -> Iterator["Processes"]:
+        """This process among those that torchrun started, until the end of the block."""
+        rank, count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+        gpu = torch.cuda.is_available()
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if gpu else torch.device("cpu")
+        if count == 1:
+            yield cls(rank, count, device)
+            return
+        dist.init_process_group("nccl" if gpu else "gloo")
+        try:
+            yield cls(rank, count, device)
+        finally:
+            dist.destroy_process_group()
+
+    @property
+    def first(self) -> bool:
+        return self.rank == 0
+
+    def parallel(self, field: nn.Module) -> nn.Module:
+        """The field with gradients averaged over all processes."""
+        if self.count == 1:
+            return field
+        ids = [self.device.index] if self.device.type == "cuda" else None
+        return nn.parallel.DistributedDataParallel(field, device_ids=ids)
+
+    def agreed(self, *values: float) -> list[float]:
+        """What the first process says, in every process."""
+        if self.count == 1:
+            return list(values)
+        tensor = torch.tensor(values, dtype=torch.float64, device=self.device)
+        dist.broadcast(tensor, 0)
+        return [float(value) for value in tensor]
+
+    def mean(self, value: Tensor) -> Tensor:
+        if self.count == 1:
+            return value
+        total = value.clone()
+        dist.all_reduce(total)
+        return total / self.count
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+        if self.count > 1:
+            dist.barrier()

@@ -1,0 +1,134 @@
+"""`naf`: the paper's network (Luo et al., Learning Neural Acoustic Fields, NeurIPS 2022), one point of one response
+at a time.
+
+A point is a bin of the spectrogram (frequency, frame), answered with log-magnitude and instantaneous frequency, or, in
+the supplement's alternative, a sample of the waveform. Eight layers 512 wide with leaky ReLU; two more layers carry the
+inputs past the first half. Every layer but the last adds an embedding of the ear and one of the head's orientation.
+
+Two things differ from the paper. It learns what every field here learns, the reflected sound aligned to the earliest
+arrival, where the paper's learns the whole response in absolute time: an easier task, so that comparing fields compares
+networks. And positions are given in as many coordinates as vary in the data, where the paper's are all at one height
+(MeshRIR's emitters, in its section 4, are not).
+
+Axes: B poses, ear, N points; metres, radians.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from training.models.local_geometry import ENCODED, GaussianGrid, OrientationEmbedding, sinusoids
+from training.models.site import Site
+
+SLOPE = 0.1
+_POSITION_OCTAVE, _POINT_OCTAVE = 7.0, 10.0
+
+
+@dataclass(frozen=True)
+class NafShape:
+    """The network's whole configuration. `grid`: one for both ends, one each, or none; `domain`: what a point is."""
+
+    grid: Literal["shared", "dual", "none"] = "shared"
+    domain: Literal["spectrogram", "time"] = "spectrogram"
+    width: int = 512
+    layers: int = 8
+    grid_spacing_m: float = 0.25
+    grid_features: int = 64
+
+    @property
+    def outputs(self) -> int:
+        """Numbers per point."""
+        return 2 if self.domain == "spectrogram" else 1
+
+
+class Naf(nn.Module):
+    """Normalised predictions (B, ear, N, outputs) at points given by their index along each of `axes`, the sizes
+    (frequency, frame) or (sample,)."""
+
+    def __init__(self, site: Site, axes: tuple[int, ...], channels: int, shape: NafShape) -> None:
+        super().__init__()
+        self.shape, self.axes, self.channels = shape, axes, channels
+        self._moving = site.listener_axes, site.emitter_axes
+        for name, values in (("_low", site.low), ("_high", site.high)):
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float32), persistent=False)
+        grids = {"shared": 1, "dual": 2, "none": 0}[shape.grid]
+        self.grids = nn.ModuleList(
+            GaussianGrid(site.low, site.high, shape.grid_spacing_m, shape.grid_features) for _ in range(grids)
+        )
+        for axis, size in enumerate(axes):
+            steps = torch.linspace(-2 * np.pi, 2 * np.pi, size, dtype=torch.float64)[:, None]
+            self.register_buffer(f"_axis_{axis}", sinusoids(steps, _POINT_OCTAVE).float(), persistent=False)
+        inner = shape.layers - 2
+        zero = torch.zeros(1, 3)
+        poses, points = self.pose_features(zero, zero).shape[-1], ENCODED * len(axes)
+        self.first = nn.Linear(poses + points, shape.width)
+        self.skip = nn.ModuleList([nn.Linear(poses + points, shape.width), nn.Linear(shape.width, shape.width)])
+        self.inner = nn.ModuleList(nn.Linear(shape.width, shape.width) for _ in range(inner))
+        self.last = nn.Linear(shape.width, shape.outputs)
+        self.ears = nn.Parameter(torch.randn(inner + 1, channels, shape.width) / shape.width**0.5)
+        self.orientations = OrientationEmbedding(site.yaws, inner + 1, shape.width)
+        # Normalisation over the training set: (*axes, outputs), the same for both ears.
+        self.register_buffer("mean", torch.zeros(*axes, shape.outputs))
+        self.register_buffer("spread", torch.ones(*axes, shape.outputs))
+        if shape.domain == "spectrogram" and channels == 2:
+            # Mean complex interaural coherence of the training set (real and imaginary, *axes).
+            self.register_buffer("coherence", torch.zeros(2, *axes))
+
+    def encoding(self, axis: int) -> Tensor:
+        """(size, ENCODED) encodings of all indices along an axis."""
+        return getattr(self, f"_axis_{axis}")
+
+    def pose_features(self, listener: Tensor, emitter: Tensor) -> Tensor:
+        """(B, features) of where the two ends are."""
+        middle, half = (self._low + self._high) / 2, torch.clamp((self._high - self._low) / 2, min=1e-3)
+        ends = []
+        for position, moving in zip((listener, emitter), self._moving, strict=True):
+            scaled = torch.clamp((position - middle) / half, -1, 1)
+            ends.append(sinusoids(scaled[:, list(moving)], _POSITION_OCTAVE))
+        if self.grids:
+            ends += [self.grids[0](listener), self.grids[-1](emitter)]
+        return torch.cat(ends, dim=-1)
+
+    def tables(self, layer: nn.Linear) -> list[Tensor]:
+        """A layer over concatenated inputs is a sum of layers over each: its (size, width) share of every axis, without
+        bias."""
+        weights = torch.split(layer.weight[:, -ENCODED * len(self.axes) :], ENCODED, dim=1)
+        return [self.encoding(axis) @ weight.T for axis, weight in enumerate(weights)]
+
+    def of_pose(self, layer: nn.Linear, features: Tensor) -> Tensor:
+        """(B, width) share of the pose features in a layer over concatenated inputs, with its bias."""
+        return nn.functional.linear(features, layer.weight[:, : features.shape[-1]], layer.bias)
+
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor, *indices: Tensor) -> Tensor:
+        """`indices` (B, N) along each axis."""
+        features = self.pose_features(listener, emitter)
+        starts = []
+        for layer in (self.first, self.skip[0]):
+            start = self.of_pose(layer, features)[:, None]
+            for table, index in zip(self.tables(layer), indices, strict=True):
+                start = start + table[index]
+            starts.append(start)
+        return self.last(self.trunk(*starts, self.orientations(yaw), self.inner))
+
+    def trunk(self, first: Tensor, skipped: Tensor, orientation: Tensor, inner: nn.ModuleList) -> Tensor:
+        """From both input layers' (B, N, width), all through `inner`, the inner layers or the first of them, to
+        (B, ear, N, width); orientation (B, layers, width)."""
+        past = self.skip[1](nn.functional.leaky_relu(skipped, SLOPE))
+        hidden = first[:, None] + self.embedding(orientation, 0)
+        for number, layer in enumerate(inner):
+            hidden = layer(nn.functional.leaky_relu(hidden, SLOPE)) + self.embedding(orientation, number + 1)
+            if number == len(self.inner) // 2 - 1:
+                hidden = hidden + past[:, None]
+        return hidden
+
+    def embedding(self, orientation: Tensor, layer: int) -> Tensor:
+        """(B, ear, 1, width) of ear and orientation."""
+        return (self.ears[layer] + orientation[:, layer, None])[:, :, None]
+
+    def in_physical_units(self, normalised: Tensor) -> Tensor:
+        """(B, ear, all points, outputs), points in the order of `axes`, to (B, outputs, ear, *axes)."""
+        shaped = normalised.unflatten(2, self.axes) * self.spread + self.mean
+        return torch.movedim(shaped, -1, 1)

@@ -1,0 +1,73 @@
+"""The graphs of a trained `naf`: the paper's network as it is written, and the same function with less arithmetic.
+
+`plain` concatenates the inputs of every point and runs all layers. `tabled` uses that a layer over concatenated inputs
+is a sum over its inputs: the shares of frequency and frame are tables, made once; that of the poses is computed once
+per pose; and two layers in a row with nothing in between are one. Both compute the same numbers up to rounding.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from server.acoustics.codec import Codec
+from training.models.naf import SLOPE, Naf
+
+
+class NafGraph(nn.Module):
+    """Log-magnitude, instantaneous frequency, its certainty (all ones: the paper's network claims no less) and the
+    training set's interaural coherence (without it for one channel); in the time domain the aligned response alone."""
+
+    def __init__(self, field: Naf, codec: Codec, *, tabled: bool) -> None:
+        super().__init__()
+        self._field = field
+        self._tabled = tabled
+        self._silence = float(np.log(codec.log_floor))
+        sizes = field.axes
+        if tabled:
+            with torch.no_grad():
+                for number, layer in enumerate((field.first, field.skip[0])):
+                    for axis, table in enumerate(field.tables(layer)):
+                        self.register_buffer(f"_table_{number}_{axis}", table.clone(), persistent=False)
+                last, folded = field.last, field.inner[-1]
+                self.register_buffer("_weight", last.weight @ folded.weight, persistent=False)
+                self.register_buffer("_bias", last(folded.bias + field.ears[-1]), persistent=False)
+        else:
+            grids = torch.meshgrid(*(torch.arange(size) for size in sizes), indexing="ij")
+            points = torch.cat([field.encoding(axis)[grid.reshape(-1)] for axis, grid in enumerate(grids)], dim=-1)
+            self.register_buffer("_points", points, persistent=False)
+
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
+        field = self._field
+        features = field.pose_features(listener, emitter)
+        orientation = field.orientations(yaw)
+        normalised = (self._from_tables if self._tabled else self._from_points)(features, orientation)
+        physical = field.in_physical_units(normalised)
+        if field.shape.domain == "time":
+            return (physical[:, 0],)
+        log_magnitude = torch.clamp(physical[:, 0], min=self._silence)
+        outputs = log_magnitude, physical[:, 1], torch.ones_like(log_magnitude)
+        if field.channels == 1:
+            return outputs
+        return *outputs, field.coherence.expand(len(listener), -1, -1, -1)
+
+    def _from_points(self, features: Tensor, orientation: Tensor) -> Tensor:
+        field, count = self._field, len(self._points)
+        inputs = torch.cat(
+            [features[:, None].expand(-1, count, -1), self._points.expand(len(features), -1, -1)], dim=-1
+        )
+        hidden = field.trunk(field.first(inputs), field.skip[0](inputs), orientation, field.inner)
+        return field.last(hidden)
+
+    def _from_tables(self, features: Tensor, orientation: Tensor) -> Tensor:
+        field = self._field
+        starts = []
+        for number, layer in enumerate((field.first, field.skip[0])):
+            start = field.of_pose(layer, features)
+            for axis in range(len(field.axes)):
+                table = getattr(self, f"_table_{number}_{axis}")
+                start = start[..., None, :] + table.reshape(1, *([1] * axis), len(table), -1)
+            starts.append(start.flatten(1, -2))
+        hidden = field.trunk(*starts, orientation, field.inner[:-1])
+        turned = nn.functional.linear(orientation[:, -1], field.last.weight)
+        last = nn.functional.linear(nn.functional.leaky_relu(hidden, SLOPE), self._weight)
+        return last + (self._bias + turned[:, None])[:, :, None]

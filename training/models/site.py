@@ -1,0 +1,44 @@
+"""Where responses were taken: what a field has to know of a place before it learns anything of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.geometry import FloorPlan
+from training.responses import ResponseSet, SimulatedResponses
+
+_MARGIN_M = 0.5
+_MOVES_M = 0.01
+
+
+@dataclass(frozen=True)
+class Site:
+    """`low` and `high` (3,) enclose all positions, metres; `plan` is the floor plan, or a box around them where none is
+    known, in which every two points see each other. `yaws` (yaw,) are the head orientations measured, ascending in
+    [0, 2 pi). `listener_axes` and `emitter_axes` are the coordinates in which that end moves, x and y always."""
+
+    plan: FloorPlan
+    low: npt.NDArray[np.float64]
+    high: npt.NDArray[np.float64]
+    yaws: npt.NDArray[np.float64]
+    listener_axes: tuple[int, ...]
+    emitter_axes: tuple[int, ...]
+
+    @classmethod
+    def of(cls, responses: ResponseSet) -> "Site":
+        ends = responses.listener, responses.emitter
+        positions = np.concatenate(ends)
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        if isinstance(responses, SimulatedResponses):
+            plan = responses.dataset.plan
+            corners = np.asarray(plan.corners)
+            low[:2], high[:2] = corners.min(axis=0), corners.max(axis=0)
+        else:
+            (x, y), (right, top) = low[:2] - _MARGIN_M, high[:2] + _MARGIN_M
+            plan = FloorPlan(((x, y), (right, y), (right, top), (x, top)), max(float(high[2]), 0.0) + _MARGIN_M)
+            low[:2], high[:2] = (x, y), (right, top)
+        axes = [(0, 1, 2) if np.ptp(end[:, 2]) > _MOVES_M else (0, 1) for end in ends]
+        # Rounded, so that one heading written as several floats stays one.
+        yaws = np.unique(np.round(np.remainder(responses.yaw, 2 * np.pi), 6))
+        return cls(plan, low, high, yaws[yaws < 2 * np.pi - 1e-5], axes[0], axes[1])

@@ -1,0 +1,219 @@
+"""The run folder: `run.json` (configuration), `dataset.json` (what the data are and where they lie), `checkpoint.pt`
+(everything needed to go on), `log.csv`, `tensorboard/` and whatever targets a kind of field keeps.
+"""
+
+import csv
+import dataclasses
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from server.errors import NafirError
+from training.models.factorised import FieldShape
+from training.models.naf import NafShape
+from training.responses import ImportedDataset, ResponseSet, SimulatedResponses
+
+CHECKPOINT = "checkpoint.pt"
+
+
+class RunError(NafirError):
+    """A run folder that holds another configuration, or no trained field."""
+
+
+@dataclass(frozen=True)
+class FactorisedRecipe:
+    """How a factorised field is trained. Those that are off did not pay where they were measured.
+
+    `fine_frames` are predicted bin by bin, later ones in cells; `level_correction` adds what a mean of logarithms lacks
+    to a mean of powers; `decay_weight` is that of the error in energy decay curves; `swap` also shows every response
+    with its ends exchanged, which is the same response where both are omnidirectional: one channel only. `teacher` is
+    the run folder of a `naf` that is asked for responses at `lessons` poses of its own.
+    """
+
+    fine_frames: int = 24
+    level_correction: bool = True
+    decay_weight: float = 0.0
+    swap: bool = False
+    teacher: str | None = None
+    lessons: int = 256
+
+
+@dataclass(frozen=True)
+class NafRecipe:
+    """How the paper's network is trained: `points` of each response per step, positions shaken by `noise_m` (standard
+    deviation), silence after a response's end shown with probability `padding`, and `phase_weight` (the paper's alpha,
+    which it does not state) of the error in instantaneous frequency."""
+
+    points: int = 2000
+    noise_m: float = 0.1
+    padding: float = 0.1
+    phase_weight: float = 0.1
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """All that decides a run's outcome besides the dataset.
+
+    Trained for `minutes` of computing if given, else for `epochs`. With `patience` training stops after so many rounds
+    (an epoch, or a twentieth of the time) without a smaller error on what is held back, and the field of the smallest
+    is kept; without, the last one, for which learning rates are scheduled. `share` is that of the training pairs used.
+    """
+
+    seed: int = 0
+    epochs: int = 14
+    minutes: float | None = None
+    share: float = 1.0
+    batch: int = 128
+    learning_rate: float = 2e-3
+    patience: int | None = None
+    shape: FieldShape | NafShape = dataclasses.field(default_factory=FieldShape)
+    recipe: FactorisedRecipe | NafRecipe = dataclasses.field(default_factory=FactorisedRecipe)
+
+    @classmethod
+    def naf(cls, shape: NafShape, recipe: NafRecipe | None = None, **changes: Any) -> "Configuration":
+        """The paper's: 200 epochs of 20 responses a step."""
+        settings = {"epochs": 200, "batch": 20, "learning_rate": 5e-4, **changes}
+        return cls(shape=shape, recipe=recipe or NafRecipe(), **settings)
+
+    @property
+    def kind(self) -> Literal["factorised", "naf"]:
+        return "naf" if isinstance(self.shape, NafShape) else "factorised"
+
+    @property
+    def name(self) -> str:
+        """The kind and variant as the command line says it."""
+        if not isinstance(self.shape, NafShape):
+            return self.kind
+        if self.shape.domain == "time":
+            return "naf-time-domain"
+        return {"shared": "naf", "dual": "naf-dual", "none": "naf-no-grid"}[self.shape.grid]
+
+    @classmethod
+    def read(cls, run: Path) -> "Configuration":
+        """Raises RunError if the folder holds no run."""
+        values = read_json(run, "run.json")
+        try:
+            naf = values.pop("kind") == "naf"
+            shape = (NafShape if naf else FieldShape)(**values.pop("shape"))
+            recipe = (NafRecipe if naf else FactorisedRecipe)(**values.pop("recipe"))
+            return cls(**values, shape=shape, recipe=recipe)
+        except (KeyError, TypeError) as exc:
+            raise RunError(f"{run / 'run.json'}: not a configuration: {exc}") from exc
+
+    def write(self, run: Path) -> None:
+        (run / "run.json").write_text(json.dumps({"kind": self.kind, **asdict(self)}, indent=2) + "\n")
+
+
+_NAF_SHAPES = {
+    "naf": NafShape(),
+    "naf-dual": NafShape(grid="dual"),
+    "naf-no-grid": NafShape(grid="none"),
+    "naf-time-domain": NafShape(domain="time"),
+}
+FIELDS = ("factorised", *_NAF_SHAPES)
+
+
+def configure(field: str, *, rank: int | None = None, points: int | None = None, **changes: Any) -> Configuration:
+    """The usual configuration of a field by its name on the command line, changed as said.
+
+    Raises RunError for another name, or for an option that this field has not.
+    """
+    if field not in FIELDS:
+        raise RunError(f"field: there is no {field!r}, but {', '.join(FIELDS)}")
+    if field == "factorised":
+        if points is not None:
+            raise RunError("points: a factorised field is trained on whole responses; leave it out")
+        return Configuration(shape=FieldShape() if rank is None else FieldShape(rank=rank), **changes)
+    if rank is not None:
+        raise RunError(f"rank: only a factorised field has one; leave it out for {field}")
+    return Configuration.naf(_NAF_SHAPES[field], NafRecipe() if points is None else NafRecipe(points=points), **changes)
+
+
+def dataset_folder(run: Path) -> Path:
+    """The dataset a run was trained on. Raises RunError if the folder holds no run."""
+    return Path(read_json(run, "dataset.json")["folder"])
+
+
+def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> None:
+    """Makes the folder this configuration's run on these data, if it is not already.
+
+    Raises RunError if the folder holds a run of another configuration or on other data.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    if (run / "run.json").exists():
+        if Configuration.read(run) != configuration:
+            raise RunError(f"{run}: holds a run of another configuration; choose an empty folder")
+        require_same_data(responses, run)
+    identity = {"folder": str(_folder(responses).resolve()), **_identity(responses)}
+    (run / "dataset.json").write_text(json.dumps(identity, indent=2) + "\n")
+    configuration.write(run)
+
+
+def require_same_data(responses: ResponseSet, run: Path) -> None:
+    """Raises RunError if the run was trained on others."""
+    recorded = read_json(run, "dataset.json")
+    identity = _identity(responses)
+    if {name: recorded.get(name) for name in identity} != identity:
+        raise RunError(f"{run}: was trained on another scene or seed than that of {_folder(responses)}")
+
+
+def read_json(run: Path, name: str) -> dict[str, Any]:
+    try:
+        return dict(json.loads((run / name).read_text()))
+    except OSError as exc:
+        raise RunError(f"{run}: not a run folder: {name}: {exc.strerror}") from exc
+    except ValueError as exc:
+        raise RunError(f"{run / name}: not JSON: {exc}") from exc
+
+
+def save_checkpoint(run: Path, state: dict[str, Any]) -> None:
+    """An interrupt in the middle of writing leaves the previous checkpoint whole."""
+    partial = run / "checkpoint.partial"
+    torch.save(state, partial)
+    partial.replace(run / CHECKPOINT)
+
+
+def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
+    """Raises RunError if there is none."""
+    try:
+        return dict(torch.load(run / CHECKPOINT, map_location=device, weights_only=True))
+    except OSError as exc:
+        raise RunError(f"{run}: holds no checkpoint: {exc.strerror}") from exc
+
+
+def append_log(run: Path, row: dict[str, float]) -> None:
+    path = run / "log.csv"
+    fresh = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if fresh:
+            writer.writeheader()
+        writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
+
+
+def _folder(responses: ResponseSet) -> Path:
+    match responses:
+        case SimulatedResponses():
+            return responses.dataset.folder
+        case ImportedDataset():
+            return responses.folder
+    raise TypeError(f"{type(responses)} lies in no folder")
+
+
+def _identity(responses: ResponseSet) -> dict[str, Any]:
+    """What makes data the same wherever they lie."""
+    if isinstance(responses, SimulatedResponses):
+        return {"seed": responses.dataset.seed, "scene": responses.dataset.scene.model_dump(mode="json")}
+    ends = np.concatenate([responses.listener, responses.emitter, responses.yaw[:, None]], axis=1)
+    return {
+        "sample_rate": responses.sample_rate,
+        "samples": responses.samples,
+        "channels": responses.channels,
+        "rows": len(ends),
+        "sum_of_poses": round(float(ends.sum()), 6),
+        "held_out": int(responses.held_out.sum()),
+    }
