@@ -14,10 +14,10 @@ from server.scene.bundle import Bundle
 from training.dataset import Dataset
 from training.export import export
 from training.models.factorised import FieldShape
-from training.scene_file import SceneFile
-from training.simulation.run import simulate
 from training.responses import SimulatedResponses
 from training.runs import Configuration
+from training.scene_file import SceneFile
+from training.simulation.run import simulate
 from training.train import train
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation
