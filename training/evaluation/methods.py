@@ -10,10 +10,14 @@ from training.evaluation.baselines import linear, linear_aligned, nearest
 from training.evaluation.coded import AAC, AudioCodec, CodedResponses, Track, opus
 from training.evaluation.evaluate import FLOOR, Column, Source
 from training.evaluation.held_out import EvaluationError, HeldOut, Responses
+from training.evaluation.helmholtz import HelmholtzInterpolation
+from training.evaluation.image_sources import ImageSources
 
 DEFAULT_METHODS = ("nearest", "linear", "linear-aligned")
 Answer = Callable[[int, npt.NDArray[np.integer]], Responses | None]
 
+# Where listeners stand about a metre apart, as in most of our data, there is little left to interpolate above.
+_HELMHOLTZ_CUTOFF_HZ = 500.0
 _BYTES_PER_SAMPLE = 2  # float16, as simulated datasets keep their responses
 
 
@@ -86,6 +90,31 @@ def _coded(name: str, prepared: _Prepared) -> Column:
     )
 
 
+def _helmholtz(name: str, prepared: _Prepared) -> Column:
+    held_out = prepared.held_out
+    cutoff_hz = _HELMHOLTZ_CUTOFF_HZ if name.endswith("lowpass") else None
+    interpolation = HelmholtzInterpolation(held_out.pairs, held_out.sample_rate, cutoff_hz)
+    return _of_stored(name, held_out, interpolation.response)
+
+
+def _image_sources(name: str, prepared: _Prepared) -> Column:
+    held_out = prepared.held_out
+    dataset = held_out.simulated
+    if dataset is None:
+        raise EvaluationError(f"--methods: {name} needs a simulated scene, whose walls are known; leave it out")
+    images = ImageSources(dataset)
+    emitters, listeners = held_out.emitters, held_out.listeners
+    return Column(
+        name,
+        lambda index, turns: images.response(
+            emitters[index], listeners[index], turns, number=int(held_out.held_out[index])
+        ),
+        "baseline",
+        (dataset.folder / "scene.toml").stat().st_size,
+        name,
+    )
+
+
 def at_pairs(held_out: HeldOut, answer: Answer) -> Source:
     """The source of a method that knows the pairs of the dataset by number."""
     return lambda index, turns: answer(int(held_out.held_out[index]), turns)
@@ -99,4 +128,7 @@ METHODS: dict[str, Callable[[str, _Prepared], Column]] = {
     "aac-linear": _coded,
     "opus-nearest": _coded,
     "opus-linear": _coded,
+    "image-sources": _image_sources,
+    "helmholtz": _helmholtz,
+    "helmholtz-lowpass": _helmholtz,
 }
