@@ -168,6 +168,41 @@ def evaluate(
 
 
 @app.command()
+def maps(
+    bundle: Annotated[Path, typer.Argument(help="Scene bundle.")],
+    data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's field was trained on.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="PNG to write.")],
+    level: Annotated[str | None, typer.Option(help="Quality level; the default one if not given.")] = None,
+    emitters: Annotated[int, typer.Option(min=1, max=8, help="How many emitters to map.")] = 3,
+    spacing_m: Annotated[float, typer.Option(min=0.05, help="Between the cells of a map.")] = 0.25,
+) -> None:
+    """Draw loudness maps side by side: simulated anew, as the field has it, nearest and linear interpolation."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from rich.progress import track
+
+    from server.field.levels import Levels
+    from server.scene.bundle import Bundle
+    from training.evaluation.held_out import open_held_out
+    from training.evaluation.maps import draw_maps, map_emitters
+
+    console = Console(stderr=True)
+    field = Levels.load(Bundle.load(bundle)).choose(level)
+    with open_held_out(data) as held_out:
+        drawn = map_emitters(
+            held_out,
+            field,
+            emitters=emitters,
+            spacing_m=spacing_m,
+            track=lambda steps, doing: track(steps, doing, console=console),
+        )
+    draw_maps(drawn, output)
+    for number, of_emitter in enumerate(drawn, start=1):
+        methods = list(of_emitter.levels_db)[1:]
+        errors = ", ".join(f"{method} {of_emitter.errors_db(method):.2f} dB" for method in methods)
+        typer.echo(f"emitter {number}: mean error against the simulation: {errors}")
+
+
+@app.command()
 def frontier(
     bundle: Annotated[Path, typer.Argument(help="Scene bundle; its fields are swept.")],
     data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's fields were trained on.")],

@@ -91,7 +91,7 @@ def linear_weights(pairs: TrainingPairs, pair: int) -> tuple[list[int], list[flo
         return [nearest_pair(pairs, pair)], [1.0]
     points = pairs.listener_positions[pairs.pair_listener[candidates], :2]
     target = pairs.listener_positions[pairs.pair_listener[pair], :2]
-    inside = _barycentric(points, target)
+    inside = barycentric(points, target)
     if inside is None:
         return [int(candidates[np.argmin(np.square(points - target).sum(axis=-1))])], [1.0]
     corners, weights = inside
@@ -154,8 +154,11 @@ def _squared_distances(
     return np.asarray(np.square(offsets).sum(axis=-1))
 
 
-def _barycentric(points: _Floats, target: _Floats) -> tuple[npt.NDArray[np.integer], _Floats] | None:
-    """Corners (indices into points) of the simplex that holds `target`, and weights; None outside the hull."""
+def barycentric(points: _Floats, target: _Floats) -> tuple[npt.NDArray[np.integer], _Floats] | None:
+    """Corners (indices into points) of the simplex that holds `target`, and weights; None outside the hull.
+
+    points: (point, 2 or 3); target: (2 or 3,).
+    """
     centre = points.mean(axis=0)
     spread, axes = np.linalg.eigh(np.cov((points - centre).T, bias=True))
     span = axes.T[spread > 1e-12 * max(float(spread[-1]), 1e-6)]

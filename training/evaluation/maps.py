@@ -1,0 +1,223 @@
+"""Loudness maps side by side, as the paper's figure: simulated anew on a grid, as the field has it, and interpolated
+from the training listeners.
+
+Level is energy per ear, averaged over ears and two opposite head orientations, in dB relative to the emitter's free
+field at one metre, as `server.loudness` defines it. Grids are (row, column), row 0 the southernmost, NaN outside the
+room. Metres.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from server.acoustics.decibels import power_to_db
+from server.field.field import AcousticField
+from server.loudness import LoudnessMap, loudness_map
+from server.whole_field import WholeField, kemar
+from training.dataset import SPEED_OF_SOUND, Dataset
+from training.evaluation.baselines import TrainingPairs, barycentric
+from training.evaluation.held_out import EvaluationError, HeldOut, require_same_scene
+from training.simulation.rays import sphere_directions
+from training.simulation.synthesis import BinauralSynthesis
+from training.simulation.tracing import RoomTracer
+
+_Floats = npt.NDArray[np.float64]
+
+_YAWS = np.array([0.0, np.pi])
+_SEED = 30
+# Nearer to a wall than this, a receiver's sphere catches too few rays.
+_CLEARANCE_M = 0.08
+
+
+@dataclass(frozen=True)
+class EmitterMaps:
+    """Maps of one emitter by method, the simulation first, all on the grid of `grid`; listeners (n, 3) are those that
+    interpolation starts from; corners (n, 2) are the room's."""
+
+    corners: _Floats
+    emitter: _Floats
+    listeners: _Floats
+    grid: LoudnessMap
+    levels_db: dict[str, _Floats]
+
+    def errors_db(self, method: str) -> float:
+        """Mean magnitude over all cells."""
+        truth, *_ = self.levels_db.values()
+        return float(np.nanmean(np.abs(self.levels_db[method] - truth)))
+
+
+def spread_out(points: _Floats, start: _Floats, count: int) -> list[int]:
+    """The point nearest to `start`, then always the one farthest from those chosen; indices into (point, 3)."""
+    chosen = [int(np.argmin(np.linalg.norm(points - start, axis=-1)))]
+    while len(chosen) < min(count, len(points)):
+        nearest = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)
+        chosen.append(int(np.argmax(nearest)))
+    return chosen
+
+
+def map_emitters(
+    held_out: HeldOut,
+    field: AcousticField,
+    *,
+    emitters: int,
+    spacing_m: float,
+    track: Callable[[Sequence[int], str], Iterable[int]] = lambda steps, _: steps,
+) -> list[EmitterMaps]:
+    """Maps of so many probes as emitters. Raises EvaluationError for measured data, which have no walls, and
+    DatasetError for a field of another scene."""
+    dataset = held_out.simulated
+    if dataset is None:
+        raise EvaluationError(f"{held_out.name}: maps need a simulated scene, whose walls are known")
+    require_same_scene(field.bundle, dataset)
+    whole = WholeField.through_kemar(field)
+    start = dataset.scene.start
+    chosen = spread_out(dataset.probes, np.array(start.emitter), emitters)
+    return [
+        _maps(held_out, dataset, whole, emitter, listener_height_m=start.listener[2], spacing_m=spacing_m)
+        for emitter in track(chosen, "mapping")
+    ]
+
+
+def _maps(
+    held_out: HeldOut,
+    dataset: Dataset,
+    whole: WholeField,
+    emitter: int,
+    *,
+    listener_height_m: float,
+    spacing_m: float,
+) -> EmitterMaps:
+    position = dataset.probes[emitter]
+    x, y, z = (float(coordinate) for coordinate in position)
+    grid = loudness_map(whole, (x, y, z), listener_height_m=listener_height_m, spacing_m=spacing_m)
+    rows, columns = grid.levels_db.shape
+    across = np.meshgrid(grid.origin[0] + spacing_m * np.arange(columns), grid.origin[1] + spacing_m * np.arange(rows))
+    cells = np.stack([*across, np.full((rows, columns), listener_height_m)], axis=-1)
+    inside = ~np.isnan(grid.levels_db) & (dataset.plan.wall_distance_m(cells) >= _CLEARANCE_M)
+    listeners, gram = _training_gram(held_out.pairs, held_out.yaws, emitter)
+
+    def on_grid(power: _Floats) -> _Floats:
+        levels = np.full(inside.shape, np.nan)
+        levels[inside] = power_to_db(power)
+        return levels
+
+    nearest, linear = _interpolated_power(listeners, gram, cells[inside])
+    return EmitterMaps(
+        np.asarray(dataset.plan.corners),
+        position,
+        listeners,
+        grid,
+        {
+            "simulation": on_grid(_simulated_power(dataset, position, cells[inside])),
+            "field": np.where(inside, grid.levels_db, np.nan),
+            "nearest": on_grid(nearest),
+            "linear": on_grid(linear),
+        },
+    )
+
+
+def _training_gram(pairs: TrainingPairs, yaws: _Floats, emitter: int) -> tuple[_Floats, _Floats]:
+    """(n, 3) listeners that were trained on with this emitter, and (n, n) products of their waveforms, per ear: the
+    energy of any weighted sum of them follows."""
+    known = np.flatnonzero(pairs.training & (pairs.pair_emitter == emitter))
+    opposite = [int(np.argmin(np.abs(np.angle(np.exp(1j * (yaws - yaw)))))) for yaw in _YAWS]
+    waves = np.stack([pairs.response(int(pair))[opposite] for pair in known]).reshape(len(known), -1)
+    ears = len(_YAWS) * 2
+    return pairs.listener_positions[pairs.pair_listener[known]], (waves @ waves.T).astype(np.float64) / ears
+
+
+def _interpolated_power(listeners: _Floats, gram: _Floats, cells: _Floats) -> tuple[_Floats, _Floats]:
+    """(cell,) energies of the nearest waveform, and of waveforms interpolated linearly in plan (the nearest in plan
+    outside of the listeners' hull)."""
+    nearest = np.argmin(np.linalg.norm(cells[:, None] - listeners, axis=-1), axis=-1)
+    linear = np.empty(len(cells))
+    for number, cell in enumerate(cells):
+        around = barycentric(listeners[:, :2], cell[:2])
+        if around is None:
+            at = int(np.argmin(np.linalg.norm(listeners[:, :2] - cell[:2], axis=-1)))
+            linear[number] = gram[at, at]
+        else:
+            corners, weights = around
+            linear[number] = weights @ gram[np.ix_(corners, corners)] @ weights
+    return gram[nearest, nearest], np.maximum(linear, 0.0)
+
+
+def _simulated_power(dataset: Dataset, emitter: _Floats, cells: _Floats) -> _Floats:
+    """(cell,) energies per ear, simulated with the rays of the dataset."""
+    settings = dataset.scene.simulation
+    directions = sphere_directions(settings.arrival_directions)
+    tracer = RoomTracer(
+        dataset.scene.geometry,
+        dataset.scene.air,
+        cells,
+        duration_s=settings.duration_s,
+        image_order=settings.image_order,
+        arrival_directions=directions,
+    )
+    synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, _YAWS, dataset.samples)
+    rng = np.random.default_rng([dataset.seed, _SEED])
+    onsets_s = dataset.plan.path_length_m(emitter, cells) / SPEED_OF_SOUND
+    visible = dataset.plan.is_visible(emitter, cells)
+    power = np.empty(len(cells))
+    for number, arrivals in enumerate(tracer.trace(emitter, rays=settings.rays, rng=rng)):
+        response = synthesis.render(arrivals, cells[number], float(onsets_s[number]), rng)
+        if visible[number]:
+            response = response + synthesis.direct(emitter, cells[number], dataset.scene.air)
+        power[number] = np.square(response).sum(axis=-1).mean()
+    return power
+
+
+def draw_maps(maps: Sequence[EmitterMaps], path: Path) -> None:
+    """Writes a PNG: a row per emitter and a column per method, one colour scale for all."""
+    methods = list(maps[0].levels_db)
+    walls = maps[0].corners
+    width, height = np.ptp(walls, axis=0)
+    across = 3.6
+    figure = Figure(
+        figsize=(across * len(methods) + 1.2, len(maps) * (across * height / width + 0.55) + 0.5),
+        layout="constrained",
+        facecolor="white",
+    )
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(maps), len(methods), squeeze=False, sharex=True, sharey=True)
+    simulated = np.concatenate([of_emitter.levels_db["simulation"].ravel() for of_emitter in maps])
+    quietest, loudest = np.nanpercentile(simulated, (1, 99))
+    image = None
+    for row, (axes_of_row, of_emitter) in enumerate(zip(panels, maps, strict=True)):
+        for axes, method in zip(axes_of_row, methods, strict=True):
+            image = _draw_map(axes, of_emitter, method, walls, (float(quietest), float(loudest)))
+            error = "" if method == "simulation" else f", off by {of_emitter.errors_db(method):.1f} dB"
+            axes.set_title(f"{method}{error}", fontsize=11)
+            if row == len(maps) - 1:
+                axes.set_xlabel("east (m)")
+        axes_of_row[0].set_ylabel("north (m)")
+    assert image is not None
+    bar = figure.colorbar(image, ax=panels, shrink=0.8, pad=0.01, extend="both")
+    bar.set_label("level (dB re free field at 1 m)")
+    figure.savefig(path, dpi=110)
+
+
+def _draw_map(axes: Axes, maps: EmitterMaps, method: str, walls: _Floats, limits_db: tuple[float, float]) -> AxesImage:
+    grid, levels = maps.grid, maps.levels_db[method]
+    half = grid.spacing_m / 2
+    rows, columns = levels.shape
+    x, y = grid.origin
+    extent = (x - half, x + (columns - 0.5) * grid.spacing_m, y - half, y + (rows - 0.5) * grid.spacing_m)
+    image = axes.imshow(
+        levels, origin="lower", extent=extent, vmin=limits_db[0], vmax=limits_db[1], cmap="viridis", aspect="equal"
+    )
+    closed = np.concatenate([walls, walls[:1]])
+    axes.plot(*closed.T, color="black", linewidth=2.0, solid_joinstyle="miter")
+    if method in {"nearest", "linear"}:
+        axes.plot(*maps.listeners[:, :2].T, ".", color="white", markersize=4, markeredgewidth=0)
+    axes.plot(*maps.emitter[:2], marker="*", color="#ff3b30", markeredgecolor="white", markersize=15, linestyle="none")
+    low, high = walls.min(axis=0) - 0.2, walls.max(axis=0) + 0.2
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    return image

@@ -1,0 +1,93 @@
+"""Gaussian process regression over pairs of places: what measurements between known places say of one between others.
+
+Axes: pairs (row, 3) emitters and (row, 3) listeners, metres; values (row, target).
+
+The covariance of two pairs adds up what they have in common: being near each other at both ends; the same listener,
+whoever speaks (a microphone's gain, what stands beside it); the same emitter heard at places near each other (its
+directivity); the same listener and emitters near each other. Lengths and shares are those of the largest marginal
+likelihood (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 5.4.1), common to all targets up to
+their scale.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+_Floats = npt.NDArray[np.float64]
+
+_SAME_M = 1e-3
+_FITTED_ROWS = 250
+_FITTED_COMPONENTS = 30
+_ITERATIONS = 25
+# Logarithms of: near at both ends (share, length at the emitter, at the listener), same listener (share), same emitter
+# (share, length), same listener (share, length at the emitter), noise (share). Lengths count in spreads of that end.
+_START = np.log([1.0, 0.7, 0.7, 0.3, 0.5, 0.15, 0.3, 0.7, 0.1])
+_BOUNDS = np.log([(1e-3, 100), (0.05, 20), (0.05, 20), (1e-3, 30), (1e-3, 30), (0.01, 5), (1e-3, 30), (0.05, 20), (1e-2, 10)])
+
+
+@dataclass(frozen=True)
+class _Ends:
+    emitter: _Floats
+    listener: _Floats
+
+
+class PairRegression:
+    """Of the pairs given, to all others."""
+
+    def __init__(self, emitter: _Floats, listener: _Floats, values: _Floats, *, seed: int = 0) -> None:
+        self._known = _Ends(emitter, listener)
+        self._spread = [max(float(np.sqrt(end.var(axis=0).sum())), _SAME_M) for end in (emitter, listener)]
+        self._mean = values.mean(axis=0)
+        rows = np.random.default_rng([seed, 12]).permutation(len(values))[:_FITTED_ROWS]
+        self._parameters = self._fitted(_Ends(emitter[rows], listener[rows]), values[rows] - values[rows].mean(axis=0))
+        self._weights = cho_solve(cho_factor(self._of_known(self._known)), values - self._mean)
+
+    def __call__(self, emitter: _Floats, listener: _Floats) -> _Floats:
+        """(row, target) expected at other pairs."""
+        return np.asarray(self._mean + self._covariance(_Ends(emitter, listener), self._known) @ self._weights)
+
+    def _fitted(self, ends: _Ends, centred: _Floats) -> _Floats:
+        left, singular, _ = np.linalg.svd(centred, full_matrices=False)
+        components = (left * singular)[:, :_FITTED_COMPONENTS]
+        rows, count = components.shape
+        if not singular.any():
+            return _START
+
+        def cost(parameters: _Floats) -> float:
+            """Negative logarithm of the likelihood, the common scale at its best."""
+            self._parameters = parameters
+            try:
+                lower, _ = cho_factor(self._of_known(ends), lower=True)
+            except np.linalg.LinAlgError:
+                return 1e12
+            white = solve_triangular(lower, components, lower=True)
+            return float(0.5 * rows * count * np.log(np.square(white).sum()) + count * np.log(np.diag(lower)).sum())
+
+        found = minimize(cost, _START, method="L-BFGS-B", bounds=_BOUNDS, options={"maxiter": _ITERATIONS})
+        return np.asarray(found.x)
+
+    def _of_known(self, ends: _Ends) -> _Floats:
+        covariance = self._covariance(ends, ends)
+        return covariance + np.exp(self._parameters[-1]) * np.eye(len(covariance))
+
+    def _covariance(self, a: _Ends, b: _Ends) -> _Floats:
+        both, at_emitter, at_listener, one_listener, one_emitter, along, of_listener, across, _ = np.exp(
+            self._parameters
+        )
+        emitters, listeners = cdist(a.emitter, b.emitter), cdist(a.listener, b.listener)
+        same_emitter, same_listener = emitters < _SAME_M, listeners < _SAME_M
+        emitters, listeners = emitters / self._spread[0], listeners / self._spread[1]
+
+        def near(distance: _Floats, length: float) -> _Floats:
+            return np.asarray(np.exp(-0.5 * (distance / length) ** 2))
+
+        return np.asarray(
+            both * near(emitters, at_emitter) * near(listeners, at_listener)
+            + one_listener * same_listener
+            + one_emitter * same_emitter * near(listeners, along)
+            + of_listener * same_listener * near(emitters, across)
+        )
