@@ -5,6 +5,9 @@ needed.
 Axes: emitter, listener, yaw, ear, sample. The pair of a probe with itself is absent (zeros). Samples are float16:
 eleven bits beneath the level of each sample, 66 dB under the signal at every point of its decay down to 6e-5. Smaller
 ones are subnormal, in steps of 6e-8: there the bits run out one by one.
+
+Beside each response lies the energy that its diffuse part was drawn from, the same for all yaws: natural logarithms,
+axes direction, band, bin. They are good to 0.03 dB. `training.simulation.expected` makes spectrograms of them.
 """
 
 from dataclasses import dataclass
@@ -15,6 +18,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.errors import NafirError
 from training.scene_file import SceneFile
@@ -66,6 +70,9 @@ class Dataset:
             file.create_dataset("done", data=np.zeros(len(probes), dtype=bool))
             for name in ("reflected", "repeats"):
                 file.create_dataset(name, shape, np.float16, chunks=(1, 1, *shape[2:]))
+            histogram = scene.simulation.arrival_directions, len(OCTAVE_BANDS_HZ), scene.simulation.histogram_bins
+            shape = (len(probes), len(probes), *histogram)
+            file.create_dataset("log_energy", shape, np.float16, chunks=(1, 1, *histogram), fillvalue=-np.inf)
         partial.replace(folder / "pairs.h5")
         return cls(folder, scene, seed, probes, yaws, held_out)
 
@@ -110,12 +117,17 @@ class Dataset:
             return [int(i) for i in np.flatnonzero(~file["done"][()])]
 
     def write(
-        self, emitter: int, responses: npt.NDArray[np.float16], repeats: dict[int, npt.NDArray[np.float16]]
+        self,
+        emitter: int,
+        responses: npt.NDArray[np.float16],
+        log_energy: npt.NDArray[np.float16],
+        repeats: dict[int, npt.NDArray[np.float16]],
     ) -> None:
-        """Stores all listeners of one emitter (listener, yaw, ear, sample), and second takes of its held-out pairs
-        by listener."""
+        """Stores all listeners of one emitter (listener, yaw, ear, sample) with their (listener, direction, band, bin)
+        logarithms of energy, and second takes of its held-out pairs by listener."""
         with h5py.File(self.folder / "pairs.h5", "r+") as file:
             file["reflected"][emitter] = responses
+            file["log_energy"][emitter] = log_energy
             for listener, repeat in repeats.items():
                 file["repeats"][emitter, listener] = repeat
             file.flush()
@@ -130,6 +142,17 @@ class Dataset:
         """(pair, yaw, ear, sample) reflected sound, or second takes with `name` "repeats"."""
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             return np.stack([file[name][emitter, listener] for emitter, listener in pairs])
+
+    def read_energy(self, pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+        """(pair, direction, band, bin) energy that the diffuse part of `reflected` was drawn from.
+
+        Raises DatasetError for a dataset that was simulated before energies were kept.
+        """
+        with h5py.File(self.folder / "pairs.h5", "r") as file:
+            if "log_energy" not in file:
+                raise DatasetError(f"{self.folder}: holds no energies; simulate into an empty folder")
+            logarithms = np.stack([file["log_energy"][emitter, listener] for emitter, listener in pairs])
+        return np.exp(logarithms.astype(np.float32))
 
 
 def _choose_held_out(probes: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:

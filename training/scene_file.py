@@ -12,6 +12,8 @@ from server.errors import NafirError
 from server.scene.geometry import Geometry, Strict
 from server.scene.manifest import Air, Start
 
+HISTOGRAM_BIN_S = 0.004
+
 _DRAWS_PER_CELL = 32
 # Two probes make one couple, and that one is held out.
 _FEWEST_PROBES = 3
@@ -41,6 +43,11 @@ class Simulation(Strict):
     image_order: Annotated[int, Field(ge=0, le=6)]
     arrival_directions: Annotated[int, Field(ge=6)]
     held_out_share: Annotated[float, Field(gt=0, lt=0.5)]
+
+    @property
+    def histogram_bins(self) -> int:
+        """Of the energy that rays bring, over the duration."""
+        return round(self.duration_s / HISTOGRAM_BIN_S)
 
 
 class SceneFile(Strict):

@@ -23,8 +23,7 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.scene.geometry import Geometry
 from training.dataset import SPEED_OF_SOUND
-
-HISTOGRAM_BIN_S = 0.004
+from training.scene_file import HISTOGRAM_BIN_S
 
 _Floats = npt.NDArray[np.float64]
 

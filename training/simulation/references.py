@@ -40,7 +40,7 @@ class DirectSound:
         if not self._visible[emitter, listener]:
             return np.zeros((len(self.dataset.yaws), 2, self.dataset.samples), dtype=np.float32)
         ends = self.dataset.probes[emitter], self.dataset.probes[listener]
-        return self._synthesis.direct(*ends, self.dataset.scene.air).astype(np.float32)
+        return self._synthesis.direct(*ends, self.dataset.scene.air)
 
 
 class References:

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
@@ -14,11 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.whole_field import kemar
 from training.dataset import Dataset, DatasetError
+from training.simulation.half_precision import to_half
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
-from training.simulation.tracing import RoomTracer
+from training.simulation.tracing import Arrivals, RoomTracer
 
 
 def simulate(scene_path: Path, folder: Path, *, seed: int, workers: int, progress: Progress) -> Dataset:
@@ -62,38 +65,39 @@ def _die_when_released(leash: Connection) -> None:
 
 def _simulate_emitter(
     dataset: Dataset, emitter: int
-) -> tuple[npt.NDArray[np.float16], dict[int, npt.NDArray[np.float16]]]:
-    """First takes of all listeners, and independent second takes of the held-out ones."""
-    listeners = np.flatnonzero(np.arange(len(dataset.probes)) != emitter)
-    repeated = np.flatnonzero(dataset.held_out[emitter])
-    first = np.zeros((len(dataset.probes), len(dataset.yaws), 2, dataset.samples), dtype=np.float16)
-    first[listeners] = _responses(dataset, emitter, listeners, take=0)
-    second = _responses(dataset, emitter, repeated, take=1)
-    return first, dict(zip(map(int, repeated), second, strict=True))
-
-
-def _responses(dataset: Dataset, emitter: int, listeners: npt.NDArray[np.int64], take: int) -> npt.NDArray[np.float16]:
-    """(listener, yaw, ear, sample)"""
-    if not len(listeners):
-        return np.zeros((0, len(dataset.yaws), 2, dataset.samples), dtype=np.float16)
-    settings = dataset.scene.simulation
+) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.float16], dict[int, npt.NDArray[np.float16]]]:
+    """First takes of all listeners and the energies they were drawn from, and independent second takes of the held-out
+    ones."""
+    probes, settings = len(dataset.probes), dataset.scene.simulation
     directions = sphere_directions(settings.arrival_directions)
+    synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
+    first = np.zeros((probes, len(dataset.yaws), 2, dataset.samples), dtype=np.float16)
+    log_energy = np.full((probes, len(directions), len(OCTAVE_BANDS_HZ), settings.histogram_bins), -np.inf, np.float16)
+    listeners = np.flatnonzero(np.arange(probes) != emitter)
+    for listener, arrivals, response in _takes(dataset, emitter, listeners, synthesis, take=0):
+        first[listener] = response
+        with np.errstate(divide="ignore"):  # where no ray came by
+            log_energy[listener] = to_half(np.log(arrivals.energy))
+    repeated = np.flatnonzero(dataset.held_out[emitter])
+    second = {listener: response for listener, _, response in _takes(dataset, emitter, repeated, synthesis, take=1)}
+    return first, log_energy, second
+
+
+def _takes(
+    dataset: Dataset, emitter: int, listeners: npt.NDArray[np.int64], synthesis: BinauralSynthesis, take: int
+) -> Iterator[tuple[int, Arrivals, npt.NDArray[np.float16]]]:
+    """Each listener with what arrives there, and its (yaw, ear, sample) response."""
+    settings = dataset.scene.simulation
     tracer = RoomTracer(
         dataset.scene.geometry,
         dataset.scene.air,
         dataset.probes[listeners],
         duration_s=settings.duration_s,
         image_order=settings.image_order,
-        arrival_directions=directions,
+        arrival_directions=synthesis.arrival_directions,
     )
-    synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
     rng = np.random.default_rng([dataset.seed, 2, emitter, take])
-    arrivals = tracer.trace(dataset.probes[emitter], rays=settings.rays, rng=rng)
-    return np.stack(
-        [
-            synthesis.render(arrival, dataset.probes[listener], dataset.onset_s[emitter, listener], rng).astype(
-                np.float16
-            )
-            for arrival, listener in zip(arrivals, listeners, strict=True)
-        ]
-    )
+    traced = tracer.trace(dataset.probes[emitter], rays=settings.rays, rng=rng)
+    for listener, arrivals in zip(map(int, listeners), traced, strict=True):
+        response = synthesis.render(arrivals, dataset.probes[listener], dataset.onset_s[emitter, listener], rng)
+        yield listener, arrivals, to_half(response)

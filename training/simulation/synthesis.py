@@ -7,23 +7,31 @@ serves all head orientations of a pair, so turning the head changes the ears and
 
 The head is the one that direct paths are rendered through: minimum phase and a delay per ear. What a measurement has
 beside these is mostly the phase of its loudspeaker.
+
+Axes: (yaw, ear, sample) responses in single precision; spectra have bins last.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import ShortTimeFFT
-from scipy.signal.windows import hann
+from scipy.fft import irfft, rfft
+from scipy.signal.windows import cosine
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.minimum_phase import folded_cepstrum
 from server.rendering.hrtf import HeadFilters
+from server.rendering.sphere import find_triangle
 from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
-from training.simulation.rays import HISTOGRAM_BIN_S
+from training.scene_file import HISTOGRAM_BIN_S
 from training.simulation.tracing import Arrivals, free_field_amplitude
+
+_Floats = npt.NDArray[np.float64]
+_Singles = npt.NDArray[np.float32]
+_Spectra = npt.NDArray[np.complex64]
 
 _WINDOW_S = 0.010
 _DIFFUSE_RISE_S = 0.002
@@ -31,11 +39,26 @@ _DIFFUSE_RISE_S = 0.002
 _LEAD_S = 0.001
 
 
-def rotate_into_head(directions: npt.NDArray[np.float64], yaws: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def rotate_into_head(directions: _Floats, yaws: _Floats) -> _Floats:
     """(direction, yaw, xyz) world directions as seen by a level head turned counter-clockwise by each yaw (radians)."""
     x, y, z = (directions[:, None, axis] for axis in range(3))
     cos, sin = np.cos(yaws), np.sin(yaws)
     return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(yaws)))], axis=-1)
+
+
+def band_weights(frequencies_hz: _Floats) -> _Floats:
+    """(band, frequency) interpolation between octave bands, linear over log frequency; columns sum to one."""
+    octave = np.log2(np.maximum(frequencies_hz, 1.0) / OCTAVE_BANDS_HZ[0])
+    position = np.clip(octave, 0, len(OCTAVE_BANDS_HZ) - 1)
+    return np.maximum(0.0, 1 - np.abs(position - np.arange(len(OCTAVE_BANDS_HZ))[:, None]))
+
+
+def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
+    """(..., bin) energy of a histogram to (..., time) energy per second, linear between the middles of its bins."""
+    position = np.clip(times_s / HISTOGRAM_BIN_S - 0.5, 0, energy.shape[-1] - 1)
+    before = np.minimum(position.astype(int), energy.shape[-1] - 2)
+    share = (position - before).astype(np.float32)
+    return (energy[..., before] * (1 - share) + energy[..., before + 1] * share) / np.float32(HISTOGRAM_BIN_S)
 
 
 @dataclass(frozen=True)
@@ -44,9 +67,47 @@ class BinauralSynthesis:
     energy."""
 
     head: HeadFilters
-    arrival_directions: npt.NDArray[np.float64]
-    yaws: npt.NDArray[np.float64]
+    arrival_directions: _Floats
+    yaws: _Floats
     samples: int
+
+    def render(self, arrivals: Arrivals, receiver: _Floats, onset_s: float, rng: np.random.Generator) -> _Singles:
+        """Reflected sound; sample 0 is emission. Nothing diffuse is heard before `onset_s`."""
+        response = self._late(arrivals.energy, onset_s, rng)
+        self._add_specular(arrivals.image_positions, arrivals.image_amplitudes, receiver, response)
+        return response
+
+    def specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats) -> _Singles:
+        """What is heard of images alone: (image, xyz), with (image, band) pressure at the receiver."""
+        response = np.zeros((len(self.yaws), 2, self.samples), dtype=np.float32)
+        self._add_specular(positions, amplitudes, receiver, response)
+        return response
+
+    def direct(self, emitter: _Floats, receiver: _Floats, air: Air) -> _Singles:
+        """Direct sound of an emitter in sight; sample 0 is emission."""
+        amplitude = free_field_amplitude(np.linalg.norm(emitter - receiver, keepdims=True), air)
+        return self.specular(emitter[None], amplitude, receiver)
+
+    def late_power(self, energy: _Singles, onset_s: float, times_s: _Floats, bins: int) -> _Floats:
+        """(yaw, ear, bin, time) expected power per sample of the diffuse part of `render`, at frequencies from 0 to
+        half the sample rate; none outside the response."""
+        step_s = self._n_fft // 2 / self._sample_rate
+        frames_s = np.arange(-(-self.samples // (self._n_fft // 2)) + 1) * step_s
+        nyquist_shares, own_shares = np.linspace(0, 1, bins), np.linspace(0, 1, self._n_fft // 2 + 1)
+        weights = band_weights(nyquist_shares * self._sample_rate / 2).astype(np.float32)
+        per_sample = power_at(frames_s, energy) / np.float32(self._sample_rate)
+        gains = np.sqrt(np.einsum("dbt,bn->ndt", per_sample, weights, optimize=True))
+        # Windows overlap on the same noise: amplitudes add up.
+        position = np.clip(times_s / step_s, 0, len(frames_s) - 1)
+        before = np.minimum(position.astype(int), len(frames_s) - 2)
+        share = (np.sin(np.pi / 2 * (position - before)) ** 2).astype(np.float32)
+        rise = np.sin(np.pi / 2 * np.clip((times_s - onset_s) / _DIFFUSE_RISE_S, 0, 1)) ** 2
+        rise[times_s >= self.samples / self._sample_rate] = 0
+        over_time = (gains[..., before] * (1 - share) + gains[..., before + 1] * share) * rise.astype(np.float32)
+        heard = np.abs(self._arrival_spectra.reshape(len(own_shares), -1)) ** 2
+        heard = np.stack([np.interp(nyquist_shares, own_shares, column) for column in heard.T], axis=-1)
+        power = heard.reshape(bins, len(energy), -1).transpose(0, 2, 1) @ over_time**2
+        return np.asarray(power.transpose(1, 0, 2).reshape(len(self.yaws), 2, bins, -1))
 
     @property
     def _sample_rate(self) -> int:
@@ -58,100 +119,101 @@ class BinauralSynthesis:
         return 2 ** int(np.ceil(np.log2(_WINDOW_S * self._sample_rate)))
 
     @cached_property
-    def _band_weights(self) -> npt.NDArray[np.float64]:
-        """(band, bin) interpolation of band energies, linear over log frequency; columns sum to one."""
-        frequency = np.maximum(np.fft.rfftfreq(self._n_fft, 1 / self._sample_rate), 1.0)
-        octave = np.clip(np.log2(frequency / OCTAVE_BANDS_HZ[0]), 0, len(OCTAVE_BANDS_HZ) - 1)
-        return np.maximum(0.0, 1 - np.abs(octave - np.arange(len(OCTAVE_BANDS_HZ))[:, None]))
+    def _band_weights(self) -> _Singles:
+        """(band, bin)"""
+        return band_weights(np.fft.rfftfreq(self._n_fft, 1 / self._sample_rate)).astype(np.float32)
 
-    def _heard_from(self, directions: npt.NDArray[np.float64]) -> npt.NDArray[np.complex128]:
-        """(..., ear, bin) spectra of the head; time zero is when a wave passes its centre."""
+    @cached_property
+    def _band_filters(self) -> _Spectra:
+        """(band, bin) logarithms of minimum-phase filters that are e in one band: times ln gains, those of a wall."""
+        return np.fft.rfft(folded_cepstrum(self._band_weights.astype(np.float64)), self._n_fft).astype(np.complex64)
+
+    @cached_property
+    def _head_filters(self) -> _Spectra:
+        """(measured direction, ear and bin) logarithms of the head's minimum-phase filters."""
+        filters = np.fft.rfft(self.head.cepstra, self._n_fft)
+        return filters.reshape(len(filters), -1).astype(np.complex64)
+
+    @cached_property
+    def _turns(self) -> _Singles:
+        """(bin,) radians per sample of delay."""
+        return (-2 * np.pi * np.fft.rfftfreq(self._n_fft)).astype(np.float32)
+
+    def _filters_from(self, directions: _Floats) -> tuple[_Spectra, _Singles]:
+        """For (..., xyz) as seen by the head: (..., ear, bin) logarithms of its minimum-phase filters, and (..., ear)
+        delays in samples after the wave passes its centre."""
         head, mesh = self.head, self.head.triangulation
-        flat = directions.reshape(-1, 3)
-        shares = (flat @ mesh.inverses.reshape(-1, 3).T).reshape(len(flat), len(mesh.inverses), 3)
-        around = np.argmax(np.minimum(np.minimum(shares[..., 0], shares[..., 1]), shares[..., 2]), axis=-1)
-        share = np.maximum(shares[np.arange(len(flat)), around], 0)
-        share /= np.sum(share, axis=-1, keepdims=True)
+        flat = np.ascontiguousarray(directions.reshape(-1, 3))
+        around, share = _triangles_around(mesh.across, mesh.inverses, flat)
         corners = mesh.triangles[around]
-        cepstra = np.einsum("dc,dcet->det", share, head.cepstra[corners])
+        filters = np.einsum("dc,dcn->dn", share.astype(np.float32), self._head_filters[corners])
         delays = np.einsum("dc,dce->de", share, head.delays_s[corners]) * head.sample_rate
-        turn = -2j * np.pi * np.fft.rfftfreq(self._n_fft) * delays[..., None]
-        spectra = np.exp(np.fft.rfft(cepstra, self._n_fft) + turn)
-        return np.asarray(spectra).reshape(*directions.shape[:-1], *spectra.shape[1:])
+        shape = (*directions.shape[:-1], 2)
+        return filters.reshape(*shape, self._n_fft // 2 + 1), delays.reshape(shape).astype(np.float32)
 
     @cached_property
-    def _transform(self) -> ShortTimeFFT:
-        return ShortTimeFFT(hann(self._n_fft, sym=False), self._n_fft // 4, self._sample_rate)
+    def _window(self) -> _Singles:
+        """Before the transform and after it: its square, at steps of half its length, adds up to one."""
+        return np.asarray(cosine(self._n_fft, sym=True), dtype=np.float32)
 
     @cached_property
-    def _arrival_spectra(self) -> npt.NDArray[np.complex128]:
-        """(bin, yaw and ear, direction)"""
-        heard = rotate_into_head(self.arrival_directions, self.yaws)
-        spectra = self._heard_from(heard)
-        return np.ascontiguousarray(np.moveaxis(spectra, (0, 3), (3, 0)).reshape(spectra.shape[-1], -1, len(heard)))
+    def _arrival_spectra(self) -> _Spectra:
+        """(bin, direction, yaw and ear)"""
+        filters, delays = self._filters_from(rotate_into_head(self.arrival_directions, self.yaws))
+        spectra = np.exp(filters + 1j * (delays[..., None] * self._turns))
+        return np.ascontiguousarray(np.moveaxis(spectra.reshape(len(spectra), -1, spectra.shape[-1]), -1, 0))
 
-    def render(
-        self, arrivals: Arrivals, receiver: npt.NDArray[np.float64], onset_s: float, rng: np.random.Generator
-    ) -> npt.NDArray[np.float64]:
-        """(yaw, ear, sample) reflected sound; sample 0 is emission. Nothing diffuse is heard before `onset_s`."""
-        response = self._late(arrivals.energy, onset_s, rng)
-        self._add_specular(arrivals.image_positions, arrivals.image_amplitudes, receiver, response)
-        return response
-
-    def direct(
-        self, emitter: npt.NDArray[np.float64], receiver: npt.NDArray[np.float64], air: Air
-    ) -> npt.NDArray[np.float64]:
-        """(yaw, ear, sample) direct sound of an emitter in sight; sample 0 is emission."""
-        response = np.zeros((len(self.yaws), 2, self.samples))
-        amplitude = free_field_amplitude(np.linalg.norm(emitter - receiver, keepdims=True), air)
-        self._add_specular(emitter[None], amplitude, receiver, response)
-        return response
-
-    def _late(
-        self, energy: npt.NDArray[np.float64], onset_s: float, rng: np.random.Generator
-    ) -> npt.NDArray[np.float64]:
-        transform = self._transform
-        noise = transform.stft(rng.standard_normal((len(energy), self.samples)))
-        frames = np.arange(transform.p_min, transform.p_max(self.samples)) * transform.hop / self._sample_rate
-        bins = (np.arange(energy.shape[-1]) + 0.5) * HISTOGRAM_BIN_S
-        position = np.clip(np.interp(frames, bins, np.arange(len(bins))), 0, len(bins) - 1)
-        before = np.minimum(position.astype(int), len(bins) - 2)
-        share = position - before
-        per_sample = energy / (HISTOGRAM_BIN_S * self._sample_rate)
-        at_frames = per_sample[..., before] * (1 - share) + per_sample[..., before + 1] * share
-        shaped = noise * np.sqrt(np.einsum("dbt,bf->dft", at_frames, self._band_weights, optimize=True))
-        heard = np.matmul(self._arrival_spectra, np.moveaxis(shaped, 1, 0))
-        late = transform.istft(np.moveaxis(heard, 0, 1), k1=self.samples)
+    def _late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
+        step = self._n_fft // 2
+        frames = -(-self.samples // step) + 1  # the first begins one step before sample 0
+        noise = rng.standard_normal((len(energy), frames + 1, step), dtype=np.float32)
+        sections = np.concatenate([noise[:, :-1], noise[:, 1:]], axis=-1)
+        sections *= self._window
+        spectra = rfft(sections)
+        times_s = np.arange(frames) * step / self._sample_rate
+        per_sample = power_at(times_s, energy) / np.float32(self._sample_rate)
+        spectra *= np.sqrt(np.moveaxis(per_sample, 1, 2) @ self._band_weights)
+        heard = np.matmul(np.ascontiguousarray(spectra.transpose(2, 1, 0)), self._arrival_spectra)
+        sections = irfft(np.ascontiguousarray(heard.transpose(2, 1, 0)), self._n_fft)
+        sections *= self._window
+        late = sections[:, :-1, step:] + sections[:, 1:, :step]
+        response = late.reshape(len(self.yaws), 2, -1)[..., : self.samples]
         # Windows smear energy to before the direct sound, where nothing scattered can be.
-        since_onset = np.arange(self.samples) / self._sample_rate - onset_s
-        late *= np.sin(np.pi / 2 * np.clip(since_onset / _DIFFUSE_RISE_S, 0, 1)) ** 2
-        return np.asarray(late.reshape(len(self.yaws), 2, self.samples))
+        begins, risen = (round(time_s * self._sample_rate) for time_s in (onset_s, onset_s + _DIFFUSE_RISE_S))
+        response[..., :begins] = 0
+        rise = np.sin(np.pi / 2 * np.linspace(0, 1, risen - begins, endpoint=False)) ** 2
+        rising = response[..., begins:risen]
+        rising *= rise[: rising.shape[-1]].astype(np.float32)
+        return np.ascontiguousarray(response)
 
-    def _add_specular(
-        self,
-        positions: npt.NDArray[np.float64],
-        amplitudes: npt.NDArray[np.float64],
-        receiver: npt.NDArray[np.float64],
-        response: npt.NDArray[np.float64],
-    ) -> None:
-        """Adds what comes from (image, xyz) with (image, band) pressure at the receiver."""
+    def _add_specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats, response: _Singles) -> None:
         offset = positions - receiver
         distance = np.linalg.norm(offset, axis=-1)
         heard = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
-        gain = _minimum_phase(amplitudes @ self._band_weights)
+        filters, ears = self._filters_from(heard)
+        filters += (np.log(np.maximum(amplitudes, 1e-12)).astype(np.float32) @ self._band_filters)[:, None, None]
         delay = distance / SPEED_OF_SOUND * self._sample_rate
         start = np.floor(delay).astype(int)
         lead = round(_LEAD_S * self._sample_rate)
-        shift = np.exp(-2j * np.pi * np.fft.rfftfreq(self._n_fft) * (lead + delay - start)[:, None])
-        spectra = self._heard_from(heard) * (gain * shift)[:, None, None]
-        taps = np.fft.irfft(spectra, self._n_fft)
+        ears += (lead + delay - start).astype(np.float32)[:, None, None]
+        phase = filters.imag + ears[..., None] * self._turns
+        spectra = np.empty_like(filters)
+        np.cos(phase, out=spectra.real)
+        np.sin(phase, out=spectra.imag)
+        spectra *= np.exp(filters.real)
+        taps = irfft(spectra, self._n_fft)
         for tap, at in zip(taps, start - lead, strict=True):
             first, last = max(0, -at), min(self._n_fft, self.samples - at)
             if last > first:
                 response[..., at + first : at + last] += tap[..., first:last]
 
 
-def _minimum_phase(magnitude: npt.NDArray[np.float64]) -> npt.NDArray[np.complex128]:
-    """(..., bin) spectra of the given magnitude whose energy comes as early as it can."""
-    n_fft = 2 * (magnitude.shape[-1] - 1)
-    return np.asarray(np.exp(np.fft.rfft(folded_cepstrum(np.log(np.maximum(magnitude, 1e-12))), n_fft)))
+@numba.njit(cache=True, nogil=True)
+def _triangles_around(across, inverses, directions):  # type: ignore[no-untyped-def]
+    """(direction,) triangle that holds each, and (direction, 3) shares of its corners."""
+    triangles, shares = np.empty(len(directions), np.int64), np.empty((len(directions), 3))
+    triangle = 0
+    for index in range(len(directions)):
+        triangle = find_triangle(across, inverses, directions[index], triangle, shares[index])
+        triangles[index] = triangle
+    return triangles, shares

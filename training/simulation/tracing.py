@@ -9,8 +9,9 @@ from server.acoustics.decibels import db_to_amplitude, db_to_power
 from server.scene.geometry import Geometry
 from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
+from training.scene_file import HISTOGRAM_BIN_S
 from training.simulation.images import images_in_height, images_in_plan
-from training.simulation.rays import HISTOGRAM_BIN_S, RayTracer, surface_shares
+from training.simulation.rays import RayTracer, surface_shares
 
 _Floats = npt.NDArray[np.float64]
 

@@ -6,7 +6,8 @@ import pytest
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.scene.geometry import Geometry, Material, Materials
-from training.simulation.rays import HISTOGRAM_BIN_S, sphere_directions
+from training.scene_file import HISTOGRAM_BIN_S
+from training.simulation.rays import sphere_directions
 
 
 class Shoebox:

@@ -3,7 +3,8 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.scene.geometry import Material, Materials
-from training.simulation.rays import HISTOGRAM_BIN_S, RayTracer, sphere_directions
+from training.scene_file import HISTOGRAM_BIN_S
+from training.simulation.rays import RayTracer, sphere_directions
 
 RAMP = np.linspace(0, 1, 7)
 # A corner of each room of the apartment that the other cannot see, not even in one mirror.
