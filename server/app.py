@@ -15,9 +15,10 @@ from starlette.staticfiles import StaticFiles
 
 from server.answers import Answers
 from server.audio_engine import AudioEngine
-from server.catalogue import load_fields, load_hrtfs, open_clips, playable_clips
-from server.field.field import AcousticField
+from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
+from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.load import AUTO, Offer
 from server.priority import become_background
 from server.problems import install_problems
 from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
@@ -27,22 +28,23 @@ from server.session import Session, compute_irs
 from server.settings import Settings
 from server.streaming import StreamHost
 
+_CALIBRATION_POSES = 3
 WEB = Path(__file__).parent / "web"
 
 _logger = logging.getLogger(__name__)
 
 
 def create_app(
-    settings: Settings, *, fields: Mapping[str, AcousticField] | None = None, hrtfs: HrtfLibrary | None = None
+    settings: Settings, *, scenes: Mapping[str, Levels] | None = None, hrtfs: HrtfLibrary | None = None
 ) -> FastAPI:
-    """`fields` by scene id, and `hrtfs`, where the caller has loaded them already to see their errors first.
+    """`scenes` by id, and `hrtfs`, where the caller has loaded them already to see their errors first.
 
     Otherwise they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError for an HRTF.
     """
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
-        loaded = await asyncio.to_thread(load_fields, settings.bundles) if fields is None else fields
+        loaded = await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes
         heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
         with ThreadPoolExecutor(settings.ir_workers, "nafir-ir", initializer=become_background) as workers:
             audio = AudioEngine(
@@ -50,9 +52,10 @@ def create_app(
                 workers,
                 threads=settings.audio_threads,
                 is_real_time=settings.realtime,
+                ir_share=settings.ir_share,
             )
             host = StreamHost(
-                fields=loaded,
+                scenes=loaded,
                 clips=open_clips(loaded, settings.clips),
                 hrtfs=heads,
                 audio=audio,
@@ -94,21 +97,27 @@ async def _become_ready(host: StreamHost) -> None:
     gc.collect()
     gc.freeze()
     host.is_ready = True
-    _logger.info("ready: %s", ", ".join(host.fields))
+    _logger.info("ready: %s", ", ".join(host.scenes))
 
 
 def _warm_up(host: StreamHost) -> None:
-    """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render."""
+    """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render. And
+    see how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
-    for scene, field in host.fields.items():
+    for scene, levels in host.scenes.items():
+        offer = host.offers[scene] = Offer(
+            tuple(levels[name].level for name in levels.names), levels.calibrate(_CALIBRATION_POSES)
+        )
         clips = playable_clips(host.clips[scene])
-        filters = host.hrtfs.filters(DEFAULT_HRTF, field.sample_rate)
-        session = Session(Hello(protocol=PROTOCOL, scene=scene), field, filters, host.clips[scene].load, window=100)
-        start = field.bundle.manifest.start
+        filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
+        hello = Hello(protocol=PROTOCOL, scene=scene)
+        (rung, *_) = offer.rungs(AUTO, block_s=hello.block_size / levels.default.sample_rate)
+        session = Session(hello, levels, filters, host.clips[scene].load, rung=rung, window=100)
+        start = levels.bundle.manifest.start
         clip = clips[0].name if clips else None
         session.receive(AddEmitter(id="warm-up", clip=clip, live=clip is None, position=start.emitter))
         for turn in range(1, 9):
             session.receive(ListenerPose(pose_id=turn, position=start.listener, yaw=0.1 * turn))
             if (request := session.take_request()) is not None:
-                session.accept(compute_irs(field, request, session.prepare))
+                session.accept(compute_irs(levels, request, session.prepare))
             session.render_block()

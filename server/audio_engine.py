@@ -10,6 +10,9 @@ the renderer's call and the way to the event loop would cost about what renderin
 stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly apart, gives a
 new stream the one with the fewest others, and renders all that is due at an instant in one call without the lock.
 
+**What a stream gets.** Four times a second a thread looks at what its streams went through, and moves them to cheaper
+or better quality (`server.load`).
+
 Messages that may call for an IR wake the thread at once, which asks for the IR and renders nothing early.
 
 Who may touch what: a `Stream` belongs to its audio thread, but for `Stream.offer`; `AudioEngine` to the event loop.
@@ -25,6 +28,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 
+from server.load import PERIOD_S, LoadControl, Reason
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
 from server.stream import Outgoing, Stream, StreamFailed
@@ -47,7 +51,8 @@ class AudioEngine:
     """Renders streams until stopped.
 
     `workers` computes IRs; each stream has at most one request with it, so its queue is never longer than there are
-    streams. `is_real_time` asks the system to schedule audio threads before all others.
+    streams. Under load, those of one audio thread's streams take `ir_share` of a core. `is_real_time` asks the system
+    to schedule audio threads before all others.
     """
 
     def __init__(
@@ -57,10 +62,11 @@ class AudioEngine:
         *,
         threads: int = 1,
         is_real_time: bool = False,
+        ir_share: float = 0.25,
         time_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.threads = [
-            AudioThread(post, workers, number=number, is_real_time=is_real_time, time_s=time_s)
+            AudioThread(post, workers, number=number, is_real_time=is_real_time, ir_share=ir_share, time_s=time_s)
             for number in range(threads)
         ]
         self._thread_of: dict[Stream, AudioThread] = {}
@@ -84,6 +90,11 @@ class AudioEngine:
         """Those open, in the order they came."""
         return tuple(self._thread_of)
 
+    @property
+    def steps(self) -> Counter[Reason]:
+        """How often streams were moved to other quality, by reason."""
+        return sum((thread.steps for thread in self.threads), Counter())
+
     def open(self, stream: Stream) -> None:
         """Start a stream now, on the thread that is least busy."""
         loads = dict.fromkeys(self.threads, 0.0)
@@ -104,13 +115,26 @@ class AudioThread:
     """Ticks its streams; `tick` is all that happens on it."""
 
     def __init__(
-        self, post: Post, workers: Executor, *, number: int, is_real_time: bool, time_s: Callable[[], float]
+        self,
+        post: Post,
+        workers: Executor,
+        *,
+        number: int,
+        is_real_time: bool,
+        ir_share: float,
+        time_s: Callable[[], float],
     ) -> None:
         self._post = post
         self._workers = workers
         self._number = number
         self._is_real_time = is_real_time
+        self._ir_share = ir_share
         self._time_s = time_s
+        self.steps: Counter[Reason] = Counter()
+        """Times that streams were moved to other quality."""
+        self._load = LoadControl()
+        self._busy_s = 0.0
+        self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
         """With the phase of each."""
         self._arrivals: deque[tuple[Stream, bool]] = deque()
@@ -159,6 +183,9 @@ class AudioThread:
                     due[stream] = self._time_s() - began_s
         if due:
             self._render(due, made)
+            self._busy_s += self._time_s() - now_s
+        if now_s - self._looked_s >= PERIOD_S:
+            self._look(now_s, made)
         if made:
             self._post(lambda: _deliver(made))
         if not self._streams:
@@ -183,6 +210,19 @@ class AudioThread:
         for (stream, cost_s), clock, samples in zip(due.items(), clocks, blocks, strict=True):
             with self._failing_alone(stream, made):
                 made[stream] += stream.finish_block(clock, samples, cost_s=cost_s + share_s, now_s=now_s)
+
+    def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
+        """Have streams step down or up, and IRs take no more than their share."""
+        busy, self._busy_s = self._busy_s / (now_s - self._looked_s), 0.0
+        self._looked_s = now_s
+        by_ladder = {stream.ladder: stream for stream in self._streams}
+        strains = {ladder: stream.strain(now_s) for ladder, stream in by_ladder.items()}
+        for ladder, reason in self._load.decide(now_s, busy, strains).items():
+            stream = by_ladder[ladder]
+            made.setdefault(stream, []).extend(stream.step(reason, now_s))
+            self.steps[reason] += 1
+        for stream in self._streams:
+            stream.ration_irs(streams=len(self._streams), share=self._ir_share)
 
     @contextmanager
     def _failing_alone(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> Iterator[None]:

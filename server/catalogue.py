@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from server.clips import Clip, ClipLibrary, DecodeError
-from server.field.field import AcousticField
+from server.field.levels import Levels
 from server.hrtfs import HrtfLibrary
 from server.protocol import Place, SceneDescription
 from server.scene.bundle import Bundle, bundled_scenes
@@ -14,28 +14,29 @@ from server.scene.bundle import Bundle, bundled_scenes
 _logger = logging.getLogger(__name__)
 
 
-def load_fields(bundles: Iterable[Path]) -> dict[str, AcousticField]:
-    """Fields by scene id: the bundled scenes, and `bundles`, which win where an id is taken.
+def load_scenes(bundles: Iterable[Path]) -> dict[str, Levels]:
+    """Quality levels by scene id: the bundled scenes, and `bundles`, which win where an id is taken.
 
     Raises BundleError for the first bundle that is damaged.
     """
-    fields = {}
+    scenes = {}
     for folder in (*bundled_scenes(), *bundles):
         bundle = Bundle.load(folder)
-        fields[bundle.id] = AcousticField.load(bundle)
-    return fields
+        scenes[bundle.id] = Levels.load(bundle)
+    return scenes
 
 
-def load_hrtfs(files: Iterable[Path], fields: Mapping[str, AcousticField]) -> HrtfLibrary:
+def load_hrtfs(files: Iterable[Path], scenes: Mapping[str, Levels]) -> HrtfLibrary:
     """Heads for the sample rates of the scenes. Raises HrtfError for the first file that cannot be used."""
-    return HrtfLibrary(files, {field.sample_rate for field in fields.values()})
+    return HrtfLibrary(files, {levels.default.sample_rate for levels in scenes.values()})
 
 
-def open_clips(fields: Mapping[str, AcousticField], files: Iterable[Path]) -> dict[str, ClipLibrary]:
+def open_clips(scenes: Mapping[str, Levels], files: Iterable[Path]) -> dict[str, ClipLibrary]:
     """Clips by scene id; scenes of one sample rate share a library, and files are named by their stem."""
     named = {path.stem: path for path in files}
-    by_rate = {rate: ClipLibrary(rate, named) for rate in {field.sample_rate for field in fields.values()}}
-    return {scene: by_rate[field.sample_rate] for scene, field in fields.items()}
+    rates = {scene: levels.default.sample_rate for scene, levels in scenes.items()}
+    by_rate = {rate: ClipLibrary(rate, named) for rate in set(rates.values())}
+    return {scene: by_rate[rate] for scene, rate in rates.items()}
 
 
 def playable_clips(clips: ClipLibrary) -> list[Clip]:
@@ -49,8 +50,8 @@ def playable_clips(clips: ClipLibrary) -> list[Clip]:
     return playable
 
 
-def describe_scene(field: AcousticField) -> SceneDescription:
-    manifest = field.bundle.manifest
+def describe_scene(levels: Levels) -> SceneDescription:
+    field, manifest = levels.default, levels.bundle.manifest
     start = manifest.start
     return SceneDescription(
         id=manifest.id,

@@ -67,7 +67,7 @@ def serve(
     from pydantic import ValidationError
 
     from server.app import create_app
-    from server.catalogue import load_fields, load_hrtfs
+    from server.catalogue import load_hrtfs, load_scenes
     from server.settings import Settings
 
     given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf}
@@ -76,16 +76,16 @@ def serve(
     except ValidationError as exc:
         first = exc.errors()[0]
         raise NafirError(f"setting {'.'.join(str(part) for part in first['loc'])}: {first['msg']}") from exc
-    fields = load_fields(settings.bundles)
-    if not fields:
+    scenes = load_scenes(settings.bundles)
+    if not scenes:
         raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
-    hrtfs = load_hrtfs(settings.hrtfs, fields)
+    hrtfs = load_hrtfs(settings.hrtfs, scenes)
     if settings.port:
         Console().print(
-            f"[bold]Nafir[/] serves {', '.join(fields)} at [link]http://{settings.host}:{settings.port}[/]",
+            f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]http://{settings.host}:{settings.port}[/]",
             highlight=False,
         )
-    uvicorn.run(create_app(settings, fields=fields, hrtfs=hrtfs), **server_options(settings))
+    uvicorn.run(create_app(settings, scenes=scenes, hrtfs=hrtfs), **server_options(settings))
 
 
 def server_options(settings: "Settings") -> dict[str, Any]:
@@ -110,10 +110,14 @@ def ir(
     yaw_deg: Annotated[
         float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
     ] = 0.0,
+    level: Annotated[
+        str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write the binaural impulse response between two places."""
     from server.field.field import AcousticField
+    from server.field.levels import require_level
     from server.impulse_response import ImpulseResponse, IrQuery, parse_format, parse_position
     from server.scene.bundle import Bundle, find_bundle
 
@@ -121,7 +125,8 @@ def ir(
     if not math.isfinite(yaw_deg):
         raise RequestError("malformed_pose", "yaw-deg is not finite", field="yaw_deg")
     query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
-    field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    bundle = Bundle.load(find_bundle(scene))
+    field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
     started_s = time.perf_counter()
     response = ImpulseResponse.compute(field, query)
     duration_ms = (time.perf_counter() - started_s) * 1000

@@ -1,6 +1,7 @@
 """How long things took, kept so cheaply that every block can be measured."""
 
 import math
+from itertools import accumulate
 
 _SHORTEST_S = 1e-6
 _PER_OCTAVE = 16
@@ -14,17 +15,26 @@ class DurationHistogram:
 
     def __init__(self) -> None:
         self.count = 0
+        self.total_s = 0.0
         self._bins = [0] * (_OCTAVES * _PER_OCTAVE)
 
     def add(self, duration_s: float) -> None:
         place = int(math.log2(max(duration_s, _SHORTEST_S) / _SHORTEST_S) * _PER_OCTAVE)
         self._bins[min(place, len(self._bins) - 1)] += 1
         self.count += 1
+        self.total_s += duration_s
 
     def merge(self, other: "DurationHistogram") -> None:
         """Add what another counted."""
         self.count += other.count
+        self.total_s += other.total_s
         self._bins = [mine + others for mine, others in zip(self._bins, other._bins, strict=True)]
+
+    def cumulative(self) -> list[tuple[float, int]]:
+        """Durations, each twice the one before, and how many were below each. Of the last, how many there were: what is
+        longer counts there too."""
+        sums = list(accumulate(self._bins))
+        return [(_SHORTEST_S * 2**octave, sums[octave * _PER_OCTAVE - 1]) for octave in range(1, _OCTAVES + 1)]
 
     def quantile_s(self, share: float) -> float | None:
         """The shortest duration that `share` of all do not exceed; None before the first."""

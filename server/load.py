@@ -15,8 +15,9 @@ are first fewer IRs, then cheaper levels, then levels whose emitters share a tai
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Self
 
+from server.errors import RequestError
 from server.scene.manifest import QualityLevel
 
 AUTO = "auto"
@@ -49,6 +50,11 @@ class Rung:
     shared_tail: bool
     cost_ms: float
 
+    @classmethod
+    def full(cls, level: QualityLevel, cost_ms: float) -> Self:
+        """All that a level has."""
+        return cls(level.name, level.ir_rate_hz, level.shared_tail, cost_ms)
+
     @property
     def patience_s(self) -> float:
         """How long IRs may take from being asked for to being there."""
@@ -62,11 +68,18 @@ class Offer:
     levels: tuple[QualityLevel, ...]
     ms_here: Mapping[str, float]
 
+    def ladder(self, choice: str, *, block_s: float) -> "Ladder":
+        """At the top of the `rungs`."""
+        return Ladder(self.rungs(choice, block_s=block_s))
+
     def rungs(self, choice: str, *, block_s: float) -> tuple[Rung, ...]:
         """Best first, for a client that chose a level, or `AUTO`: then all levels whose IR takes no longer than a block
-        lasts, or, where none is so cheap, the cheapest. Raises KeyError for a level that is not offered."""
+        lasts, or, where none is so cheap, the cheapest. Raises RequestError unknown_level."""
         if choice != AUTO:
-            level = {level.name: level for level in self.levels}[choice]
+            level = next((level for level in self.levels if level.name == choice), None)
+            if level is None:
+                known = ", ".join(sorted(level.name for level in self.levels))
+                raise RequestError("unknown_level", f"{choice!r} is none of {AUTO}, {known}", field="level")
             return (*self._slower(level), self._rung(level, _LEAST_RATE_HZ))
         fitting = [level for level in self.levels if self.ms_here[level.name] <= 1000 * block_s] or self.levels[:1]
         # The most expensive is the best, but what shares a tail comes last.
@@ -78,7 +91,7 @@ class Offer:
     def _slower(self, level: QualityLevel) -> tuple[Rung, ...]:
         own = level.ir_rate_hz
         rates = [rate for rate in _RATES_HZ if own is None or rate < own]
-        return tuple(Rung(level.name, rate, level.shared_tail, self.ms_here[level.name]) for rate in (own, *rates))
+        return (Rung.full(level, self.ms_here[level.name]), *(self._rung(level, rate) for rate in rates))
 
     def _rung(self, level: QualityLevel, most_hz: float) -> Rung:
         rate_hz = most_hz if level.ir_rate_hz is None else min(most_hz, level.ir_rate_hz)

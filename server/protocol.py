@@ -21,6 +21,7 @@ from server.acoustics.geometry import Pose
 from server.blocks import DryBlock, Encoding
 from server.durations import DurationHistogram
 from server.errors import RequestError
+from server.load import AUTO, Reason
 from server.scene.geometry import Opening
 from server.scene.manifest import Bounds, QualityLevel
 
@@ -31,6 +32,7 @@ EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
 PoseId = Annotated[int, Field(ge=0, lt=2**32)]
 Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Quaternion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+LevelName = Annotated[str, Field(max_length=256)]
 GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
 
 _POSE_FIELDS = frozenset({"position", "orientation", "yaw", "listener"})
@@ -80,7 +82,8 @@ class ListenerStart(_Directed):
 class Hello(_Message):
     """First message. `sample_rate` may be left out; given, it has to be the scene's. `buffer_blocks` is how many blocks
     ahead of real time the server runs: more survives a worse network, less is heard sooner. `hrtf` names the head to
-    hear through, one of GET /v1/hrtfs."""
+    hear through, one of GET /v1/hrtfs. `level` names a quality level of the scene, or leaves it to the server (auto):
+    the best that its host computes in time, and a cheaper one under load."""
 
     type: Literal["hello"] = "hello"
     protocol: int
@@ -90,6 +93,7 @@ class Hello(_Message):
     encoding: Encoding = "f32"
     listener: ListenerStart | None = None
     hrtf: Annotated[str, Field(max_length=256)] | None = None
+    level: LevelName = AUTO
     buffer_blocks: Annotated[int, Field(ge=1, le=32)] = 8
 
 
@@ -163,6 +167,13 @@ class SetGain(_Message):
     gain_db: GainDb
 
 
+class SetLevel(_Message):
+    """The quality level to hear from now on, or auto; a level changed says when."""
+
+    type: Literal["set_level"] = "set_level"
+    level: LevelName
+
+
 class RemoveEmitter(_Message):
     type: Literal["remove_emitter"] = "remove_emitter"
     id: EmitterId
@@ -210,7 +221,7 @@ class Ping(_Message):
     id: Annotated[int, Field(ge=0, lt=2**53)]  # what JavaScript counts exactly
 
 
-TextMessage = Hello | AddEmitter | MoveEmitter | SetGain | RemoveEmitter | ListenerPose | Acknowledge | Ping
+TextMessage = Hello | AddEmitter | MoveEmitter | SetGain | SetLevel | RemoveEmitter | ListenerPose | Acknowledge | Ping
 ClientMessage = TextMessage | DryBlock
 _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(discriminator="type")])
 
@@ -274,7 +285,8 @@ class SceneDescription(_Message):
 
 
 class Welcome(_Message):
-    """Answer to a good hello. `window` is how many blocks may be unacknowledged before the server skips ahead."""
+    """Answer to a good hello. `window` is how many blocks may be unacknowledged before the server skips ahead. `level`
+    is the quality level heard at first."""
 
     type: Literal["welcome"] = "welcome"
     protocol: Literal[2] = PROTOCOL
@@ -303,6 +315,22 @@ class EmitterAdded(_Message):
 class EmitterRemoved(_Message):
     type: Literal["emitter_removed"] = "emitter_removed"
     id: str
+
+
+class LevelChanged(_Message):
+    """From `sample_clock` on another quality is heard: impulse responses of `level`, at most `ir_rate_hz` a second for
+    each emitter or, where that is None, one with every pose; with `shared_tail` all emitters share one late tail.
+
+    `reason` is chosen (by the client), load (there is too much to do for what was heard before) or recovered (there no
+    longer is).
+    """
+
+    type: Literal["level_changed"] = "level_changed"
+    level: str
+    reason: Reason
+    ir_rate_hz: float | None
+    shared_tail: bool
+    sample_clock: int
 
 
 class Durations(_Message):
@@ -338,7 +366,8 @@ class Status(_Message):
     `buffer_ms` is how far ahead of real time it is. `render_ms` is what a block costs; of blocks rendered together with
     other streams', its share. `lateness_ms` is how long after it was due a block was ready to be sent: what it cost,
     what was rendered with it, and how late the audio thread woke. `pose_ms` and `reverberation_ms` run from the arrival
-    of a pose to the first block, ready to be sent, whose direct sound and whose reverberation has it.
+    of a pose to the first block, ready to be sent, whose direct sound and whose reverberation has it. `level` is the
+    quality level heard, and `ir_rate_hz` how many impulse responses an emitter gets per second at most.
     """
 
     type: Literal["status"] = "status"
@@ -354,6 +383,8 @@ class Status(_Message):
     pose_ms: Durations
     reverberation_ms: Durations
     ir_exchanges: int
+    level: str
+    ir_rate_hz: float | None
     live: tuple[LiveStatus, ...] = ()
 
 
@@ -375,7 +406,7 @@ class Error(_Message):
         return cls(code=refusal.code, message=str(refusal), field=refusal.field)
 
 
-ServerMessage = Welcome | EmitterAdded | EmitterRemoved | Status | Pong | Error
+ServerMessage = Welcome | EmitterAdded | EmitterRemoved | LevelChanged | Status | Pong | Error
 _SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
 
 

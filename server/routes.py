@@ -6,11 +6,13 @@ from typing import Annotated, Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response, WebSocket
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import FiniteFloat
 
 from server.catalogue import describe_scene, playable_clips
 from server.errors import RequestError
-from server.field.field import AcousticField
+from server.field.levels import Levels
+from server.frontier import Frontier
 from server.hrtfs import DEFAULT_HRTF
 from server.impulse_response import (
     MEDIA_TYPES,
@@ -22,16 +24,19 @@ from server.impulse_response import (
 )
 from server.loudness import loudness_map
 from server.streaming import Connection, StreamHost
+from server.telemetry import ServerCollector, exposition
 from server.whole_field import WholeField
 
 MAX_MAP_POINTS = 2_000
 """A point costs milliseconds."""
+MAX_MAP_S = 30.0
 CACHE_CONTROL = "public, max-age=3600"
 """Entity tags outlive it: after an hour an unchanged answer costs a 304."""
 
 api = APIRouter(prefix="/v1")
 health = APIRouter()
 
+LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
 PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"])]
 
 
@@ -51,14 +56,28 @@ async def readyz(request: Request) -> dict[str, str]:
     return {"status": "ready"}
 
 
+@health.get("/metrics", include_in_schema=False)
+async def metrics(request: Request) -> Response:
+    """For Prometheus."""
+    body = await anyio.to_thread.run_sync(exposition, ServerCollector(_host(request)))
+    return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+
 @api.get("/scenes")
 async def scenes(request: Request) -> dict[str, Any]:
-    return {"scenes": [describe_scene(field).model_dump() for field in _host(request).fields.values()]}
+    return {"scenes": [describe_scene(levels).model_dump() for levels in _host(request).scenes.values()]}
 
 
 @api.get("/scenes/{scene}")
 async def one_scene(request: Request, scene: str) -> dict[str, Any]:
-    return describe_scene(_field(request, scene)).model_dump()
+    return describe_scene(_levels(request, scene)).model_dump()
+
+
+@api.get("/scenes/{scene}/frontier")
+async def frontier(request: Request, scene: str) -> Frontier:
+    """What the accuracy of each quality level costs in time."""
+    levels, offer = _levels(request, scene), _host(request).offers.get(scene)
+    return Frontier.of(levels, {} if offer is None else offer.ms_here)
 
 
 @api.get("/scenes/{scene}/impulse-response", response_class=Response)
@@ -68,10 +87,11 @@ async def impulse_response(
     listener: PositionText,
     emitter: PositionText,
     yaw_deg: Annotated[FiniteFloat, Query(description="of the head, counter-clockwise, 0 looks along +x")] = 0.0,
+    level: LevelText = None,
     format: Annotated[str, Query(description="wav, npy or json")] = "wav",  # noqa: A002  the parameter's name
 ) -> Response:
     """The impulse response between two places, as `nafir ir` writes it."""
-    field = _field(request, scene)
+    field = _levels(request, scene).choose(level)
     name = parse_format(format)
     query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
     query.require_inside(field)
@@ -90,10 +110,11 @@ async def loudness(
     emitter: PositionText,
     height_m: Annotated[FiniteFloat, Query(description="of the listener's ears")] = 1.5,
     spacing_m: Annotated[FiniteFloat, Query(ge=0.1, le=2, description="between map points")] = 0.25,
+    level: LevelText = None,
     format: Annotated[str, Query(description="png or json")] = "png",  # noqa: A002  the parameter's name
 ) -> Response:
     """How loud an emitter is at every place of the scene."""
-    field = _field(request, scene)
+    field = _levels(request, scene).choose(level)
     if format not in {"png", "json"}:
         raise RequestError("unknown_format", f"{format!r} is none of png, json", field="format")
     position = parse_position(emitter, "emitter")
@@ -102,8 +123,15 @@ async def loudness(
     if not bounds.minimum[2] <= height_m <= bounds.maximum[2]:
         raise RequestError("position_out_of_bounds", f"height_m {height_m:g} is outside the scene", field="height_m")
 
-    if field.bundle.floor_plan.area_m2 > MAX_MAP_POINTS * spacing_m**2:
+    points = field.bundle.floor_plan.area_m2 / spacing_m**2
+    if points > MAX_MAP_POINTS:
         raise RequestError("map_too_fine", f"more than {MAX_MAP_POINTS} points: widen spacing_m", field="spacing_m")
+    offer = _host(request).offers.get(scene)
+    if offer and points * offer.ms_here[field.level.name] > 1000 * MAX_MAP_S:
+        problem = (
+            f"at level {field.level.name} that many points take too long: widen spacing_m, or take a cheaper level"
+        )
+        raise RequestError("map_too_slow", problem, field="level")
 
     def draw() -> bytes:
         whole = WholeField.through_kemar(field)
@@ -143,9 +171,9 @@ def _host(connection: Request | WebSocket) -> StreamHost:
     return host
 
 
-def _field(request: Request, scene: str) -> AcousticField:
+def _levels(request: Request, scene: str) -> Levels:
     try:
-        return _host(request).fields[scene]
+        return _host(request).scenes[scene]
     except KeyError:
         raise RequestError("unknown_scene", f"there is no scene {scene!r}", field="scene", status=404) from None
 

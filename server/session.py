@@ -24,7 +24,8 @@ from server.blocks import AudioBlock, DryBlock, FloatArray
 from server.direct_sound import DirectSound, reverberation_gain
 from server.emitters import Emitter, LiveInput
 from server.errors import RequestError
-from server.field.field import AcousticField
+from server.field.levels import Levels
+from server.load import Reason, Rung
 from server.pacing import SendWindow
 from server.protocol import (
     PROTOCOL,
@@ -35,6 +36,7 @@ from server.protocol import (
     EmitterRemoved,
     Error,
     Hello,
+    LevelChanged,
     ListenerPose,
     LiveStatus,
     MoveEmitter,
@@ -51,9 +53,10 @@ from server.scene.bundle import Bundle
 
 @dataclass(frozen=True)
 class IrRequest:
-    """IRs wanted for the poses as they were when `pose_id` was the newest."""
+    """IRs of a quality level wanted for the poses as they were when `pose_id` was the newest."""
 
     pose_id: int
+    level: str
     listener: Pose
     emitters: tuple[tuple[int, Vector3], ...]
     """Serial number and position of each emitter whose IR is out of date."""
@@ -66,13 +69,14 @@ class IrResponse:
     """One per emitter of the request."""
 
 
-def compute_irs(field: AcousticField, request: IrRequest, prepare: Callable[[FloatArray], PartitionedIr]) -> IrResponse:
+def compute_irs(levels: Levels, request: IrRequest, prepare: Callable[[FloatArray], PartitionedIr]) -> IrResponse:
     """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
     count = len(request.emitters)
-    irs = field.impulse_responses(
+    irs = levels[request.level].impulse_responses(
         np.tile(np.asarray(request.listener.position), (count, 1)),
         np.asarray([position for _, position in request.emitters]),
         np.full(count, request.listener.yaw),
+        remember=True,
     )
     return IrResponse(request, tuple(prepare(ir) for ir in irs))
 
@@ -85,7 +89,8 @@ def _start_pose(bundle: Bundle) -> Pose:
 class Session:
     """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
 
-    `filters` are the head it hears through. `load_clip` gives mono float32 at the field's rate, and is quick: it is
+    `levels` are the scene's, and `rung` is what to hear of them first.
+    `filters` are the head it hears through. `load_clip` gives mono float32 at the scene's rate, and is quick: it is
     called on the rendering thread.
     Raises RequestError for a hello that cannot be served.
     """
@@ -93,14 +98,16 @@ class Session:
     def __init__(
         self,
         hello: Hello,
-        field: AcousticField,
+        levels: Levels,
         filters: HeadFilters,
         load_clip: Callable[[str], FloatArray],
         *,
+        rung: Rung,
         max_emitters: int = 16,
         shared_tail: bool = False,
         window: int = 40,
     ) -> None:
+        field = levels.default
         if hello.protocol != PROTOCOL:
             raise RequestError(
                 "unsupported_protocol",
@@ -116,17 +123,21 @@ class Session:
         self.window = SendWindow(window)
         self.ir_exchanges = 0
         self.blocks_dropped = 0
-        self._bundle = field.bundle
+        self._bundle = levels.bundle
+        self._rung = self._heard = rung
+        self._reason: Reason = "chosen"
         self._sample_rate = field.sample_rate
         self._load_clip = load_clip
         self._direct_sound = DirectSound.of(self._bundle, filters)
         self.renderer = self._direct_sound.renderer(
             block_size=hello.block_size,
-            ir_samples=field.ir_samples,
+            ir_samples=max(level.ir_samples for level in levels.values()),
             sample_rate=field.sample_rate,
             max_emitters=max_emitters,
             shared_tail=shared_tail,
+            switches_tail=any(level.level.shared_tail for level in levels.values()),
         )
+        self.renderer.share_tail(rung.shared_tail)
         self.prepare = self.renderer.prepare
         self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
         self._bundle.require_inside(self._listener.position, "listener.position")
@@ -138,6 +149,8 @@ class Session:
         self._applied_pose_id = 0  # by the impulse responses
         self._in_flight: IrRequest | None = None
         self._waits_for_change = False
+        self._ir_interval_s = 0.0
+        self._next_request_clock = 0
 
     @property
     def sample_clock(self) -> int:
@@ -145,9 +158,29 @@ class Session:
         return self.renderer.sample_clock
 
     @property
+    def rung(self) -> Rung:
+        """The quality that is heard."""
+        return self._heard
+
+    @property
     def awaits_irs(self) -> bool:
-        """Whether a request is unanswered; may be asked from any thread."""
-        return self._in_flight is not None
+        """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
+        return self._in_flight is not None or self.sample_clock < self._next_request_clock
+
+    def hear(self, rung: Rung, reason: Reason) -> list[ServerMessage]:
+        """Have what follows the direct sound come from another rung: from now on, or, where it takes another level's
+        IRs, from when they are there."""
+        if rung.level != self._rung.level:
+            for emitter in self._emitters.values():
+                emitter.is_outdated = True
+            self._waits_for_change = False
+            self._next_request_clock = 0
+        self._rung, self._reason = rung, reason
+        return self._change() if rung.level == self._heard.level or not self._emitters else []
+
+    def space_irs(self, interval_s: float) -> None:
+        """Have so much time pass from one request for IRs to the next, unless an emitter waits for its first."""
+        self._ir_interval_s = interval_s
 
     def receive(self, message: ClientMessage) -> list[ServerMessage]:
         """Take in one message; what is wrong with it comes back as an `Error`, and nothing has changed then."""
@@ -182,16 +215,24 @@ class Session:
         if not outdated:
             self._accepted_pose_id = self._newest_pose_id
             return None
+        if self.sample_clock < self._next_request_clock and all(emitter.token is not None for emitter in outdated):
+            return None
+        self._next_request_clock = self.sample_clock + round(self._ir_interval_s * self._sample_rate)
         for emitter in outdated:
             emitter.is_outdated = False
         self._in_flight = IrRequest(
-            self._newest_pose_id, self._listener, tuple((emitter.serial, emitter.position) for emitter in outdated)
+            self._newest_pose_id,
+            self._rung.level,
+            self._listener,
+            tuple((emitter.serial, emitter.position) for emitter in outdated),
         )
         return self._in_flight
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""
         self._in_flight = None
+        if response.request.level not in {self._rung.level, self._heard.level}:
+            return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
         pose_id = response.request.pose_id
         arrived = {serial: ir for (serial, _), ir in zip(response.request.emitters, response.irs, strict=True)}
         events: list[ServerMessage] = []
@@ -203,6 +244,8 @@ class Session:
                 events.append(EmitterAdded(id=identifier, sample_clock=self.sample_clock))
             emitter.token = pose_id
         self._accepted_pose_id = pose_id
+        if response.request.level == self._rung.level:
+            events += self._change()
         return events
 
     def give_up(self, request: IrRequest) -> list[ServerMessage]:
@@ -261,6 +304,22 @@ class Session:
         """What was wrong with live samples since this was asked last."""
         refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
+
+    def _change(self) -> list[ServerMessage]:
+        """Stand on the rung that was asked for last, with the block that follows."""
+        if self._rung == self._heard:
+            return []
+        self._heard = self._rung
+        self.renderer.share_tail(self._heard.shared_tail)
+        return [
+            LevelChanged(
+                level=self._heard.level,
+                reason=self._reason,
+                ir_rate_hz=self._heard.ir_rate_hz,
+                shared_tail=self._heard.shared_tail,
+                sample_clock=self.sample_clock,
+            )
+        ]
 
     def _has_applied_all(self) -> bool:
         return all(
@@ -324,7 +383,7 @@ class Session:
         self._require_emitter(message.id)
         del self._emitters[message.id]
         self.renderer.remove_emitter(message.id)
-        return [EmitterRemoved(id=message.id)]
+        return [EmitterRemoved(id=message.id), *([] if self._emitters else self._change())]
 
     def _require_emitter(self, identifier: str) -> Emitter:
         if identifier not in self._emitters:

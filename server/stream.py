@@ -13,14 +13,27 @@ from functools import partial
 
 from server.blocks import AudioBlock, FloatArray
 from server.durations import DurationHistogram
-from server.field.field import AcousticField
+from server.errors import RequestError
+from server.field.levels import Levels
+from server.load import Ladder, Offer, Reason, Strain, ir_interval_s
 from server.pacing import StreamClock
-from server.protocol import AddEmitter, ClientMessage, Durations, ListenerPose, MoveEmitter, ServerMessage, Status
+from server.protocol import (
+    AddEmitter,
+    ClientMessage,
+    Durations,
+    Error,
+    ListenerPose,
+    MoveEmitter,
+    ServerMessage,
+    SetLevel,
+    Status,
+)
 from server.session import IrRequest, IrResponse, Session, compute_irs
 
 MAX_WAITING_MESSAGES = 256
 _MAX_BEHIND_S = 0.5
 _LOAD_SMOOTHING = 0.02
+_COST_SMOOTHING = 0.2
 _logger = logging.getLogger(__name__)
 
 
@@ -57,18 +70,22 @@ class PoseTimes:
 
 
 class Stream:
-    """`deliver` is called on the event loop with what the stream made, in order."""
+    """`ladder`, of the levels on `offer`, is where the session stands. `deliver` is called on the event loop with what
+    the stream made, in order."""
 
     def __init__(
         self,
         session: Session,
-        field: AcousticField,
+        levels: Levels,
         *,
+        offer: Offer,
+        ladder: Ladder,
         block_s: float,
         lead: int,
         deliver: Callable[[list[Outgoing]], None],
     ) -> None:
         self.session = session
+        self.ladder = ladder
         self.block_s = block_s
         self.deliver = deliver
         self.blocks_late = 0
@@ -81,14 +98,30 @@ class Stream:
         self.next_block = 0
         self.load = 0.0
         """Share of a core that its blocks have taken of late."""
-        self._field = field
+        self._levels = levels
+        self._offer = offer
+        self._request_s = 0.0
+        """CPU time that a request for impulse responses has taken of late."""
+        self._asked_s: float | None = None
+        """When the request was made that is unanswered."""
+        self._longest_wait_s: float | None = None
+        self._worst_lateness_s = 0.0
         self._lead = lead
         self._clock: StreamClock | None = None
         self._wake: Callable[[], None] = lambda: None
         self._time_s: Callable[[], float] = time.monotonic
         self._messages: deque[tuple[float, ClientMessage]] = deque()
-        self._answers: deque[tuple[IrRequest, Future[tuple[IrResponse, float]]]] = deque()
+        self._answers: deque[tuple[IrRequest, Future[_Computed]]] = deque()
         self._next_status_s = 1.0
+
+    @property
+    def scene(self) -> str:
+        return self._levels.bundle.id
+
+    @property
+    def awaits_irs_since_s(self) -> float | None:
+        """When the request for impulse responses was made that is unanswered."""
+        return self._asked_s
 
     def attach(self, *, wake: Callable[[], None], time_s: Callable[[], float]) -> None:
         """`wake` has the audio thread look at what waits; `time_s` is its clock."""
@@ -131,15 +164,36 @@ class Stream:
             outgoing += self._take_answer(*self._answers.popleft())
         for _ in range(len(self._messages)):
             arrived_s, message = self._messages.popleft()
-            refused = self.session.receive(message)
+            refused = self._choose(message) if isinstance(message, SetLevel) else self.session.receive(message)
             if isinstance(message, ListenerPose | MoveEmitter) and not refused:
                 self.pose_times.arrive(message.pose_id, arrived_s)
                 self.reverberation_times.arrive(message.pose_id, arrived_s)
             outgoing += refused
         if (request := self.session.take_request()) is not None:
-            answer = workers.submit(_compute_timed, self._field, request, self.session)
+            self._asked_s = self._time_s()
+            answer = workers.submit(_compute_timed, self._levels, request, self.session)
             answer.add_done_callback(partial(self._keep_answer, request))
         return outgoing
+
+    def strain(self, now_s: float) -> Strain:
+        """What it went through since this was asked last."""
+        waiting_s = () if self._asked_s is None else (now_s - self._asked_s,)
+        answered_s = () if self._longest_wait_s is None else (self._longest_wait_s,)
+        strain = Strain(
+            self._worst_lateness_s / (self._lead * self.block_s), max((*waiting_s, *answered_s), default=None)
+        )
+        self._worst_lateness_s, self._longest_wait_s = 0.0, None
+        return strain
+
+    def step(self, reason: Reason, now_s: float) -> list[Outgoing]:
+        """Hear what the ladder, which has been moved, now stands on."""
+        if self._asked_s is not None:
+            self._asked_s = now_s  # what was asked for before does not tell how the new rung does
+        return [*self.session.hear(self.ladder.rung, reason)]
+
+    def ration_irs(self, *, streams: int, share: float) -> None:
+        """Leave others what `share` of a core, divided between `streams`, leaves them."""
+        self.session.space_irs(ir_interval_s(self.ladder, request_s=self._request_s, streams=streams, share=share))
 
     def finish_block(self, sample_clock: int, samples: FloatArray, *, cost_s: float, now_s: float) -> list[Outgoing]:
         """Pass on the block just rendered, which took `cost_s` and is ready `now_s`."""
@@ -152,7 +206,10 @@ class Stream:
         self.load += _LOAD_SMOOTHING * (cost_s / self.block_s - self.load)
         self.render_times.add(cost_s)
         if self.next_block >= self._lead:  # the first were due before the stream was
-            self.latenesses.add(now_s - self.due_s)
+            lateness_s = now_s - self.due_s
+            self.latenesses.add(lateness_s)
+            if lateness_s > self._worst_lateness_s:
+                self._worst_lateness_s = lateness_s
         if self.clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
             self.clock.slip(self.next_block, now_s)
         self.next_block += 1
@@ -162,17 +219,28 @@ class Stream:
             outgoing.append(self._status(now_s))
         return outgoing
 
-    def _keep_answer(self, request: IrRequest, answer: Future[tuple[IrResponse, float]]) -> None:
+    def _choose(self, message: SetLevel) -> list[ServerMessage]:
+        try:
+            self.ladder = self._offer.ladder(message.level, block_s=self.block_s)
+        except RequestError as refusal:
+            return [Error.from_refusal(refusal)]
+        return self.session.hear(self.ladder.rung, "chosen")
+
+    def _keep_answer(self, request: IrRequest, answer: "Future[_Computed]") -> None:
         self._answers.append((request, answer))  # on the worker's thread
         self._wake()
 
-    def _take_answer(self, request: IrRequest, answer: Future[tuple[IrResponse, float]]) -> list[ServerMessage]:
+    def _take_answer(self, request: IrRequest, answer: "Future[_Computed]") -> list[ServerMessage]:
+        if self._asked_s is not None:
+            self._longest_wait_s = max(self._longest_wait_s or 0.0, self._time_s() - self._asked_s)
+            self._asked_s = None
         if (failure := answer.exception()) is not None:
             _logger.error("no impulse response for pose %d", request.pose_id, exc_info=failure)
             return self.session.give_up(request)
-        response, duration_s = answer.result()
-        self.ir_times.add(duration_s)
-        return self.session.accept(response)
+        computed = answer.result()
+        self.ir_times.add(computed.duration_s)
+        self._request_s += (_COST_SMOOTHING if self._request_s else 1.0) * (computed.cpu_s - self._request_s)
+        return self.session.accept(computed.response)
 
     def _status(self, now_s: float) -> Status:
         session = self.session
@@ -189,11 +257,21 @@ class Stream:
             pose_ms=Durations.of(self.pose_times.durations),
             reverberation_ms=Durations.of(self.reverberation_times.durations),
             ir_exchanges=session.ir_exchanges,
+            level=session.rung.level,
+            ir_rate_hz=session.rung.ir_rate_hz,
             live=session.live_statuses(),
         )
 
 
-def _compute_timed(field: AcousticField, request: IrRequest, session: Session) -> tuple[IrResponse, float]:
-    started_s = time.perf_counter()
-    response = compute_irs(field, request, session.prepare)
-    return response, time.perf_counter() - started_s
+@dataclass(frozen=True)
+class _Computed:
+    response: IrResponse
+    duration_s: float
+    cpu_s: float
+    """What the thread that computed it spent."""
+
+
+def _compute_timed(levels: Levels, request: IrRequest, session: Session) -> _Computed:
+    started_s, started_cpu_s = time.perf_counter(), time.thread_time()
+    response = compute_irs(levels, request, session.prepare)
+    return _Computed(response, time.perf_counter() - started_s, time.thread_time() - started_cpu_s)

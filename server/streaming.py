@@ -23,8 +23,9 @@ from server.blocks import FloatArray
 from server.catalogue import describe_scene
 from server.clips import ClipLibrary, DecodeError
 from server.errors import RequestError
-from server.field.field import AcousticField
+from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.load import Offer
 from server.protocol import (
     AddEmitter,
     ClientMessage,
@@ -39,6 +40,7 @@ from server.protocol import (
 from server.session import Session
 from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
+from server.telemetry import StreamTotals
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
 MAX_WAITING_ANSWERS = 256
@@ -66,15 +68,18 @@ class ClosingError(Exception):
 @dataclass
 class StreamHost:
     """What all connections share: loaded scenes, their clips, heads, the audio engine, and how many streams there
-    are."""
+    are. `offers` says what the quality levels of each scene cost here, once that was measured."""
 
-    fields: Mapping[str, AcousticField]
+    scenes: Mapping[str, Levels]
     clips: Mapping[str, ClipLibrary]
     """By scene, since every scene has its sample rate."""
     hrtfs: HrtfLibrary
     audio: AudioEngine
     settings: Settings
     answers: Answers
+    offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
+    past: StreamTotals = dataclasses.field(default_factory=StreamTotals)
+    """Of streams that have ended."""
     is_ready: bool = False
     streams: int = 0
 
@@ -132,19 +137,24 @@ class Connection:
 
     async def _open(self, hello: Hello) -> Stream:
         settings = self._host.settings
-        field = self._host.fields.get(hello.scene)
+        levels = self._host.scenes.get(hello.scene)
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
         window = settings.window_blocks + hello.buffer_blocks
         self._capacity = window + MAX_WAITING_ANSWERS
         try:
-            if field is None:
+            if levels is None:
                 raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
+            field = levels.default
+            block_s = hello.block_size / field.sample_rate
+            offer = self._host.offers[hello.scene]
+            ladder = offer.ladder(hello.level, block_s=block_s)
             session = await asyncio.to_thread(
                 Session,
                 hello,
-                field,
+                levels,
                 self._host.hrtfs.filters(hrtf, field.sample_rate),
                 lambda name: load_clip(self._host.clips[hello.scene], name),
+                rung=ladder.rung,
                 max_emitters=settings.max_emitters,
                 shared_tail=settings.shared_tail,
                 window=window,
@@ -154,7 +164,7 @@ class Connection:
         await self._send_message(
             Welcome(
                 session=uuid.uuid4().hex,
-                scene=describe_scene(field),
+                scene=describe_scene(levels),
                 sample_rate=field.sample_rate,
                 block_size=hello.block_size,
                 channels=field.channels,
@@ -163,13 +173,15 @@ class Connection:
                 window=window,
                 ir_samples=field.ir_samples,
                 hrtf=hrtf,
-                level=field.level.name,
+                level=ladder.rung.level,
             )
         )
         return Stream(
             session,
-            field,
-            block_s=hello.block_size / field.sample_rate,
+            levels,
+            offer=offer,
+            ladder=ladder,
+            block_s=block_s,
             lead=hello.buffer_blocks,
             deliver=self._enqueue,
         )
@@ -186,6 +198,7 @@ class Connection:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._host.audio.close(stream)
+            self._host.past.add(stream)
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)

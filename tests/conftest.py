@@ -12,7 +12,9 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from server.field.field import AcousticField
+from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.load import Rung
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.geometry import Geometry, Material, Materials, Opening
@@ -122,6 +124,17 @@ def bundle(tmp_path_factory) -> Bundle:
 @pytest.fixture
 def field(bundle) -> AcousticField:
     return AcousticField.load(bundle)
+
+
+@pytest.fixture
+def levels(field) -> Levels:
+    """The scene's only level, whose field is `field`."""
+    return Levels([field])
+
+
+@pytest.fixture
+def rung(field) -> Rung:
+    return Rung.full(field.level, cost_ms=1.0)
 
 
 @pytest.fixture(scope="session")

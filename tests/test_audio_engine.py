@@ -11,6 +11,8 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
+from server.field.levels import Levels
+from server.load import Offer
 from server.protocol import PROTOCOL, AddEmitter, EmitterAdded, Error, Hello, ListenerPose, Status
 from server.session import Session
 from server.stream import MAX_WAITING_MESSAGES, Stream, StreamFailed, TimedBlock
@@ -47,6 +49,14 @@ class Patient(Executor):
         self.work.clear()
 
 
+def open_stream(hello, field, filters, load_clip, *, lead, deliver, window=40):
+    """At the top of its ladder, which has the scene's only level."""
+    levels, offer = Levels([field]), Offer((field.level,), {field.level.name: 1.0})
+    ladder = offer.ladder(hello.level, block_s=BLOCK_S)
+    session = Session(hello, levels, filters, load_clip, rung=ladder.rung, window=window)
+    return Stream(session, levels, offer=offer, ladder=ladder, block_s=BLOCK_S, lead=lead, deliver=deliver)
+
+
 class Stage:
     """An engine that is not running, ticked by hand, and what its streams delivered."""
 
@@ -58,9 +68,10 @@ class Stage:
     def open(self, *, lead=4, window=1_000):
         clip = np.ones(64, np.float32)
         hello = Hello(protocol=PROTOCOL, scene="flat")
-        session = Session(hello, self.field, self.filters, lambda _: clip, window=window)
         delivered = []
-        stream = Stream(session, self.field, block_s=BLOCK_S, lead=lead, deliver=delivered.extend)
+        stream = open_stream(
+            hello, self.field, self.filters, lambda _: clip, window=window, lead=lead, deliver=delivered.extend
+        )
         self.engine.open(stream)
         return stream, delivered
 
@@ -160,8 +171,8 @@ def test_a_stream_goes_to_the_thread_that_is_least_busy(field, filters):
     engine = AudioEngine(lambda call: call(), Patient(), threads=2, time_s=clock)
 
     def opened(load=0.0):
-        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, lambda _: np.ones(64, np.float32))
-        stream = Stream(session, field, block_s=BLOCK_S, lead=1, deliver=lambda _: None)
+        hello, clip = Hello(protocol=PROTOCOL, scene="flat"), np.ones(64, np.float32)
+        stream = open_stream(hello, field, filters, lambda _: clip, lead=1, deliver=lambda _: None)
         engine.open(stream)
         stream.load = load
         return stream
@@ -239,7 +250,7 @@ def test_a_field_that_fails_costs_an_error_message_and_no_sound(stage):
     stage.workers.run()
     stage.run(BLOCK_S)
     works = stage.field.impulse_responses
-    stage.field.impulse_responses = lambda *_: np.full((1, 2, 100), np.inf, np.float32)
+    stage.field.impulse_responses = lambda *_, **__: np.full((1, 2, 100), np.inf, np.float32)
     stream.offer(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)))
     stage.run(2 * BLOCK_S)
     stage.workers.run()
@@ -372,9 +383,9 @@ def test_the_real_threads_keep_time_and_stop(field, filters):
     with ThreadPoolExecutor(1) as workers:
         engine = AudioEngine(lambda call: call(), workers, threads=2)
         hello = Hello(protocol=PROTOCOL, scene="flat")
-        session = Session(hello, field, filters, lambda _: np.ones(64, np.float32), window=1_000)
+        clip = np.ones(64, np.float32)
         engine.start()
-        stream = Stream(session, field, block_s=BLOCK_S, lead=8, deliver=deliver)
+        stream = open_stream(hello, field, filters, lambda _: clip, window=1_000, lead=8, deliver=deliver)
         engine.open(stream)
         add(stream)
         assert enough.wait(5)
@@ -392,9 +403,9 @@ def test_where_real_time_is_refused_the_engine_says_so_once_and_runs(field, filt
     ticked = threading.Event()
     with ThreadPoolExecutor(1) as workers:
         engine = AudioEngine(lambda call: call(), workers, threads=3, is_real_time=True)
-        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, lambda _: np.ones(64, np.float32))
+        hello, clip = Hello(protocol=PROTOCOL, scene="flat"), np.ones(64, np.float32)
         engine.start()
-        engine.open(Stream(session, field, block_s=BLOCK_S, lead=1, deliver=lambda _: ticked.set()))
+        engine.open(open_stream(hello, field, filters, lambda _: clip, lead=1, deliver=lambda _: ticked.set()))
         assert ticked.wait(5)
         engine.stop()
     assert [record.getMessage() for record in caplog.records] == [

@@ -13,6 +13,8 @@ from server.answers import Answers
 from server.audio_engine import AudioEngine
 from server.blocks import AudioBlock
 from server.catalogue import open_clips
+from server.field.levels import Levels
+from server.load import Offer
 from server.protocol import (
     PROTOCOL,
     Acknowledge,
@@ -67,12 +69,13 @@ async def hosting(field, hrtfs, **settings):
     with ThreadPoolExecutor(1) as workers:
         audio = AudioEngine(asyncio.get_running_loop().call_soon_threadsafe, workers)
         host = StreamHost(
-            fields={"flat": field},
-            clips=open_clips({"flat": field}, ()),
+            scenes={"flat": Levels([field])},
+            clips=open_clips({"flat": Levels([field])}, ()),
             hrtfs=hrtfs,
             audio=audio,
             settings=Settings(**settings),
             answers=Answers(workers=1, waiting=1),
+            offers={"flat": Offer((field.level,), {field.level.name: 1.0})},
             is_ready=True,
         )
         audio.start()
@@ -193,7 +196,7 @@ def test_a_stream_that_fails_is_closed_with_an_internal_error(field, hrtfs):
         async with hosting(field, hrtfs) as host:
             running = asyncio.create_task(Connection(socket, host).run())
             # Fewer responses than poses, however many are asked for at once: stands for a defect of our own.
-            field.impulse_responses = lambda *_: np.zeros((0, 2, 100), np.float32)
+            field.impulse_responses = lambda *_, **__: np.zeros((0, 2, 100), np.float32)
             socket.say(HELLO)
             socket.say(AddEmitter(id="a", clip="trumpet", position=(1.0, 2.0, 1.0)))
             await asyncio.wait_for(running, 5)

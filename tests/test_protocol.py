@@ -12,6 +12,7 @@ from server.acoustics.geometry import Pose
 from server.blocks import DryBlock
 from server.catalogue import describe_scene
 from server.errors import RequestError
+from server.field.levels import Levels
 from server.protocol import (
     PROTOCOL,
     Acknowledge,
@@ -22,6 +23,7 @@ from server.protocol import (
     EmitterRemoved,
     Error,
     Hello,
+    LevelChanged,
     ListenerPose,
     ListenerStart,
     LiveStatus,
@@ -30,6 +32,7 @@ from server.protocol import (
     Pong,
     RemoveEmitter,
     SetGain,
+    SetLevel,
     Status,
     Welcome,
     parse_client_message,
@@ -60,6 +63,7 @@ CLIENT_MESSAGES = [
     MoveEmitter(id="talker", position=(1, 2, 3), pose_id=2**32 - 1),
     MoveEmitter(id="talker", position=(1, 2, 3), yaw=0.0, pose_id=1),
     SetGain(id="talker", gain_db=-80),
+    SetLevel(level="fast"),
     RemoveEmitter(id="talker"),
     ListenerPose(pose_id=4, position=(1, 2, 3), yaw=-math.pi),
     ListenerPose(pose_id=4, position=(1, 2, 3), orientation=(0, 0, 1, 0)),
@@ -70,6 +74,7 @@ CLIENT_MESSAGES = [
 SERVER_MESSAGES = [
     EmitterAdded(id="talker", sample_clock=512),
     EmitterRemoved(id="talker"),
+    LevelChanged(level="fast", reason="load", ir_rate_hz=5.0, shared_tail=True, sample_clock=512),
     Status(
         sample_clock=24_000,
         blocks_sent=90,
@@ -82,6 +87,8 @@ SERVER_MESSAGES = [
         ir_ms=Durations(p50=None, p99=None, p99_9=None),
         pose_ms=Durations(p50=None, p99=None, p99_9=None),
         reverberation_ms=Durations(p50=None, p99=None, p99_9=None),
+        level="standard",
+        ir_rate_hz=12.0,
         ir_exchanges=4,
         live=(LiveStatus(id="talker", samples_queued=1, samples_dropped=2, samples_gated=3, underruns=4),),
     ),
@@ -103,7 +110,7 @@ def test_server_messages_survive_the_wire(message):
 def test_a_welcome_with_its_scene_survives_the_wire(field):
     welcome = Welcome(
         session="5e",
-        scene=describe_scene(field),
+        scene=describe_scene(Levels([field])),
         sample_rate=24_000,
         block_size=256,
         channels=2,
@@ -121,7 +128,7 @@ def test_hello_as_a_person_would_type_it():
     hello = parse_client_message(
         '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [1, 2, 1.5]}}'
     )
-    assert (hello.block_size, hello.encoding, hello.buffer_blocks) == (256, "f32", 8)
+    assert (hello.block_size, hello.encoding, hello.buffer_blocks, hello.level) == (256, "f32", 8, "auto")
     assert hello.listener.pose == Pose((1, 2, 1.5))
 
 

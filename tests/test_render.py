@@ -9,6 +9,8 @@ from scipy.signal import fftconvolve
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
 from server.direct_sound import DirectSound
+from server.field.levels import Levels
+from server.load import Rung
 from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
 from server.render import PathError, PathPoint, RenderedEmitter, read_path, render
 from server.rendering.fade import raised_cosine
@@ -175,7 +177,14 @@ def test_a_live_session_replayed_is_equal_to_the_bit(field, filters):
     """Live: IRs arrive when they arrive, some poses are never heard. The replay gets what the blocks' headers say."""
     rng = np.random.default_rng(7)
     clips = {"a": noise(8, 2_000), "b": noise(9, 5_000)}
-    session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, clips.get, window=1_000)
+    session = Session(
+        Hello(protocol=PROTOCOL, scene="flat"),
+        Levels([field]),
+        filters,
+        clips.get,
+        rung=Rung.full(field.level, 1.0),
+        window=1_000,
+    )
     places = {"a": Pose.from_yaw((1.0, 2.0, 1.5), 1.0), "b": THERE}
     session.receive(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)))
     poses = {1: Pose((2.0, 2.0, 1.5))}
@@ -192,7 +201,7 @@ def test_a_live_session_replayed_is_equal_to_the_bit(field, filters):
                 ListenerPose(pose_id=pose_id, position=poses[pose_id].position, orientation=poses[pose_id].orientation)
             )
         if request is not None and rng.random() < 0.5:
-            session.accept(compute_irs(field, request, session.prepare))
+            session.accept(compute_irs(Levels([field]), request, session.prepare))
             request = None
         request = session.take_request() or request
         blocks.append(session.render_block())

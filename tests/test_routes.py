@@ -10,6 +10,7 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from server.app import create_app
+from server.field.levels import Levels
 from server.impulse_response import ImpulseResponse, IrQuery
 from server.settings import Settings
 
@@ -28,7 +29,9 @@ def wait_until_ready(client):
 @pytest.fixture
 def client(field, hrtfs):
     settings = Settings(ir_workers=1, max_waiting_requests=1)
-    with TestClient(create_app(settings, fields={"flat": field}, hrtfs=hrtfs), raise_server_exceptions=False) as client:
+    with TestClient(
+        create_app(settings, scenes={"flat": Levels([field])}, hrtfs=hrtfs), raise_server_exceptions=False
+    ) as client:
         wait_until_ready(client)
         yield client
 
@@ -54,12 +57,12 @@ def test_health(client):
 def test_ready_only_after_the_field_has_been_used(field, hrtfs):
     compute, may_go_on = field.impulse_responses, threading.Event()
 
-    def held_up(*arguments):
+    def held_up(*arguments, **options):
         may_go_on.wait(5)
-        return compute(*arguments)
+        return compute(*arguments, **options)
 
     field.impulse_responses = held_up
-    with TestClient(create_app(Settings(), fields={"flat": field}, hrtfs=hrtfs)) as client:
+    with TestClient(create_app(Settings(), scenes={"flat": Levels([field])}, hrtfs=hrtfs)) as client:
         assert client.get("/livez").status_code == 200
         check_problem(client.get("/readyz"), 503, "not_ready")
         may_go_on.set()
@@ -67,11 +70,11 @@ def test_ready_only_after_the_field_has_been_used(field, hrtfs):
 
 
 def test_a_failing_warm_up_leaves_the_server_live_and_not_ready(field, hrtfs, caplog):
-    def broken(*_):
+    def broken(*_, **__):
         raise RuntimeError("the field broke")
 
     field.impulse_responses = broken
-    with TestClient(create_app(Settings(), fields={"flat": field}, hrtfs=hrtfs)) as client:
+    with TestClient(create_app(Settings(), scenes={"flat": Levels([field])}, hrtfs=hrtfs)) as client:
         for _ in range(3_600):
             if "warm-up failed" in caplog.text:
                 break
@@ -101,7 +104,7 @@ def test_heads_are_named_and_kemar_is_the_default(client):
 def test_a_clip_that_cannot_be_decoded_is_left_out_and_the_log_says_why(field, hrtfs, tmp_path, caplog):
     (tmp_path / "noise.flac").write_bytes(b"not audio")
     settings = Settings(clips=(tmp_path / "noise.flac",))
-    with TestClient(create_app(settings, fields={"flat": field}, hrtfs=hrtfs)) as client:
+    with TestClient(create_app(settings, scenes={"flat": Levels([field])}, hrtfs=hrtfs)) as client:
         names = {clip["name"] for clip in client.get("/v1/clips").json()["clips"]}
     assert "noise" not in names
     assert "noise.flac" in caplog.text
@@ -181,7 +184,7 @@ def test_a_wrong_method_is_a_problem_too(client):
 
 
 def test_a_crash_is_a_problem_that_tells_nothing_of_the_inside(client, field):
-    def broken(*_):
+    def broken(*_, **__):
         raise RuntimeError("secret")
 
     field.impulse_responses = broken
@@ -207,9 +210,9 @@ def test_the_loudness_map_is_a_picture_or_numbers_and_loudest_at_the_emitter(cli
 def test_too_many_waiting_requests_are_turned_away_and_health_is_answered_meanwhile(client, field):
     compute, may_go_on = field.impulse_responses, threading.Event()
 
-    def held_up(*arguments):
+    def held_up(*arguments, **options):
         may_go_on.wait(10)
-        return compute(*arguments)
+        return compute(*arguments, **options)
 
     field.impulse_responses = held_up
     statuses = []

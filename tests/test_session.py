@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 from server.acoustics.geometry import Pose
 from server.blocks import DryBlock
 from server.errors import RequestError
+from server.field.levels import Levels
+from server.load import Rung
 from server.protocol import (
     PROTOCOL,
     Acknowledge,
@@ -30,6 +32,8 @@ from server.session import Session, compute_irs
 from server.whole_field import WholeField
 
 CLIP = np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
+HELLO = Hello(protocol=PROTOCOL, scene="flat")
+FULL = Rung("standard", None, False, 1.0)
 HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 
 
@@ -41,7 +45,7 @@ def load_clip(name):
 
 @pytest.fixture
 def session(field, filters):
-    return Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=1_000)
+    return Session(HELLO, Levels([field]), filters, load_clip, rung=FULL, window=1_000)
 
 
 def add(session, identifier="talker", **changes):
@@ -51,7 +55,7 @@ def add(session, identifier="talker", **changes):
 def answer(session, field):
     """Compute what the session wants, at once, and hand it in."""
     request = session.take_request()
-    return [] if request is None else session.accept(compute_irs(field, request, session.prepare))
+    return [] if request is None else session.accept(compute_irs(Levels([field]), request, session.prepare))
 
 
 def poses(block):
@@ -64,7 +68,7 @@ def codes(events):
 
 def dead(field):
     """Nothing follows the direct sound any more."""
-    field.impulse_responses = lambda listeners, *_: np.zeros((len(listeners), 2, field.ir_samples), np.float32)
+    field.impulse_responses = lambda listeners, *_, **__: np.zeros((len(listeners), 2, field.ir_samples), np.float32)
     return field
 
 
@@ -79,7 +83,9 @@ def level_db(samples):
 
 def test_sound_is_the_clip_along_the_direct_path_and_convolved_with_the_fields_ir(field, filters):
     def heard(field):
-        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=1_000)
+        session = Session(
+            Hello(protocol=PROTOCOL, scene="flat"), Levels([field]), filters, load_clip, rung=FULL, window=1_000
+        )
         session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
         add(session, loop=False, gain_db=-6.0)
         assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
@@ -142,7 +148,9 @@ def test_a_gain_scales_direct_sound_and_reverberation_alike(session, field):
 
 def test_what_is_sent_live_sounds_as_the_same_clip_does(field, filters):
     def heard(message, blocks):
-        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=1_000)
+        session = Session(
+            Hello(protocol=PROTOCOL, scene="flat"), Levels([field]), filters, load_clip, rung=FULL, window=1_000
+        )
         session.receive(message)
         answer(session, field)
         for sequence, block in enumerate(blocks):
@@ -190,7 +198,7 @@ def test_poses_that_arrive_during_a_computation_become_one_request(session, fiel
     for pose_id in range(1, 100):
         session.receive(ListenerPose(pose_id=pose_id, position=(2.0 + pose_id / 100, 2.0, 1.5)))
     assert session.take_request() is None
-    session.accept(compute_irs(field, first, session.prepare))
+    session.accept(compute_irs(Levels([field]), first, session.prepare))
     second = session.take_request()
     assert (second.pose_id, second.listener.position) == (99, (2.99, 2.0, 1.5))
 
@@ -204,7 +212,7 @@ def test_a_block_carries_the_pose_of_its_direct_paths_and_the_one_whose_irs_it_f
     assert poses(session.render_block()) == (7, 0)
     session.receive(ListenerPose(pose_id=8, position=HERE))
     session.receive(ListenerPose(pose_id=9, position=HERE))
-    session.accept(compute_irs(field, request, session.prepare))
+    session.accept(compute_irs(Levels([field]), request, session.prepare))
     exchange, after = session.render_block(), session.render_block()
     assert (*poses(exchange), exchange.is_exchange) == (9, 7, True)
     assert (*poses(after), after.is_exchange) == (9, 7, False)
@@ -248,7 +256,7 @@ def test_an_answer_for_an_emitter_that_left_is_ignored_even_if_its_id_is_taken_a
     request = session.take_request()
     assert session.receive(RemoveEmitter(id="talker")) == [EmitterRemoved(id="talker")]
     add(session, position=HERE)
-    assert session.accept(compute_irs(field, request, session.prepare)) == []
+    assert session.accept(compute_irs(Levels([field]), request, session.prepare)) == []
     assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
 
 
@@ -269,7 +277,9 @@ def test_after_a_failure_sound_goes_on_and_the_next_pose_asks_for_everything_out
 
 def test_a_full_window_drops_blocks_but_not_time(field, filters):
     def run(acknowledged):
-        session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, window=4)
+        session = Session(
+            Hello(protocol=PROTOCOL, scene="flat"), Levels([field]), filters, load_clip, rung=FULL, window=4
+        )
         add(session)
         answer(session, field)
         blocks = []
@@ -324,7 +334,9 @@ def test_a_bad_message_changes_nothing_and_the_stream_goes_on(session, field, me
 
 
 def test_emitters_are_limited(field, filters):
-    session = Session(Hello(protocol=PROTOCOL, scene="flat"), field, filters, load_clip, max_emitters=2)
+    session = Session(
+        Hello(protocol=PROTOCOL, scene="flat"), Levels([field]), filters, load_clip, rung=FULL, max_emitters=2
+    )
     assert codes(add(session, "a") + add(session, "b") + add(session, "c")) == ["too_many_emitters"]
 
 
@@ -339,7 +351,9 @@ def test_emitters_are_limited(field, filters):
 )
 def test_a_hello_that_cannot_be_served_is_refused(field, filters, changes, code):
     with pytest.raises(RequestError) as refusal:
-        Session(Hello(**{"protocol": PROTOCOL, "scene": "flat", **changes}), field, filters, load_clip)
+        Session(
+            Hello(**{"protocol": PROTOCOL, "scene": "flat", **changes}), Levels([field]), filters, load_clip, rung=FULL
+        )
     assert refusal.value.code == code
 
 
@@ -351,16 +365,16 @@ def test_a_listener_starts_where_the_scene_says_unless_hello_says_otherwise(fiel
             Pose.from_yaw(HERE, 1.0),
         ),
     ]:
-        session = Session(hello, field, filters, load_clip)
+        session = Session(hello, Levels([field]), filters, load_clip, rung=FULL)
         add(session)
         assert session.take_request().listener == expected
 
 
 def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
-    field.impulse_responses = lambda listeners, *_: np.full((len(listeners), 2, field.ir_samples), np.nan, np.float32)
+    field.impulse_responses = lambda listeners, *_, **__: np.full((len(listeners), 2, field.ir_samples), np.nan, np.float32)
     add(session)
     with pytest.raises(ValueError):
-        compute_irs(field, session.take_request(), session.prepare)
+        compute_irs(Levels([field]), session.take_request(), session.prepare)
 
 
 def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
@@ -368,7 +382,12 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
         @initialize()
         def begin(self):
             self.session = Session(
-                Hello(protocol=PROTOCOL, scene="flat", block_size=128), field, filters, load_clip, window=6
+                Hello(protocol=PROTOCOL, scene="flat", block_size=128),
+                Levels([field]),
+                filters,
+                load_clip,
+                rung=FULL,
+                window=6,
             )
             self.pose_id = self.sequence = 0
             self.request = None
@@ -415,7 +434,7 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
                 return
             request, self.request = self.request, None
             if succeeds:
-                self.session.accept(compute_irs(field, request, self.session.prepare))
+                self.session.accept(compute_irs(Levels([field]), request, self.session.prepare))
             else:
                 self.session.give_up(request)
 
@@ -446,5 +465,5 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
 def test_a_shared_tail_is_the_operators_choice(field, filters):
     hello = Hello(protocol=PROTOCOL, scene="flat")
     for wanted in (False, True):
-        session = Session(hello, field, filters, load_clip, shared_tail=wanted)
+        session = Session(hello, Levels([field]), filters, load_clip, rung=FULL, shared_tail=wanted)
         assert session.renderer._convolver._has_shared_tail is wanted

@@ -11,6 +11,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from server.app import create_app
 from server.blocks import AudioBlock, DryBlock
+from server.field.levels import Levels
 from server.protocol import (
     PROTOCOL,
     Acknowledge,
@@ -45,7 +46,7 @@ def clip_files(tmp_path):
 @pytest.fixture
 def client(field, hrtfs, clip_files):
     settings = Settings(clips=clip_files, hello_timeout_s=0.5, max_streams=2)
-    with TestClient(create_app(settings, fields={"flat": field}, hrtfs=hrtfs)) as client:
+    with TestClient(create_app(settings, scenes={"flat": Levels([field])}, hrtfs=hrtfs)) as client:
         for _ in range(3_600):  # the first time ever, everything is compiled
             if client.get("/readyz").status_code == 200:
                 break

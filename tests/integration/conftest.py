@@ -11,7 +11,7 @@ import uvicorn
 
 from server.app import create_app
 from server.cli import server_options
-from server.field.field import AcousticField
+from server.field.levels import Levels
 from server.settings import Settings
 
 
@@ -19,7 +19,7 @@ from server.settings import Settings
 def served(bundle, hrtfs) -> Iterator[str]:
     """HOST:PORT of a server of the arithmetic scene, ready, with the options of `nafir serve`."""
     settings = Settings(port=0)
-    app = create_app(settings, fields={bundle.id: AcousticField.load(bundle)}, hrtfs=hrtfs)
+    app = create_app(settings, scenes={bundle.id: Levels.load(bundle)}, hrtfs=hrtfs)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
     thread = threading.Thread(target=server.run)
     thread.start()

@@ -13,6 +13,7 @@ from server.bench.listen import listen
 from server.blocks import AudioBlock
 from server.catalogue import describe_scene
 from server.errors import NafirError
+from server.field.levels import Levels
 from server.protocol import AddEmitter, Welcome, parse_client_message
 
 
@@ -47,7 +48,7 @@ class SkippingServer:
 
     async def __call__(self, socket):
         await socket.recv()
-        description = describe_scene(self.field)
+        description = describe_scene(Levels([self.field]))
         welcome = Welcome(
             session="s",
             scene=description,

@@ -15,6 +15,7 @@ from server.catalogue import describe_scene
 from server.clips import ClipLibrary
 from server.direct_sound import DirectSound
 from server.field.field import AcousticField
+from server.field.levels import Levels
 from server.protocol import EmitterAdded, Welcome
 from server.render import RenderedEmitter, read_path, render
 
@@ -86,7 +87,7 @@ def test_a_walk_to_the_wrong_address_says_so_in_one_line(served, tmp_path, url):
 def test_a_walk_whose_server_goes_away_says_so_in_one_line(field, tmp_path):
     welcome = Welcome(
         session="s",
-        scene=describe_scene(field),
+        scene=describe_scene(Levels([field])),
         sample_rate=24_000,
         block_size=256,
         channels=2,

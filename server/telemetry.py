@@ -1,0 +1,168 @@
+"""Counters and durations of a running server, in Prometheus' text format.
+
+Nothing is counted for it: the figures are those that streams keep for their own clients, read when they are asked for.
+"""
+
+import platform
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.metadata import version
+from typing import Protocol
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, InfoMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
+
+from server.audio_engine import AudioEngine
+from server.clips import ClipLibrary
+from server.durations import DurationHistogram
+from server.load import Offer
+from server.stream import Stream
+
+_SHORTEST_S, _LONGEST_S = 3e-5, 10.0
+"""Bounds of what durations are told apart."""
+
+
+class StreamTotals:
+    """What several streams counted and timed, together."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.durations: defaultdict[str, DurationHistogram] = defaultdict(DurationHistogram)
+
+    def add(self, stream: Stream) -> None:
+        session = stream.session
+        self.counts["sent"] += session.window.sent
+        self.counts["late"] += stream.blocks_late
+        self.counts["dropped"] += session.blocks_dropped
+        self.counts["exchanges"] += session.ir_exchanges
+        self.durations["render"].merge(stream.render_times)
+        self.durations["lateness"].merge(stream.latenesses)
+        self.durations["ir"].merge(stream.ir_times)
+        self.durations["pose"].merge(stream.pose_times.durations)
+
+    def merge(self, other: "StreamTotals") -> None:
+        self.counts += other.counts
+        for name, durations in other.durations.items():
+            self.durations[name].merge(durations)
+
+
+class Host(Protocol):
+    """What is asked of a server."""
+
+    @property
+    def audio(self) -> AudioEngine: ...
+
+    @property
+    def clips(self) -> Mapping[str, ClipLibrary]: ...
+
+    @property
+    def offers(self) -> Mapping[str, Offer]: ...
+
+    @property
+    def past(self) -> StreamTotals: ...
+
+    @property
+    def is_ready(self) -> bool: ...
+
+
+class ServerCollector(Collector):
+    """All metrics of a host, as they are when they are collected; on any thread."""
+
+    def __init__(self, host: Host) -> None:
+        self._host = host
+
+    def collect(self) -> Iterator[Metric]:
+        streams = self._host.audio.streams
+        totals = StreamTotals()
+        totals.merge(self._host.past)
+        for stream in streams:
+            totals.add(stream)
+        yield InfoMetricFamily(
+            "nafir_build", "What runs.", value={"version": version("nafir"), "python": platform.python_version()}
+        )
+        yield GaugeMetricFamily("nafir_ready", "1 where streams may be opened.", value=self._host.is_ready)
+        yield from self._streams(streams)
+        yield from self._blocks(totals)
+        yield CounterMetricFamily(
+            "nafir_ir_exchanges", "Blocks that faded to other impulse responses.", value=totals.counts["exchanges"]
+        )
+        yield GaugeMetricFamily(
+            "nafir_ir_requests_waiting",
+            "Streams whose request for impulse responses is unanswered.",
+            value=sum(stream.awaits_irs_since_s is not None for stream in streams),
+        )
+        yield self._level_steps()
+        yield self._level_costs()
+        clips = {name for library in self._host.clips.values() for name in library.names}
+        yield GaugeMetricFamily("nafir_clips", "Recordings an emitter can play.", value=len(clips))
+
+    def _streams(self, streams: Iterable[Stream]) -> Iterator[Metric]:
+        levels = Counter((stream.scene, stream.session.rung.level) for stream in streams)
+        eased = Counter(stream.scene for stream in streams if stream.ladder.is_eased)
+        by_level = GaugeMetricFamily("nafir_streams", "Open streams, by what they hear.", labels=["scene", "level"])
+        for scene, offer in self._host.offers.items():
+            for level in offer.levels:
+                by_level.add_metric([scene, level.name], levels[scene, level.name])
+        yield by_level
+        below = GaugeMetricFamily("nafir_streams_eased", "Streams below the best quality for them.", labels=["scene"])
+        for scene in self._host.offers:
+            below.add_metric([scene], eased[scene])
+        yield below
+
+    def _blocks(self, totals: StreamTotals) -> Iterator[Metric]:
+        yield CounterMetricFamily("nafir_blocks_sent", "Audio blocks sent.", value=totals.counts["sent"])
+        yield CounterMetricFamily("nafir_blocks_late", "Of those sent, later than needed.", value=totals.counts["late"])
+        yield CounterMetricFamily(
+            "nafir_blocks_dropped",
+            "Blocks not sent: too many unacknowledged.",
+            value=totals.counts["dropped"],
+        )
+        yield _histogram("nafir_block_render_seconds", "What a block costs.", totals.durations["render"])
+        yield _histogram(
+            "nafir_block_lateness_seconds",
+            "From when a block is due until it is ready.",
+            totals.durations["lateness"],
+        )
+        yield _histogram(
+            "nafir_ir_seconds", "What one request for impulse responses takes a worker.", totals.durations["ir"]
+        )
+        yield _histogram(
+            "nafir_pose_to_audio_seconds", "From a pose to the first block that follows it.", totals.durations["pose"]
+        )
+
+    def _level_steps(self) -> Metric:
+        steps = CounterMetricFamily(
+            "nafir_level_steps",
+            "Times that a stream was moved to cheaper quality (load), or back to better (recovered).",
+            labels=["reason"],
+        )
+        counted = self._host.audio.steps
+        steps.add_metric(["load"], counted["load"])
+        steps.add_metric(["recovered"], counted["recovered"])
+        return steps
+
+    def _level_costs(self) -> Metric:
+        costs = GaugeMetricFamily(
+            "nafir_level_ir_seconds", "What an impulse response of a level took at start.", labels=["scene", "level"]
+        )
+        for scene, offer in self._host.offers.items():
+            for name, ms in offer.ms_here.items():
+                costs.add_metric([scene, name], ms / 1000)
+        return costs
+
+
+def exposition(collector: Collector) -> bytes:
+    """All of it as text."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(collector)
+    return generate_latest(registry)
+
+
+def _histogram(name: str, documentation: str, durations: DurationHistogram) -> Metric:
+    counts = durations.cumulative()
+    buckets = [(f"{bound_s:.6g}", count) for bound_s, count in counts if _SHORTEST_S < bound_s < _LONGEST_S]
+    return HistogramMetricFamily(
+        name, documentation, buckets=[*buckets, ("+Inf", counts[-1][1])], sum_value=durations.total_s
+    )
