@@ -17,7 +17,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 @compiled
-def _contains(corners: Floats, x: float, y: float) -> bool:
+def contains(corners: Floats, x: float, y: float) -> bool:
     """As FloorPlan.contains, in plan."""
     inside = False
     x0, y0 = corners[-1]
@@ -38,7 +38,7 @@ def _contains(corners: Floats, x: float, y: float) -> bool:
 
 
 @compiled
-def _is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> bool:
+def is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> bool:
     """As FloorPlan.is_visible."""
     ray_x, ray_y = qx - px, qy - py
     x0, y0 = corners[-1]
@@ -52,7 +52,7 @@ def _is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> 
             if p_side * q_side < -TOUCH_M:
                 return False
         x0, y0, start = x1, y1, end
-    return _contains(corners, (px + qx) / 2, (py + qy) / 2)
+    return contains(corners, (px + qx) / 2, (py + qy) / 2)
 
 
 @compiled
@@ -111,7 +111,7 @@ def find_sound_paths(
     for bend in range(count):
         x, y = bends[bend]
         distance = math.hypot(x - listener[0], y - listener[1])
-        if distance >= COINCIDENT_M and _is_visible(corners, listener[0], listener[1], x, y):
+        if distance >= COINCIDENT_M and is_visible(corners, listener[0], listener[1], x, y):
             from_listener[bend] = distance
     for bend in range(count):
         for via in range(count):
@@ -124,7 +124,7 @@ def find_sound_paths(
         rise = emitter[2] - listener[2]
         plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
         straight = math.hypot(plan, rise)
-        seen = count == 0 or _is_visible(corners, listener[0], listener[1], emitter[0], emitter[1])
+        seen = count == 0 or is_visible(corners, listener[0], listener[1], emitter[0], emitter[1])
         around, last = np.inf, -1
         if not seen:
             for bend in range(count):
@@ -133,7 +133,7 @@ def find_sound_paths(
                 if (
                     distance >= COINCIDENT_M
                     and to_bend[bend] + distance < around
-                    and _is_visible(corners, emitter[0], emitter[1], x, y)
+                    and is_visible(corners, emitter[0], emitter[1], x, y)
                 ):
                     around, last = to_bend[bend] + distance, bend
         in_sight[row] = last < 0
