@@ -34,6 +34,19 @@ _FEWEST_BINS = 64
 _LEVEL: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
+def head_axes(quaternion: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """(3, 3) from the world to a head turned by a unit quaternion (x, y, z, w)."""
+    x, y, z, w = (float(part) for part in quaternion)
+    # The transpose of the usual matrix.
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
+            (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
+            (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
+        )
+    )
+
+
 class PathTarget(NamedTuple):
     """The way that an emitter's first sound takes to the listener's head."""
 
@@ -108,11 +121,7 @@ class DirectPath:
 
     def set_orientation(self, quaternion: Sequence[float] | npt.NDArray[np.floating]) -> None:
         """(x, y, z, w), unit: turns the head's axes to where they are in the world. From the next block on."""
-        x, y, z, w = (float(part) for part in quaternion)
-        # The transpose of the usual matrix: from the world to the head.
-        self.state.to_head[0] = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)
-        self.state.to_head[1] = 2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)
-        self.state.to_head[2] = 2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)
+        self.state.to_head[:] = head_axes(quaternion)
 
     def process(self, blocks: FloatArray, out: FloatArray) -> None:
         """Add to `out` (2, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored.

@@ -35,6 +35,11 @@ def no_head(sample_rate: int, taps: int) -> HeadFilters:
 
 
 @pytest.fixture
+def headless():
+    return no_head
+
+
+@pytest.fixture
 def make_path(kemar_at):
     def make(*, head=True, slots=1, block_size=256, sample_rate=48_000, taps=64, air_db_per_m=0.0, **rest):
         filters = kemar_at(sample_rate)[1] if head else no_head(sample_rate, taps)

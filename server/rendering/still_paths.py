@@ -1,0 +1,71 @@
+"""Impulse responses of many paths at rest, heard through one head and added up.
+
+Where `DirectPath` follows motion block by block, this is for paths that are exchanged as a whole: reflections inside
+impulse responses, and single responses.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.minimum_phase import band_cepstra
+from server.rendering.direct_path import NEAR_LIMIT_M, head_axes
+from server.rendering.fractional_delay import sinc_table
+from server.rendering.hrtf import HeadFilters
+from server.rendering.still_paths_kernel import DoubleArray, FloatArray, StillPathTables, add_still_paths
+
+
+@cache
+def _band_cepstra(sample_rate: int, taps: int) -> FloatArray:
+    return band_cepstra(sample_rate, taps).astype(np.float32)
+
+
+@cache
+def _sinc_table() -> FloatArray:
+    return sinc_table()
+
+
+class StillPaths:
+    """A head and the air around it; safe to share between threads. `air_db_per_m` (band,) >= 0."""
+
+    def __init__(self, filters: HeadFilters, *, speed_of_sound: float, air_db_per_m: npt.NDArray[np.floating]) -> None:
+        orders = np.maximum(np.arange(filters.taps), 1)
+        self._tables = StillPathTables(
+            cepstra=filters.cepstra,
+            head_delays_s=filters.delays_s,
+            triangles=filters.triangulation.triangles,
+            across=filters.triangulation.across,
+            inverses=filters.triangulation.inverses,
+            band_cepstra=_band_cepstra(filters.sample_rate, filters.taps),
+            orders=orders.astype(np.float32),
+            reciprocals=(1 / orders).astype(np.float32),
+            sinc=_sinc_table(),
+            air_db_per_m=np.array(air_db_per_m, np.float64).reshape(len(OCTAVE_BANDS_HZ)),
+            sample_rate=float(filters.sample_rate),
+            speed_of_sound=float(speed_of_sound),
+            nearest_m=NEAR_LIMIT_M,
+        )
+
+    def add(
+        self,
+        lengths_m: DoubleArray,
+        arrivals: DoubleArray,
+        band_gains_db: DoubleArray,
+        orientation: Sequence[float],
+        out: FloatArray,
+    ) -> None:
+        """Add to `out` (2, sample), where sample 0 is emission, what a head turned by the quaternion `orientation`
+        hears of paths: lengths (n,), unit vectors (n, 3) in the world towards where they come from, gains (n, band)
+        beside distance and air. What would be heard before sample 0 or after the last is left out."""
+        # One layout of each, so that one version is ever compiled.
+        add_still_paths(
+            self._tables,
+            head_axes(orientation),
+            np.ascontiguousarray(lengths_m, np.float64),
+            np.ascontiguousarray(arrivals, np.float64),
+            np.ascontiguousarray(band_gains_db, np.float64),
+            out,
+        )

@@ -1,0 +1,94 @@
+"""Impulse responses of paths at rest, in compiled code or, without a compiler, in Python and NumPy.
+
+The same steps as in one block of a direct path: delays and minimum-phase filters of head, air and surfaces, and the
+windowed sinc. Letters: n taps, e ears.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from server.compiled import HAS_NUMBA, compiled
+from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
+from server.rendering.sphere import find_triangle
+
+if HAS_NUMBA:
+    import server.rendering.path_loops as loops
+else:
+    import server.rendering.path_loops_numpy as loops  # type: ignore[no-redef]
+
+FloatArray = npt.NDArray[np.float32]
+DoubleArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+class StillPathTables(NamedTuple):
+    """What `add_still_paths` reads."""
+
+    cepstra: FloatArray  # (direction, e, n)
+    head_delays_s: DoubleArray  # (direction, e)
+    triangles: IntArray
+    across: IntArray
+    inverses: DoubleArray
+    band_cepstra: FloatArray  # (band, n) of one decibel
+    orders: FloatArray  # (n,) 1, 1, 2, 3 ...
+    reciprocals: FloatArray  # (n,) of `orders`
+    sinc: FloatArray
+    air_db_per_m: DoubleArray  # (band,) >= 0
+    sample_rate: float
+    speed_of_sound: float
+    nearest_m: float
+
+
+@compiled
+def add_still_paths(
+    tables: StillPathTables,
+    to_head: DoubleArray,
+    lengths_m: DoubleArray,
+    arrivals: DoubleArray,
+    gains_db: DoubleArray,
+    out: FloatArray,
+) -> None:
+    """Add to `out` (e, sample) what paths (path,), (path, 3), (path, band) make of a unit impulse at sample 0."""
+    count, bands = tables.cepstra.shape[2], tables.band_cepstra.shape[0]
+    wide = -(-(count + TAPS - 1) // loops.TILE) * loops.TILE
+    cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)
+    taps, padded = np.zeros((2, count), np.float32), np.zeros(wide + TAPS - 1, np.float32)
+    still_taps, heard = np.zeros(TAPS, np.float32), np.zeros(wide, np.float32)
+    direction, weights = np.zeros(3), np.zeros(3)
+    triangle = 0
+    for path in range(lengths_m.size):
+        length = lengths_m[path]
+        for axis in range(3):
+            direction[axis] = 0.0
+            for world in range(3):
+                direction[axis] += to_head[axis, world] * arrivals[path, world]
+        triangle = find_triangle(tables.across, tables.inverses, direction, triangle, weights)
+        for ear in range(2):
+            of_ear = cepstrum[ear, :count]
+            of_ear[:] = 0
+            for corner in range(3):
+                measured = tables.triangles[triangle, corner]
+                loops.add_scaled(tables.cepstra[measured, ear], weights[corner], of_ear)
+            for band in range(bands):
+                level_db = gains_db[path, band] - tables.air_db_per_m[band] * length
+                loops.add_scaled(tables.band_cepstra[band], level_db, of_ear)
+            of_ear *= tables.orders
+        loops.series_exponential(cepstrum, tables.reciprocals, sums, taps)
+        gain = np.float32(1.0 / max(length, tables.nearest_m))
+        for ear in range(2):
+            delay_s = length / tables.speed_of_sound
+            for corner in range(3):
+                delay_s += weights[corner] * tables.head_delays_s[tables.triangles[triangle, corner], ear]
+            delay = delay_s * tables.sample_rate
+            whole = int(np.ceil(delay))
+            phase = (whole - delay) * PHASES
+            row = min(PHASES - 1, int(phase))
+            loops.interpolate_reversed(tables.sinc[row], phase - row, still_taps)
+            padded[TAPS - 1 : TAPS - 1 + count] = taps[ear]
+            loops.filter_block(padded, still_taps, heard)
+            begin = whole + BEFORE - (TAPS - 1)
+            # Beyond the filter and the sinc, there are zeros only.
+            for i in range(max(0, -begin), min(count + TAPS - 1, out.shape[1] - begin)):
+                out[ear, begin + i] += gain * heard[i]
