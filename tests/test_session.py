@@ -371,7 +371,8 @@ def test_a_listener_starts_where_the_scene_says_unless_hello_says_otherwise(fiel
 
 
 def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
-    field.impulse_responses = lambda listeners, *_, **__: np.full((len(listeners), 2, field.ir_samples), np.nan, np.float32)
+    shape = 1, 2, field.ir_samples
+    field.impulse_responses = lambda *_, **__: np.full(shape, np.nan, np.float32)
     add(session)
     with pytest.raises(ValueError):
         compute_irs(Levels([field]), session.take_request(), session.prepare)
