@@ -93,15 +93,11 @@ def _reflected_power(
     field: AcousticField, listeners: npt.NDArray[np.float64], emitter: Vector3
 ) -> npt.NDArray[np.float64]:
     """(listener,) energy per ear, averaged over ears and head orientations, straight from the predicted magnitudes."""
-    codec = field.bundle.manifest.codec.codec
     yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
     positions, heads = np.repeat(listeners, _YAWS, axis=0), np.tile(yaws, len(listeners))
     power = np.empty(len(heads))
-    # Bins between DC and Nyquist stand for two.
-    weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
     for start in range(0, len(heads), _CHUNK):
         part = slice(start, start + _CHUNK)
         emitters = np.broadcast_to(emitter, positions[part].shape)
-        magnitude = codec.magnitude(field.spectrograms(positions[part], emitters, heads[part]).log_magnitude)
-        power[part] = np.einsum("bcft,f->b", magnitude**2, weight) / 2
+        power[part] = field.energy(positions[part], emitters, heads[part]).mean(axis=-1)
     return np.asarray(power.reshape(-1, _YAWS).mean(axis=1))

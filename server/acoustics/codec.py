@@ -103,9 +103,9 @@ class Codec:
     def integrate(self, instantaneous_frequency: Array) -> Array:
         """Phase from its advances: the inverse of `instantaneous_frequency`, up to whole turns."""
         frames = np.arange(instantaneous_frequency.shape[-1])
+        phase = np.cumsum(instantaneous_frequency, axis=-1, dtype=np.float64) + self.nominal_advance * frames
         # Whole turns are dropped before they can eat the mantissa of a float32.
-        nominal = (self.nominal_advance * frames) % (2 * np.pi)
-        return np.cumsum(instantaneous_frequency, axis=-1) + nominal.astype(instantaneous_frequency.dtype)
+        return (phase % (2 * np.pi)).astype(instantaneous_frequency.dtype)
 
     def synthesise(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.floating]:
         """Complex (..., frequency, frame) to (..., sample), of all frames or of the first few and what they reach.

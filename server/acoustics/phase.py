@@ -12,11 +12,14 @@ count from the moment sound arrives, so their levels are delayed to the time of 
 only the known part moves with the emitter. Responses of neighbouring poses therefore crossfade without combing. The
 noise of the right ear is mixed so that the whole has the predicted complex interaural coherence.
 
+Where magnitudes are all that is trusted, `griffin_lim` finds the phases that fit them best.
+
 Axes: (..., ear, frequency, frame), ear 0 = left; coherence (..., frequency, frame), E[S_left conj(S_right)] over the
 magnitudes.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -28,7 +31,12 @@ Real = npt.NDArray[np.float32]
 Complex = npt.NDArray[np.complex64]
 Number = TypeVar("Number", np.float32, np.complex64)
 
-_UNDECIDED = 1e-6
+UNDECIDED = 1e-6
+"""Noise of two ears below this product of magnitudes, relative to the whole, has whatever coherence."""
+MOST_COHERENT = 1 - 1e-5
+"""Of noise at two ears: nearer to 1, what is left of 1 - coherence**2 would be rounding."""
+NO_PHASE = 1e-30
+"""Square of a magnitude below which the phase is taken as zero."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,13 @@ class FrozenNoise:
         scale = 1 / np.sqrt(codec.window_energy)
         return cls((codec.transform(signal.astype(np.float64)) * scale).astype(np.complex64))
 
+    @cached_property
+    def parts(self) -> Real:
+        """(frequency, 4, frame) left and right, real and imaginary; with silent frames to a multiple of eight."""
+        left, right = self.spectrogram
+        parts = np.stack([left.real, left.imag, right.real, right.imag], axis=1)
+        return np.pad(parts, [(0, 0), (0, 0), (0, -parts.shape[-1] % 8)])
+
 
 def separate(magnitude: Real, known_phase: Real, certainty: Real, coherence: Complex) -> tuple[Complex, Real, Complex]:
     """The known part, and the magnitude and coherence of the noise that makes up the rest.
@@ -54,9 +69,9 @@ def separate(magnitude: Real, known_phase: Real, certainty: Real, coherence: Com
     unknown = np.sqrt(np.maximum(1 - certainty**2, 0))
     # The known parts bring a coherence of their own; the noise makes up the difference.
     rest = coherence[..., :known_frames] - phasors[..., 0, :, :] * np.conj(phasors[..., 1, :, :])
-    share = np.maximum(unknown[..., 0, :, :] * unknown[..., 1, :, :], _UNDECIDED)
+    share = np.maximum(unknown[..., 0, :, :] * unknown[..., 1, :, :], UNDECIDED)
     noise_coherence = np.concatenate([rest / share, coherence[..., known_frames:]], axis=-1)
-    noise_coherence /= np.maximum(np.abs(noise_coherence), 1)
+    noise_coherence *= MOST_COHERENT / np.maximum(np.abs(noise_coherence), 1)
     noise_magnitude = magnitude.copy()
     noise_magnitude[..., :known_frames] *= unknown
     return magnitude[..., :known_frames] * phasors, noise_magnitude, noise_coherence
@@ -87,3 +102,21 @@ def correlated_noise(magnitude: Real, coherence: Complex, noise: FrozenNoise) ->
     spectrogram[..., 1, :, :] = np.conj(coherence) * left + independent * right
     spectrogram *= magnitude
     return spectrogram
+
+
+def zero_phase(magnitude: Real) -> Complex:
+    """(..., frequency, frame) spectrogram whose phase is zero in the middle of each window, where the window lets
+    through what adds up there."""
+    return (magnitude * (-1) ** np.arange(magnitude.shape[-2])[:, None]).astype(np.complex64)
+
+
+def griffin_lim(codec: Codec, magnitude: Real, signal: Real, iterations: int) -> Real:
+    """(..., sample) whose transform has nearly these magnitudes (..., frequency, frame), from a `signal` (..., sample)
+    near it: the transform's phases with the magnitudes asked for, again and again (Griffin and Lim 1984)."""
+    for _ in range(iterations):
+        spectrogram = codec.transform(signal)
+        square = spectrogram.real**2 + spectrogram.imag**2
+        has_phase = square >= NO_PHASE
+        phasors = np.where(has_phase, spectrogram / np.sqrt(np.where(has_phase, square, 1)), 1)
+        signal = codec.synthesise((magnitude * phasors).astype(np.complex64)).astype(np.float32)
+    return signal

@@ -25,14 +25,17 @@ def field(
     poses: Annotated[int, typer.Option(min=1, help="Random poses per round.")] = 20,
     as_json: AsJson = False,
 ) -> None:
-    """Time from a pose to a binaural impulse response, one at a time on one core."""
-    from server.bench.field import measure_field
-    from server.field.field import AcousticField
+    """Time from a pose to a binaural impulse response, one at a time on one core, at every quality level."""
+    from server.bench.field import measure_levels
+    from server.field.levels import Levels
     from server.scene.bundle import Bundle, find_bundle
 
-    acoustic_field = AcousticField.load(Bundle.load(find_bundle(scene)), threads=1)
-    measured = measure_field(acoustic_field, rounds=rounds, poses=poses)
-    _report(as_json, f"One impulse response of scene {acoustic_field.bundle.id}", measured)
+    measured = measure_levels(Levels.load(Bundle.load(find_bundle(scene))), rounds=rounds, poses=poses)
+    if as_json:
+        print_json(measured)
+        return
+    print_rows(f"One impulse response of scene {measured['scene']}, {measured['ir_s']:g} s", measured["levels"])
+    print_rows("Goals", measured["summary"])
 
 
 @app.command()

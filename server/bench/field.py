@@ -1,34 +1,83 @@
-"""What an impulse response costs: from a pose to a binaural IR, one at a time on one core."""
+"""What impulse responses (IRs) cost at each quality level: from a pose to a binaural IR, one at a time on one core."""
 
 import math
 import statistics
 import time
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from server.bench.report import Goal
 from server.field.field import AcousticField
+from server.field.levels import Levels
+
+Floats = npt.NDArray[np.float64]
+
+GOAL = Goal("ms_p50 of the default level", at_least=1.0, is_at_most=True)
+
+_STEP_M = 0.1
 
 
-def measure_field(field: AcousticField, *, rounds: int, poses: int) -> dict[str, Any]:
-    """Wall time of single IRs between random places: the median of the rounds' medians, and p99 of all."""
-    bounds = field.bundle.manifest.bounds
-    rng = np.random.default_rng(0)
-    places = rng.uniform(bounds.minimum, bounds.maximum, (10 * poses, 3))
-    places = places[field.bundle.floor_plan.contains(places)]
-    times_ms: list[list[float]] = []
-    for _ in range(rounds + 1):
-        times_ms.append([])
-        for _ in range(poses):
-            listener, emitter = rng.choice(places, 2)
-            started_s = time.perf_counter()
-            field.impulse_responses([listener], [emitter], [rng.uniform(-math.pi, math.pi)])
-            times_ms[-1].append((time.perf_counter() - started_s) * 1000)
-    measured = times_ms[1:]  # the first round warms up
+def measure_levels(levels: Levels, *, rounds: int, poses: int) -> dict[str, Any]:
+    """Wall time of single IRs, by level: the median of the rounds' medians, and p99 of all; and of these the part that
+    the graph takes, the rest being decoding.
+
+    A listener walks about. Levels take turns from round to round, so that what else the host does meanwhile is alike
+    for all; within a round each has the caches to itself, as it has when it is served.
+    """
+    times_ms: dict[str, list[list[tuple[float, float]]]] = {name: [] for name in levels}
+    for number in range(rounds + 1):
+        walk = _walk(levels, number, poses)
+        for name, field in levels.items():
+            times = [_time(field, *pose) for pose in walk]
+            if number:  # the first round warms up
+                times_ms[name].append(times)
+    default = levels.default
+    summaries = [{"name": name, **_summary(times_ms[name])} for name in levels]
     return {
-        "ir_s": field.ir_samples / field.sample_rate,
+        "scene": levels.bundle.id,
+        "ir_s": default.ir_samples / default.sample_rate,
         "rounds": rounds,
         "poses": poses,
-        "median_ms": statistics.median(statistics.median(times) for times in measured),
-        "p99_ms": float(np.percentile(np.concatenate(measured), 99)),
+        "levels": summaries,
+        "summary": [asdict(GOAL.judge(summaries[0]["ms_p50"]))],
     }
+
+
+def _summary(rounds: list[list[tuple[float, float]]]) -> dict[str, Any]:
+    whole, graph = (np.array([[times[part] for times in one] for one in rounds]) for part in (0, 1))
+    p50, graph_p50 = (statistics.median(np.median(part, axis=1).tolist()) for part in (whole, graph))
+    return {
+        "ms_p50": p50,
+        "ms_p99": float(np.percentile(whole, 99)),
+        "graph_ms_p50": graph_p50,
+        "decode_ms_p50": max(0.0, p50 - graph_p50),
+    }
+
+
+def _time(field: AcousticField, listener: Floats, emitter: Floats, yaw: float) -> tuple[float, float]:
+    """Milliseconds of an IR, and of the graph alone right after it."""
+    started_s = time.perf_counter()
+    field.impulse_responses([listener], [emitter], [yaw], remember=True)
+    done_s = time.perf_counter()
+    field.graph.run([listener], [emitter], [yaw])
+    return (done_s - started_s) * 1000, (time.perf_counter() - done_s) * 1000
+
+
+def _walk(levels: Levels, seed: int, poses: int) -> list[tuple[Floats, Floats, float]]:
+    """A listener's steps from a place to one in its sight, towards an emitter somewhere, and on from another place."""
+    bounds, plan = levels.bundle.manifest.bounds, levels.bundle.floor_plan
+    rng = np.random.default_rng(seed)
+    walk: list[tuple[Floats, Floats, float]] = []
+    while len(walk) < poses:
+        start, end, emitter = rng.uniform(bounds.minimum, bounds.maximum, (3, 3))
+        if not np.all(plan.contains(np.stack([start, end, emitter]))) or not plan.is_visible(start, end):
+            continue
+        steps = math.ceil(np.linalg.norm(end - start) / _STEP_M)
+        walk += [
+            (start + (end - start) * step / steps, emitter, rng.uniform(-math.pi, math.pi))
+            for step in range(min(steps, poses - len(walk)))
+        ]
+    return walk

@@ -56,10 +56,16 @@ class BankField(AcousticField):
             frozen_noise=np.zeros((self.channels, _SAMPLES), np.float32),
         )
         self.level = _MANIFEST.levels[0]
-        self._codec = _CODEC.codec
         self._bank = np.stack([_LEVEL * room(seed, _SAMPLES) for seed in range(_BANK)])
 
-    def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> FloatArray:
+    def impulse_responses(
+        self,
+        listeners: npt.ArrayLike,
+        emitters: npt.ArrayLike,
+        yaws: npt.ArrayLike,
+        *,
+        remember: bool = False,  # noqa: ARG002  there is no phase to look for
+    ) -> FloatArray:
         """As `AcousticField`'s, of poses that lie where they like."""
         places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), np.atleast_1d(yaws)])
         entry = np.floor(places @ np.arange(1, places.shape[1] + 1) * _POSES_PER_M).astype(np.int64)

@@ -3,38 +3,59 @@
 Reflected sound is all that follows the direct sound, which is not in here: it is computed from geometry
 (`server.whole_field` adds it).
 
-Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians, seconds.
+Axes: B poses; responses (B, ear, sample). Metres, radians, seconds.
 """
 
 import numpy as np
 import numpy.typing as npt
+from scipy.fft import irfft, next_fast_len, rfft
 
-from server.acoustics.phase import FrozenNoise, correlated_noise, delayed, separate
+from server.acoustics.phase import FrozenNoise
+from server.acoustics.sound_path import SoundPathFinder
 from server.errors import BundleError
-from server.field.graph import FieldGraph, Spectrograms, open_graph
+from server.field.decoder import Decoder, add_from, apply_gate, onset_gate, resized
+from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
+from server.field.phase_cache import PhaseCache
 from server.scene.bundle import Bundle
-from server.scene.manifest import QualityLevel
+from server.scene.manifest import Phase, QualityLevel
 
 Float32 = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
 
-_RISE_S = 0.0003
 _CHUNK = 32
 
 
 class AcousticField:
-    """One scene's field at one quality level. Thread-safe: every call works on its own arrays."""
+    """One scene's field at one quality level. Thread-safe: every call works on its own arrays.
+
+    `noise` is that of the graph's codec, where somebody has it already.
+    """
 
     channels = 2
 
-    def __init__(self, bundle: Bundle, level: QualityLevel, graph: FieldGraph) -> None:
+    def __init__(
+        self, bundle: Bundle, level: QualityLevel, graph: FieldGraph, noise: FrozenNoise | None = None
+    ) -> None:
         self.bundle = bundle
         self.level = level
-        self._graph = graph
-        parameters = graph.parameters
-        self._codec = parameters.codec
-        self._lead = parameters.lead_samples
-        self._noise = FrozenNoise.from_signal(self._codec, bundle.frozen_noise)
-        self._gate = self._onset_gate()
+        self.graph = graph
+        self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+        self._gate = onset_gate(graph.parameters)
+        self._decoder: Decoder | None = None
+        if graph.gives_responses:
+            if level.frames is not None or level.phase != Phase():
+                raise BundleError(
+                    graph.path, RESPONSE, f"needs no decoding: take phase and frames from levels.{level.name}"
+                )
+        else:
+            self._decoder = Decoder(
+                graph.parameters,
+                noise or frozen_noise(bundle, graph),
+                ir_samples=self.ir_samples,
+                phase=level.phase,
+                frames=level.frames,
+            )
+        self._cache = PhaseCache() if level.phase.warm else None
 
     @classmethod
     def load(cls, bundle: Bundle, *, level: str | None = None, threads: int = 1) -> "AcousticField":
@@ -49,73 +70,82 @@ class AcousticField:
 
     @property
     def sample_rate(self) -> int:
-        return self._codec.sample_rate
+        return self.bundle.manifest.codec.sample_rate
 
     @property
     def ir_samples(self) -> int:
-        return self._codec.samples
+        return self.bundle.manifest.codec.samples
 
-    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
-        """Network outputs for B poses; positions (B, 3), yaws (B,)."""
-        return self._graph.spectrograms(listeners, emitters, yaws)
-
-    def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
+    def impulse_responses(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike, *, remember: bool = False
+    ) -> Float32:
         """(B, 2, ir_samples) without the direct sound; sample 0 is the moment of emission, unit pressure at one
-        metre."""
+        metre.
+
+        The same for the same poses, always; but with `remember` a level whose phase is warm starts from the phase that
+        it last found near a pose, and leaves its own to the next: for streams, which go from each pose to one near it.
+        """
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
+        cache = self._cache if remember else None
         for start in range(0, len(yaws), _CHUNK):
             part = slice(start, start + _CHUNK)
-            responses[part] = self._decode(listeners[part], emitters[part], yaws[part])
+            responses[part] = self._compute(listeners[part], emitters[part], yaws[part], cache)
         return responses
 
-    def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+        """What is decoded to responses, of a field that gives spectrograms; positions (B, 3), yaws (B,)."""
+        return self.graph.spectrograms(listeners, emitters, yaws)
+
+    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:
+        """(B, 2) sum of the squared samples at each ear, as predicted: without decoding where there is something to
+        decode."""
+        if self.graph.gives_responses:
+            aligned = self.graph.impulse_responses(listeners, emitters, yaws)
+            return np.asarray(np.sum(aligned.astype(np.float64) ** 2, axis=-1))
+        codec = self.graph.parameters.codec
+        # Bins between DC and Nyquist stand for two.
+        weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
+        magnitude = codec.magnitude(self.graph.spectrograms(listeners, emitters, yaws).log_magnitude)
+        return np.asarray(np.einsum("bcft,f->bc", magnitude[..., : self.level.frames] ** 2, weight))
+
+    def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
         """(B,) time at which sound can first arrive, round corners where it must."""
-        length = self.bundle.floor_plan.path_length_m(np.asarray(emitters), np.asarray(listeners))
-        return np.asarray(length / self.bundle.manifest.speed_of_sound)
+        pairs = zip(np.asarray(listeners), np.asarray(emitters)[:, None], strict=True)
+        length_m = np.concatenate([self._paths.find(*pair).length_m for pair in pairs])
+        return np.asarray(length_m / self.bundle.manifest.speed_of_sound)
 
-    def _decode(
-        self, listeners: npt.NDArray[np.float64], emitters: npt.NDArray[np.float64], yaws: npt.NDArray[np.float64]
-    ) -> Float32:
-        predicted = self.spectrograms(listeners, emitters, yaws)
-        codec = self._codec
-        aligned_s = self.onset_s(listeners, emitters) * self.sample_rate - self._lead
-        start = np.floor(aligned_s).astype(int)
-        known, magnitude, coherence = separate(
-            codec.magnitude(predicted.log_magnitude),
-            codec.integrate(predicted.instantaneous_frequency),
-            predicted.certainty,
-            predicted.coherence,
-        )
-        frames = aligned_s / codec.hop
-        responses = codec.synthesise(
-            correlated_noise(delayed(magnitude, frames), delayed(coherence, frames), self._noise)
-        )
-        shift = np.exp(-2j * np.pi * np.arange(codec.bins) / codec.n_fft * (aligned_s - start)[:, None])
-        early = codec.synthesise(known * shift[:, None, :, None].astype(np.complex64))
-        for response, part, at in zip(responses, early, start, strict=True):
-            _add(part, response, at)
-            _apply(self._gate, response, at)
-        return responses.astype(np.float32, copy=False)
+    def _compute(self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None) -> Float32:
+        parameters = self.graph.parameters
+        aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
+        if self._decoder is None:
+            return self._placed(self.graph.impulse_responses(listeners, emitters, yaws), aligned)
+        predicted = self.graph.spectrograms(listeners, emitters, yaws)
+        if cache is None:
+            return self._decoder.decode(predicted, aligned)
+        responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
+        # One after the other: each may start from the one before it.
+        for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
+            rows = slice(row, row + 1)
+            responses[rows] = self._decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
+            cache.keep(*pose, responses[row])
+        return responses
 
-    def _onset_gate(self) -> Float32:
-        """Silence until the direct sound passes the head, for windows smear energy to where it cannot be. What reaches
-        the nearer ear sooner is the direct sound alone."""
-        rise = round(_RISE_S * self.sample_rate)
-        opens = np.sin(np.pi / 2 * (np.arange(rise) + 0.5) / rise)
-        return np.concatenate([np.zeros(self._lead), opens]).astype(np.float32)
+    def _placed(self, coded: Float32, aligned: Floats) -> Float32:
+        """Responses whose first sample belongs at `aligned`: later by whole samples and a fraction of one."""
+        start = np.floor(aligned).astype(int)
+        size = next_fast_len(coded.shape[-1] + 1, real=True)
+        turns = -2j * np.pi * np.arange(size // 2 + 1) / size * (aligned - start)[:, None, None]
+        shifted = irfft(rfft(coded, size) * np.exp(turns).astype(np.complex64), size)[..., : coded.shape[-1]]
+        responses = np.zeros((len(coded), 2, self.ir_samples), dtype=np.float32)
+        for response, part, at in zip(responses, shifted, start, strict=True):
+            add_from(part, response, at)
+            apply_gate(self._gate, response, at)
+        return responses
 
 
-def _add(part: Float32, response: Float32, at: int) -> None:
-    """Adds (ear, sample) `part` to the response from sample `at` on, as far as both reach."""
-    first, last = max(0, at), min(response.shape[-1], at + part.shape[-1])
-    if last > first:
-        response[:, first:last] += part[:, first - at : last - at]
-
-
-def _apply(gate: Float32, response: Float32, at: int) -> None:
-    """Multiplies the response by a gate that begins at sample `at`, silent before it."""
-    response[:, : max(0, at)] = 0
-    first, last = max(0, at), min(response.shape[-1], at + len(gate))
-    if last > first:
-        response[:, first:last] *= gate[first - at : last - at]
+def frozen_noise(bundle: Bundle, graph: FieldGraph) -> FrozenNoise:
+    """The scene's noise as the graph's codec transforms it; silent where the codec's responses are longer than the
+    scene's, of which nothing is heard."""
+    codec = graph.parameters.codec
+    return FrozenNoise.from_signal(codec, resized(bundle.frozen_noise, codec.samples))

@@ -8,7 +8,6 @@ Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sampl
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +45,14 @@ class Spectrograms:
         """(B, frequency, frame)"""
         return np.asarray(self.interaural[:, 0] + 1j * self.interaural[:, 1], dtype=np.complex64)
 
+    def __getitem__(self, rows: slice) -> "Spectrograms":
+        return Spectrograms(
+            self.log_magnitude[rows],
+            self.instantaneous_frequency[rows],
+            self.certainty[rows],
+            self.interaural[rows],
+        )
+
 
 def open_graph(bundle: Bundle, file: str, *, threads: int = 1) -> InferenceSession:
     """A session for one of the bundle's files. Raises BundleError for one that is no graph."""
@@ -69,45 +76,44 @@ class FieldGraph:
         self.parameters: CodecParameters = entry.codec or bundle.manifest.codec
         self._session = session
         self._path = bundle.folder / entry.file
+        outputs = {output.name: output.type for output in session.get_outputs()}
+        self.gives_responses = RESPONSE in outputs
+        """Impulse responses and not spectrograms."""
+        self._outputs = (RESPONSE,) if self.gives_responses else OUTPUTS
         inputs = {given.name: given.shape[1:] for given in session.get_inputs()}
         if inputs != INPUTS:
             raise BundleError(self._path, "inputs", f"are {inputs}, expected {INPUTS} after the batch axis")
-        outputs = {output.name: output.type for output in session.get_outputs()}
-        expected = (RESPONSE,) if self.gives_responses else OUTPUTS
-        if any(outputs.get(output) != _TENSOR for output in expected):
+        if any(outputs.get(output) != _TENSOR for output in self._outputs):
             raise BundleError(
                 self._path, "outputs", f"are {outputs}, expected {_TENSOR} {OUTPUTS}, or {RESPONSE} alone"
             )
         self._check_outputs(bundle)
 
-    @cached_property
-    def gives_responses(self) -> bool:
-        """Impulse responses and not spectrograms."""
-        return RESPONSE in {output.name for output in self._session.get_outputs()}
-
     @property
     def path(self) -> Path:
         return self._path
 
+    def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> list[Float32]:
+        """The outputs, OUTPUTS or RESPONSE alone, for B poses; positions (B, 3), yaws (B,)."""
+        return list(self._session.run(self._outputs, _feed(listeners, emitters, yaws)))
+
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
-        """Of B poses; positions (B, 3), yaws (B,). Not of a graph that gives responses."""
-        return Spectrograms(*self._session.run(OUTPUTS, _feed(listeners, emitters, yaws)))
+        """Not of a graph that gives responses."""
+        return Spectrograms(*self.run(listeners, emitters, yaws))
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
         """(B, 2, samples), aligned. Only of a graph that gives responses."""
-        (responses,) = self._session.run((RESPONSE,), _feed(listeners, emitters, yaws))
-        return np.asarray(responses)
+        return self.run(listeners, emitters, yaws)[0]
 
     def _check_outputs(self, bundle: Bundle) -> None:
         """Runs the graph once, in the middle of the bounds."""
         bounds = bundle.manifest.bounds
         middle = (np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2
-        expected = self._shapes
         try:
-            found = self._session.run(tuple(expected), _feed(middle, middle, np.zeros(1)))
+            found = self.run(middle, middle, np.zeros(1))
         except SESSION_ERRORS as exc:
             raise BundleError(self._path, "outputs", f"cannot be computed: {exc}") from exc
-        for (output, shape), values in zip(expected.items(), found, strict=True):
+        for (output, shape), values in zip(self._shapes.items(), found, strict=True):
             if values.shape != shape or not np.isfinite(values).all():
                 raise BundleError(self._path, output, f"has shape {values.shape}, expected {shape} and finite")
 

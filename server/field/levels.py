@@ -6,11 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from server.acoustics.phase import FrozenNoise
 from server.errors import RequestError
-from server.field.field import AcousticField
+from server.field.field import AcousticField, frozen_noise
 from server.field.graph import FieldGraph, open_graph
 from server.field.runtime import InferenceSession
 from server.scene.bundle import Bundle
+from server.scene.manifest import CodecParameters
 
 _CALIBRATION_POSES = 5
 
@@ -32,7 +34,14 @@ class Levels(Mapping[str, AcousticField]):
             if file not in sessions:
                 sessions[file] = open_graph(bundle, file, threads=threads)
             graphs[name] = FieldGraph(bundle, name, sessions[file])
-        return cls([AcousticField(bundle, level, graphs[level.field]) for level in bundle.manifest.levels])
+        noises: dict[CodecParameters, FrozenNoise] = {}
+        fields = []
+        for level in bundle.manifest.levels:
+            graph = graphs[level.field]
+            if graph.parameters not in noises:
+                noises[graph.parameters] = frozen_noise(bundle, graph)
+            fields.append(AcousticField(bundle, level, graph, noises[graph.parameters]))
+        return cls(fields)
 
     def __getitem__(self, name: str) -> AcousticField:
         return self._fields[name]
@@ -62,14 +71,7 @@ class Levels(Mapping[str, AcousticField]):
 
     def choose(self, name: str | None) -> AcousticField:
         """The level a client named, or the default. Raises RequestError `unknown_level` with the names there are."""
-        if name is None:
-            return self.default
-        try:
-            return self[name]
-        except KeyError:
-            known = ", ".join(self)
-            problem = f"scene {self.bundle.id} has no quality level {name!r}, but {known}"
-            raise RequestError("unknown_level", problem, field="level") from None
+        return self.default if name is None else self[require_level(self.bundle, name)]
 
     def calibrate(self, poses: int = _CALIBRATION_POSES) -> dict[str, float]:
         """What an impulse response takes here and now, by level: the median of `poses`, milliseconds.
@@ -90,3 +92,12 @@ class Levels(Mapping[str, AcousticField]):
         """Between the two places a visitor starts from, along a line."""
         start = self.bundle.manifest.start
         return [tuple(place) for place in np.linspace(start.listener, start.emitter, count)]
+
+
+def require_level(bundle: Bundle, name: str) -> str:
+    """The name, if the bundle has such a quality level. Raises RequestError `unknown_level` with those there are."""
+    names = [level.name for level in bundle.manifest.levels]
+    if name not in names:
+        problem = f"scene {bundle.id} has no quality level {name!r}, only {', '.join(names)}"
+        raise RequestError("unknown_level", problem, field="level")
+    return name

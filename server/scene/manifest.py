@@ -150,8 +150,9 @@ class Cost(Strict):
 class QualityLevel(Strict):
     """A point on the accuracy-cost frontier; `accuracy` and `cost` are absent until they were measured.
 
-    Of the response only the first `frames` are computed, or all; an emitter gets `ir_rate_hz` responses per second at
-    most, or one with every pose; with `shared_tail` all emitters of a listener share one late tail.
+    Of the response all is computed, or only the first `frames`, and the rest is silent; an emitter gets `ir_rate_hz`
+    responses per second at most, or one with every pose; with `shared_tail` all emitters of a listener share one late
+    tail.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
@@ -194,9 +195,16 @@ class Manifest(Strict):
         for name, field in self.fields.items():
             if field.file not in self.files:
                 raise ValueError(f"fields.{name}.file: {field.file} is not listed in files")
+            if field.codec is not None and field.codec.sample_rate != self.codec.sample_rate:
+                raise ValueError(f"fields.{name}.codec.sample_rate: must be the scene's, {self.codec.sample_rate}")
         for level in self.levels:
             if level.field not in self.fields:
                 raise ValueError(f"levels.{level.name}.field: there is no field {level.field}")
+            codec = (self.fields[level.field].codec or self.codec).codec
+            if level.frames is not None and level.frames > codec.frames:
+                raise ValueError(f"levels.{level.name}.frames: the field has {codec.frames}")
+        if len({level.name for level in self.levels}) < len(self.levels):
+            raise ValueError("levels: two have the same name")
         if ARRAYS_FILE not in self.files:
             raise ValueError(f"files: {ARRAYS_FILE} is not listed")
         return self

@@ -61,7 +61,7 @@ def test_ears_have_the_coherence_asked_for(noise: FrozenNoise, coherence: comple
 def test_impossible_coherence_is_limited(noise: FrozenNoise) -> None:
     nothing = np.zeros((2, CODEC.bins, 0), dtype=np.float32)
     left, right = _composed(np.ones((2, *SHAPE), np.float32), nothing, nothing, _flat(3.0), noise)
-    assert_allclose(left, right, atol=1e-3)
+    assert_allclose(left, right, atol=3e-2)
 
 
 def test_smooth_magnitudes_survive_the_time_domain(noise: FrozenNoise) -> None:

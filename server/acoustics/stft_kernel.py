@@ -1,0 +1,184 @@
+"""Short-time Fourier transforms of both ears for compiled code, eight frames at a time.
+
+The two ears are the real and the imaginary part of one complex transform. `frames` is workspace at an address, float32:
+(2, n_fft, 8), real and imaginary parts of n_fft bins or samples of eight neighbouring frames. `total` (2, length) holds
+each ear's signal in the way of overlap-add: frame t spans the samples from t * hop on. Four frames overlap.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.codec import Codec
+from server.acoustics.lane_fft import order, transform_lanes, twiddles
+from server.acoustics.phase import NO_PHASE
+from server.acoustics.simd import (
+    LANES,
+    add,
+    at_least,
+    broadcast,
+    choose_below,
+    divide,
+    load,
+    multiply,
+    multiply_add,
+    square_root,
+    store,
+    subtract,
+    transpose,
+)
+from server.compiled import compiled
+
+Float32 = npt.NDArray[np.float32]
+
+
+class Windows(NamedTuple):
+    """Constants of one codec: `analysis` and `synthesis` (n_fft,), the latter with the inverse's 1 / n_fft; `passes`
+    and `places` of the transform, the latter where each bin or sample lies after it."""
+
+    n_fft: int
+    analysis: Float32
+    synthesis: Float32
+    passes: Float32
+    places: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, codec: Codec) -> "Windows":
+        return cls(
+            codec.n_fft,
+            codec.window.astype(np.float32),
+            (codec.dual_window / codec.n_fft).astype(np.float32),
+            twiddles(codec.n_fft),
+            np.argsort(order(codec.n_fft)),
+        )
+
+
+@compiled
+def place_bin(frames: int, n_fft: int, bin_: int, left_re, left_im, right_re, right_im) -> None:
+    """Of eight frames, as `synthesise` takes it."""
+    # The sum left + i right, with parts exchanged for the inverse transform; negative frequencies are conjugate.
+    size = LANES * n_fft
+    at = LANES * bin_
+    if bin_ == 0 or 2 * bin_ == n_fft:
+        store(frames, at, right_re)
+        store(frames, size + at, left_re)
+        return
+    mirrored = size - at
+    store(frames, at, add(left_im, right_re))
+    store(frames, size + at, subtract(left_re, right_im))
+    store(frames, mirrored, subtract(right_re, left_im))
+    store(frames, size + mirrored, add(left_re, right_im))
+
+
+@compiled
+def synthesise(frames: int, windows: Windows, total: Float32, first: int) -> None:
+    """Add eight frames, from frame `first` on, to `total`; what was placed in `frames` is lost."""
+    n_fft = windows.n_fft
+    hop, size = n_fft // 4, LANES * n_fft
+    transform_lanes(frames, n_fft, windows.passes.ctypes.data)
+    window = windows.synthesis.ctypes.data
+    places = windows.places
+    for ear in range(2):
+        part = size * (1 - ear)
+        signal = total[ear].ctypes.data
+        for n in range(0, n_fft, LANES):
+            samples = transpose(
+                (
+                    load(frames, part + LANES * places[n]),
+                    load(frames, part + LANES * places[n + 1]),
+                    load(frames, part + LANES * places[n + 2]),
+                    load(frames, part + LANES * places[n + 3]),
+                    load(frames, part + LANES * places[n + 4]),
+                    load(frames, part + LANES * places[n + 5]),
+                    load(frames, part + LANES * places[n + 6]),
+                    load(frames, part + LANES * places[n + 7]),
+                )
+            )
+            weight = load(window, n)
+            at = first * hop + n
+            store(signal, at, multiply_add(samples[0], weight, load(signal, at)))
+            at += hop
+            store(signal, at, multiply_add(samples[1], weight, load(signal, at)))
+            at += hop
+            store(signal, at, multiply_add(samples[2], weight, load(signal, at)))
+            at += hop
+            store(signal, at, multiply_add(samples[3], weight, load(signal, at)))
+            at += hop
+            store(signal, at, multiply_add(samples[4], weight, load(signal, at)))
+            at += hop
+            store(signal, at, multiply_add(samples[5], weight, load(signal, at)))
+            at += hop
+            store(signal, at, multiply_add(samples[6], weight, load(signal, at)))
+            at += hop
+            store(signal, at, multiply_add(samples[7], weight, load(signal, at)))
+
+
+@compiled
+def analyse(frames: int, windows: Windows, total: Float32, first: int) -> None:
+    """Transform eight frames of `total`, from frame `first` on; bin k of left + i right is at place k."""
+    n_fft = windows.n_fft
+    hop, size = n_fft // 4, LANES * n_fft
+    window = windows.analysis.ctypes.data
+    for ear in range(2):
+        signal = total[ear].ctypes.data
+        for n in range(0, n_fft, LANES):
+            weight = load(window, n)
+            at = first * hop + n
+            samples = transpose(
+                (
+                    multiply(load(signal, at), weight),
+                    multiply(load(signal, at + hop), weight),
+                    multiply(load(signal, at + 2 * hop), weight),
+                    multiply(load(signal, at + 3 * hop), weight),
+                    multiply(load(signal, at + 4 * hop), weight),
+                    multiply(load(signal, at + 5 * hop), weight),
+                    multiply(load(signal, at + 6 * hop), weight),
+                    multiply(load(signal, at + 7 * hop), weight),
+                )
+            )
+            to = ear * size + LANES * n
+            store(frames, to, samples[0])
+            store(frames, to + 8, samples[1])
+            store(frames, to + 16, samples[2])
+            store(frames, to + 24, samples[3])
+            store(frames, to + 32, samples[4])
+            store(frames, to + 40, samples[5])
+            store(frames, to + 48, samples[6])
+            store(frames, to + 56, samples[7])
+    transform_lanes(frames, n_fft, windows.passes.ctypes.data)
+
+
+@compiled
+def _with_magnitude(re, im, magnitude):
+    """That magnitude with the phase of re + i im."""
+    square = multiply_add(re, re, multiply(im, im))
+    tiny = broadcast(np.float32(NO_PHASE))
+    scale = divide(magnitude, square_root(at_least(square, tiny)))
+    return (
+        choose_below(square, tiny, magnitude, multiply(re, scale)),
+        choose_below(square, tiny, broadcast(np.float32(0.0)), multiply(im, scale)),
+    )
+
+
+@compiled
+def impose_magnitudes(analysed: int, placed: int, windows: Windows, target: Float32, first: int) -> None:
+    """Of eight frames, from `first` on: the phases of `analysed`, the magnitudes of `target` (bin, ear, frame)."""
+    n_fft = windows.n_fft
+    size = LANES * n_fft
+    places = windows.places
+    half = broadcast(np.float32(0.5))
+    for bin_ in range(n_fft // 2 + 1):
+        at, mirrored = LANES * places[bin_], LANES * places[(n_fft - bin_) % n_fft]
+        re, im = load(analysed, at), load(analysed, size + at)
+        mirrored_re, mirrored_im = load(analysed, mirrored), load(analysed, size + mirrored)
+        magnitude = target[bin_].ctypes.data
+        left_re, left_im = _with_magnitude(
+            multiply(add(re, mirrored_re), half), multiply(subtract(im, mirrored_im), half), load(magnitude, first)
+        )
+        right_re, right_im = _with_magnitude(
+            multiply(add(im, mirrored_im), half),
+            multiply(subtract(mirrored_re, re), half),
+            load(magnitude, target.shape[2] + first),
+        )
+        place_bin(placed, n_fft, bin_, left_re, left_im, right_re, right_im)

@@ -1,0 +1,70 @@
+"""Responses found lately, for the phases of the next ones near them.
+
+Metres, radians.
+"""
+
+import math
+import threading
+from collections import OrderedDict
+
+import numpy as np
+import numpy.typing as npt
+
+Float32 = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+CELL_M = 0.05
+"""One response is kept of all poses that agree so closely, the newest."""
+RADIUS_M = 0.5
+"""Within it poses are near: the lengths of the listener's way, the emitter's, and an ear's as the head turns, squared
+and added up."""
+CAPACITY = 64
+
+_EAR_M = 0.0875
+_NOWHERE = math.inf
+
+
+class PhaseCache:
+    """The last `capacity` responses by pose; safe to share between threads. The one unused for longest makes room."""
+
+    def __init__(self, capacity: int = CAPACITY) -> None:
+        self._lock = threading.Lock()
+        self._places: OrderedDict[tuple[int, ...], int] = OrderedDict()
+        self._poses = np.full((capacity, 8), _NOWHERE)
+        self._responses: list[Float32 | None] = [None] * capacity
+
+    def nearest(self, listener: Floats, emitter: Floats, yaw: float) -> Float32 | None:
+        """Of the responses within RADIUS_M, the nearest pose's; not to be written to."""
+        pose = _pose(listener, emitter, yaw)
+        with self._lock:
+            distance = np.linalg.norm(self._poses - pose, axis=-1)
+            place = int(np.argmin(distance))
+            if not distance[place] <= RADIUS_M:
+                return None
+            self._places.move_to_end(_cell(self._poses[place]))
+            return self._responses[place]
+
+    def keep(self, listener: Floats, emitter: Floats, yaw: float, response: Float32) -> None:
+        """Copies the response."""
+        pose, own = _pose(listener, emitter, yaw), response.copy()
+        cell = _cell(pose)
+        with self._lock:
+            if cell in self._places:
+                place = self._places[cell]
+            elif len(self._places) < len(self._responses):
+                place = len(self._places)
+            else:
+                _, place = self._places.popitem(last=False)
+            self._places[cell] = place
+            self._places.move_to_end(cell)
+            self._poses[place] = pose
+            self._responses[place] = own
+
+
+def _pose(listener: Floats, emitter: Floats, yaw: float) -> Floats:
+    """(8,) metres: two poses are as far apart as these, and headings as an ear on a head's circle."""
+    return np.array([*listener, *emitter, _EAR_M * math.cos(yaw), _EAR_M * math.sin(yaw)])
+
+
+def _cell(pose: Floats) -> tuple[int, ...]:
+    return tuple(np.floor(pose / CELL_M).astype(int).tolist())
