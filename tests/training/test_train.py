@@ -1,17 +1,27 @@
 import csv
 import dataclasses
 import json
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
 import torch
 from rich.progress import Progress
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from training import train as train_module
+from training.learning.factorised import FactorisedLearner, RecipeError
+from training.learning.naf import NafLearner
+from training.learning.pairs import split
+from training.learning.precision import bfloat16_gains
 from training.models.cells import Cells
+from training.models.naf import NafShape
 from training.models.targets import codec_of, load_targets
 from training.responses import SimulatedResponses
-from training.runs import Configuration, RunError, dataset_folder
-from training.train import load_learner, train
+from training.runs import Configuration, FactorisedRecipe, NafRecipe, RunError, configure, dataset_folder
+from training.train import DivergedError, load_learner, train
 
 
 class Impatient(Progress):
@@ -131,3 +141,167 @@ def test_targets_are_of_the_codec_of_the_data(dataset):
     codec = codec_of(dataset)
     assert (codec.sample_rate, codec.samples) == (dataset.sample_rate, dataset.samples)
     assert Cells(codec).fine_frames < codec.frames
+
+
+@pytest.fixture
+def naf_configuration():
+    return Configuration.naf(
+        NafShape(width=16, grid_features=4, grid_spacing_m=1.0), NafRecipe(points=30), epochs=3, batch=4
+    )
+
+
+def test_a_run_interrupted_within_an_epoch_goes_on_to_the_same_field(dataset, naf_configuration, tmp_path, monkeypatch):
+    responses = SimulatedResponses(dataset)
+    train(responses, tmp_path / "whole", naf_configuration, Progress(disable=True))
+    # A checkpoint after every step; steps are counted by what they read.
+    monkeypatch.setattr(train_module, "_CHECKPOINT_S", 0.0)
+    losses_of, calls = NafLearner.losses, []
+
+    def impatient(self, *given):
+        calls.append(0)
+        if len(calls) == 20:
+            raise KeyboardInterrupt
+        return losses_of(self, *given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(NafLearner, "losses", impatient)
+        with pytest.raises(KeyboardInterrupt):
+            train(responses, tmp_path / "pieces", naf_configuration, Progress(disable=True))
+    reached = torch.load(tmp_path / "pieces" / "checkpoint.pt", weights_only=True)
+    assert reached["epochs"] % 1 > 0
+    train(responses, tmp_path / "pieces", naf_configuration, Progress(disable=True))
+    whole, pieces = (load_learner(responses, tmp_path / name).field.state_dict() for name in ("whole", "pieces"))
+    for name, values in whole.items():
+        assert torch.equal(pieces[name], values), name
+    assert losses(tmp_path / "pieces", "training") == losses(tmp_path / "whole", "training")
+
+
+@pytest.mark.parametrize("field", ["naf", "naf-dual", "naf-no-grid", "naf-time-domain"])
+def test_every_variant_of_the_papers_network_learns(dataset, field, tmp_path):
+    usual = configure(field, seed=1, epochs=15, batch=4, points=60, learning_rate=3e-3)
+    small = dataclasses.replace(usual, shape=dataclasses.replace(usual.shape, width=32, grid_features=4))
+    train(SimulatedResponses(dataset), tmp_path, small, Progress(disable=True))
+    assert Configuration.read(tmp_path) == small
+    assert small.name == field
+    training = losses(tmp_path, "training")
+    assert np.mean(training[-3:]) < 0.9 * training[0]
+
+
+def test_minutes_end_a_run_and_count_over_its_pieces(dataset, configuration, tmp_path):
+    responses = SimulatedResponses(dataset)
+    timed = dataclasses.replace(configuration, minutes=1.5 / 60)
+    with pytest.raises(KeyboardInterrupt):
+        train(responses, tmp_path, timed, Impatient(12))
+    with pytest.raises(RunError, match=r"of 0\.025 minutes"):
+        load_learner(responses, tmp_path)
+    train(responses, tmp_path, timed, Progress(disable=True))
+    seconds = losses(tmp_path, "seconds")
+    assert len(seconds) == 20
+    np.testing.assert_allclose(seconds[:-1], 1.5 * np.arange(1, 20) / 20, atol=0.3)
+    assert 1.5 <= seconds[-1] < 2.5
+
+
+def test_without_progress_on_what_is_held_back_a_run_stops_and_keeps_the_best(dataset, configuration, tmp_path):
+    # With such a rate it only gets worse.
+    hasty = dataclasses.replace(configuration, epochs=60, patience=3, learning_rate=0.05)
+    train(SimulatedResponses(dataset), tmp_path, hasty, Progress(disable=True))
+    sums = np.sum([losses(tmp_path, name) for name in ("fine", "late", "phasor", "interaural")], axis=0)
+    assert len(sums) < 60
+    assert np.argmin(sums) == len(sums) - 4
+    learner = trained(dataset, tmp_path)
+    learner.prepare(tmp_path, Progress(disable=True))
+    _, held_back = split(learner.responses, share=1.0, seed=hasty.seed)
+    inputs, targets = learner.batch(held_back, None)
+    with torch.no_grad():
+        found = sum(float(part) for part in learner.losses(learner.field(*inputs), targets).values())
+    assert found == pytest.approx(sums.min(), rel=1e-3)
+
+
+@pytest.mark.parametrize("broken", ["loss", "gradient"])
+def test_a_run_that_diverges_says_so_and_keeps_its_checkpoint(dataset, configuration, tmp_path, monkeypatch, broken):
+    losses_of, calls = FactorisedLearner.losses, []
+
+    def diverging(self, prediction, targets):
+        calls.append(0)
+        parts = losses_of(self, prediction, targets)
+        if len(calls) > 40 and torch.is_grad_enabled():
+            # Square roots are finite at zero, their derivatives are not.
+            zero = prediction.sum() * 0
+            parts["broken"] = zero + float("nan") if broken == "loss" else torch.sqrt(zero)
+        return parts
+
+    monkeypatch.setattr(FactorisedLearner, "losses", diverging)
+    with pytest.raises(DivergedError, match="lower learning rate"):
+        train(SimulatedResponses(dataset), tmp_path, configuration, Progress(disable=True))
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert state["epochs"] >= 1
+    assert all(torch.isfinite(values).all() for values in state["field"].values())
+    assert all(np.isfinite(losses(tmp_path, "training")))
+
+
+def test_two_processes_learn_what_one_does(dataset, configuration, tmp_path):
+    """Half a batch each, gradients averaged: the same steps up to rounding."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys, torch\n"
+        "from pathlib import Path\n"
+        "from rich.progress import Progress\n"
+        "from training.responses import open_responses\n"
+        "from training.runs import Configuration\n"
+        "from training.train import train\n"
+        "torch.set_num_threads(1)\n"
+        "run = Path(sys.argv[2])\n"
+        "configuration = Configuration.read(run)\n"
+        "train(open_responses(Path(sys.argv[1])), run.parent / 'two', configuration, Progress(disable=True))\n"
+    )
+    short = dataclasses.replace(configuration, epochs=2)
+    train(SimulatedResponses(dataset), tmp_path / "one", short, Progress(disable=True))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run(
+        [*command, script, dataset.folder, tmp_path / "one"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    one, two = (trained(dataset, tmp_path / name).field.state_dict() for name in ("one", "two"))
+    for name, values in one.items():
+        torch.testing.assert_close(two[name], values, rtol=1e-3, atol=2e-4, msg=name)
+    for column in ("training", "fine", "late"):
+        np.testing.assert_allclose(losses(tmp_path / "two", column), losses(tmp_path / "one", column), rtol=1e-3)
+
+
+def test_tensorboard_shows_what_the_log_says(run, configuration):
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    assert set(events.Tags()["scalars"]) >= {"training/loss", "training/learning_rate", "held_back/fine"}
+    for tag, column in (("training/loss", "training"), ("held_back/late", "late")):
+        shown = events.Scalars(tag)
+        assert len(shown) == configuration.epochs
+        np.testing.assert_allclose([point.value for point in shown], losses(run, column), rtol=1e-4)
+
+
+def test_bfloat16_is_chosen_where_it_is_faster():
+    def taking(seconds):
+        return lambda bfloat16: time.sleep(seconds[bfloat16])
+
+    cpu = torch.device("cpu")
+    assert bfloat16_gains(taking({False: 0.02, True: 0.01}), cpu)
+    assert not bfloat16_gains(taking({False: 0.01, True: 0.0095}), cpu)
+    assert not bfloat16_gains(taking({False: 0.001, True: 0.02}), cpu)
+
+
+@pytest.mark.parametrize(
+    ("field", "options", "told"),
+    [
+        ("nerf", {}, "there is no 'nerf'"),
+        ("naf", {"rank": 64}, "only a factorised field"),
+        ("factorised", {"points": 100}, "whole responses"),
+    ],
+)
+def test_options_that_a_field_has_not_are_refused(field, options, told):
+    with pytest.raises(RunError, match=told):
+        configure(field, **options)
+
+
+def test_swapped_ends_are_refused_where_a_head_listens(dataset, configuration, tmp_path):
+    swapped = dataclasses.replace(configuration, recipe=FactorisedRecipe(swap=True))
+    with pytest.raises(RecipeError, match="head"):
+        train(SimulatedResponses(dataset), tmp_path, swapped, Progress(disable=True))
