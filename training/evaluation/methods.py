@@ -12,6 +12,7 @@ from training.evaluation.evaluate import FLOOR, Column, Source
 from training.evaluation.held_out import EvaluationError, HeldOut, Responses
 from training.evaluation.helmholtz import HelmholtzInterpolation
 from training.evaluation.image_sources import ImageSources
+from training.evaluation.shaped import ShapedNearest
 
 DEFAULT_METHODS = ("nearest", "linear", "linear-aligned")
 Answer = Callable[[int, npt.NDArray[np.integer]], Responses | None]
@@ -97,6 +98,12 @@ def _helmholtz(name: str, prepared: _Prepared) -> Column:
     return _of_stored(name, held_out, interpolation.response)
 
 
+def _shaped(name: str, prepared: _Prepared) -> Column:
+    held_out = prepared.held_out
+    shaped = ShapedNearest(held_out.pairs, held_out.delays_s, held_out.sample_rate)
+    return _of_stored(name, held_out, shaped.response)
+
+
 def _image_sources(name: str, prepared: _Prepared) -> Column:
     held_out = prepared.held_out
     dataset = held_out.simulated
@@ -124,6 +131,7 @@ METHODS: dict[str, Callable[[str, _Prepared], Column]] = {
     "nearest": _plain,
     "linear": _plain,
     "linear-aligned": _aligned,
+    "shaped-nearest": _shaped,
     "aac-nearest": _coded,
     "aac-linear": _coded,
     "opus-nearest": _coded,

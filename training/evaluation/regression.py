@@ -26,7 +26,9 @@ _ITERATIONS = 25
 # Logarithms of: near at both ends (share, length at the emitter, at the listener), same listener (share), same emitter
 # (share, length), same listener (share, length at the emitter), noise (share). Lengths count in spreads of that end.
 _START = np.log([1.0, 0.7, 0.7, 0.3, 0.5, 0.15, 0.3, 0.7, 0.1])
-_BOUNDS = np.log([(1e-3, 100), (0.05, 20), (0.05, 20), (1e-3, 30), (1e-3, 30), (0.01, 5), (1e-3, 30), (0.05, 20), (1e-2, 10)])
+_BOUNDS = np.log(
+    [(1e-3, 100), (0.05, 20), (0.05, 20), (1e-3, 30), (1e-3, 30), (0.01, 5), (1e-3, 30), (0.05, 20), (1e-2, 10)]
+)
 
 
 @dataclass(frozen=True)

@@ -9,61 +9,65 @@ Axes: one pair's responses are `(yaw, channel, sample)`.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
-from scipy.signal import resample
+from scipy.signal import oaconvolve, resample
 
 from server.acoustics.decay import onset_sample
 from training.dataset import SPEED_OF_SOUND
-from training.evaluation.baselines import TrainingPairs, Turns, nearest_pair
+from training.evaluation.baselines import ALL_TURNS, TrainingPairs, Turns, nearest_pair
 from training.evaluation.regression import PairRegression
 
 _Floats = npt.NDArray[np.float64]
 
-_LEAD_S = 0.0015
-"""What is kept in front of the arrival."""
 _CROSSOVERS_HZ = (700.0, 1400.0, 2800.0, 5600.0, 11200.0)
 _HIGHEST = 0.4  # crossover, as a share of the rate
 # After the arrival. The first stretch is the direct sound, as the direct-to-reverberant ratio has it.
 _EDGES_S = (0.0025, 0.006, 0.012, 0.025, 0.050, 0.1, 0.2, 0.4, 0.8)
 _FADE = 0.12  # of an edge's time, on either side
-_LARGEST_GAIN = np.log(4.5)  # 13 dB: more is a fault of the measurement or of the regression
+_LARGEST_GAIN = 4.5  # more is a fault of the measurement or of the regression
 _SILENCE = 1e-12  # of the energy of a response
-_ARRIVAL_S = 0.005
+_SEARCH_S = (0.0015, 0.005)  # for the arrival, before and after what geometry says
 _UPSAMPLING = 8
+_KERNEL_REACH = 32  # samples on either side
+_KERNEL_BETA = 8.0
 _NEAREST_M = 0.1
 _MOST_PAIRS = 2000
 
 
-@dataclass(frozen=True)
-class Parts:
-    """Octave bands times stretches of time that add up to the whole, for responses that arrive after `lead` samples."""
+def bands(responses: npt.NDArray[np.floating], sample_rate: float) -> _Floats:
+    """(..., band, sample) octaves, the lowest and highest open, that add up to the responses `(..., sample)`."""
+    samples = responses.shape[-1]
+    size = next_fast_len(2 * samples, real=True)  # what a band's filter smears wraps into nothing
+    octave = np.log2(np.maximum(rfftfreq(size, 1 / sample_rate), 1e-3))
+    crossovers = [hertz for hertz in _CROSSOVERS_HZ if hertz < _HIGHEST * sample_rate]
+    above = [np.ones_like(octave), *(_rise(octave - np.log2(hertz) + 0.5) for hertz in crossovers)]
+    passes = [low - high for low, high in zip(above, [*above[1:], np.zeros_like(octave)], strict=True)]
+    spectra = rfft(np.asarray(responses, dtype=np.float64), size)[..., np.newaxis, :] * np.stack(passes)
+    return np.asarray(irfft(spectra, size)[..., :samples])
 
-    sample_rate: float
-    samples: int
-    lead: int
 
-    @cached_property
-    def stretches(self) -> _Floats:
-        """(stretch, sample) weights that sum to one."""
-        time_s = (np.arange(self.samples) - self.lead) / self.sample_rate
-        edges = [edge for edge in _EDGES_S if edge * (1 + _FADE) < time_s[-1]]
-        later = [_rise((time_s / edge - 1 + _FADE) / (2 * _FADE)) for edge in edges]
-        bounds = [np.ones(self.samples), *later, np.zeros(self.samples)]
-        return np.stack([bounds[index] - bounds[index + 1] for index in range(len(bounds) - 1)])
+def stretches(arrival_s: npt.NDArray[np.floating], samples: int, sample_rate: float, count: int) -> _Floats:
+    """(..., stretch, sample) weights that add up to one, for responses whose sound arrives at `arrival_s` (...)."""
+    after_s = np.arange(samples) / sample_rate - arrival_s[..., np.newaxis]
+    later = [_rise((after_s / edge - 1 + _FADE) / (2 * _FADE)) for edge in _EDGES_S[: count - 1]]
+    bounds = [np.ones_like(after_s), *later, np.zeros_like(after_s)]
+    return np.stack([bounds[index] - bounds[index + 1] for index in range(count)], axis=-2)
 
-    def split(self, responses: npt.NDArray[np.floating]) -> _Floats:
-        """(..., band, stretch, sample)"""
-        size = next_fast_len(2 * self.samples, real=True)  # what a band's filter smears wraps into nothing
-        octave = np.log2(np.maximum(rfftfreq(size, 1 / self.sample_rate), 1e-3))
-        crossovers = [hertz for hertz in _CROSSOVERS_HZ if hertz < _HIGHEST * self.sample_rate]
-        above = [np.ones_like(octave), *(_rise(octave - np.log2(hertz) + 0.5) for hertz in crossovers)]
-        passes = [low - high for low, high in zip(above, [*above[1:], np.zeros_like(octave)], strict=True)]
-        spectra = rfft(np.asarray(responses, dtype=np.float64), size)[..., np.newaxis, :] * np.stack(passes)
-        return irfft(spectra, size)[..., np.newaxis, : self.samples] * self.stretches
+
+def moved(responses: npt.NDArray[np.floating], later: npt.NDArray[np.floating]) -> _Floats:
+    """(..., sample) later by fractions of samples (...). At the open end the outermost sample goes on: a measurement's
+    offset would else end in a step, and the step ring."""
+    whole = np.round(later).astype(int)
+    taps = np.arange(-_KERNEL_REACH, _KERNEL_REACH + 1)
+    kernel = np.sinc(taps - (later - whole)[..., np.newaxis]) * np.kaiser(len(taps), _KERNEL_BETA)
+    reach = _KERNEL_REACH + int(np.abs(whole).max(initial=0))
+    padded = np.pad(responses, [(0, 0)] * (responses.ndim - 1) + [(reach, reach)], mode="edge")
+    filtered = oaconvolve(padded, kernel, mode="same", axes=-1)
+    index = np.arange(responses.shape[-1]) + reach - whole[..., np.newaxis]
+    return np.asarray(np.take_along_axis(filtered, index, axis=-1))
 
 
 def _rise(x: _Floats) -> _Floats:
@@ -71,77 +75,77 @@ def _rise(x: _Floats) -> _Floats:
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip(x, 0.0, 1.0)))
 
 
-def moved(responses: npt.NDArray[np.floating], later: npt.ArrayLike) -> _Floats:
-    """(..., sample) later by fractions of samples (...), silence at the open end."""
-    samples = responses.shape[-1]
-    later = np.asarray(later, dtype=np.float64)
-    size = next_fast_len(samples + 2 * int(np.ceil(np.abs(later).max(initial=0.0))) + 64, real=True)
-    shift = np.exp(-2j * np.pi * np.fft.rfftfreq(size) * later[..., np.newaxis])
-    return np.asarray(irfft(rfft(np.asarray(responses, dtype=np.float64), size) * shift, size)[..., :samples])
+@dataclass(frozen=True)
+class _Described:
+    """arrival_s: (yaw, channel), later than geometry says; parts: (yaw, channel, band, stretch, sample), which add up
+    to the response; energy: (yaw, channel, band, stretch), logarithm, less what spherical spreading makes of it."""
+
+    arrival_s: _Floats
+    parts: _Floats
+    energy: _Floats
 
 
 class ShapedNearest:
-    """All targets of one regression: arrivals (yaw, channel), and energies (yaw, channel, band, stretch)."""
+    """One regression says all: arrivals and energies, each in its own spread."""
 
     def __init__(self, pairs: TrainingPairs, delays_s: npt.NDArray[np.floating], sample_rate: float) -> None:
         self._pairs, self._delays_s, self._rate = pairs, delays_s, sample_rate
         training = np.flatnonzero(pairs.training)
         training = np.sort(np.random.default_rng(12).permutation(training)[:_MOST_PAIRS])
-        samples = pairs.response(int(training[0])).shape[-1]
-        lead = round(_LEAD_S * sample_rate)
-        # Whatever an alignment moves to the front must not push the end out.
-        self._parts = Parts(sample_rate, samples, lead)
-        described = [self._described(int(pair)) for pair in training]
-        self._shape = described[0][1].shape
-        values = np.stack([np.concatenate([late.ravel(), energy.ravel()]) for late, energy, _ in described])
-        self._scale = np.concatenate(
-            [np.full(part.size, max(float(spread), 1e-9)) for part, spread in self._spreads(described)]
-        )
-        self._expected = PairRegression(*self._ends(training), values / self._scale)
+        remaining_s = pairs.response(int(training[0])).shape[-1] / sample_rate - float(delays_s.max())
+        self._stretches = 1 + sum(edge * (1 + 2 * _FADE) < remaining_s for edge in _EDGES_S)
+        arrivals, energies = [], []
+        for pair in training:
+            described = self._described(int(pair))
+            arrivals.append(described.arrival_s)
+            energies.append(described.energy)
+        self._shapes = arrivals[0].shape, energies[0].shape
+        self._scales = [max(float(np.std(part, axis=0).mean()), 1e-9) for part in (arrivals, energies)]
+        values = [np.stack(part) / scale for part, scale in zip((arrivals, energies), self._scales, strict=True)]
+        flat = np.concatenate([part.reshape(len(training), -1) for part in values], axis=1)
+        self._expected = PairRegression(*self._ends(training), flat)
 
-    def response(self, pair: int, turns: Turns) -> npt.NDArray[np.float32]:
+    def response(self, pair: int, turns: Turns = ALL_TURNS) -> npt.NDArray[np.float32]:
         """(yaw, channel, sample)"""
-        emitter, listener = self._ends(np.array([pair]))
-        values = self._expected(emitter, listener)[0] * self._scale
-        size = int(np.prod(self._shape[:2]))
-        arrival = values[:size].reshape(self._shape[:2])
-        energy = values[size:].reshape(self._shape) + self._spherical(pair)
-        late, known, aligned = self._described(nearest_pair(self._pairs, pair), turns)
-        known = known + self._spherical(nearest_pair(self._pairs, pair))
-        gain = np.exp(0.5 * np.clip(energy[turns] - known, -2 * _LARGEST_GAIN, 2 * _LARGEST_GAIN))
-        shaped = np.sum(self._parts.split(aligned) * gain[..., np.newaxis], axis=(-3, -2))
-        starts = self._start(pair) + arrival[turns] * self._rate
-        return moved(shaped, starts).astype(np.float32)
+        values = self._expected(*self._ends(np.array([pair])))[0]
+        split = np.split(values, [int(np.prod(self._shapes[0]))])
+        arrival_s, energy = (
+            part.reshape(shape)[turns] * scale
+            for part, shape, scale in zip(split, self._shapes, self._scales, strict=True)
+        )
+        near = nearest_pair(self._pairs, pair)
+        described = self._described(near, turns)
+        # Towards spherical spreading, which descriptions leave out, and away from that of the nearest.
+        change = energy + self._spreading(pair) - described.energy - self._spreading(near)
+        gain = np.clip(np.exp(0.5 * change), 1 / _LARGEST_GAIN, _LARGEST_GAIN)
+        shaped = np.sum(described.parts * gain[..., np.newaxis], axis=(-3, -2))
+        later_s = float(self._delays_s[pair] - self._delays_s[near]) + arrival_s - described.arrival_s
+        return moved(shaped, later_s * self._rate).astype(np.float32)
 
-    def _described(self, pair: int, turns: Turns = slice(None)) -> tuple[_Floats, _Floats, _Floats]:
-        """(yaw, channel) seconds by which sound arrives later than geometry says, (yaw, channel, band, stretch)
-        logarithm of energy less that of spherical spreading, and the response aligned to its arrival."""
+    def _described(self, pair: int, turns: Turns = ALL_TURNS) -> _Described:
         response = self._pairs.response(pair)[turns]
-        roughly = moved(response, np.full(response.shape[:-1], -self._start(pair)))
-        head = roughly[..., : self._parts.lead + round(_ARRIVAL_S * self._rate)]
-        onset = onset_sample(resample(head, head.shape[-1] * _UPSAMPLING, axis=-1)) / _UPSAMPLING
-        late = np.where(onset >= 0, onset - self._parts.lead, 0.0)
-        aligned = moved(roughly, -late)
-        power = np.square(self._parts.split(aligned)).sum(axis=-1)
+        geometric_s = float(self._delays_s[pair])
+        arrival_s = geometric_s + self._lateness_s(response, geometric_s)
+        weights = stretches(arrival_s, response.shape[-1], self._rate, self._stretches)
+        parts = bands(response, self._rate)[..., np.newaxis, :] * weights[..., np.newaxis, :, :]
+        power = np.square(parts).sum(axis=-1)
         floor = _SILENCE * max(float(power.sum(axis=(-2, -1)).max()), np.finfo(np.float64).tiny)
-        return late / self._rate, np.log(power + floor) - self._spherical(pair), aligned
+        return _Described(arrival_s - geometric_s, parts, np.log(power + floor) - self._spreading(pair))
 
-    def _start(self, pair: int) -> float:
-        """Samples, of a response that is aligned by geometry."""
-        return float(self._delays_s[pair]) * self._rate - self._parts.lead
+    def _lateness_s(self, response: npt.NDArray[np.floating], geometric_s: float) -> _Floats:
+        """(yaw, channel) seconds from the arrival that geometry gives to the one heard near it."""
+        start, stop = (round((geometric_s + offset) * self._rate) for offset in (-_SEARCH_S[0], _SEARCH_S[1]))
+        start = max(start, 0)
+        head = response[..., start:stop]
+        onset = onset_sample(resample(head, head.shape[-1] * _UPSAMPLING, axis=-1))
+        heard_s = (start + onset / _UPSAMPLING) / self._rate
+        return np.where(onset >= 0, heard_s - geometric_s, 0.0)
 
-    def _spherical(self, pair: int) -> _Floats:
+    def _spreading(self, pair: int) -> _Floats:
         """(stretch,): the direct sound spreads, what follows fills the room."""
         distance = max(float(self._delays_s[pair]) * SPEED_OF_SOUND, _NEAREST_M)
-        return np.where(np.arange(len(self._parts.stretches)) == 0, -2.0 * np.log(distance), 0.0)
+        return np.where(np.arange(self._stretches) == 0, -2.0 * np.log(distance), 0.0)
 
     def _ends(self, pairs: npt.NDArray[np.integer]) -> tuple[_Floats, _Floats]:
         known = self._pairs
         return known.emitter_positions[known.pair_emitter[pairs]], known.listener_positions[known.pair_listener[pairs]]
-
-    @staticmethod
-    def _spreads(described: list[tuple[_Floats, _Floats, _Floats]]) -> list[tuple[_Floats, float]]:
-        """Arrivals and energies have different units: each counts in its own spread."""
-        return [
-            (described[0][part], float(np.mean(np.std([each[part] for each in described], axis=0)))) for part in (0, 1)
-        ]

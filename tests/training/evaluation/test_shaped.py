@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+
+from server.acoustics.decibels import power_to_db
+from training.dataset import SPEED_OF_SOUND
+from training.evaluation.baselines import TrainingPairs, nearest
+from training.evaluation.shaped import ShapedNearest, bands, moved, stretches
+
+RATE = 16_000
+SAMPLES = 2400
+
+
+def test_bands_add_up_to_the_response():
+    responses = np.random.default_rng(0).standard_normal((2, 3, 500))
+    parts = bands(responses, RATE)
+    assert parts.shape[:2] == (2, 3)
+    np.testing.assert_allclose(parts.sum(axis=-2), responses, atol=1e-12)
+
+
+@pytest.mark.parametrize(("hertz", "band"), [(200, 0), (1000, 1), (2000, 2), (7000, 4)])
+def test_a_band_holds_its_octave(hertz, band):
+    tone = np.sin(2 * np.pi * hertz * np.arange(4000) / RATE) * np.hanning(4000)
+    power = np.square(bands(tone, RATE)).sum(axis=-1)
+    assert power[band] > 0.99 * power.sum()
+
+
+def test_stretches_add_up_to_one_and_follow_the_arrival():
+    weights = stretches(np.array([0.01, 0.02]), SAMPLES, RATE, 6)
+    np.testing.assert_allclose(weights.sum(axis=-2), 1.0)
+    later = round(0.01 * RATE)
+    np.testing.assert_allclose(weights[1, :, later:], weights[0, :, :-later], atol=1e-9)
+    # The first ends 2.5 ms after the arrival.
+    assert np.flatnonzero(weights[0, 0] > 0.5)[-1] == pytest.approx(0.0125 * RATE, abs=1)
+
+
+@pytest.mark.parametrize("later", [0.0, 3.0, -7.0, 0.37, -12.61])
+def test_a_moved_sound_arrives_that_much_later(later):
+    time = np.arange(600) / RATE
+    pulse = np.exp(-(((time - 0.018) / 4e-4) ** 2)) * np.cos(2 * np.pi * 3000 * (time - 0.018))
+    shifted_time = time - later / RATE
+    expected = np.exp(-(((shifted_time - 0.018) / 4e-4) ** 2)) * np.cos(2 * np.pi * 3000 * (shifted_time - 0.018))
+    np.testing.assert_allclose(moved(pulse[None], np.array([later]))[0], expected, atol=1e-3)
+
+
+def test_an_offset_does_not_ring_when_moved():
+    np.testing.assert_allclose(moved(np.full((1, 300), 0.1), np.array([40.4])), 0.1, atol=1e-4)
+
+
+class Room:
+    """Microphones every 5 cm with gains of their own, loudspeakers that beam: smooth in place, and a diffuse tail that
+    nobody can foresee."""
+
+    def __init__(self, *, tail=0.02):
+        rng = np.random.default_rng(4)
+        self.listeners = np.column_stack([np.zeros(20), 0.05 * np.arange(20), np.zeros(20)])
+        self.emitters = np.array([[0.6, 0.1, 0.0], [0.9, 0.5, 0.0], [0.7, 0.9, 0.0]])
+        self.emitter, self.listener = np.divmod(np.arange(60), 20)
+        ends = self.emitters[self.emitter], self.listeners[self.listener]
+        offset = ends[1] - ends[0]
+        distance = np.linalg.norm(offset, axis=-1)
+        self.delays_s = distance / SPEED_OF_SOUND
+        gain = rng.uniform(0.8, 1.25, 20)[self.listener]
+        beam = 0.6 + 0.4 * np.cos(3 * np.arctan2(offset[:, 1], offset[:, 0]))
+        time = np.arange(SAMPLES) / RATE - self.delays_s[:, None]
+        direct = np.sinc(time * RATE) * (beam / distance)[:, None]
+        diffuse = tail * rng.standard_normal((60, SAMPLES)) * np.exp(-6.9 * np.maximum(time, 0) / 0.2) * (time > 0)
+        self.responses = ((direct + diffuse) * gain[:, None]).astype(np.float32)[:, None, None]  # pair, yaw, channel
+        training = np.random.default_rng(5).random(60) > 0.3
+        self.held_out = np.flatnonzero(~training)
+        self.pairs = TrainingPairs(self.responses, self.listener, self.emitter, self.listeners, self.emitters, training)
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Room()
+
+
+@pytest.fixture(scope="module")
+def shaped(room):
+    return ShapedNearest(room.pairs, room.delays_s, RATE)
+
+
+def level_errors(room, answer, part=slice(None)):
+    levels = [
+        power_to_db(np.square(np.stack([room.responses[pair], answer(pair)])[..., part]).sum(axis=-1)).ravel()
+        for pair in room.held_out
+    ]
+    return np.abs(np.diff(levels, axis=1))
+
+
+def test_levels_are_closer_than_those_of_the_nearest(room, shaped):
+    ours = level_errors(room, shaped.response).mean()
+    theirs = level_errors(room, lambda pair: nearest(room.pairs, pair)).mean()
+    assert ours < 0.65 * theirs
+
+
+def test_late_levels_are_closer_too(room, shaped):
+    late = slice(round(0.03 * RATE), round(0.1 * RATE))
+    ours = level_errors(room, shaped.response, late).mean()
+    assert ours < 0.7 * level_errors(room, lambda pair: nearest(room.pairs, pair), late).mean()
+
+
+def test_sound_arrives_when_it_should(room, shaped):
+    for pair in room.held_out:
+        peak = np.abs(shaped.response(pair)[0, 0]).argmax()
+        assert abs(peak - room.delays_s[pair] * RATE) < 1.5
+
+
+def test_where_nothing_changes_but_distance_the_response_is_exact():
+    room = Room(tail=0.0)
+    for index in range(60):
+        distance = room.delays_s[index] * SPEED_OF_SOUND
+        time = np.arange(SAMPLES) / RATE - room.delays_s[index] - 0.002
+        room.responses[index, 0, 0] = np.exp(-((time / 2e-4) ** 2)) / distance
+    shaped = ShapedNearest(room.pairs, room.delays_s + 0.002, RATE)
+    for pair in room.held_out:
+        expected = room.responses[pair]
+        np.testing.assert_allclose(shaped.response(pair), expected, atol=0.03 * expected.max())
+
+
+def test_orientations_that_are_asked_for_are_answered(room):
+    doubled = np.concatenate([room.responses, 0.5 * room.responses], axis=1)
+    pairs = TrainingPairs(doubled, room.listener, room.emitter, room.listeners, room.emitters, room.pairs.training)
+    both = ShapedNearest(pairs, room.delays_s, RATE)
+    pair = int(room.held_out[0])
+    whole, second = both.response(pair), both.response(pair, np.array([1]))
+    assert whole.shape == (2, 1, SAMPLES)
+    np.testing.assert_allclose(second[0], whole[1], atol=1e-6)
+    np.testing.assert_allclose(whole[1], 0.5 * whole[0], atol=1e-3 * np.abs(whole).max())
