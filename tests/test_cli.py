@@ -18,9 +18,12 @@ from server.acoustics.geometry import Pose
 from server.cli import main
 from server.clips import ClipLibrary
 from server.direct_sound import DirectSound
+from server.field.levels import Levels
 from server.impulse_response import ImpulseResponse, IrQuery
 from server.render import PathPoint, RenderedEmitter, render
 from server.rendering.hrtf import KEMAR
+from server.scene.bundle import write_bundle
+from server.scene.manifest import QualityLevel
 
 NAFIR = [sys.executable, "-c", "from server.cli import main; main()"]
 PLACES = ("--listener", "1,2,1.5", "--emitter", "6,3,1.5")
@@ -57,6 +60,25 @@ def test_ir_writes_what_http_answers(nafir, bundle, field, tmp_path, suffix):
     assert str(output) in said
     query = IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5), 90.0)
     assert output.read_bytes() == ImpulseResponse.compute(field, query).encode(suffix)
+
+
+def test_ir_of_a_level_is_that_levels(nafir, bundle, tmp_path):
+    rough = QualityLevel(name="rough", field="arithmetic", frames=8)
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    manifest = bundle.manifest.model_copy(update={"levels": (*bundle.manifest.levels, rough)})
+    levels = Levels.load(write_bundle(tmp_path / "scene", manifest, files))
+    output = tmp_path / "ir.npy"
+    code, _, _ = nafir("ir", levels.bundle.folder, *PLACES, "--level", "rough", "-o", output)
+    assert code == 0
+    query = IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5))
+    assert output.read_bytes() == ImpulseResponse.compute(levels["rough"], query).encode("npy")
+    assert output.read_bytes() != ImpulseResponse.compute(levels["standard"], query).encode("npy")
+    assert query.etag(levels["rough"], "npy") != query.etag(levels["standard"], "npy")
+
+
+def test_unknown_level_is_refused_with_the_names_there_are(nafir, bundle, tmp_path):
+    result = nafir("ir", bundle.folder, *PLACES, "--level", "luxurious", "-o", tmp_path / "ir.wav")
+    check_error(result, "luxurious", "standard")
 
 
 def test_ir_tells_programs_what_it_did(nafir, bundle, tmp_path):

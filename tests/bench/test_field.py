@@ -1,0 +1,32 @@
+"""What the bench says of a field's levels."""
+
+import pytest
+
+from server.bench.field import measure_levels
+from server.field.levels import Levels
+from server.scene.bundle import write_bundle
+from server.scene.manifest import Phase, QualityLevel
+
+
+@pytest.fixture(scope="module")
+def levels(bundle, tmp_path_factory) -> Levels:
+    dear = QualityLevel(name="dear", field="arithmetic", phase=Phase(kind="griffin_lim", iterations=64))
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    manifest = bundle.manifest.model_copy(update={"levels": (*bundle.manifest.levels, dear)})
+    return Levels.load(write_bundle(tmp_path_factory.mktemp("dear") / "scene", manifest, files))
+
+
+def test_the_dear_level_costs_more_and_it_is_decoding_that_costs(levels):
+    measured = measure_levels(levels, rounds=3, poses=5)
+    assert [level["name"] for level in measured["levels"]] == ["standard", "dear"]
+    standard, dear = measured["levels"]
+    assert dear["ms_p50"] > 2 * standard["ms_p50"]
+    assert dear["decode_ms_p50"] > 2 * dear["graph_ms_p50"]
+    for level in (standard, dear):
+        assert 0 < level["graph_ms_p50"] <= level["ms_p50"] <= level["ms_p99"]
+    assert measured["summary"][0]["value"] == standard["ms_p50"]
+
+
+def test_calibration_tells_them_apart_too(levels):
+    costs_ms = levels.calibrate()
+    assert costs_ms["dear"] > 2 * costs_ms["standard"]
