@@ -392,3 +392,38 @@ class TestBadInput:
     def test_empty_response(self) -> None:
         with pytest.raises(ValueError, match="at least one sample"):
             onset_sample(np.zeros((2, 0)))
+
+
+class TestMarkedEchoes:
+    """dEchorate: when the direct sound and the first reflections arrive was marked by people."""
+
+    @pytest.fixture
+    def room(self) -> dict[str, npt.NDArray[np.float64]]:
+        with np.load(MEASURED / "dechorate.npz") as arrays:
+            return {name: arrays[name] for name in arrays.files}
+
+    def test_onset_is_the_rise_to_the_marked_direct_sound(self, room) -> None:
+        """Marks are on peaks; the rise to them takes a tenth of a millisecond."""
+        onset_s = onset_sample(room["responses"]) / int(room["sample_rate"])
+        early_s = room["direct_s"] - onset_s
+        assert np.all((early_s > 0.0) & (early_s < 150e-6))
+
+    def test_the_early_share_leaps_across_strong_echoes(self, room) -> None:
+        """The index of early to late energy grows by more across the marks of ceiling and south wall, which the
+        loudspeaker points at, than across as long a stretch of time elsewhere."""
+        rate = int(room["sample_rate"])
+
+        def growth(response, onset_s: float, at_s: float) -> float:
+            before, after = (clarity_db(response[np.newaxis], rate, early_s=at_s - onset_s + d) for d in (-4e-4, 4e-4))
+            return float((after - before)[0])
+
+        for surface, name, least in ((5, "ceiling", 0.85), (2, "south wall", 0.6)):
+            ranks = []
+            for response, direct_s, reflected_s in zip(
+                room["responses"], room["direct_s"], room["reflected_s"], strict=True
+            ):
+                across = growth(response, direct_s, reflected_s[surface])
+                elsewhere = [growth(response, direct_s, at_s) for at_s in np.arange(direct_s + 1.5e-3, 0.028, 7e-4)]
+                ranks.append(np.mean(across > np.array(elsewhere)))
+            assert np.median(ranks) > 0.9, name
+            assert min(ranks) > least, name
