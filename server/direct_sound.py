@@ -1,37 +1,29 @@
 """Where the sound that comes before all reflections travels in a scene: what makes a renderer's direct paths follow
-poses.
+poses. Beside it, where the scene wants them from geometry, the first reflections.
 
 Metres; positions and directions in the world's axes.
 """
 
-import math
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.decibels import db_to_power
-from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
-from server.acoustics.geometry import FloorPlan, Pose, Quaternion, Vector3
+from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.sound_path import SoundPathFinder
+from server.early_reflections import EarlyReflections
+from server.radiation import Placed, departure_gain_db
 from server.rendering.hrtf import HeadFilters
 from server.rendering.renderer import Renderer
 from server.scene.bundle import Bundle
 
 
-class Placed(Protocol):
-    """An emitter, as far as its direct path is concerned."""
-
-    @property
-    def pose(self) -> Pose: ...
-
-    @property
-    def directivity(self) -> Directivity: ...
-
-
 class DirectSound:
-    """One scene's floor plan and air, heard through one head; `air_db_per_m` (7,) per octave band."""
+    """One scene's floor plan and air, heard through one head; `air_db_per_m` (7,) per octave band.
+
+    `early_reflections` are what the impulse responses of the scene's fields leave out, None where they hold it.
+    """
 
     def __init__(
         self,
@@ -40,7 +32,9 @@ class DirectSound:
         speed_of_sound: float,
         air_db_per_m: npt.NDArray[np.float64],
         filters: HeadFilters,
+        early_reflections: EarlyReflections | None = None,
     ) -> None:
+        self.early_reflections = early_reflections
         self._finder = SoundPathFinder(plan, speed_of_sound)
         self._speed_of_sound = speed_of_sound
         self._air_db_per_m = air_db_per_m
@@ -54,6 +48,7 @@ class DirectSound:
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
             filters=filters,
+            early_reflections=EarlyReflections.of(bundle, filters),
         )
 
     def renderer(
@@ -87,25 +82,5 @@ class DirectSound:
         gains_db = paths.screen_db
         for number, emitter in enumerate(emitters.values()):
             if emitter.directivity != OMNIDIRECTIONAL:
-                departure = seen_from(emitter.pose.orientation, paths.departure[number].tolist())
-                gains_db[number] += emitter.directivity.gain_db(departure)
+                gains_db[number] += departure_gain_db(emitter, paths.departure[number])
         renderer.set_paths(list(emitters), paths.length_m, paths.arrival, gains_db)
-
-
-def seen_from(orientation: Quaternion, direction: Vector3) -> Vector3:
-    """A direction of the world in the frame of something turned by `orientation`."""
-    qx, qy, qz, qw = orientation
-    x, y, z = direction
-    # v - w t + q x t with t = 2 q x v, in scalars: NumPy would take ten times as long for three numbers.
-    tx, ty, tz = 2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)
-    return (
-        x - qw * tx + qy * tz - qz * ty,
-        y - qw * ty + qz * tx - qx * tz,
-        z - qw * tz + qx * ty - qy * tx,
-    )
-
-
-def reverberation_gain(directivity: Directivity) -> float:
-    """Amplitude at which an emitter fills a room, beside one that is all round as loud as this is ahead: the power mean
-    over all directions and octave bands."""
-    return math.sqrt(np.mean(db_to_power(directivity.diffuse_gain_db)))

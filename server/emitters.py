@@ -38,7 +38,7 @@ class Emitter:
         return self.pose.position
 
     def move(self, message: MoveEmitter) -> None:
-        # A field knows no orientation of emitters: turning on the spot leaves the impulse response as it is.
+        # Turning on the spot leaves what a field says as it is.
         self.is_outdated |= message.position != self.position
         self.is_displaced = True
         self.pose = message.pose if message.has_front else Pose(message.position, self.pose.orientation)

@@ -85,7 +85,7 @@ def loudness_map(
     inside = bundle.floor_plan.contains(cells)
     levels = np.full((rows, columns), np.nan)
     reflected = _reflected_power(field.field, cells[inside], emitter)
-    levels[inside] = power_to_db(field.direct_power(cells[inside], emitter) + reflected)
+    levels[inside] = power_to_db(field.path_power(cells[inside], emitter) + reflected)
     return LoudnessMap(levels, (float(x[0]), float(y[0])), spacing_m, listener_height_m)
 
 

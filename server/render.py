@@ -17,8 +17,10 @@ import numpy.typing as npt
 
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose
-from server.direct_sound import DirectSound, reverberation_gain
+from server.direct_sound import DirectSound
+from server.early_reflections import EarlyReflections
 from server.errors import NafirError
+from server.radiation import reverberation_gain
 from server.rendering.renderer import render_all
 from server.rendering.sources import ClipPlayer
 
@@ -225,7 +227,8 @@ def render(
             direct_sound.aim(renderer, direct[block], named)
             renderer.set_orientation(direct[block].orientation)
         if block in reverberation:
-            for name, ir in zip(named, _irs(field, emitters, reverberation[block]), strict=True):
+            irs = _irs(field, direct_sound.early_reflections, emitters, reverberation[block])
+            for name, ir in zip(named, irs, strict=True):
                 renderer.set_ir(name, ir)
         (output[:, block],) = render_all([renderer])
         if progress:
@@ -238,7 +241,12 @@ def _block_at(sample: int, block_size: int) -> int:
     return -(-sample // block_size)
 
 
-def _irs(field: ImpulseResponses, emitters: Sequence[RenderedEmitter], listener: Pose) -> FloatArray:
+def _irs(
+    field: ImpulseResponses, early: EarlyReflections | None, emitters: Sequence[RenderedEmitter], listener: Pose
+) -> FloatArray:
     count = len(emitters)
     places = [emitter.pose.position for emitter in emitters]
-    return field.impulse_responses([listener.position] * count, places, [listener.yaw] * count)
+    irs = field.impulse_responses([listener.position] * count, places, [listener.yaw] * count)
+    if early is not None:
+        early.add(irs, listener, emitters)
+    return irs

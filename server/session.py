@@ -18,10 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from server.acoustics.decibels import db_to_amplitude
-from server.acoustics.directivity import OMNIDIRECTIONAL
-from server.acoustics.geometry import Pose, Vector3
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.geometry import Pose
 from server.blocks import AudioBlock, DryBlock, FloatArray
-from server.direct_sound import DirectSound, reverberation_gain
+from server.direct_sound import DirectSound
+from server.early_reflections import EarlyReflections
 from server.emitters import Emitter, LiveInput
 from server.errors import RequestError
 from server.field.levels import Levels
@@ -44,11 +45,21 @@ from server.protocol import (
     ServerMessage,
     SetGain,
 )
+from server.radiation import reverberation_gain
 from server.rendering.convolver import PartitionedIr
 from server.rendering.hrtf import HeadFilters
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
 from server.rendering.sources import ClipPlayer, Source
 from server.scene.bundle import Bundle
+
+
+@dataclass(frozen=True)
+class EmitterSnapshot:
+    """An emitter as it was when its IR was asked for; `serial` tells it from others of the same id."""
+
+    serial: int
+    pose: Pose
+    directivity: Directivity
 
 
 @dataclass(frozen=True)
@@ -58,8 +69,10 @@ class IrRequest:
     pose_id: int
     level: str
     listener: Pose
-    emitters: tuple[tuple[int, Vector3], ...]
-    """Serial number and position of each emitter whose IR is out of date."""
+    emitters: tuple[EmitterSnapshot, ...]
+    """Those whose IR is out of date."""
+    early_reflections: EarlyReflections | None
+    """What the field's IRs leave out, as this session's head hears it; None where they hold it."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +87,12 @@ def compute_irs(levels: Levels, request: IrRequest, prepare: Callable[[FloatArra
     count = len(request.emitters)
     irs = levels[request.level].impulse_responses(
         np.tile(np.asarray(request.listener.position), (count, 1)),
-        np.asarray([position for _, position in request.emitters]),
+        np.asarray([emitter.pose.position for emitter in request.emitters]),
         np.full(count, request.listener.yaw),
         remember=True,
     )
+    if request.early_reflections is not None:
+        request.early_reflections.add(irs, request.listener, request.emitters)
     return IrResponse(request, tuple(prepare(ir) for ir in irs))
 
 
@@ -224,7 +239,8 @@ class Session:
             self._newest_pose_id,
             self._rung.level,
             self._listener,
-            tuple((emitter.serial, emitter.position) for emitter in outdated),
+            tuple(EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity) for emitter in outdated),
+            self._direct_sound.early_reflections,
         )
         return self._in_flight
 
@@ -234,7 +250,7 @@ class Session:
         if response.request.level not in {self._rung.level, self._heard.level}:
             return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
         pose_id = response.request.pose_id
-        arrived = {serial: ir for (serial, _), ir in zip(response.request.emitters, response.irs, strict=True)}
+        arrived = {emitter.serial: ir for emitter, ir in zip(response.request.emitters, response.irs, strict=True)}
         events: list[ServerMessage] = []
         for identifier, emitter in self._emitters.items():
             if emitter.serial not in arrived:
@@ -252,7 +268,7 @@ class Session:
         """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
         self._in_flight = None
         self._waits_for_change = True
-        failed = {serial for serial, _ in request.emitters}
+        failed = {emitter.serial for emitter in request.emitters}
         for emitter in self._emitters.values():
             emitter.is_outdated |= emitter.serial in failed
         return [
@@ -341,7 +357,11 @@ class Session:
         emitter = self._require_emitter(message.id)
         self._bundle.require_inside(message.position, "position")
         self._advance_pose_id(message.pose_id)
+        before = emitter.pose.orientation
         emitter.move(message)
+        # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
+        is_mirrored = self._direct_sound.early_reflections is not None and emitter.directivity != OMNIDIRECTIONAL
+        emitter.is_outdated |= is_mirrored and emitter.pose.orientation != before
 
     def _advance_pose_id(self, pose_id: int) -> None:
         if pose_id <= self._newest_pose_id:

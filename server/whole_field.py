@@ -1,32 +1,42 @@
-"""A scene's whole impulse responses: the direct path from geometry, and what follows it from the field.
+"""A scene's whole impulse responses: the direct path from geometry, with it the first reflections where the field
+leaves them out, and what follows from the field.
 
 Axes: B poses; responses (B, ear, sample). Metres, radians.
 """
 
 from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_power
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
+from server.early_reflections import EarlyReflections
 from server.field.field import AcousticField
-from server.rendering.direct_path import NEAR_LIMIT_M, DirectPath, PathTarget
+from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 from server.rendering.sphere import solid_angles
+from server.rendering.still_paths import StillPaths
 from server.scene.bundle import Bundle
 
 _N_FFT = 512
-# For impulse responses every size gives the same, and a large one the soonest.
-_BLOCK = 4096
 
 
 @cache
 def kemar(sample_rate: int) -> HeadFilters:
     """The head of single responses, of maps, and of simulations."""
     return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
+
+
+class _AllRound(NamedTuple):
+    """An emitter that radiates alike in all directions."""
+
+    pose: Pose
+    directivity: Directivity = OMNIDIRECTIONAL
 
 
 class WholeField:
@@ -39,14 +49,8 @@ class WholeField:
         self._filters = filters
         self._air_db_per_m = manifest.air.absorption_db_per_m
         self._paths = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
-        self._direct = DirectPath(
-            slots=1,
-            block_size=_BLOCK,
-            sample_rate=field.sample_rate,
-            filters=filters,
-            speed_of_sound=manifest.speed_of_sound,
-            air_db_per_m=self._air_db_per_m,
-        )
+        self._direct = StillPaths(filters, speed_of_sound=manifest.speed_of_sound, air_db_per_m=self._air_db_per_m)
+        self._early = EarlyReflections.of(field.bundle, filters)
 
     @classmethod
     def through_kemar(cls, field: AcousticField) -> "WholeField":
@@ -68,24 +72,23 @@ class WholeField:
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
         responses = self.field.impulse_responses(listeners, emitters, yaws)
         for response, listener, emitter, yaw in zip(responses, listeners, emitters, yaws, strict=True):
-            response += self._direct_sound(listener, emitter, yaw)
+            head = Pose.from_yaw(tuple(listener), float(yaw))
+            paths = self._paths.find(listener, emitter[None])
+            self._direct.add(paths.length_m, paths.arrival, paths.screen_db, head.orientation, response)
+            if self._early is not None:
+                self._early.add(response[None], head, [_AllRound(Pose(tuple(emitter)))])
         return responses
 
-    def direct_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """(B,) energy per ear of the direct path, averaged over all orientations of the head."""
+    def path_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """(B,) energy per ear of what `impulse_responses` adds to those of the field, averaged over all orientations of
+        the head."""
         # A path is the same both ways, and here are many listeners to one emitter.
         paths = self._paths.find(emitter, listeners)
-        bands = db_to_power(paths.screen_db - paths.length_m[:, None] * self._air_db_per_m)
-        return np.asarray(bands @ self._diffuse_energy / np.maximum(paths.length_m, NEAR_LIMIT_M) ** 2)
-
-    def _direct_sound(
-        self, listener: npt.NDArray[np.float64], emitter: npt.NDArray[np.float64], yaw: float
-    ) -> npt.NDArray[np.float32]:
-        """(2, ir_samples)"""
-        paths = self._paths.find(listener, emitter[None])
-        target = PathTarget(float(paths.length_m[0]), tuple(paths.arrival[0]), paths.screen_db[0].astype(np.float32))
-        orientation = Pose.from_yaw((0.0, 0.0, 0.0), float(yaw)).orientation
-        return self._direct.impulse_response(target, orientation, self.field.ir_samples)
+        spread = np.maximum(paths.length_m, NEAR_LIMIT_M)[:, None] ** 2
+        bands = db_to_power(paths.screen_db - paths.length_m[:, None] * self._air_db_per_m) / spread
+        if self._early is not None:
+            bands += self._early.band_power(listeners, emitter)
+        return np.asarray(bands @ self._diffuse_energy)
 
     @cached_property
     def _diffuse_energy(self) -> npt.NDArray[np.float64]:

@@ -113,17 +113,31 @@ def arithmetic_graph() -> bytes:
     return model.SerializeToString()
 
 
-@pytest.fixture(scope="session")
-def bundle(tmp_path_factory) -> Bundle:
+def write_flat(folder: Path, manifest: Manifest) -> Bundle:
     noise = io.BytesIO()
     np.savez(noise, frozen_noise=np.random.default_rng(7).standard_normal((2, CODEC.samples), dtype=np.float32))
-    files = {"arithmetic.onnx": arithmetic_graph(), "arrays.npz": noise.getvalue()}
-    return write_bundle(tmp_path_factory.mktemp("scenes") / "flat", MANIFEST, files)
+    return write_bundle(folder, manifest, {"arithmetic.onnx": arithmetic_graph(), "arrays.npz": noise.getvalue()})
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory) -> Bundle:
+    return write_flat(tmp_path_factory.mktemp("scenes") / "flat", MANIFEST)
 
 
 @pytest.fixture
 def field(bundle) -> AcousticField:
     return AcousticField.load(bundle)
+
+
+@pytest.fixture(scope="session")
+def mirrored_bundle(tmp_path_factory) -> Bundle:
+    """The same scene, whose field leaves the first reflections to geometry."""
+    return write_flat(tmp_path_factory.mktemp("scenes") / "flat", MANIFEST.model_copy(update={"image_order": 1}))
+
+
+@pytest.fixture
+def mirrored_field(mirrored_bundle) -> AcousticField:
+    return AcousticField.load(mirrored_bundle)
 
 
 @pytest.fixture

@@ -173,8 +173,10 @@ def test_nothing_sounds_before_the_path_begins_and_the_clip_begins_with_it(open_
     assert error_db(late[:, 5 * SIZE :], prompt[:, : 15 * SIZE]) < -120
 
 
-def test_a_live_session_replayed_is_equal_to_the_bit(field, filters):
+@pytest.mark.parametrize("name", ["field", "mirrored_field"])
+def test_a_live_session_replayed_is_equal_to_the_bit(name, filters, request):
     """Live: IRs arrive when they arrive, some poses are never heard. The replay gets what the blocks' headers say."""
+    field = request.getfixturevalue(name)
     rng = np.random.default_rng(7)
     clips = {"a": noise(8, 2_000), "b": noise(9, 5_000)}
     session = Session(

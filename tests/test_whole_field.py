@@ -97,11 +97,11 @@ def test_direct_sound_does_not_stop_at_the_corner(apartment):
     assert (levels[0] - levels[-1] > 10).all()
 
 
-def test_direct_power_is_that_of_the_responses(apartment):
+def test_the_power_of_paths_is_that_of_the_responses(apartment):
     """Averaged over as many headings as there are, in sight and out of it."""
     emitter = np.array((2.0, 2.0, 1.5))
     listeners = np.array([(2.6, 2.8, 1.3), (1.0, 4.0, 1.7), (5.0, 1.0, 1.5)])
-    power = apartment.direct_power(listeners, emitter)
+    power = apartment.path_power(listeners, emitter)
     yaws = 2 * np.pi * np.arange(24) / 24
     for listener, expected in zip(listeners, power, strict=True):
         heard = direct(apartment, np.tile(listener, (24, 1)), np.tile(emitter, (24, 1)), yaws)

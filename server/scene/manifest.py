@@ -1,7 +1,8 @@
 """`scene.json`: what a scene bundle says of itself.
 
 Since format 2 the responses of a bundle's fields hold what follows the direct sound and not the direct sound itself,
-which the server computes from geometry.
+which the server computes from geometry. With `image_order` 1 it computes the first reflections too, and the fields hold
+what follows those.
 """
 
 from typing import Annotated, Literal
@@ -176,6 +177,8 @@ class Manifest(Strict):
     bounds: Bounds
     speed_of_sound: Annotated[float, Field(gt=100, lt=1000)]
     air: Air = Air()
+    image_order: Literal[0, 1] = 0
+    """Mirrored reflections of up to so many surfaces are not in the fields: the server computes them from geometry."""
     start: Start
     channels: tuple[Literal["left"], Literal["right"]] = ("left", "right")
     codec: CodecParameters

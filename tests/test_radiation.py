@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL, SUPERCARDIOID, PolarPattern
 from server.acoustics.geometry import Pose
-from server.direct_sound import reverberation_gain, seen_from
+from server.radiation import reverberation_gain, seen_from
 
 coordinates = st.floats(-1, 1)
 

@@ -1,0 +1,48 @@
+"""How emitters radiate where they are placed: what a direction of the world is to one that is turned, and how loud a
+room gets."""
+
+import math
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.decibels import db_to_power
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.geometry import Pose, Quaternion, Vector3
+
+
+class Placed(Protocol):
+    """An emitter, as far as the paths from it are concerned."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def directivity(self) -> Directivity: ...
+
+
+def departure_gain_db(emitter: Placed, departure: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:
+    """(band,) gain of what leaves an emitter in a direction (3,) of the world; 0 for one that radiates all round."""
+    if emitter.directivity == OMNIDIRECTIONAL:
+        return 0.0
+    return emitter.directivity.gain_db(seen_from(emitter.pose.orientation, departure.tolist()))
+
+
+def seen_from(orientation: Quaternion, direction: Vector3) -> Vector3:
+    """A direction of the world in the frame of something turned by `orientation`."""
+    qx, qy, qz, qw = orientation
+    x, y, z = direction
+    # v - w t + q x t with t = 2 q x v, in scalars: NumPy would take ten times as long for three numbers.
+    tx, ty, tz = 2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)
+    return (
+        x - qw * tx + qy * tz - qz * ty,
+        y - qw * ty + qz * tx - qx * tz,
+        z - qw * tz + qx * ty - qy * tx,
+    )
+
+
+def reverberation_gain(directivity: Directivity) -> float:
+    """Amplitude at which an emitter fills a room, beside one that is all round as loud as this is ahead: the power mean
+    over all directions and octave bands."""
+    return math.sqrt(np.mean(db_to_power(directivity.diffuse_gain_db)))
