@@ -84,7 +84,8 @@ class ImpulseResponse:
 
     @classmethod
     def compute(cls, field: AcousticField, query: IrQuery) -> "ImpulseResponse":
-        """Milliseconds of work: keep it off the event loop. Raises RequestError position_out_of_bounds."""
+        """Milliseconds of work: keep it off the event loop. The same samples for the same query, whatever was asked
+        before: a warm phase starts from the frozen one. Raises RequestError position_out_of_bounds."""
         query.require_inside(field)
         whole = WholeField.through_kemar(field)
         samples = whole.impulse_responses([query.listener], [query.emitter], [math.radians(query.yaw_deg)])[0]

@@ -15,6 +15,8 @@ from server.scene.bundle import Bundle
 from server.scene.manifest import CodecParameters
 
 _CALIBRATION_POSES = 5
+_CALIBRATION_MS = 50.0
+"""Of a level that has taken so long no more is asked."""
 
 
 class Levels(Mapping[str, AcousticField]):
@@ -74,19 +76,24 @@ class Levels(Mapping[str, AcousticField]):
         return self.default if name is None else self[require_level(self.bundle, name)]
 
     def calibrate(self, poses: int = _CALIBRATION_POSES) -> dict[str, float]:
-        """What an impulse response takes here and now, by level: the median of `poses`, milliseconds.
+        """What an impulse response takes here and now, by level: the median of `poses`, or of fewer for a level that is
+        slow, milliseconds.
 
-        Levels take turns, so that what else runs meanwhile slows all of them.
+        Time of this thread, so that what else runs meanwhile counts little; levels take turns, so that it slows all of
+        them.
         """
         places = self._places(poses)
         times_ms: dict[str, list[float]] = {name: [] for name in self}
-        for number in range(-1, poses):  # the first round warms up
+        for number in range(-1, poses):
             listener, emitter = places[number], places[number - 1]
             for name, field in self.items():
-                started_s = time.perf_counter()
+                if sum(times_ms[name]) > _CALIBRATION_MS:
+                    continue
+                started_s = time.thread_time()
                 field.impulse_responses([listener], [emitter], [float(number)])
-                times_ms[name].append((time.perf_counter() - started_s) * 1000)
-        return {name: statistics.median(times[1:]) for name, times in times_ms.items()}
+                times_ms[name].append((time.thread_time() - started_s) * 1000)
+        # The first time warms up, where there is another.
+        return {name: statistics.median(times[1:] or times) for name, times in times_ms.items()}
 
     def _places(self, count: int) -> list[tuple[float, ...]]:
         """Between the two places a visitor starts from, along a line."""

@@ -1,5 +1,7 @@
 """Quality levels side by side."""
 
+import time
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -66,3 +68,17 @@ def test_calibration_times_every_level(bundle, tmp_path):
     costs_ms = levels.calibrate()
     assert list(costs_ms) == list(levels)
     assert np.all(np.array(list(costs_ms.values())) > 0)
+
+
+def test_a_slow_level_is_not_asked_again(bundle, tmp_path, monkeypatch):
+    levels = Levels.load(_with(bundle, tmp_path / "two", levels=_levels(None, None)))
+    asked, respond = [], levels["level1"].impulse_responses
+
+    def slowly(*pose):
+        asked.append(pose)
+        time.sleep(0.06)
+        return respond(*pose)
+
+    monkeypatch.setattr(levels["level1"], "impulse_responses", slowly)
+    assert levels.calibrate()["level1"] >= 60
+    assert len(asked) == 1
