@@ -1,0 +1,39 @@
+"""Where numba is absent a field answers the same, only slower."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from server.scene.bundle import BUNDLED
+
+RESPOND = """
+import sys
+from pathlib import Path
+if sys.argv[1] == "without":
+    sys.modules["numba"] = sys.modules["llvmlite"] = None
+import numpy as np
+from server.compiled import HAS_NUMBA
+from server.field.levels import Levels
+from server.scene.bundle import Bundle
+
+assert HAS_NUMBA == (sys.argv[1] == "with")
+field = Levels.load(Bundle.load(Path(sys.argv[2]))).default
+rng = np.random.default_rng(2)
+listeners, emitters = rng.uniform((1, 1, 1.3), (7, 4, 1.8), (2, 12, 3))
+np.save(sys.argv[3], field.impulse_responses(listeners, emitters, rng.uniform(-3, 3, 12)))
+"""
+
+
+@pytest.mark.parametrize("scene", ["flat", "apartment"])
+def test_a_field_answers_the_same(scene, bundle, tmp_path):
+    folder = bundle.folder if scene == "flat" else BUNDLED / scene
+    answers = []
+    for how in ("with", "without"):
+        output = tmp_path / f"{how}.npy"
+        subprocess.run([sys.executable, "-c", RESPOND, how, str(folder), str(output)], check=True)
+        answers.append(np.load(output).astype(np.float64))
+    compiled, plain = answers
+    difference = np.linalg.norm(compiled - plain, axis=(1, 2)) / np.linalg.norm(plain, axis=(1, 2))
+    assert difference.max() < 1e-5
