@@ -46,14 +46,23 @@ def read(path: Path | None, sample_rate: int) -> np.ndarray:
     return soxr.resample(samples.mean(axis=1), rate, sample_rate)
 
 
+def say(change: dict, sample_rate: int) -> None:
+    """What a `level_changed` tells."""
+    at_s, rate_hz = change["sample_clock"] / sample_rate, change["ir_rate_hz"]
+    pace = "with every pose" if rate_hz is None else f"at most {rate_hz:g} times a second"
+    why = {"chosen": "as chosen", "load": "the server is under load", "recovered": "the server has recovered"}
+    print(f"{at_s:.2f} s: level {change['level']}, responses {pace}: {why[change['reason']]}")
+
+
 async def perform(arguments: argparse.Namespace) -> None:
     # Compression off: audio does not shrink, and trying takes time.
     async with connect(arguments.url, compression=None, max_size=None) as socket:
         hello = {"protocol": PROTOCOL, "scene": arguments.scene, "block_size": BLOCK_SIZE, "encoding": "f32"}
-        await socket.send(json.dumps({"type": "hello", **hello}))
+        await socket.send(json.dumps({"type": "hello", **hello, "level": arguments.level}))
         welcome = json.loads(await socket.recv())
         if welcome["type"] == "error":
             raise SystemExit(f"{welcome['code']}: {welcome['message']}")
+        print(f"level {welcome['level']}")
         rate = welcome["sample_rate"]
         dry = read(arguments.input, rate)
         dry = np.pad(dry, (0, -len(dry) % BLOCK_SIZE)).reshape(-1, BLOCK_SIZE)
@@ -84,6 +93,8 @@ async def perform(arguments: argparse.Namespace) -> None:
                 start = event["sample_clock"]
             elif event["type"] == "status":
                 state = event["live"] and event["live"][0]
+            elif event["type"] == "level_changed":
+                say(event, rate)
             elif event["type"] == "error":
                 raise SystemExit(f"{event['code']}: {event['message']}")
 
@@ -102,6 +113,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Send sound to a scene as it is made, and keep what comes back.")
     parser.add_argument("--url", default="ws://127.0.0.1:8000/v1/stream")
     parser.add_argument("--scene", default="apartment")
+    parser.add_argument("--level", default="auto", help="a quality level of GET /v1/scenes/SCENE/frontier")
     parser.add_argument("--input", type=Path, help="audio file to send (default: claps)")
     parser.add_argument(
         "--ahead", type=int, default=4, help="blocks sent ahead: more survives a worse network, fewer are heard sooner"

@@ -130,6 +130,14 @@ class Recording:
         return rows
 
 
+def say(change: dict, sample_rate: int) -> None:
+    """What a `level_changed` tells."""
+    at_s, rate_hz = change["sample_clock"] / sample_rate, change["ir_rate_hz"]
+    pace = "with every pose" if rate_hz is None else f"at most {rate_hz:g} times a second"
+    why = {"chosen": "as chosen", "load": "the server is under load", "recovered": "the server has recovered"}
+    print(f"{at_s:.2f} s: level {change['level']}, responses {pace}: {why[change['reason']]}")
+
+
 async def send_poses(socket: ClientConnection, walk: Walk, poses: dict[int, Pose], sent_s: dict[int, float]) -> None:
     started_s = time.monotonic()
     for step in range(1, round(walk.duration_s * POSES_PER_SECOND) + 1):
@@ -152,11 +160,13 @@ async def listen(arguments: argparse.Namespace) -> None:
             "scene": arguments.scene,
             "block_size": BLOCK_SIZE,
             "encoding": "f32",
+            "level": arguments.level,
         }
         await socket.send(json.dumps(hello))
         welcome = json.loads(await socket.recv())
         if welcome["type"] == "error":
             raise SystemExit(f"{welcome['code']}: {welcome['message']}")
+        print(f"level {welcome['level']}")
         scene = welcome["scene"]
         walk = Walk.through(scene, arguments.seconds)
         recording = Recording(welcome["sample_rate"])
@@ -183,6 +193,8 @@ async def listen(arguments: argparse.Namespace) -> None:
             if event["type"] == "emitter_added":
                 recording.start = event["sample_clock"]
                 walking = asyncio.create_task(send_poses(socket, walk, poses, sent_s))
+            elif event["type"] == "level_changed":
+                say(event, recording.sample_rate)
             elif event["type"] == "error":
                 raise SystemExit(f"{event['code']}: {event['message']}")
         if walking is not None:
@@ -219,6 +231,7 @@ def main() -> None:
     parser.add_argument("--url", default="ws://127.0.0.1:8000/v1/stream")
     parser.add_argument("--scene", default="apartment")
     parser.add_argument("--clip", default="woman-reading", help="one of GET /v1/clips")
+    parser.add_argument("--level", default="auto", help="a quality level of GET /v1/scenes/SCENE/frontier")
     parser.add_argument("--seconds", type=float, default=12.0, help="how long the walk takes")
     parser.add_argument("-o", "--output", type=Path, default=Path("heard.wav"))
     parser.add_argument("--path", type=Path, help="CSV of the path as heard (default: path.csv beside the output)")
