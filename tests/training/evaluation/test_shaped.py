@@ -1,10 +1,18 @@
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
 from training.dataset import SPEED_OF_SOUND
 from training.evaluation.baselines import TrainingPairs, nearest
+from training.evaluation.run import evaluate_bundles
 from training.evaluation.shaped import ShapedNearest, bands, moved, stretches
+from training.importers.conditioning import Conditioning, conditioned
+from training.importers.meshrir import read
+from training.importers.report import ImportReport
+from training.responses import ImportedDataset
 
 RATE = 16_000
 SAMPLES = 2400
@@ -127,3 +135,19 @@ def test_orientations_that_are_asked_for_are_answered(room):
     assert whole.shape == (2, 1, SAMPLES)
     np.testing.assert_allclose(second[0], whole[1], atol=1e-6)
     np.testing.assert_allclose(whole[1], 0.5 * whole[0], atol=1e-3 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("held_out_share", [0.1, 0.5])
+def test_it_is_the_best_answer_on_the_measured_office(tmp_path, held_out_share):
+    office = os.environ.get("NAFIR_MEASURED_OFFICE")
+    if not office:
+        pytest.skip("NAFIR_MEASURED_OFFICE names no folder")
+    report = ImportReport()
+    rows = conditioned(read(Path(office), report), Conditioning(), report)
+    ImportedDataset.write(tmp_path, rows, report, layout="meshrir", source=office, held_out_share=held_out_share)
+    others = ("nearest", "linear", "linear-aligned")
+    evaluation, _ = evaluate_bundles([], tmp_path, methods=[*others, "shaped-nearest"])
+    ours = evaluation.of("shaped-nearest").summaries
+    for metric in ("spectral_loss", "c50", "drr", "level", "onset"):
+        best = min(evaluation.of(name).summaries[metric].mean for name in others)
+        assert ours[metric].mean < best, metric
