@@ -1,6 +1,6 @@
 """The dataset folder: `scene.toml`, and in `pairs.h5` the reflected sound of all pairs of probes, which is what follows
-the direct sound. That one is not stored: `training.simulation.references` computes it from the scene whenever it is
-needed.
+the direct sound and the first reflections. Those are not stored: `training.simulation.references` computes them from
+the scene whenever they are needed.
 
 Axes: emitter, listener, yaw, ear, sample. The pair of a probe with itself is absent (zeros). Samples are float16:
 eleven bits beneath the level of each sample, 66 dB under the signal at every point of its decay down to 6e-5. Smaller
@@ -13,6 +13,7 @@ axes direction, band, bin. They are good to 0.03 dB. `training.simulation.expect
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import h5py
 import numpy as np
@@ -24,7 +25,9 @@ from server.errors import NafirError
 from training.scene_file import SceneFile
 
 SPEED_OF_SOUND = 343.0
-FORMAT = 2
+FORMAT = 3
+GEOMETRIC_ORDER: Literal[1] = 1
+"""Mirrored reflections of up to so many surfaces are left to geometry, as the direct sound is."""
 
 
 class DatasetError(NafirError):
@@ -54,6 +57,8 @@ class Dataset:
             existing = cls.open(folder, finished=False)
             if existing.scene != scene or existing.seed != seed:
                 raise DatasetError(f"{folder}: holds another scene or seed; choose an empty folder")
+            if existing.remaining() and not existing.keeps_energies:
+                raise DatasetError(f"{folder}: was begun when no energies were kept; choose an empty folder")
             return existing
         probes = scene.probe_positions(seed)
         yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
@@ -82,8 +87,12 @@ class Dataset:
         try:
             scene = SceneFile.read(folder / "scene.toml")
             with h5py.File(folder / "pairs.h5", "r") as file:
-                if file.attrs.get("format") != FORMAT:
-                    raise DatasetError(f"{folder}: format {file.attrs.get('format')}, expected {FORMAT}")
+                found = file.attrs.get("format")
+                if found != FORMAT:
+                    holds = ", which holds the first reflections too" if found == 2 else ""
+                    raise DatasetError(
+                        f"{folder}: format {found}{holds}, expected {FORMAT}: simulate into an empty folder"
+                    )
                 done = file["done"][()]
                 dataset = cls(
                     folder, scene, int(file.attrs["seed"]), file["probes"][()], file["yaws"][()], file["held_out"][()]
@@ -110,6 +119,11 @@ class Dataset:
     def onset_s(self) -> npt.NDArray[np.float64]:
         """(emitter, listener) time at which sound can first arrive, round corners where it must."""
         return self.plan.path_length_m(self.probes[:, None], self.probes[None]) / SPEED_OF_SOUND
+
+    @property
+    def keeps_energies(self) -> bool:
+        with h5py.File(self.folder / "pairs.h5", "r") as file:
+            return "log_energy" in file
 
     def remaining(self) -> list[int]:
         """Emitters not simulated yet."""
@@ -148,9 +162,9 @@ class Dataset:
 
         Raises DatasetError for a dataset that was simulated before energies were kept.
         """
+        if not self.keeps_energies:
+            raise DatasetError(f"{self.folder}: holds no energies; simulate into an empty folder")
         with h5py.File(self.folder / "pairs.h5", "r") as file:
-            if "log_energy" not in file:
-                raise DatasetError(f"{self.folder}: holds no energies; simulate into an empty folder")
             logarithms = np.stack([file["log_energy"][emitter, listener] for emitter, listener in pairs])
         return np.exp(logarithms.astype(np.float32))
 

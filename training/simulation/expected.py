@@ -12,7 +12,7 @@ from scipy.special import exp1
 
 from server.acoustics.codec import Codec
 from server.whole_field import kemar
-from training.dataset import Dataset
+from training.dataset import GEOMETRIC_ORDER, Dataset
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
@@ -52,6 +52,7 @@ class ExpectedSpectrograms:
             duration_s=settings.duration_s,
             image_order=settings.image_order,
             arrival_directions=self._synthesis.arrival_directions,
+            least_order=GEOMETRIC_ORDER + 1,
         )
 
     def specular(self, emitter: int, listener: int) -> npt.NDArray[np.float32]:

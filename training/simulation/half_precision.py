@@ -24,7 +24,7 @@ def to_half(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float16]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _round(values, bits, half):  # type: ignore[no-untyped-def]
+def _round(values, bits, half):
     for index in range(len(values)):
         sign = (bits[index] >> np.uint32(16)) & np.uint32(0x8000)
         size = bits[index] & np.uint32(0x7FFFFFFF)

@@ -1,5 +1,5 @@
-"""Simulation of what follows the direct sound, between all pairs of probes of a scene: resumable emitter by emitter,
-the same for the same seed."""
+"""Simulation of what follows the direct sound and the first reflections, between all pairs of probes of a scene:
+resumable emitter by emitter, the same for the same seed."""
 
 import multiprocessing
 import os
@@ -17,7 +17,7 @@ from rich.progress import Progress
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.whole_field import kemar
-from training.dataset import Dataset, DatasetError
+from training.dataset import GEOMETRIC_ORDER, Dataset, DatasetError
 from training.simulation.half_precision import to_half
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
@@ -95,6 +95,7 @@ def _takes(
         duration_s=settings.duration_s,
         image_order=settings.image_order,
         arrival_directions=synthesis.arrival_directions,
+        least_order=GEOMETRIC_ORDER + 1,
     )
     rng = np.random.default_rng([dataset.seed, 2, emitter, take])
     traced = tracer.trace(dataset.probes[emitter], rays=settings.rays, rng=rng)

@@ -209,7 +209,7 @@ class BinauralSynthesis:
 
 
 @numba.njit(cache=True, nogil=True)
-def _triangles_around(across, inverses, directions):  # type: ignore[no-untyped-def]
+def _triangles_around(across, inverses, directions):
     """(direction,) triangle that holds each, and (direction, 3) shares of its corners."""
     triangles, shares = np.empty(len(directions), np.int64), np.empty((len(directions), 3))
     triangle = 0

@@ -19,7 +19,7 @@ _Floats = npt.NDArray[np.float64]
 @dataclass(frozen=True)
 class Arrivals:
     """What the room sends from one emitter to one receiver, at unit pressure one metre from the emitter: all but the
-    direct sound.
+    direct sound and the images that were left out.
 
     `image_positions` (image, xyz) are apparent emitter positions of the specular reflections that reach the receiver,
     none where every path is blocked; `image_amplitudes` (image, band) is their pressure there. `energy` (direction,
@@ -50,12 +50,16 @@ class RoomTracer:
         duration_s: float,
         image_order: int,
         arrival_directions: _Floats,
+        least_order: int = 1,
     ) -> None:
+        """Mirrored paths of up to `image_order` reflections are images, and those of fewer than `least_order` are left
+        out."""
         self._plan = geometry.floor_plan
         self._air = air
         self._receivers = np.asarray(receivers, dtype=np.float64)
         self._duration_s = duration_s
         self._image_order = image_order
+        self._least_order = least_order
         self._mirrored = np.sqrt(np.prod([surface_shares(geometry)[0], 1 - surface_shares(geometry)[1]], axis=0))
         self._rays = RayTracer(
             geometry,
@@ -79,7 +83,7 @@ class RoomTracer:
         heights, level = images_in_height(float(emitter[2]), self._plan.height_m, order)
         receiver, plan, walls = images_in_plan(self._plan, emitter[:2], self._receivers[:, :2], order)
         reflections = walls[:, None] + level.sum(axis=1)
-        path, height = np.nonzero((reflections > 0) & (reflections <= order))
+        path, height = np.nonzero((reflections >= self._least_order) & (reflections <= order))
         receiver = receiver[path]
         positions = np.column_stack([plan[path], heights[height]])
         distance = np.linalg.norm(positions - self._receivers[receiver], axis=-1)

@@ -84,3 +84,5 @@ def test_a_dataset_without_energies_says_so(tiny_scene, tmp_path, codec):
         del file["log_energy"]
     with pytest.raises(DatasetError, match="holds no energies"):
         ExpectedSpectrograms(dataset, codec).diffuse_power(0, 1)
+    with pytest.raises(DatasetError, match="no energies were kept"):
+        Dataset.create(tmp_path, tiny_scene, 0)
