@@ -110,7 +110,8 @@ def export(
     chosen = [known for name in precision.split(",") for known in PRECISIONS if known == name.strip()]
     if len(chosen) != len(precision.split(",")):
         raise typer.BadParameter(f"knows {', '.join(PRECISIONS)}", param_hint="--precision")
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    for talkative in (None, "torch.onnx"):
+        logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or dataset_folder(runs[0]))
     bundle = export_bundle(responses, runs, output, precisions=chosen, exact_tables=exact_tables)
     size = sum(path.stat().st_size for path in output.iterdir())
@@ -200,6 +201,45 @@ def maps(
         methods = list(of_emitter.levels_db)[1:]
         errors = ", ".join(f"{method} {of_emitter.errors_db(method):.2f} dB" for method in methods)
         typer.echo(f"emitter {number}: mean error against the simulation: {errors}")
+
+
+@app.command()
+def probe(
+    bundle: Annotated[Path, typer.Argument(help="Scene bundle.")],
+    data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's field was trained on.")],
+    field: Annotated[str | None, typer.Option(help="Field of the bundle; the default level's if not given.")] = None,
+    emitters: Annotated[int | None, typer.Option(min=1, help="Probes to draw as emitters; all if not given.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="Draw true and decoded distances to this PNG.")] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Decode the distance to the nearest wall from a field's hidden features, against MFCC of the true responses."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from rich.progress import track
+
+    from server.scene.bundle import Bundle
+    from training.evaluation.held_out import open_held_out
+    from training.evaluation.probe_figure import draw_probe
+    from training.probe import probe as probe_field
+
+    console = Console(stderr=True)
+    with open_held_out(data) as held_out:
+        probing = probe_field(
+            Bundle.load(bundle),
+            held_out,
+            field=field,
+            emitters=emitters,
+            seed=seed,
+            track=lambda steps, doing: track(steps, doing, console=console),
+        )
+    if figure is not None:
+        draw_probe(probing, figure)
+    if as_json:
+        typer.echo(json.dumps(probing.to_json(), indent=2))
+        return
+    for name, decoding in (("hidden features", probing.features), ("MFCC of the responses", probing.coefficients)):
+        spread = f"± {100 * decoding.spread:.1f}"
+        typer.echo(f"{name}: {100 * decoding.mean:.1f} {spread} % of the variance over {len(probing.places)} places")
 
 
 @app.command()
