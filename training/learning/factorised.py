@@ -44,6 +44,8 @@ class FactorisedLearner:
             raise RecipeError(
                 "swap: a head is no loudspeaker, so binaural responses differ with their ends exchanged; leave it off"
             )
+        if recipe.expected and not isinstance(responses, SimulatedResponses):
+            raise RecipeError("expected: what is expected of a response is known of simulated ones only; leave it off")
         self.responses = responses
         self.recipe = recipe
         known = 1 if isinstance(responses, SimulatedResponses) else _KNOWN_FRAMES_OF_WHOLE_RESPONSES
@@ -54,7 +56,7 @@ class FactorisedLearner:
         self._targets: Targets | None = None
 
     def prepare(self, folder: Path, progress: Progress) -> None:
-        self._targets = load_targets(self.responses, self.cells, folder, progress)
+        self._targets = load_targets(self.responses, self.cells, folder, progress, expected=self.recipe.expected)
 
     @property
     def targets(self) -> Targets:
