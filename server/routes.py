@@ -29,7 +29,7 @@ from server.whole_field import WholeField
 
 MAX_MAP_POINTS = 2_000
 """A point costs milliseconds."""
-MAX_MAP_S = 30.0
+MAX_MAP_S = 120.0
 CACHE_CONTROL = "public, max-age=3600"
 """Entity tags outlive it: after an hour an unchanged answer costs a 304."""
 

@@ -187,8 +187,7 @@ class Stream:
 
     def step(self, reason: Reason, now_s: float) -> list[Outgoing]:
         """Hear what the ladder, which has been moved, now stands on."""
-        if self._asked_s is not None:
-            self._asked_s = now_s  # what was asked for before does not tell how the new rung does
+        self._forget_waits(now_s)
         return [*self.session.hear(self.ladder.rung, reason)]
 
     def ration_irs(self, *, streams: int, share: float) -> None:
@@ -224,7 +223,14 @@ class Stream:
             self.ladder = self._offer.ladder(message.level, block_s=self.block_s)
         except RequestError as refusal:
             return [Error.from_refusal(refusal)]
+        self._forget_waits(self._time_s())
         return self.session.hear(self.ladder.rung, "chosen")
+
+    def _forget_waits(self, now_s: float) -> None:
+        """What was asked for before does not tell how a new rung does."""
+        self._longest_wait_s = None
+        if self._asked_s is not None:
+            self._asked_s = now_s
 
     def _keep_answer(self, request: IrRequest, answer: "Future[_Computed]") -> None:
         self._answers.append((request, answer))  # on the worker's thread

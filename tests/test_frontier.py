@@ -75,7 +75,7 @@ def test_a_map_that_would_take_too_long_is_refused(levels, hrtfs):
     with TestClient(create_app(Settings(), scenes={"flat": levels}, hrtfs=hrtfs)) as client:
         while client.get("/readyz").status_code != 200:
             pass
-        client.app_state["host"].offers["flat"].ms_here["good"] = 1_000.0
+        client.app_state["host"].offers["flat"].ms_here["good"] = 5_000.0
         slow = client.get("/v1/scenes/flat/loudness?emitter=6,3,1.5&format=json&spacing_m=0.5&level=good")
         assert (slow.status_code, slow.json()["code"]) == (422, "map_too_slow")
         assert client.get("/v1/scenes/flat/loudness?emitter=6,3,1.5&format=json&spacing_m=2&level=fast").is_success

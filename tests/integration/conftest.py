@@ -4,7 +4,8 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 import uvicorn
@@ -12,14 +13,13 @@ import uvicorn
 from server.app import create_app
 from server.cli import server_options
 from server.field.levels import Levels
+from server.hrtfs import HrtfLibrary
 from server.settings import Settings
 
 
-@pytest.fixture
-def served(bundle, hrtfs) -> Iterator[str]:
-    """HOST:PORT of a server of the arithmetic scene, ready, with the options of `nafir serve`."""
-    settings = Settings(port=0)
-    app = create_app(settings, scenes={bundle.id: Levels.load(bundle)}, hrtfs=hrtfs)
+@contextmanager
+def _serving(levels: Levels, hrtfs: HrtfLibrary) -> Iterator[str]:
+    app = create_app(settings := Settings(port=0), scenes={levels.bundle.id: levels}, hrtfs=hrtfs)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
     thread = threading.Thread(target=server.run)
     thread.start()
@@ -32,6 +32,19 @@ def served(bundle, hrtfs) -> Iterator[str]:
     finally:
         server.should_exit = True
         thread.join()
+
+
+@pytest.fixture
+def serving() -> Callable[[Levels, HrtfLibrary], AbstractContextManager[str]]:
+    """Makes HOST:PORT of a server of a scene's levels, ready, with the options of `nafir serve`."""
+    return _serving
+
+
+@pytest.fixture
+def served(bundle, hrtfs) -> Iterator[str]:
+    """HOST:PORT of a server of the arithmetic scene."""
+    with _serving(Levels.load(bundle), hrtfs) as address:
+        yield address
 
 
 def _wait_until_ready(address: str) -> None:

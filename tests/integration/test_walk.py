@@ -68,6 +68,12 @@ def test_a_walk_where_there_is_no_such_scene_says_so(served, tmp_path):
     assert done.stderr.strip() == "unknown_scene: there is no scene 'moon'"
 
 
+def test_a_walk_at_a_level_there_is_not_says_which_there_are(served, tmp_path):
+    done = walk(served, "--scene", "flat", "--level", "best", "-o", str(tmp_path / "heard.wav"))
+    assert done.returncode == 1
+    assert done.stderr.strip() == "unknown_level: 'best' is none of auto, standard"
+
+
 def test_a_walk_without_a_server_says_so(tmp_path):
     done = walk("127.0.0.1:1", "-o", str(tmp_path / "heard.wav"))
     assert done.returncode == 1
