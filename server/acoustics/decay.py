@@ -35,7 +35,8 @@ class EnergyDecay:
     """energy: (..., sample), never rising. onset: (...), samples; -1 where the response is silent.
 
     lowest_db: (...), level relative to the onset down to which the curve may be evaluated: 10 dB above the noise, or
-    the end of the response where no noise is seen; 0 where the tail does not decay.
+    the end of the response where no noise is seen. Where no decay can be told from noise, all of it may be noise at the
+    level that the response ends with; 0 for noise throughout.
     """
 
     energy: _Floats
@@ -91,7 +92,7 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
     """Where each row `(row, sample)` of squared pressure ends.
 
     Returns the end of integration (samples), the noise power per sample, the energy beyond the end, and the lowest
-    energy of the decay curve that may be evaluated (inf where the tail does not decay).
+    energy of the decay curve that may be evaluated.
     """
     rows, samples = power.shape
     audible = power > power.max(axis=-1, keepdims=True) * db_to_power(_NOTHING_DB)
@@ -109,7 +110,9 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
             continue
         tail = _tail(block_power[row, first:stop], levels[row, first:stop])
         if tail is None:
-            lowest[row] = np.inf
+            # What ends the response may be noise or a decay cut off early: as noise from the onset on, it bounds both.
+            late = block_power[row, stop - max(1, round(_TAIL_SHARE * (stop - first))) : stop].mean()
+            lowest[row] = late * (last[row] - onset[row]) * db_to_power(_NOISE_MARGIN_DB)
             continue
         decay_per_sample = tail.decay_db / window * np.log(10.0) / 10.0
         at = last[row] / window - first - 0.5

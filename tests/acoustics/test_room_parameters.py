@@ -137,6 +137,16 @@ class TestEarlyDecayTime:
         with pytest.raises(UnmeasurableError):
             early_decay_time_s(ir, RATE)
 
+    def test_of_a_response_cut_off_within_a_slow_tail(self) -> None:
+        """A fast decay for 25 dB, then a tail that falls by less than 10 dB before the response ends, so that it could
+        be noise: what happens above is known all the same, and the late decay is not."""
+        time_s = np.arange(round(0.09 * RATE)) / RATE
+        power = 10.0 ** (-6.0 * time_s / 0.03) + 1e-4 * 10.0 ** (-6.0 * time_s)
+        ir = np.tile(np.sqrt(power), (2, 1))
+        assert_allclose(early_decay_time_s(ir, RATE), 0.03, rtol=0.05)
+        with pytest.raises(UnmeasurableError):
+            reverberation_time_s(ir, RATE)
+
 
 class TestClarity:
     @pytest.mark.parametrize("t60_s", [0.2, 0.5, 1.0])
