@@ -187,6 +187,20 @@ def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
         raise RunError(f"{run}: holds no checkpoint: {exc.strerror}") from exc
 
 
+def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> None:
+    """Gives the field what a finished run learned. Raises RunError if the run is unfinished."""
+    state = load_checkpoint(run, torch.device("cpu"))
+    if not state["finished"]:
+        length = (
+            f"{state['epochs']:.3g} of {configuration.epochs} epochs"
+            if configuration.minutes is None
+            else f"{state['seconds'] / 60:.1f} of {configuration.minutes:g} minutes"
+        )
+        raise RunError(f"{run}: {length} are trained; run train again")
+    field.load_state_dict(state["field"])
+    field.eval()
+
+
 def append_log(run: Path, row: dict[str, float]) -> None:
     path = run / "log.csv"
     fresh = not path.exists()

@@ -30,11 +30,11 @@ from training.responses import ResponseSet
 from training.runs import (
     CHECKPOINT,
     Configuration,
-    RunError,
     append_log,
     claim,
     load_checkpoint,
     require_same_data,
+    restore,
     save_checkpoint,
 )
 
@@ -80,16 +80,7 @@ def load_learner(responses: ResponseSet, run: Path) -> Learner:
     configuration = Configuration.read(run)
     require_same_data(responses, run)
     learner = learner_of(responses, configuration)
-    state = load_checkpoint(run, torch.device("cpu"))
-    if not state["finished"]:
-        length = (
-            f"{state['epochs']:.3g} of {configuration.epochs} epochs"
-            if configuration.minutes is None
-            else f"{state['seconds'] / 60:.1f} of {configuration.minutes:g} minutes"
-        )
-        raise RunError(f"{run}: {length} are trained; run train again")
-    learner.field.load_state_dict(state["field"])
-    learner.field.eval()
+    restore(learner.field, run, configuration)
     return learner
 
 

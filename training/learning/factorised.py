@@ -4,25 +4,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from rich.progress import Progress
 from torch import Tensor
 
 from server.errors import NafirError
 from training.learning.learner import Losses, Rows
+from training.learning.lessons import Lessons, lessons_of
+from training.learning.naf import NafLearner
 from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
 from training.models.site import Site
 from training.models.targets import Targets, codec_of, load_targets
 from training.responses import ResponseSet, SimulatedResponses
-from training.runs import Configuration, FactorisedRecipe
+from training.runs import Configuration, FactorisedRecipe, require_same_data, restore
 
 # What a target differs by from the best possible prediction (ln magnitude of one noisy bin, of a pooled cell; unit
 # phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its
 # floor.
 _SPREADS = {"fine": 0.64, "late": 0.25, "phasor": 1.0, "interaural": 1.0}
 _HEAD_WEIGHTS = {"fine": 1.0, "late": 1.0, "phasor": 2.0, "interaural": 1.0}
+_LEVEL_HEADS = ("fine", "late")
 _WEIGHT_DECAY = 1e-2
 _SAMPLE_ROWS = 3000
 # A measured response starts with the direct sound, whose phase can be learned; reflections have hardly one.
@@ -54,8 +58,11 @@ class FactorisedLearner:
         self.site = Site.of(responses)
         self.field = FactorisedField(self.site.plan, self.cells, shape, responses.channels)
         self._targets: Targets | None = None
+        self._lessons: Lessons | None = None
 
     def prepare(self, folder: Path, progress: Progress) -> None:
+        if self.recipe.teacher is not None:
+            self._lessons = self._taught(Path(self.recipe.teacher))
         self._targets = load_targets(self.responses, self.cells, folder, progress, expected=self.recipe.expected)
 
     @property
@@ -85,37 +92,58 @@ class FactorisedLearner:
         return one_cycle(fraction)
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
-        return rng.permutation(rows)
+        """Lessons are counted on from the last response."""
+        if self._lessons is None:
+            return rng.permutation(rows)
+        measured = len(self.targets.yaw)
+        return rng.permutation(np.concatenate([rows, measured + np.arange(len(self._lessons.yaw))]))
 
     def validation(self, rows: Rows) -> Rows:
         return rows
 
     def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         rows = np.sort(rows)
-        targets = self.targets
+        measured = int(np.searchsorted(rows, len(self.targets.yaw)))
+        parts = [_rows_of(self.targets, rows[:measured])]
+        if self._lessons is not None:
+            parts.append(_rows_of(self._lessons, rows[measured:] - len(self.targets.yaw)))
         listener, emitter, yaw, flat = (
-            torch.from_numpy(part[rows]) for part in (targets.listener, targets.emitter, targets.yaw, targets.flat)
+            torch.from_numpy(np.concatenate(columns)) for columns in zip(*parts, strict=True)
         )
         if self.recipe.swap and rng is not None:
             swapped = torch.from_numpy(rng.random(len(rows)) < 0.5)[:, None]
             listener, emitter = torch.where(swapped, emitter, listener), torch.where(swapped, listener, emitter)
-        return (listener, emitter, yaw), (flat,)
+        return (listener, emitter, yaw), (flat, torch.arange(len(rows)) < measured)
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
-        field, flat = self.field, targets[0].float()
-        residual = prediction - (flat - field.mean) / field.spread
-        losses = {
-            name: _HEAD_WEIGHTS[name] * residual[:, part].square().mean() for name, part in field.heads.slices.items()
-        }
+        field, flat, measured = self.field, targets[0].float(), targets[1]
+        squared = (prediction - (flat - field.mean) / field.spread).square()
+        losses = {}
+        for name, part in field.heads.slices.items():
+            of_rows = squared[:, part].mean(dim=1)
+            # Lessons are of levels alone.
+            counted = of_rows if name in _LEVEL_HEADS else of_rows * measured
+            losses[name] = _HEAD_WEIGHTS[name] * counted.mean()
         if self.recipe.decay_weight:
             difference = self._decay(field.in_physical_units(prediction)) - self._decay(flat)
             losses["decay"] = self.recipe.decay_weight * difference.abs().mean()
         return losses
 
+    def _taught(self, run: Path) -> Lessons:
+        """Raises RunError if the folder holds no finished run on these data, and RecipeError if it is of another
+        kind."""
+        configuration = Configuration.read(run)
+        if configuration.kind != "naf" or configuration.name == "naf-time-domain":
+            raise RecipeError(f"teacher: {run} holds {configuration.name}; a naf with spectrograms can teach")
+        require_same_data(self.responses, run)
+        teacher = NafLearner(self.responses, configuration)
+        restore(teacher.field, run, configuration)
+        return lessons_of(teacher, self.cells, self.recipe.lessons, configuration.seed)
+
     def _decay(self, flat: Tensor) -> Tensor:
         """(B, channel, band, step) natural logarithm of the energy from each fine frame or late cell on."""
         heads, cells = self.field.heads, self.cells
-        shapes = {name: flat[:, heads.slices[name]].unflatten(1, heads.shapes[name]) for name in ("fine", "late")}
+        shapes = {name: flat[:, heads.slices[name]].unflatten(1, heads.shapes[name]) for name in _LEVEL_HEADS}
         pool = torch.tensor(cells.bands.pool(), device=flat.device)
         fine = pool.T @ torch.exp(2 * shapes["fine"])
         widths = torch.tensor(cells.late_frames.widths, device=flat.device)
@@ -135,9 +163,14 @@ class FactorisedLearner:
         power = torch.zeros_like(field.mean)
         sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
         for start in range(0, len(sample), 256):
-            poses, (flat,) = self.batch(sample[start : start + 256], None)
+            poses, (flat, _) = self.batch(sample[start : start + 256], None)
             predicted = field.in_physical_units(field(*(pose.to(power.device) for pose in poses)))
             power += torch.exp(2 * (flat.to(power.device).float() - predicted)).sum(dim=0) / len(sample)
-        for name in ("fine", "late"):
+        for name in _LEVEL_HEADS:
             part = field.heads.slices[name]
             field.level_correction[part] = 0.5 * torch.log(power[part])
+
+
+def _rows_of(source: Targets | Lessons, rows: Rows) -> tuple[npt.NDArray[np.floating], ...]:
+    """Listener, emitter, yaw and flat target."""
+    return source.listener[rows], source.emitter[rows], source.yaw[rows], source.flat[rows]
