@@ -17,7 +17,7 @@ from server.field.graph import INPUTS, OUTPUTS, RESPONSE
 from server.field.runtime import open_session
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel
-from training.dataset import SPEED_OF_SOUND
+from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.graphs import halve_weights, pose_by_pose, to_int8, to_onnx
 from training.learning.factorised import FactorisedLearner
 from training.learning.naf import NafLearner
@@ -255,6 +255,7 @@ def _manifest(
         ),
         speed_of_sound=SPEED_OF_SOUND,
         air=scene.air,
+        image_order=GEOMETRIC_ORDER,
         start=scene.start,
         codec=codec,
         fields=fields,

@@ -40,7 +40,7 @@ class Simulation(Strict):
     duration_s: Annotated[float, Field(ge=0.25, allow_inf_nan=False)]
     yaws: Annotated[int, Field(ge=1)]
     rays: Annotated[int, Field(ge=100)]
-    image_order: Annotated[int, Field(ge=0, le=6)]
+    image_order: Annotated[int, Field(ge=1, le=6)]
     arrival_directions: Annotated[int, Field(ge=6)]
     held_out_share: Annotated[float, Field(gt=0, lt=0.5)]
 

@@ -56,9 +56,9 @@ def test_second_takes_share_the_mirrors_and_not_the_noise(dataset):
     assert not np.array_equal(first, second)
     for (emitter, listener), one, other in zip(pairs, first, second, strict=True):
         onset = round(dataset.onset_s[emitter, listener] * dataset.sample_rate)
-        # Most of the mirrors in the six walls are heard this early here.
+        # Mirrors in two walls are heard this early here, between what is diffuse.
         head = slice(onset, onset + round(0.008 * dataset.sample_rate))
-        assert np.corrcoef(one[..., head].ravel(), other[..., head].ravel())[0, 1] > 0.3
+        assert np.corrcoef(one[..., head].ravel(), other[..., head].ravel())[0, 1] > 0.2
         tail = slice(onset + 800, None)
         assert abs(np.corrcoef(one[..., tail].ravel(), other[..., tail].ravel())[0, 1]) < 0.2
         # Independent simulations of one room agree on its level.
@@ -97,6 +97,14 @@ def test_a_folder_keeps_to_its_scene_and_seed(dataset, tiny_scene, tmp_path):
     other.write_text(tiny_scene.read_text().replace("rays = 500", "rays = 501"))
     with pytest.raises(DatasetError, match="another scene or seed"):
         Dataset.create(dataset.folder, other, dataset.seed)
+
+
+def test_a_dataset_that_holds_the_first_reflections_is_refused_by_name(tiny_scene, tmp_path):
+    Dataset.create(tmp_path, tiny_scene, 0)
+    with h5py.File(tmp_path / "pairs.h5", "r+") as file:
+        file.attrs["format"] = 2
+    with pytest.raises(DatasetError, match="holds the first reflections too, expected 3: simulate into an empty"):
+        Dataset.open(tmp_path, finished=False)
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "format"])

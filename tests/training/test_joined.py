@@ -1,5 +1,5 @@
-"""The direct path that is rendered and the reflected sound that fields learn are one response, and no part of it comes
-twice.
+"""The direct path and the first reflections that are rendered and the reflected sound that fields learn are one
+response, and no part of it comes twice.
 
 The oracle is the simulation with its own direct sound. Beside a wall's edge, and round it, the direct path bends and
 the simulated one does not: pairs for this stand clear of both.
@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
+from server.acoustics.geometry import Pose
 from server.acoustics.room_parameters import measure
+from server.early_reflections import EarlyReflections
 from server.field.field import AcousticField
+from server.render import RenderedEmitter
 from server.rendering.direct_path import DirectPath, PathTarget
 from server.scene.bundle import BUNDLED, Bundle
 from server.whole_field import WholeField, kemar
-from training.dataset import SPEED_OF_SOUND
+from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
@@ -27,11 +30,13 @@ RATE = 24_000
 
 @dataclasses.dataclass
 class Simulated:
-    """Responses (yaw, ear, sample) of one pair: in two independent takes, and the direct sound in both."""
+    """Responses (yaw, ear, sample) of one pair: in two independent takes, and what is in both, the direct sound and the
+    first reflections."""
 
     emitter: np.ndarray
     listener: np.ndarray
     direct: np.ndarray
+    first: np.ndarray
     reflected: np.ndarray
     again: np.ndarray
 
@@ -54,14 +59,20 @@ def pairs(apartment):
     listeners = emitter + away
     settings = apartment.simulation
     directions = sphere_directions(settings.arrival_directions)
-    tracer = RoomTracer(
-        apartment.geometry,
-        apartment.air,
-        listeners,
-        duration_s=settings.duration_s,
-        image_order=settings.image_order,
-        arrival_directions=directions,
-    )
+
+    def tracer_of(least_order, image_order):
+        return RoomTracer(
+            apartment.geometry,
+            apartment.air,
+            listeners,
+            duration_s=settings.duration_s,
+            image_order=image_order,
+            arrival_directions=directions,
+            least_order=least_order,
+        )
+
+    tracer = tracer_of(GEOMETRIC_ORDER + 1, settings.image_order)
+    firsts = tracer_of(1, GEOMETRIC_ORDER).images(emitter)
     synthesis = BinauralSynthesis(kemar(RATE), directions, YAWS, round(settings.duration_s * RATE))
     rng = np.random.default_rng(0)
     takes = []
@@ -70,8 +81,14 @@ def pairs(apartment):
         onsets = np.linalg.norm(away, axis=-1) / SPEED_OF_SOUND
         takes.append([synthesis.render(*what, rng) for what in zip(arrivals, listeners, onsets, strict=True)])
     return [
-        Simulated(emitter, listener, synthesis.direct(emitter, listener, apartment.air), *reflected)
-        for listener, *reflected in zip(listeners, *takes, strict=True)
+        Simulated(
+            emitter,
+            listener,
+            synthesis.direct(emitter, listener, apartment.air),
+            synthesis.specular(*first, listener),
+            *reflected,
+        )
+        for listener, first, *reflected in zip(listeners, firsts, *takes, strict=True)
     ]
 
 
@@ -97,6 +114,22 @@ def direct_paths(pair, air):
     return np.stack([path.impulse_response(target, quaternion, pair.direct.shape[-1]) for quaternion in turned])
 
 
+def first_reflections(pair, scene):
+    """(yaw, ear, sample) by the code of the server."""
+    early = EarlyReflections(
+        scene.geometry.floor_plan,
+        scene.geometry.materials,
+        speed_of_sound=SPEED_OF_SOUND,
+        air_db_per_m=scene.air.absorption_db_per_m,
+        filters=kemar(RATE),
+    )
+    responses = np.zeros(pair.first.shape, np.float32)
+    emitter = RenderedEmitter(np.zeros(1, np.float32), Pose(tuple(pair.emitter)))
+    for response, yaw in zip(responses, YAWS, strict=True):
+        early.add(response[None], Pose.from_yaw(tuple(pair.listener), yaw), [emitter])
+    return responses
+
+
 def energy_db(response):
     return power_to_db(np.sum(np.square(response, dtype=np.float64), axis=-1))
 
@@ -108,26 +141,40 @@ def test_the_direct_path_is_the_direct_sound_of_the_simulation(pairs, apartment)
         assert np.abs(difference).max() < 0.2
 
 
+def test_first_reflections_are_those_of_the_simulation(pairs, apartment):
+    for pair in pairs:
+        rendered = first_reflections(pair, apartment)
+        assert np.abs(energy_db(rendered) - energy_db(pair.first)).max() < 0.2
+        # In phase, too, from the lowest to the highest frequencies.
+        assert np.sum((rendered - pair.first) ** 2) < 0.02 * np.sum(pair.first**2)
+
+
 def test_joined_to_the_simulated_reflections_nothing_counts_twice(pairs, apartment):
     ratios, energies = [], []
     for pair in pairs:
-        joined, reference = (pair.reflected + part for part in (direct_paths(pair, apartment.air), pair.direct))
+        reference = pair.reflected + pair.direct + pair.first
+        joined = pair.reflected + direct_paths(pair, apartment.air) + first_reflections(pair, apartment)
         ratios.append(pair.drr_db(joined) - pair.drr_db(reference))
         energies.append(energy_db(joined) - energy_db(reference))
-    assert np.abs(ratios).mean() < 0.3
-    assert np.abs(np.mean(ratios)) < 0.15
+    assert np.abs(ratios).mean() < 0.15
     assert np.abs(energies).mean() < 0.15
     # A direct sound more, or less, and this is what it would be.
     once, twice = ([pair.drr_db(pair.reflected + n * pair.direct) for pair in pairs] for n in (1, 2))
     assert np.mean(np.array(twice) - once) > 2
+    # And this, without the first reflections.
+    without = [pair.drr_db(pair.reflected + pair.direct) for pair in pairs]
+    whole = [pair.drr_db(pair.reflected + pair.direct + pair.first) for pair in pairs]
+    assert np.abs(np.array(without) - whole).mean() > 1
 
 
 def test_the_bundled_field_is_the_reflected_sound(pairs, field):
     """Against independent simulations, which differ among each other by 0.3 dB."""
     levels = []
+    holds_first = field.bundle.manifest.image_order < GEOMETRIC_ORDER
     for pair in pairs:
+        reflected = pair.reflected + holds_first * pair.first
         predicted = field.impulse_responses([pair.listener] * len(YAWS), [pair.emitter] * len(YAWS), YAWS)
-        levels.append(energy_db(predicted) - energy_db(pair.reflected))
+        levels.append(energy_db(predicted) - energy_db(reflected))
     assert np.abs(levels).mean() < 0.7
     assert np.abs(np.mean(levels)) < 0.35
 
@@ -136,10 +183,10 @@ def test_the_bundled_field_and_the_direct_path_are_the_whole_response(pairs, fie
     whole = WholeField.through_kemar(field)
     ratios, floor, levels = [], [], []
     for pair in pairs:
-        reference = pair.reflected + pair.direct
+        reference = pair.reflected + pair.direct + pair.first
         predicted = whole.impulse_responses([pair.listener] * len(YAWS), [pair.emitter] * len(YAWS), YAWS)
         ratios.append(pair.drr_db(predicted) - pair.drr_db(reference))
-        floor.append(pair.drr_db(pair.again + pair.direct) - pair.drr_db(reference))
+        floor.append(pair.drr_db(pair.again + pair.direct + pair.first) - pair.drr_db(reference))
         levels.append(energy_db(predicted) - energy_db(reference))
     assert np.abs(ratios).mean() < np.abs(floor).mean() + 0.8
     assert np.abs(np.mean(ratios)) < 0.7
