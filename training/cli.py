@@ -71,6 +71,9 @@ def train(
     points: Annotated[
         int | None, typer.Option(min=1, help="Points of a response a naf sees per step; 2000 if not given.")
     ] = None,
+    teacher: Annotated[
+        Path | None, typer.Option(help="Run folder of a naf on the same data, for a factorised field to learn from.")
+    ] = None,
 ) -> None:
     """Train a field on a dataset. Run again after an interruption to go on; with torchrun, in several processes."""
     from training.responses import open_responses
@@ -82,6 +85,7 @@ def train(
         field,
         rank=rank,
         points=points,
+        teacher=teacher,
         seed=seed,
         share=share,
         **{name: value for name, value in given.items() if value is not None},
@@ -89,6 +93,35 @@ def train(
     with _progress() as progress:
         train_field(open_responses(data), output, configuration, progress)
     typer.echo(f"{output}: {configuration.name} is trained")
+
+
+@app.command()
+def ablate(
+    data: Annotated[Path, typer.Argument(help="Dataset folder from simulate or import.")],
+    output: Folder,
+    rank: Annotated[int, typer.Option(min=16, max=256, help="Size of the basis.")] = 128,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the training set, of every run.")] = 14,
+    teacher: Annotated[Path | None, typer.Option(help="Run folder of a naf on the same data, to learn from.")] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Train the factorised field once per lever and compare errors on the held-out pairs. Run again to go on."""
+    from dataclasses import asdict
+
+    from training.ablation import ablate as ablate_levers
+    from training.ablation import table, variants
+    from training.responses import open_responses
+    from training.runs import configure
+
+    responses = open_responses(data)
+    configurations = variants(configure("factorised", rank=rank, epochs=epochs, seed=seed), responses, teacher)
+    with _progress() as progress:
+        rows = ablate_levers(responses, output, configurations, progress)
+    if as_json:
+        typer.echo(json.dumps([asdict(row) for row in rows], indent=2))
+        return
+    for line in table(rows):
+        typer.echo("".join(column.ljust(24 if number == 0 else 15) for number, column in enumerate(line)).rstrip())
 
 
 @app.command()
@@ -122,7 +155,10 @@ def export(
 @app.command()
 def evaluate(
     places: Annotated[
-        list[Path], typer.Argument(metavar="BUNDLE... DATA", help="Scene bundles, and last the dataset folder.")
+        list[Path],
+        typer.Argument(
+            metavar="BUNDLE... DATA", help="Scene bundles, or runs on measured data, and last the dataset folder."
+        ),
     ],
     methods: Annotated[
         str, typer.Option(help="What to compare with, comma by comma; an empty string for nothing.")
@@ -144,13 +180,15 @@ def evaluate(
     from training.evaluation.report import markdown, report
     from training.evaluation.run import evaluate_bundles
 
-    if record and len(places) != 2:
+    runs = [place for place in places[:-1] if (place / "run.json").is_file()]
+    bundles = [Bundle.load(place) for place in places[:-1] if place not in runs]
+    if record and (len(bundles) != 1 or runs):
         raise typer.BadParameter("takes one bundle", param_hint="--record")
     console = Console(stderr=True)
-    bundles = [Bundle.load(place) for place in places[:-1]]
     evaluation, published = evaluate_bundles(
         bundles,
         places[-1],
+        runs=runs,
         methods=[name.strip() for name in methods.split(",") if name.strip()],
         pairs=pairs,
         yaws=yaws,

@@ -127,11 +127,10 @@ def _factorised(
     poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
     codec = _codec_parameters(learner, cells.known_frames)
     exported = []
+    graph = to_onnx(module, _tensors(poses, 2), OUTPUTS)
     for precision in precisions:
-        model = to_onnx(module, _tensors(poses, 2), OUTPUTS)
-        if precision == "int8":
-            model = to_int8(model, least_weights=min(_INT8_LEAST_WEIGHTS, learner.field.basis.numel()))
-        model = halve_weights(model)
+        least_weights = min(_INT8_LEAST_WEIGHTS, learner.field.basis.numel())
+        model = halve_weights(to_int8(graph, least_weights=least_weights) if precision == "int8" else graph)
         _check(model, module, poses, OUTPUTS, precision)
         exported.append(_Exported(f"factorised-r{rank}{_suffix(precision)}", model, "factorised", rank, codec))
     return exported
@@ -148,11 +147,10 @@ def _naf(
     exported = []
     for tabled in (False, True)[: 1 + exact_tables]:
         module = NafGraph(field, learner.codec, tabled=tabled).eval()
+        graph = to_onnx(module, _tensors(poses, 1), outputs, free_batch=False)
         for precision in precisions:
-            model = to_onnx(module, _tensors(poses, 1), outputs, free_batch=False)
-            if precision == "int8":
-                model = to_int8(model, least_weights=field.shape.width**2)
-            model = pose_by_pose(model)
+            small = to_int8(graph, least_weights=field.shape.width**2) if precision == "int8" else graph
+            model = pose_by_pose(small)
             _check(model, module, poses, outputs, precision)
             name = f"{configuration.name}{'-tables' if tabled else ''}{_suffix(precision)}"
             exported.append(_Exported(name, model, configuration.name, None, codec))

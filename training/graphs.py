@@ -47,37 +47,31 @@ def to_onnx(
 def pose_by_pose(model: onnx.ModelProto) -> onnx.ModelProto:
     """A graph of one pose as the body of a scan over a free batch axis, so that memory does not grow with the batch:
     one response of `naf` takes a third of a gigabyte of intermediate values."""
-    body = model.graph
-    shapes = {name: list(INPUTS[name]) for name in INPUTS}
-    given, taken, nodes_before, nodes_after = [], [], [], []
-    for name, shape in shapes.items():
+    body = onnx.GraphProto()
+    body.CopyFrom(model.graph)
+    outputs = [output.name for output in body.output]
+    # What the whole batch is called outside may not be called the same inside.
+    inside = {name: f"{name}_alone" for name in (*INPUTS, *outputs)}
+    for node in body.node:
+        node.input[:] = [inside.get(name, name) for name in node.input]
+        node.output[:] = [inside.get(name, name) for name in node.output]
+    for tensor in body.initializer:
+        tensor.name = inside.get(tensor.name, tensor.name)
+    scanned, given, taken, before, after = [], [], [], [], []
+    for name, shape in INPUTS.items():
         given.append(helper.make_tensor_value_info(f"{name}_of_pose", TensorProto.FLOAT, shape))
-        nodes_before.append(helper.make_node("Unsqueeze", [f"{name}_of_pose", "batch_axis"], [name]))
+        scanned.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]))
+        before.append(helper.make_node("Unsqueeze", [f"{name}_of_pose", "batch_axis"], [inside[name]]))
+    results = []
     for output in body.output:
-        shape = [dimension.dim_value for dimension in output.type.tensor_type.shape.dim][1:]
+        shape = [axis.dim_value for axis in output.type.tensor_type.shape.dim][1:]
         taken.append(helper.make_tensor_value_info(f"{output.name}_of_pose", TensorProto.FLOAT, shape))
-        nodes_after.append(helper.make_node("Squeeze", [output.name, "batch_axis"], [f"{output.name}_of_pose"]))
-    of_pose = helper.make_graph(
-        [*nodes_before, *body.node, *nodes_after],
-        "pose",
-        given,
-        taken,
-        [*body.initializer, numpy_helper.from_array(np.zeros(1, np.int64), "batch_axis")],
-        value_info=body.value_info,
-    )
-    # Names inside the body hide those outside, where the same names are the whole batch's.
-    names = [output.name for output in body.output]
-    scan = helper.make_node("Scan", list(shapes), names, body=of_pose, num_scan_inputs=len(shapes))
-    results = [
-        helper.make_tensor_value_info(
-            name, TensorProto.FLOAT, ["batch", *(axis.dim_value for axis in value.type.tensor_type.shape.dim)]
-        )
-        for name, value in zip(names, taken, strict=True)
-    ]
-    inputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]) for name, shape in shapes.items()
-    ]
-    whole = helper.make_graph([scan], "poses", inputs, results)
+        results.append(helper.make_tensor_value_info(output.name, TensorProto.FLOAT, ["batch", *shape]))
+        after.append(helper.make_node("Squeeze", [inside[output.name], "batch_axis"], [f"{output.name}_of_pose"]))
+    axis = numpy_helper.from_array(np.zeros(1, np.int64), "batch_axis")
+    of_pose = helper.make_graph([*before, *body.node, *after], "pose", given, taken, [*body.initializer, axis])
+    scan = helper.make_node("Scan", list(INPUTS), outputs, body=of_pose, num_scan_inputs=len(INPUTS))
+    whole = helper.make_graph([scan], "poses", scanned, results)
     wrapped = helper.make_model(whole, opset_imports=model.opset_import, ir_version=model.ir_version)
     onnx.checker.check_model(wrapped)
     return wrapped
@@ -86,7 +80,9 @@ def pose_by_pose(model: onnx.ModelProto) -> onnx.ModelProto:
 def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
     """Stores large float32 constants as float16, cast back as the graph is loaded: half the bundle, the same
     arithmetic."""
-    graph = model.graph
+    halved = onnx.ModelProto()
+    halved.CopyFrom(model)
+    graph = halved.graph
     casts = []
     for tensor in graph.initializer:
         values = numpy_helper.to_array(tensor)
@@ -97,8 +93,8 @@ def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
         casts.append(helper.make_node("Cast", [f"{name}_half"], [name], to=TensorProto.FLOAT))
     for position, node in enumerate(casts):
         graph.node.insert(position, node)
-    onnx.checker.check_model(model)
-    return model
+    onnx.checker.check_model(halved)
+    return halved
 
 
 def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
@@ -107,14 +103,20 @@ def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     constants = {tensor.name: int(np.prod(tensor.dims)) for tensor in model.graph.initializer}
+    # The quantiser makes a product and a sum of a Gemm, and calls the product so.
     kept = [
-        node.name
+        name
         for node in model.graph.node
+        for name in (node.name, f"{node.name}_MatMul")
         if node.op_type in {"MatMul", "Gemm"} and constants.get(node.input[1], 0) < least_weights
     ]
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    # The quantiser transposes weights and then trips over their shapes as noted before.
+    copy.graph.ClearField("value_info")
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
-        onnx.save(model, source)
+        onnx.save(copy, source)
         quantize_dynamic(
             source,
             target,

@@ -119,7 +119,9 @@ _NAF_SHAPES = {
 FIELDS = ("factorised", *_NAF_SHAPES)
 
 
-def configure(field: str, *, rank: int | None = None, points: int | None = None, **changes: Any) -> Configuration:
+def configure(
+    field: str, *, rank: int | None = None, points: int | None = None, teacher: Path | None = None, **changes: Any
+) -> Configuration:
     """The usual configuration of a field by its name on the command line, changed as said.
 
     Raises RunError for another name, or for an option that this field has not.
@@ -129,9 +131,12 @@ def configure(field: str, *, rank: int | None = None, points: int | None = None,
     if field == "factorised":
         if points is not None:
             raise RunError("points: a factorised field is trained on whole responses; leave it out")
-        return Configuration(shape=FieldShape() if rank is None else FieldShape(rank=rank), **changes)
-    if rank is not None:
-        raise RunError(f"rank: only a factorised field has one; leave it out for {field}")
+        shape = FieldShape() if rank is None else FieldShape(rank=rank)
+        recipe = FactorisedRecipe(teacher=None if teacher is None else str(teacher.resolve()))
+        return Configuration(shape=shape, recipe=recipe, **changes)
+    for option, value in (("rank", rank), ("teacher", teacher)):
+        if value is not None:
+            raise RunError(f"{option}: only a factorised field has one; leave it out for {field}")
     return Configuration.naf(_NAF_SHAPES[field], NafRecipe() if points is None else NafRecipe(points=points), **changes)
 
 

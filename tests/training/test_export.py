@@ -5,14 +5,19 @@ import onnx
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from rich.progress import Progress
 
+from server.field.levels import Levels
 from server.field.runtime import open_session
 from training import export as export_module
 from training.export import INPUTS, MODEL_FILE, OUTPUTS, ExportError, export
 from training.graphs import halve_weights
 from training.models.factorised import ExportedField
+from training.models.naf import NafShape
+from training.models.naf_graph import NafGraph
 from training.responses import SimulatedResponses
-from training.train import load_learner
+from training.runs import Configuration, NafRecipe
+from training.train import load_learner, train
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +145,109 @@ def test_the_manifest_describes_the_scene(tiny_bundle, dataset):
     assert (probes <= manifest.bounds.maximum).all()
     for position in (manifest.start.listener, manifest.start.emitter):
         tiny_bundle.require_inside(position, "start")
+
+
+@pytest.fixture(scope="module")
+def naf_run(dataset, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("naf") / "run"
+    shape = NafShape(width=32, grid_features=4)
+    configuration = Configuration.naf(shape, NafRecipe(points=60), epochs=4, batch=4, learning_rate=3e-3)
+    train(SimulatedResponses(dataset), folder, configuration, Progress(disable=True))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def time_domain_run(dataset, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("time") / "run"
+    configuration = Configuration.naf(NafShape(domain="time", width=16), NafRecipe(points=60), epochs=1, batch=4)
+    train(SimulatedResponses(dataset), folder, configuration, Progress(disable=True))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def family(dataset, run, naf_run, tmp_path_factory):
+    """A bundle of both kinds of fields in both precisions."""
+    return export(
+        SimulatedResponses(dataset),
+        [run, naf_run],
+        tmp_path_factory.mktemp("family") / "bundle",
+        precisions=("float32", "int8"),
+        exact_tables=True,
+    )
+
+
+def test_several_runs_become_fields_of_one_bundle(family):
+    names = ["factorised", "factorised-r16-int8", "naf", "naf-int8", "naf-tables", "naf-tables-int8"]
+    assert list(family.manifest.fields) == names
+    assert [level.name for level in family.manifest.levels] == ["standard", *names[1:]]
+    assert [level.field for level in family.manifest.levels] == names
+    assert all(level.phase.kind == "frozen" for level in family.manifest.levels)
+    fields = family.manifest.fields
+    assert fields["factorised"].codec is None
+    assert (fields["factorised"].rank, fields["naf"].rank) == (16, None)
+    assert (fields["naf"].codec.n_fft, fields["naf"].codec.hop) == (512, 128)
+
+
+def test_the_first_field_is_what_it_is_alone(family, tiny_bundle):
+    assert family.models[MODEL_FILE] == tiny_bundle.models[MODEL_FILE]
+    assert family.manifest.fields["factorised"] == tiny_bundle.manifest.fields["factorised"]
+    assert family.manifest.levels[0] == tiny_bundle.manifest.levels[0]
+    assert family.manifest.codec == tiny_bundle.manifest.codec
+
+
+def test_all_of_them_are_heard(family):
+    levels = Levels.load(family)
+    ends = [(1.0, 1.0, 1.5)], [(3.0, 2.0, 1.5)]
+    responses = {name: field.impulse_responses(*ends, [0.3])[0] for name, field in levels.items()}
+    assert all(np.isfinite(response).all() for response in responses.values())
+    assert all(np.sum(response**2) > 0 for response in responses.values())
+    # The same network, written in two ways.
+    scale = np.abs(responses["naf"]).max()
+    np.testing.assert_allclose(responses["naf-tables"], responses["naf"], atol=1e-3 * scale)
+
+
+def test_a_field_in_the_time_domain_gives_responses(dataset, time_domain_run, tmp_path):
+    bundle = export(SimulatedResponses(dataset), [time_domain_run], tmp_path / "bundle")
+    assert list(bundle.manifest.fields) == ["naf-time-domain"]
+    field = Levels.load(bundle).default
+    assert field.level.name == "standard"
+    assert field.graph.gives_responses
+    response = field.impulse_responses([(1.0, 1.0, 1.5)], [(3.0, 2.0, 1.5)], [0.3])[0]
+    assert response.shape == (2, dataset.samples)
+    assert np.isfinite(response).all()
+    assert np.sum(response**2) > 0
+
+
+def test_a_graph_of_naf_computes_what_torch_does_pose_by_pose(family, dataset, naf_run):
+    learner = load_learner(SimulatedResponses(dataset), naf_run)
+    arrays = poses(3)
+    with torch.no_grad():
+        expected = NafGraph(learner.field, learner.codec, tabled=False)(*map(torch.from_numpy, arrays))
+    for name in ("naf.onnx", "naf-tables.onnx"):
+        found = answer(open_session(family.models[name]), arrays)
+        for output, values in zip(OUTPUTS, expected, strict=True):
+            np.testing.assert_allclose(found[output], values, atol=1e-4)
+
+
+def test_eight_bits_are_smaller_and_close(family):
+    for name, other in (("factorised", "factorised-r16-int8"), ("naf", "naf-int8")):
+        whole, small = (family.models[f"{each}.onnx"] for each in (name, other))
+        assert b"MatMulInteger" in small
+        assert b"MatMulInteger" not in whole
+        arrays = poses(6)
+        one, two = (answer(open_session(model), arrays)["log_magnitude"] for model in (whole, small))
+        assert 0 < np.sqrt(np.mean((one - two) ** 2)) < 0.1
+    assert len(family.models["naf-int8.onnx"]) < len(family.models["naf.onnx"])
+
+
+def test_the_coherence_of_naf_is_the_training_sets(family, dataset, naf_run):
+    stored = load_learner(SimulatedResponses(dataset), naf_run).field.coherence.numpy()
+    found = answer(open_session(family.models["naf.onnx"]), poses(2))
+    np.testing.assert_allclose(found["interaural_coherence"], np.stack([stored] * 2), atol=1e-6)
+    assert not found["phase_certainty"].any()
+
+
+def test_fields_of_the_same_name_do_not_share_a_bundle(dataset, run, tmp_path):
+    with pytest.raises(ExportError, match="factorised-r16: more than one run"):
+        export(SimulatedResponses(dataset), [run, run], tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()

@@ -14,8 +14,11 @@ from training.models.naf import SLOPE, Naf
 
 
 class NafGraph(nn.Module):
-    """Log-magnitude, instantaneous frequency, its certainty (all ones: the paper's network claims no less) and the
-    training set's interaural coherence (without it for one channel); in the time domain the aligned response alone."""
+    """Log-magnitude, instantaneous frequency, its certainty and the training set's interaural coherence (without it for
+    one channel); in the time domain the aligned response alone.
+
+    The certainty is nothing throughout. The paper's network does not say how sure it is of a phase, and the paper's
+    own evaluation puts random phase in its place; a level that integrates the frequency does not ask."""
 
     def __init__(self, field: Naf, codec: Codec, *, tabled: bool) -> None:
         super().__init__()
@@ -45,7 +48,7 @@ class NafGraph(nn.Module):
         if field.shape.domain == "time":
             return (physical[:, 0],)
         log_magnitude = torch.clamp(physical[:, 0], min=self._silence)
-        outputs = log_magnitude, physical[:, 1], torch.ones_like(log_magnitude)
+        outputs = log_magnitude, physical[:, 1], torch.zeros_like(log_magnitude)
         if field.channels == 1:
             return outputs
         return *outputs, field.coherence.expand(len(listener), -1, -1, -1)
