@@ -1,7 +1,7 @@
 """A trained acoustic field: poses in, binaural impulse responses of the reflected sound out.
 
 Reflected sound is all that follows the direct sound, which is not in here: it is computed from geometry
-(`server.whole_field` adds it).
+(`server.whole_field` adds it). So are the first reflections, where the bundle's `image_order` is 1.
 
 Axes: B poses; responses (B, ear, sample). Metres, radians, seconds.
 """
@@ -79,8 +79,7 @@ class AcousticField:
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike, *, remember: bool = False
     ) -> Float32:
-        """(B, 2, ir_samples) without the direct sound; sample 0 is the moment of emission, unit pressure at one
-        metre.
+        """(B, 2, ir_samples) without what geometry adds; sample 0 is the moment of emission, unit pressure at one metre.
 
         The same for the same poses, always; but with `remember` a level whose phase is warm starts from the phase that
         it last found near a pose, and leaves its own to the next: for streams, which go from each pose to one near it.

@@ -32,7 +32,7 @@ class Entry:
     visible: bool
     reference: _Responses
     reflected: _Responses
-    """The reference without its direct sound."""
+    """What a field is asked for: the reference without its direct sound and its first reflections."""
     repeat: _Responses
     parameters: RoomParameters
 

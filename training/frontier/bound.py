@@ -9,7 +9,7 @@ from training.models.targets import align
 
 
 class TruePhase:
-    """Whole responses (yaw, ear, sample): predicted magnitudes, the reference's phase and direct sound."""
+    """Whole responses (yaw, ear, sample): predicted magnitudes, the reference's phase, and what geometry adds to it."""
 
     def __init__(self, field: AcousticField) -> None:
         manifest = field.bundle.manifest
