@@ -79,7 +79,7 @@ class AcousticField:
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike, *, remember: bool = False
     ) -> Float32:
-        """(B, 2, ir_samples) without what geometry adds; sample 0 is the moment of emission, unit pressure at one metre.
+        """(B, 2, ir_samples) without what geometry adds; sample 0 is emission, unit pressure at one metre.
 
         The same for the same poses, always; but with `remember` a level whose phase is warm starts from the phase that
         it last found near a pose, and leaves its own to the next: for streams, which go from each pose to one near it.
