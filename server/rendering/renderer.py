@@ -101,6 +101,7 @@ class Renderer:
         self._mixer = Mixer(self._convolver, self._direct)
         self._emitters: dict[str, _Emitter] = {}
         self._changed: list[_Emitter] = []  # since the last block
+        self._has_changed = False  # before the last block
         self._leaving: list[_Emitter] = []  # ramp down in the next block
         self._ringing: list[int] = []  # slots of those gone since
         self._free_slots = list(range(slots))
@@ -114,7 +115,7 @@ class Renderer:
     @property
     def exchanged(self) -> bool:
         """Whether an IR was exchanged in the block last rendered."""
-        return bool(self._convolver.exchanged)
+        return self._has_changed and bool(self._convolver.exchanged)
 
     def applied(self, emitter_id: str) -> int | None:
         """Token of the IR in effect, in its head, at the end of the block last rendered; None before the first."""
@@ -245,6 +246,7 @@ class Renderer:
                 if not emitter.has_played:
                     emitter.has_played = True
                     self._mixer.play(emitter.slot, emitter.source)
+        self._has_changed = bool(self._changed)
         self._changed.clear()
         return self._mixer
 
