@@ -1,6 +1,7 @@
 // Joins the parts: scene and loudness over HTTP, poses and audio through the stream worker, the plan, the panel and the keyboard.
 
 import { FloorPlan } from "./floorplan.js";
+import { Frontier } from "./frontier.js";
 import { PoseLedger } from "./latency.js";
 import { Legend } from "./legend.js";
 import { LoudnessField, combine, parseGrid, raised, scaleOf } from "./loudness.js";
@@ -10,7 +11,7 @@ import { onThemeChange } from "./palette.js";
 import { Panel } from "./panel.js";
 import { Paper } from "./paper.js";
 import { Player } from "./player.js";
-import { fetchClips, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
+import { fetchClips, fetchFrontier, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
 import { Sources } from "./sources.js";
 import { Walking } from "./walking.js";
 import { World } from "./world.js";
@@ -28,6 +29,8 @@ class Page {
     this.notices = new Notices(find("notices"));
     this.panel = new Panel(document);
     this.legend = new Legend(find("legend"));
+    this.frontier = new Frontier(find("quality"));
+    this.level = null; // what is heard; null while there is no stream
     this.player = new Player();
     this.ledger = new PoseLedger();
     this.reverberationLedger = new PoseLedger();
@@ -53,11 +56,13 @@ class Page {
       return;
     }
     if (wanted && chosen.id !== wanted) this.notices.show("scene", `There is no scene called “${wanted}”; this is ${chosen.name}.`);
-    const [scene, clips] = await Promise.all([
+    const [scene, clips, frontier] = await Promise.all([
       this.#untilAnswered(() => fetchScene(chosen.id)),
       this.#untilAnswered(fetchClips),
+      this.#untilAnswered(() => fetchFrontier(chosen.id)),
     ]);
     this.#setUp(scene, clips);
+    this.frontier.show(frontier);
     this.#offer(scenes, scene);
     this.#setConnection("idle", "Ready");
   }
@@ -154,6 +159,10 @@ class Page {
         this.reverberationLedger.posed(detail);
       },
       status: (detail) => this.panel.status(detail),
+      level: (detail) => {
+        this.level = detail.level;
+        this.frontier.changed(detail);
+      },
       refused: ({ code, message }) => this.notices.show(code, message),
     };
     this.worker.onmessage = ({ data: { type, detail } }) => handlers[type](detail);
@@ -162,6 +171,7 @@ class Page {
 
   #listenToControls() {
     find("play").addEventListener("click", () => (this.playing ? this.pause() : this.play()));
+    this.frontier.addEventListener("chosen", ({ detail }) => this.#tell("level", { name: detail }));
     find("volume").addEventListener("input", ({ target }) => this.#setVolume(target.valueAsNumber));
     this.#setVolume(find("volume").valueAsNumber);
     onThemeChange(() => {
@@ -204,7 +214,7 @@ class Page {
     }
     if (!this.playing) return;
     this.notices.clear("audio");
-    const hello = { scene: this.scene.id, sampleRate: this.scene.sample_rate };
+    const hello = { scene: this.scene.id, sampleRate: this.scene.sample_rate, level: this.frontier.chosen };
     const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
     this.#tell("open", { url: streamUrl(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
   }
@@ -216,6 +226,7 @@ class Page {
     if (this.playing) return;
     this.#tell("close");
     this.panel.rest();
+    this.frontier.heard = this.level = null;
     this.plan.glow(0, 0);
     this.#setConnection("idle", "Paused");
   }
@@ -240,6 +251,9 @@ class Page {
     if (state === "connecting" && attempt === 0) this.#setConnection("connecting", "Connecting");
     else if (state === "live") {
       this.#setConnection("live", "Live");
+      this.frontier.heard = this.level = detail.welcome.level;
+      // A page opened while the server warmed up does not know yet what levels cost there.
+      fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
       this.notices.clear("connection");
     } else if (state === "waiting") {
       this.steady = false;

@@ -28,6 +28,7 @@ async function getJson(url, options) {
 
 export const fetchScenes = async () => (await getJson(endpoint("scenes"))).scenes;
 export const fetchScene = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}`));
+export const fetchFrontier = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}/frontier`));
 export const fetchClips = async () => (await getJson(endpoint("clips"))).clips;
 
 export function fetchLoudness(scene, { position, heightM, spacingM, signal }) {

@@ -32,8 +32,8 @@ export class Stream {
   #heartbeat = 0;
 
   /**
-   * `hello` is {scene, sampleRate}; `listeners` are callbacks: block(block), state({state, ...}), posed({poseId, at}),
-   * status(message), refused({code, message, field}).
+   * `hello` is {scene, sampleRate, level}; `listeners` are callbacks: block(block), state({state, ...}), posed({poseId, at}),
+   * status(message), level(message), refused({code, message, field}).
    */
   constructor({ url, hello, listener, emitters, listeners }) {
     this.#url = url;
@@ -70,6 +70,11 @@ export class Stream {
     if (!this.#emitters.delete(id)) return;
     this.#dirty.delete(`emitter ${id}`);
     if (this.#welcomed) this.#send(message.removeEmitter(id));
+  }
+
+  setLevel(level) {
+    this.#hello = { ...this.#hello, level };
+    if (this.#welcomed) this.#send(message.setLevel(level));
   }
 
   close() {
@@ -126,6 +131,7 @@ export class Stream {
     this.#heardAt = now();
     if (received.type === "welcome") this.#welcome(received);
     else if (received.type === "status") this.#listeners.status(received);
+    else if (received.type === "level_changed") this.#listeners.level(received);
     else if (received.type === "error") {
       this.#lastError = received.message;
       this.#listeners.refused(received);

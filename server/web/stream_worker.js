@@ -23,6 +23,7 @@ function open({ url, hello, listener, emitters, port }) {
       },
       posed: tell("posed"),
       status: tell("status"),
+      level: tell("level"),
       refused: tell("refused"),
     },
   });
@@ -33,6 +34,7 @@ const commands = {
   listener: (detail) => stream?.setListener(detail),
   emitter: (detail) => stream?.setEmitter(detail),
   remove: ({ id }) => stream?.removeEmitter(id),
+  level: ({ name }) => stream?.setLevel(name),
   close() {
     stream?.close();
     stream = null;

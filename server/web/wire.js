@@ -54,8 +54,9 @@ export function parseBlock(buffer) {
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, listener }) =>
-    JSON.stringify({ type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", listener }),
+  hello: ({ scene, sampleRate, level, listener }) =>
+    JSON.stringify({ type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, listener }),
+  setLevel: (level) => JSON.stringify({ type: "set_level", level }),
   addEmitter: ({ id, clip, position, gainDb }) => JSON.stringify({ type: "add_emitter", id, clip, position, gain_db: gainDb }),
   setGain: ({ id, gainDb }) => JSON.stringify({ type: "set_gain", id, gain_db: gainDb }),
   moveEmitter: ({ id, position, poseId }) => JSON.stringify({ type: "move_emitter", id, position, pose_id: poseId }),

@@ -1,0 +1,163 @@
+// What accuracy costs in time: one mark per quality level, on a logarithmic scale of milliseconds, and what the server says of
+// the one that is heard.
+//
+// Errors are in just-noticeable differences (JND), the mean over the metrics that have one; smaller is better.
+
+const SVG = "http://www.w3.org/2000/svg";
+const [WIDTH, HEIGHT] = [296, 132];
+const MARGIN = { left: 26, right: 14, top: 12, bottom: 22 };
+const KEPT = 3; // changes told
+const REASONS = {
+  chosen: "as you chose",
+  load: "the server has too much to do",
+  recovered: "the server has time again",
+};
+
+const milliseconds = (value) => `${value < 1 ? value.toFixed(2) : value.toPrecision(2)} ms`;
+const costOf = (level) => level.ms_p50 ?? level.ms_here;
+const isPlaced = (level) => level.audible !== null && costOf(level) !== null;
+
+function draw(name, attributes, parent, text) {
+  const node = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, typeof value === "number" ? +value.toFixed(2) : value);
+  if (text !== undefined) node.textContent = text;
+  parent?.append(node);
+  return node;
+}
+
+export class Frontier extends EventTarget {
+  #chart;
+  #choice;
+  #name;
+  #note;
+  #changes;
+  #levels = [];
+  #heard = null;
+  #told = []; // {at, text}, newest first
+
+  /** `root` is the section; emits "chosen" with a level's name, or "auto". */
+  constructor(root) {
+    super();
+    const find = (id) => root.querySelector(`#${id}`);
+    this.#chart = find("frontier");
+    this.#choice = find("level-choice");
+    this.#name = find("level");
+    this.#note = find("level-note");
+    this.#changes = find("level-changes");
+    this.#choice.addEventListener("change", () => this.#choose());
+  }
+
+  /** Name of the level asked for, or "auto". */
+  get chosen() {
+    return this.#choice.value;
+  }
+
+  show({ levels }) {
+    const chosen = this.chosen || "auto";
+    this.#levels = levels;
+    const options = [...levels].reverse().map((level) => {
+      const cost = level.ms_here ?? level.ms_p50;
+      return new Option(cost === null ? level.name : `${level.name}, ${milliseconds(cost)}`, level.name);
+    });
+    this.#choice.replaceChildren(new Option("Automatic", "auto"), ...options);
+    this.#choice.value = chosen;
+    this.#choice.disabled = false;
+    this.#draw();
+  }
+
+  /** The level heard from now on; null while there is no stream. */
+  set heard(name) {
+    this.#heard = name;
+    this.#draw();
+  }
+
+  /** What the server says when it changes what is heard. */
+  changed({ level, reason, ir_rate_hz: rateHz }) {
+    const pace = rateHz === null ? "" : `, at most ${+rateHz.toFixed(1)} responses a second`;
+    this.#told.unshift({ at: new Date(), text: `${level}${pace}: ${REASONS[reason]}` });
+    this.#told.length = Math.min(this.#told.length, KEPT);
+    this.#changes.replaceChildren(
+      ...this.#told.map(({ at, text }) => {
+        const item = document.createElement("li");
+        const time = document.createElement("time");
+        time.textContent = at.toLocaleTimeString([], { hour12: false });
+        item.append(time, ` ${text}`);
+        return item;
+      }),
+    );
+    this.heard = level;
+  }
+
+  #choose(name = this.#choice.value) {
+    this.#choice.value = name;
+    this.dispatchEvent(new CustomEvent("chosen", { detail: name }));
+  }
+
+  #draw() {
+    const heard = this.#levels.find(({ name }) => name === this.#heard);
+    this.#name.textContent = heard ? heard.name : "–";
+    const cost = heard?.ms_here ?? null;
+    this.#note.textContent = heard ? (cost === null ? "" : `${milliseconds(cost)} here`) : "once playing";
+    this.#chart.replaceChildren();
+    const placed = this.#levels.filter(isPlaced);
+    this.#chart.parentElement.hidden = placed.length === 0;
+    if (placed.length === 0) return;
+    const { x, y } = this.#axes(placed);
+    const floors = placed.map((level) => level.audible_floor).filter((floor) => floor !== null);
+    if (floors.length > 0) this.#floor(y(Math.min(...floors)));
+    const line = [...placed].sort((a, b) => costOf(a) - costOf(b)).map((level) => `${x(costOf(level)).toFixed(1)} ${y(level.audible).toFixed(1)}`);
+    draw("path", { class: "through", d: `M${line.join("L")}` }, this.#chart);
+    for (const level of placed) this.#mark(level, x, y);
+  }
+
+  #axes(placed) {
+    const costs = placed.flatMap((level) => [level.ms_p50, level.ms_here]).filter((cost) => cost !== null);
+    // Half a decade on either side, so that there is a power of ten to read.
+    const low = Math.log10(Math.min(...costs)) - 0.5;
+    const high = Math.log10(Math.max(...costs)) + 0.5;
+    const worst = Math.max(...placed.map(({ audible, audible_floor: floor }) => Math.max(audible, floor ?? 0)));
+    const step = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20].find((value) => worst / value <= 4) ?? worst;
+    const top = step * Math.ceil((1.05 * worst) / step);
+    const [left, right] = [MARGIN.left, WIDTH - MARGIN.right];
+    const [above, below] = [MARGIN.top, HEIGHT - MARGIN.bottom];
+    const x = (ms) => left + ((right - left) * (Math.log10(ms) - low)) / (high - low);
+    const y = (jnd) => below - ((below - above) * jnd) / top;
+    for (let value = 0; value <= top + step / 2; value += step) {
+      draw("path", { class: "grid", d: `M${left} ${y(value).toFixed(1)}H${right}` }, this.#chart);
+      draw("text", { x: left - 6, y: y(value) + 3.5, class: "tick end" }, this.#chart, +value.toFixed(1));
+    }
+    for (let power = Math.ceil(low); power <= high; power++) {
+      const at = x(10 ** power);
+      draw("path", { class: "grid", d: `M${at.toFixed(1)} ${below}v4` }, this.#chart);
+      draw("text", { x: at, y: HEIGHT - 5, class: "tick" }, this.#chart, `${+(10 ** power).toPrecision(1)}`);
+    }
+    draw("text", { x: WIDTH, y: HEIGHT - 5, class: "tick end" }, this.#chart, "ms");
+    return { x, y };
+  }
+
+  #floor(at) {
+    draw("path", { class: "floor", d: `M${MARGIN.left} ${at.toFixed(1)}H${WIDTH - MARGIN.right}` }, this.#chart);
+    // Where errors are large costs are small: below the line, that corner is free.
+    draw("text", { x: MARGIN.left + 4, y: at + 12, class: "tick start" }, this.#chart, "floor");
+  }
+
+  #mark(level, x, y) {
+    const isHeard = level.name === this.#heard;
+    const mark = draw("g", { class: isHeard ? "level heard" : "level", "data-level": level.name }, this.#chart);
+    const [at, height] = [x(costOf(level)), y(level.audible)];
+    if (level.ms_here !== null && level.ms_p50 !== null) {
+      draw("path", { class: "here", d: `M${at.toFixed(1)} ${height.toFixed(1)}H${x(level.ms_here).toFixed(1)}m0 -3.5v7` }, mark);
+    }
+    if (isHeard) draw("circle", { class: "halo", cx: at, cy: height, r: 8 }, mark);
+    draw("circle", { class: "dot", cx: at, cy: height, r: 4 }, mark);
+    draw("circle", { class: "touch", cx: at, cy: height, r: 11 }, mark);
+    const floor = level.audible_floor === null ? "" : `, floor ${level.audible_floor.toFixed(2)}`;
+    const here = level.ms_here === null ? "" : `, ${milliseconds(level.ms_here)} on this server`;
+    const bundled = level.ms_p50 === null ? "" : `, ${milliseconds(level.ms_p50)} where it was made`;
+    draw("title", {}, mark, `${level.name}: error ${level.audible.toFixed(2)} JND${floor}${bundled}${here}`);
+    mark.addEventListener("click", () => this.#choose(level.name));
+    if (!isHeard) return;
+    const isLeft = at > WIDTH * 0.6;
+    draw("text", { x: at + (isLeft ? -12 : 12), y: height - 7, class: isLeft ? "name end" : "name" }, this.#chart, level.name);
+  }
+}
