@@ -40,7 +40,7 @@ def markdown(evaluation: Evaluation, published: PublishedTable) -> str:
     lines = [
         f"{_title(evaluation)}. {_caption(evaluation, published)}",
         "",
-        "| method | " + " | ".join(_head(metric).replace("\n", " ") for metric in METRICS) + " | storage (MB) | ms |",
+        "| method | " + " | ".join(" ".join(_head(metric).split()) for metric in METRICS) + " | storage (MB) | ms |",
         "| --- |" + " ---: |" * (len(METRICS) + 2),
     ]
     best = {metric.name: _best(evaluation, metric) for metric in METRICS}

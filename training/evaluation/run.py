@@ -13,6 +13,7 @@ from training.evaluation.figure import draw_figure
 from training.evaluation.held_out import HeldOut, open_held_out
 from training.evaluation.methods import DEFAULT_METHODS, floor_column, method_columns
 from training.evaluation.published import PublishedTable, published_table
+from training.responses import open_responses
 
 _DRAWN = 2  # columns whose decays are drawn
 
@@ -21,6 +22,7 @@ def evaluate_bundles(
     bundles: Sequence[Bundle],
     data: Path,
     *,
+    runs: Sequence[Path] = (),
     methods: Sequence[str] = DEFAULT_METHODS,
     pairs: int | None = None,
     yaws: int | None = None,
@@ -28,14 +30,23 @@ def evaluate_bundles(
     figure: Path | None = None,
     track: Track = lambda steps, _: steps,
 ) -> tuple[Evaluation, PublishedTable]:
-    """Every quality level of every bundle beside `methods` and the floor, on the same pairs and orientations: all that
-    are held out, or as many as asked for. Optionally with a figure (PNG).
+    """Every quality level of every bundle, and the field of every run folder on measured data, beside `methods` and the
+    floor, on the same pairs and orientations: all that are held out, or as many as asked for. Optionally with a figure
+    (PNG).
 
-    Raises EvaluationError, or DatasetError if the dataset is of another scene than a bundle.
+    Raises EvaluationError, DatasetError if the dataset is of another scene than a bundle, and RunError for a run of
+    other data.
     """
     with open_held_out(data) as everything:
         held_out = everything.sample(pairs=pairs, yaws=yaws, seed=seed)
-        columns = [*field_columns(bundles, held_out), *method_columns(methods, held_out, track)]
+        columns = field_columns(bundles, held_out)
+        if runs:
+            # Torch takes seconds to load, and bundles do without.
+            from training.evaluation.measured_fields import run_column
+
+            responses = open_responses(data)
+            columns += [run_column(run, responses, held_out) for run in runs]
+        columns += method_columns(methods, held_out, track)
         floor = floor_column(held_out)
         evaluation = evaluate(
             held_out,

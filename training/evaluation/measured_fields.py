@@ -1,0 +1,111 @@
+"""Fields that were trained on measured responses, straight from their run folders: no scene bundle holds them, for
+nothing is known of their walls.
+
+A field says magnitudes and what it knows of phase; the rest of phase is noise that stands still, as the server fills it
+in. Measured responses hold their direct sound, so nothing is joined to them.
+
+Axes: B poses; (B, channel, frequency, frame) and (B, channel, sample).
+"""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from server.acoustics.codec import Codec
+from server.acoustics.phase import FrozenNoise, correlated_noise, separate
+from training.evaluation.evaluate import Column
+from training.evaluation.held_out import EvaluationError, HeldOut, Responses
+from training.learning.factorised import FactorisedLearner
+from training.learning.naf import NafLearner
+from training.models.factorised import ExportedField
+from training.models.frozen_noise import even_noise
+from training.models.naf_graph import NafGraph
+from training.models.targets import LEAD_SAMPLES, align
+from training.responses import ResponseSet, SimulatedResponses
+from training.runs import Configuration
+from training.train import load_learner
+
+Answers = tuple[npt.NDArray[np.float32], ...]
+_BYTES_PER_PARAMETER = 4
+
+
+def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
+    """Raises RunError for a run that is missing, unfinished or of other data, and EvaluationError for one on simulated
+    responses, whose direct sound and levels only a bundle knows."""
+    if isinstance(responses, SimulatedResponses):
+        raise EvaluationError(f"{run}: was trained on a simulated scene; export it and evaluate the bundle")
+    learner = load_learner(responses, run)
+    codec: Codec
+    module: nn.Module
+    if isinstance(learner, FactorisedLearner):
+        codec, module = learner.cells.codec, ExportedField(learner.field, learner.cells)
+    elif isinstance(learner, NafLearner):
+        codec, module = learner.codec, NafGraph(learner.field, learner.codec, tabled=True)
+    else:
+        raise TypeError(f"{type(learner)} cannot be evaluated")
+    configuration = Configuration.read(run)
+    module.eval()
+    noise = FrozenNoise.from_signal(codec, even_noise(codec, np.random.default_rng([configuration.seed, 6])))
+    listeners, emitters = held_out.listeners, held_out.emitters
+
+    def source(index: int, turns: npt.NDArray[np.integer]) -> Responses:
+        shape = (len(turns), 3)
+        poses = (
+            np.broadcast_to(listeners[index], shape),
+            np.broadcast_to(emitters[index], shape),
+            held_out.yaws[turns],
+        )
+        with torch.no_grad():
+            answers = module(*(torch.from_numpy(np.array(pose, dtype=np.float32)) for pose in poses))
+        aligned = decoded(tuple(answer.numpy() for answer in answers), codec, noise)
+        later = float(held_out.delays_s[held_out.held_out[index]]) * held_out.sample_rate - LEAD_SAMPLES
+        return moved_later(aligned, later)
+
+    parameters = sum(parameter.numel() for parameter in learner.field.parameters())
+    return Column(
+        Path(run).resolve().name,
+        source,
+        "field",
+        parameters * _BYTES_PER_PARAMETER + noise.spectrogram.nbytes,
+        method="naf" if configuration.kind == "naf" else "",
+    )
+
+
+def decoded(answers: Answers, codec: Codec, noise: FrozenNoise) -> npt.NDArray[np.float32]:
+    """Aligned responses from what a field says: those themselves, or log-magnitude, instantaneous frequency, certainty
+    and, of two ears, interaural coherence as real and imaginary parts."""
+    if len(answers) == 1:
+        return answers[0]
+    log_magnitude, frequency, certainty, *interaural = answers
+    magnitude, phase = codec.magnitude(log_magnitude), codec.integrate(frequency)
+    if interaural:
+        coherence = np.asarray(interaural[0][:, 0] + 1j * interaural[0][:, 1], dtype=np.complex64)
+        spectrogram = _with_phase(magnitude, phase, certainty, coherence, noise)
+    else:
+        # A lone microphone is the left of two ears that have nothing to do with each other.
+        twice = (np.repeat(values, 2, axis=1) for values in (magnitude, phase, certainty))
+        spectrogram = _with_phase(*twice, np.zeros(magnitude[:, 0].shape, np.complex64), noise)[:, :1]
+    return codec.synthesise(spectrogram).astype(np.float32)
+
+
+def _with_phase(
+    magnitude: npt.NDArray[np.float32],
+    phase: npt.NDArray[np.float32],
+    certainty: npt.NDArray[np.float32],
+    coherence: npt.NDArray[np.complex64],
+    noise: FrozenNoise,
+) -> npt.NDArray[np.complex64]:
+    known, rest, coherence = separate(magnitude, phase, certainty, coherence)
+    spectrogram = correlated_noise(rest, coherence, noise)
+    spectrogram[..., : known.shape[-1]] += known
+    return spectrogram
+
+
+def moved_later(aligned: npt.NDArray[np.float32], samples: float) -> npt.NDArray[np.float32]:
+    """The inverse of aligning: (..., sample) later by a fraction of samples, silent before, cut at the end."""
+    count = aligned.shape[-1]
+    room = np.pad(aligned, [(0, 0)] * (aligned.ndim - 1) + [(0, max(0, int(np.ceil(samples))))])
+    return align(room, -samples)[..., :count].astype(np.float32)
