@@ -18,13 +18,14 @@ from server.audio_engine import AudioEngine
 from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.ir_request import compute_irs
 from server.load import AUTO, Offer
 from server.priority import become_background
 from server.problems import install_problems
 from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
 from server.rendering.renderer import warm_up
 from server.routes import api, health
-from server.session import Session, compute_irs
+from server.session import Session
 from server.settings import Settings
 from server.streaming import StreamHost
 

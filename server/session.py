@@ -13,19 +13,16 @@ A `Session` belongs to the thread that renders it. Positions are metres, clocks 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-
-import numpy as np
 
 from server.acoustics.decibels import db_to_amplitude
-from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.blocks import AudioBlock, DryBlock, FloatArray
 from server.direct_sound import DirectSound
-from server.early_reflections import EarlyReflections
 from server.emitters import Emitter, LiveInput
 from server.errors import RequestError
 from server.field.levels import Levels
+from server.ir_request import EmitterSnapshot, IrRequest, IrResponse
 from server.load import Reason, Rung
 from server.pacing import SendWindow
 from server.protocol import (
@@ -46,54 +43,10 @@ from server.protocol import (
     SetGain,
 )
 from server.radiation import reverberation_gain
-from server.rendering.convolver import PartitionedIr
 from server.rendering.hrtf import HeadFilters
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
 from server.rendering.sources import ClipPlayer, Source
 from server.scene.bundle import Bundle
-
-
-@dataclass(frozen=True)
-class EmitterSnapshot:
-    """An emitter as it was when its IR was asked for; `serial` tells it from others of the same id."""
-
-    serial: int
-    pose: Pose
-    directivity: Directivity
-
-
-@dataclass(frozen=True)
-class IrRequest:
-    """IRs of a quality level wanted for the poses as they were when `pose_id` was the newest."""
-
-    pose_id: int
-    level: str
-    listener: Pose
-    emitters: tuple[EmitterSnapshot, ...]
-    """Those whose IR is out of date."""
-    early_reflections: EarlyReflections | None
-    """What the field's IRs leave out, as this session's head hears it; None where they hold it."""
-
-
-@dataclass(frozen=True)
-class IrResponse:
-    request: IrRequest
-    irs: tuple[PartitionedIr, ...]
-    """One per emitter of the request."""
-
-
-def compute_irs(levels: Levels, request: IrRequest, prepare: Callable[[FloatArray], PartitionedIr]) -> IrResponse:
-    """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
-    count = len(request.emitters)
-    irs = levels[request.level].impulse_responses(
-        np.tile(np.asarray(request.listener.position), (count, 1)),
-        np.asarray([emitter.pose.position for emitter in request.emitters]),
-        np.full(count, request.listener.yaw),
-        remember=True,
-    )
-    if request.early_reflections is not None:
-        request.early_reflections.add(irs, request.listener, request.emitters)
-    return IrResponse(request, tuple(prepare(ir) for ir in irs))
 
 
 def _start_pose(bundle: Bundle) -> Pose:

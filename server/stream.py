@@ -15,6 +15,7 @@ from server.blocks import AudioBlock, FloatArray
 from server.durations import DurationHistogram
 from server.errors import RequestError
 from server.field.levels import Levels
+from server.ir_request import IrRequest, IrResponse, compute_irs
 from server.load import Ladder, Offer, Reason, Strain, ir_interval_s
 from server.pacing import StreamClock
 from server.protocol import (
@@ -28,7 +29,7 @@ from server.protocol import (
     SetLevel,
     Status,
 )
-from server.session import IrRequest, IrResponse, Session, compute_irs
+from server.session import Session
 
 MAX_WAITING_MESSAGES = 256
 _MAX_BEHIND_S = 0.5

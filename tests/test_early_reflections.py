@@ -12,12 +12,13 @@ from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIO
 from server.acoustics.geometry import Pose
 from server.early_reflections import EarlyReflections
 from server.field.levels import Levels
+from server.ir_request import compute_irs
 from server.load import Rung
 from server.protocol import PROTOCOL, AddEmitter, Hello, MoveEmitter
 from server.radiation import reverberation_gain
 from server.rendering.still_paths import StillPaths
 from server.scene.manifest import Manifest
-from server.session import Session, compute_irs
+from server.session import Session
 from server.whole_field import WholeField
 
 SIZE = np.array((8.0, 5.0, 2.8))

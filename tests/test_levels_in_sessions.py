@@ -5,10 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from server.field.levels import Levels
+from server.ir_request import compute_irs
 from server.load import Rung
 from server.protocol import PROTOCOL, AddEmitter, EmitterAdded, Hello, LevelChanged, ListenerPose, RemoveEmitter
 from server.scene.manifest import QualityLevel
-from server.session import Session, compute_irs
+from server.session import Session
 
 RATE, BLOCK = 24_000, 256
 HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)

@@ -10,11 +10,12 @@ from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIO
 from server.acoustics.geometry import FloorPlan, Pose
 from server.direct_sound import DirectSound
 from server.field.levels import Levels
+from server.ir_request import compute_irs
 from server.load import Rung
 from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
 from server.render import PathError, PathPoint, RenderedEmitter, read_path, render
 from server.rendering.fade import raised_cosine
-from server.session import Session, compute_irs
+from server.session import Session
 
 SAMPLE_RATE = 24_000
 SIZE = 256

@@ -11,6 +11,7 @@ from server.acoustics.geometry import Pose
 from server.blocks import DryBlock
 from server.errors import RequestError
 from server.field.levels import Levels
+from server.ir_request import compute_irs
 from server.load import Rung
 from server.protocol import (
     PROTOCOL,
@@ -28,7 +29,7 @@ from server.protocol import (
     RemoveEmitter,
     SetGain,
 )
-from server.session import Session, compute_irs
+from server.session import Session
 from server.whole_field import WholeField
 
 CLIP = np.random.default_rng(3).standard_normal(3_000).astype(np.float32)

@@ -1,0 +1,56 @@
+"""Impulse responses (IRs) that a session asks for, and how they are computed."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from server.acoustics.directivity import Directivity
+from server.acoustics.geometry import Pose
+from server.blocks import FloatArray
+from server.early_reflections import EarlyReflections
+from server.field.levels import Levels
+from server.rendering.convolver import PartitionedIr
+
+
+@dataclass(frozen=True)
+class EmitterSnapshot:
+    """An emitter as it was when its IR was asked for; `serial` tells it from others of the same id."""
+
+    serial: int
+    pose: Pose
+    directivity: Directivity
+
+
+@dataclass(frozen=True)
+class IrRequest:
+    """IRs of a quality level wanted for the poses as they were when `pose_id` was the newest."""
+
+    pose_id: int
+    level: str
+    listener: Pose
+    emitters: tuple[EmitterSnapshot, ...]
+    """Those whose IR is out of date."""
+    early_reflections: EarlyReflections | None
+    """What the field's IRs leave out, as this session's head hears it; None where they hold it."""
+
+
+@dataclass(frozen=True)
+class IrResponse:
+    request: IrRequest
+    irs: tuple[PartitionedIr, ...]
+    """One per emitter of the request."""
+
+
+def compute_irs(levels: Levels, request: IrRequest, prepare: Callable[[FloatArray], PartitionedIr]) -> IrResponse:
+    """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
+    count = len(request.emitters)
+    irs = levels[request.level].impulse_responses(
+        np.tile(np.asarray(request.listener.position), (count, 1)),
+        np.asarray([emitter.pose.position for emitter in request.emitters]),
+        np.full(count, request.listener.yaw),
+        remember=True,
+    )
+    if request.early_reflections is not None:
+        request.early_reflections.add(irs, request.listener, request.emitters)
+    return IrResponse(request, tuple(prepare(ir) for ir in irs))
