@@ -20,6 +20,7 @@ from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFil
 from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.graphs import halve_weights, pose_by_pose, to_int8, to_onnx
 from training.learning.factorised import FactorisedLearner
+from training.learning.learner import Learner
 from training.learning.naf import NafLearner
 from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
@@ -77,8 +78,9 @@ def export(
     if not isinstance(responses, SimulatedResponses):
         raise ExportError("the data are measured responses: no scene bundle holds those; evaluate the run instead")
     exported: list[_Exported] = []
-    for run in runs:
-        exported += _graphs(responses, run, precisions, exact_tables=exact_tables)
+    # All are opened before the first graph is made, which takes a while.
+    for learner, run in [(load_learner(responses, run), run) for run in runs]:
+        exported += _graphs(learner, Configuration.read(run), precisions, exact_tables=exact_tables)
     names = [each.name for each in exported]
     if doubled := {name for name in names if names.count(name) > 1}:
         raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
@@ -86,9 +88,8 @@ def export(
     noise = even_noise(codec.codec, np.random.default_rng([Configuration.read(runs[0]).seed, 6]))
     arrays = io.BytesIO()
     np.savez(arrays, frozen_noise=noise)
-    # The default field is called by its kind alone, whatever its rank and precision.
-    kind = exported[0].architecture
-    titles = [kind, *(name if name != kind else f"{name}-plain" for name in names[1:])]
+    # The default field is called by its kind alone, whatever its rank, unless it is less than exact.
+    titles = [exported[0].architecture if precisions[0] == "float32" else names[0], *names[1:]]
     files = {f"{title}.onnx": each.model.SerializeToString() for title, each in zip(titles, exported, strict=True)}
     fields = {
         title: FieldFile(
@@ -107,11 +108,9 @@ def export(
 
 
 def _graphs(
-    responses: SimulatedResponses, run: Path, precisions: Sequence[Precision], *, exact_tables: bool
+    learner: Learner, configuration: Configuration, precisions: Sequence[Precision], *, exact_tables: bool
 ) -> list[_Exported]:
     """All graphs of a run, each checked."""
-    learner = load_learner(responses, run)
-    configuration = Configuration.read(run)
     if isinstance(learner, FactorisedLearner):
         return _factorised(learner, configuration, precisions)
     if isinstance(learner, NafLearner):

@@ -108,3 +108,35 @@ def test_evaluating_needs_one_bundle_to_record_into(nafir_train, dataset):
     code, _, err = nafir_train("evaluate", dataset.folder, "--record")
     assert code == 2
     assert "--record" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("train", "{data}", "-o", "{tmp}/run", "--field", "nerf"), "there is no 'nerf'"),
+        (("train", "{data}", "-o", "{tmp}/run", "--field", "naf", "--rank", "64"), "leave it out for naf"),
+        (("train", "{data}", "-o", "{tmp}/run", "--teacher", "{run}", "--epochs", "1"), "a naf with spectrograms"),
+        (("export", "{run}", "{tmp}", "-o", "{tmp}/bundle"), "not a run folder"),
+    ],
+)
+def test_fields_and_options_that_do_not_fit_are_told_in_a_line(nafir_train, dataset, run, tmp_path, arguments, told):
+    places = {"tmp": tmp_path, "data": dataset.folder, "run": run}
+    code, _, err = nafir_train(*(argument.format(**places) for argument in arguments))
+    assert code == 2
+    assert told in err.strip().splitlines()[-1]
+
+
+def test_an_unknown_precision_is_refused(nafir_train, run, tmp_path):
+    code, _, err = nafir_train("export", run, "-o", tmp_path / "bundle", "--precision", "float32,float8")
+    assert code == 2
+    assert "--precision" in err
+
+
+def test_a_part_of_the_pairs_is_trained_for_a_part_of_a_minute(nafir_train, dataset, tmp_path):
+    options = ("--share", "0.5", "--minutes", "0.01", "--rank", "16", "--learning-rate", "0.001")
+    code, out, _ = nafir_train("train", dataset.folder, "-o", tmp_path / "run", *options)
+    assert code == 0
+    assert "factorised is trained" in out
+    written = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (written["share"], written["minutes"], written["shape"]["rank"]) == (0.5, 0.01, 16)
+    assert written["learning_rate"] == 0.001

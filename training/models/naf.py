@@ -5,10 +5,10 @@ A point is a bin of the spectrogram (frequency, frame), answered with log-magnit
 the supplement's alternative, a sample of the waveform. Eight layers 512 wide with leaky ReLU; two more layers carry the
 inputs past the first half. Every layer but the last adds an embedding of the ear and one of the head's orientation.
 
-Two things differ from the paper. It learns what every field here learns, the reflected sound aligned to the earliest
-arrival, where the paper's learns the whole response in absolute time: an easier task, so that comparing fields compares
-networks. And positions are given in as many coordinates as vary in the data, where the paper's are all at one height
-(MeshRIR's emitters, in its section 4, are not).
+Two things differ from the paper. It learns what every field here learns from the same data, of a simulated scene what
+follows the direct sound and the first reflections, aligned to the earliest arrival, where the paper's learns whole
+responses in absolute time: an easier task, and the same for all fields compared. And positions are given in as many
+coordinates as vary in the data, where the paper's are all at one height (MeshRIR's emitters, in section 4, are not).
 
 Axes: B poses, ear, N points; metres, radians.
 """
