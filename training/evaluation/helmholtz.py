@@ -31,12 +31,12 @@ class HelmholtzInterpolation:
     leave nothing to interpolate from."""
 
     def __init__(self, pairs: TrainingPairs, sample_rate: int, cutoff_hz: float | None = None) -> None:
-        """The regularisation is the one of least error when listeners that were trained on are left out, one by one,
-        of the first emitters that have enough."""
+        """`regularisations` (octave,) are those of least error when listeners that were trained on are left out, one by
+        one, of the first emitters that have enough."""
         self._pairs = pairs
         self._sample_rate = sample_rate
         self._cutoff_hz = cutoff_hz
-        self.regularisation = self._choose()
+        self.regularisations = self._choose()
 
     def response(self, pair: int, turns: Turns = ALL_TURNS) -> _Responses | None:
         """None where the pair's emitter was never trained on."""
@@ -58,7 +58,8 @@ class HelmholtzInterpolation:
         estimate = np.zeros(spectra.shape[1:], dtype=np.complex64)
         for start in range(0, len(used), _CHUNK):
             part = used[start : start + _CHUNK]
-            matrix = kernel(frequency[part], between) + self.regularisation * np.eye(len(known))
+            ridge = self.regularisations[octaves(frequency[part])][:, None, None]
+            matrix = kernel(frequency[part], between) + ridge * np.eye(len(known))
             weights = np.linalg.solve(matrix, kernel(frequency[part], towards)[..., None])[..., 0]
             estimate[..., part] = np.einsum("nycf,fn->ycf", spectra[..., part], weights * passed[part, None])
         return irfft(estimate, size, axis=-1)[..., :samples].astype(np.float32)
@@ -76,8 +77,9 @@ class HelmholtzInterpolation:
         octaves = np.log2(np.maximum(frequency, 1e-3) / self._cutoff_hz)
         return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip(2 * octaves, 0, 1)))
 
-    def _choose(self) -> float:
-        errors = np.zeros(len(REGULARISATIONS))
+    def _choose(self) -> _Floats:
+        count = int(octaves(np.array([self._sample_rate / 2]))[0]) + 1
+        errors = np.zeros((count, len(REGULARISATIONS)))
         emitters = [number for number in np.unique(self._pairs.pair_emitter) if len(self._known(int(number))) > 2]
         for emitter in emitters[:_CHOOSING_EMITTERS]:
             known = self._known(int(emitter))
@@ -89,8 +91,14 @@ class HelmholtzInterpolation:
             listeners = self._pairs.listener_positions[self._pairs.pair_listener[known]]
             matrix = kernel(frequency[used], np.linalg.norm(listeners[:, None] - listeners, axis=-1))
             for number, regularisation in enumerate(REGULARISATIONS):
-                errors[number] += np.sum(np.abs(left_out_errors(matrix, spectra, regularisation)) ** 2)
-        return REGULARISATIONS[int(np.argmin(errors))]
+                left_out = np.abs(left_out_errors(matrix, spectra, regularisation)) ** 2
+                errors[:, number] += np.bincount(octaves(frequency[used]), left_out.sum(axis=(1, 2)), count)
+        return np.array(REGULARISATIONS)[np.argmin(errors, axis=1)]
+
+
+def octaves(frequency: _Floats) -> npt.NDArray[np.int64]:
+    """(frequency,) which octave each is in, the lowest being everything below 125 Hz."""
+    return np.maximum(np.floor(np.log2(np.maximum(frequency, 1.0) / 62.5)), 0).astype(np.int64)
 
 
 def kernel(frequency: _Floats, distance_m: _Floats) -> _Floats:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from training.evaluation.baselines import TrainingPairs, nearest
-from training.evaluation.helmholtz import REGULARISATIONS, HelmholtzInterpolation, kernel, left_out_errors
+from training.evaluation.helmholtz import REGULARISATIONS, HelmholtzInterpolation, kernel, left_out_errors, octaves
 
 RATE = 8_000
 SAMPLES = 800
@@ -57,7 +57,7 @@ def test_the_low_pass_is_silent_above_and_the_same_below(pairs):
     target = len(pairs.training) - 1
     plain = HelmholtzInterpolation(pairs, RATE)
     low = HelmholtzInterpolation(pairs, RATE, cutoff_hz=180.0)
-    low.regularisation = plain.regularisation
+    low.regularisations = plain.regularisations
     spectra = [np.abs(np.fft.rfft(method.response(target)[0, 0])) for method in (plain, low)]
     frequency = np.fft.rfftfreq(SAMPLES, 1 / RATE)
     loudest = spectra[0].max()
@@ -107,5 +107,11 @@ def test_noise_asks_for_more_regularisation(pairs):
         pairs.emitter_positions,
         pairs.training,
     )
-    assert clean.regularisation == min(REGULARISATIONS)
-    assert HelmholtzInterpolation(noisy, RATE).regularisation > clean.regularisation
+    sounding = octaves(np.array([100.0, 150.0, 280.0]))
+    assert np.all(clean.regularisations[sounding] == min(REGULARISATIONS))
+    assert np.all(HelmholtzInterpolation(noisy, RATE).regularisations[sounding] > min(REGULARISATIONS))
+
+
+def test_octaves_double():
+    found = octaves(np.array([0.0, 60.0, 124.0, 126.0, 249.0, 251.0, 1001.0]))
+    np.testing.assert_array_equal(found, [0, 0, 0, 1, 1, 2, 4])
