@@ -30,7 +30,8 @@ def _progress() -> Progress:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, console=Console(stderr=True))
+    # Of the processes that torchrun starts the first speaks for all.
+    return Progress(*columns, console=Console(stderr=True), disable=os.environ.get("RANK", "0") != "0")
 
 
 @app.command()
