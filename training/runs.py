@@ -29,15 +29,15 @@ class FactorisedRecipe:
     """How a factorised field is trained. Those that are off did not pay where they were measured.
 
     `fine_frames` are predicted bin by bin, later ones in cells; `level_correction` adds what a mean of logarithms lacks
-    to a mean of powers; `decay_weight` is that of the error in energy decay curves; `swap` also shows every response
-    with its ends exchanged, which is the same response where both are omnidirectional: one channel only; `expected`
-    trains on the power that is expected of a simulated response in place of the one drawn. `teacher` is the run folder
-    of a `naf` that is asked for the levels of responses at `lessons` poses of its own.
+    to a mean of powers; `energy_weight` is that of the error in energies (`training.learning.energies`); `swap` also
+    shows every response with its ends exchanged, which is the same response where both are omnidirectional: one channel
+    only; `expected` trains on the power that is expected of a simulated response in place of the one drawn. `teacher`
+    is the run folder of a `naf` that is asked for the levels of responses at `lessons` poses of its own.
     """
 
     fine_frames: int = 24
     level_correction: bool = True
-    decay_weight: float = 0.0
+    energy_weight: float = 0.0
     swap: bool = False
     expected: bool = False
     teacher: str | None = None

@@ -10,6 +10,7 @@ from rich.progress import Progress
 from torch import Tensor
 
 from server.errors import NafirError
+from training.learning.energies import RAYLEIGH_DEFICIT, EnergyError
 from training.learning.learner import Losses, Rows
 from training.learning.lessons import Lessons, lessons_of
 from training.learning.naf import NafLearner
@@ -57,6 +58,8 @@ class FactorisedLearner:
         self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), min(known, recipe.fine_frames))
         self.site = Site.of(responses)
         self.field = FactorisedField(self.site.plan, self.cells, shape, responses.channels)
+        deficit = 0.0 if recipe.expected else RAYLEIGH_DEFICIT
+        self._energy_error = EnergyError(self.cells, self.field.heads, deficit=deficit)
         self._targets: Targets | None = None
         self._lessons: Lessons | None = None
 
@@ -124,9 +127,9 @@ class FactorisedLearner:
             # Lessons are of levels alone.
             counted = of_rows if name in _LEVEL_HEADS else of_rows * measured
             losses[name] = _HEAD_WEIGHTS[name] * counted.mean()
-        if self.recipe.decay_weight:
-            difference = self._decay(field.in_physical_units(prediction)) - self._decay(flat)
-            losses["decay"] = self.recipe.decay_weight * difference.abs().mean()
+        if self.recipe.energy_weight:
+            error = self._energy_error.to(flat.device)(field.in_physical_units(prediction), flat)
+            losses["energy"] = self.recipe.energy_weight * error
         return losses
 
     def _taught(self, run: Path) -> Lessons:
@@ -139,16 +142,6 @@ class FactorisedLearner:
         teacher = NafLearner(self.responses, configuration)
         restore(teacher.field, run, configuration)
         return lessons_of(teacher, self.cells, self.recipe.lessons, configuration.seed)
-
-    def _decay(self, flat: Tensor) -> Tensor:
-        """(B, channel, band, step) natural logarithm of the energy from each fine frame or late cell on."""
-        heads, cells = self.field.heads, self.cells
-        shapes = {name: flat[:, heads.slices[name]].unflatten(1, heads.shapes[name]) for name in _LEVEL_HEADS}
-        pool = torch.tensor(cells.bands.pool(), device=flat.device)
-        fine = pool.T @ torch.exp(2 * shapes["fine"])
-        widths = torch.tensor(cells.late_frames.widths, device=flat.device)
-        energy = torch.cat([fine, torch.exp(2 * shapes["late"]) * widths], dim=-1)
-        return torch.log(energy.flip(-1).cumsum(-1).flip(-1))
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> None:

@@ -11,7 +11,7 @@ from training.learning.lessons import lessons_of
 from training.learning.pairs import split
 from training.models.factorised import ExportedField, FieldShape
 from training.models.naf import NafShape
-from training.models.targets import LEAD_SAMPLES, align, flat_targets
+from training.models.targets import LEAD_SAMPLES, align
 from training.responses import ImportedDataset, Measurement, SimulatedResponses
 from training.runs import Configuration, FactorisedRecipe, NafRecipe
 from training.train import load_learner, train
@@ -93,25 +93,6 @@ def test_swapping_shows_every_response_with_its_ends_exchanged_half_of_the_time(
     assert 0.3 < swapped.mean() < 0.7
     np.testing.assert_allclose(emitter[swapped], learner.targets.listener[rows][swapped])
     np.testing.assert_array_equal(flat, learner.targets.flat[rows])
-
-
-def test_the_decay_loss_is_that_of_backward_integrated_energy(dataset, configuration):
-    """Noise of twice the amplitude is ln 4 above itself everywhere; faster decays differ, equal ones do not."""
-    responses = SimulatedResponses(dataset)
-    weighted = dataclasses.replace(configuration, recipe=FactorisedRecipe(decay_weight=1.0))
-    learner = FactorisedLearner(responses, weighted)
-    codec = learner.cells.codec
-    noise = np.random.default_rng(0).standard_normal((3, 2, codec.samples)) * np.exp(-np.arange(codec.samples) / 2000)
-    one, two = (torch.from_numpy(flat_targets(scale * noise, learner.cells)).float() for scale in (1.0, 2.0))
-    np.testing.assert_allclose(learner._decay(two) - learner._decay(one), np.log(4), atol=0.02)
-    # Against the energy of the spectrogram itself, in all bands together.
-    power = np.abs(codec.transform(noise)) ** 2
-    bands = learner.cells.bands
-    whole = np.cumsum((bands.pool().T @ power)[..., ::-1], axis=-1)[..., ::-1]
-    found = learner._decay(one)[..., 0].numpy()
-    np.testing.assert_allclose(found, np.log(whole[..., 0]), atol=0.02)
-    alike = learner.losses((one - learner.field.mean) / learner.field.spread, (one, torch.ones(3, dtype=bool)))
-    assert alike["decay"] == pytest.approx(0, abs=1e-5)
 
 
 def test_without_level_correction_the_field_stays_as_regressed(dataset, configuration, tmp_path):

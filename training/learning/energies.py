@@ -1,0 +1,68 @@
+"""Energies of responses as an error to train on: what clarity, decay times and levels are made of.
+
+Errors of single bins average out in no sum of them where they are alike, and a sum is what is heard. So sums are
+compared too: of runs of frames and of all that is still to come, by octave and over all.
+
+Axes: levels are natural logarithms of magnitude, flat as the heads have them; energies (B, channel, octave, step).
+"""
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from training.models.cells import Cells
+from training.models.factorised import Heads
+
+# A mean of ln |S| lies so far below ln of the root of the mean power, for the Rayleigh-distributed magnitude of noise:
+# half of Euler's constant.
+RAYLEIGH_DEFICIT = float(np.euler_gamma / 2)
+_RUN = 4
+_EVERY = 4
+_TINY = 1e-12
+
+
+class EnergyError(nn.Module):
+    """Mean squared differences of energies, in squared ln of magnitude.
+
+    `deficit` is by how much predicted levels of single bins lie below those of their expected power.
+    """
+
+    def __init__(self, cells: Cells, heads: Heads, *, deficit: float) -> None:
+        super().__init__()
+        self._shapes = {name: (heads.slices[name], heads.shapes[name]) for name in ("fine", "late")}
+        self._deficit = deficit
+        codec = cells.codec
+        bins_hz = np.arange(codec.bins) * codec.sample_rate / codec.n_fft
+        centres = (cells.bands.edges[:-1] + cells.bands.edges[1:] - 1) / 2
+        cells_hz = centres * codec.sample_rate / codec.n_fft
+        for name, sums in (
+            ("_of_bins", _octaves(bins_hz)),
+            ("_of_cells", _octaves(cells_hz) * cells.bands.widths),
+            ("_widths", cells.late_frames.widths),
+        ):
+            self.register_buffer(name, torch.tensor(np.asarray(sums, dtype=np.float32)), persistent=False)
+
+    def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Of flat (B, heads.size) levels in physical units."""
+        ours, theirs = self._energies(predicted, self._deficit), self._energies(target, 0.0)
+        return torch.stack([(a - b).square().mean() for a, b in zip(ours, theirs, strict=True)]).sum()
+
+    def _energies(self, flat: Tensor, deficit: float) -> list[Tensor]:
+        """Half the logarithm of what is to come by octave, of the same in all, and of runs of fine frames by octave."""
+        fine, late = (torch.exp(2 * flat[:, part].unflatten(1, shape)) for part, shape in self._shapes.values())
+        by_octave = torch.cat(
+            [self._of_bins @ fine * np.exp(2 * deficit), self._of_cells @ late * self._widths], dim=-1
+        )
+        to_come = by_octave.flip(-1).cumsum(-1).flip(-1)
+        fine_frames = fine.shape[-1] // _RUN * _RUN
+        runs = by_octave[..., :fine_frames].unflatten(-1, (-1, _RUN)).sum(-1)
+        picked = to_come[..., ::_EVERY]
+        return [0.5 * torch.log(energy + _TINY) for energy in (picked, picked.sum(-2), runs)]
+
+
+def _octaves(frequencies_hz: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """(octave, frequency) one where a frequency is nearest, in octaves, to the octave's centre."""
+    distance = np.abs(np.log2(np.maximum(frequencies_hz, 1.0)) - np.log2(OCTAVE_BANDS_HZ)[:, None])
+    return np.asarray(np.argmin(distance, axis=0) == np.arange(len(OCTAVE_BANDS_HZ))[:, None], dtype=np.float64)
