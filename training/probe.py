@@ -59,6 +59,8 @@ def _last_layer_input(graph: onnx.GraphProto) -> tuple[str, int]:
     constant = {tensor.name for tensor in graph.initializer}
     axes = {value.name: len(value.type.tensor_type.shape.dim) for value in (*graph.value_info, *graph.input)}
     last: tuple[str, int] | None = None
+    if any(node.op_type == "MatMulInteger" for node in graph.node):
+        raise EvaluationError("probe: the graph's weights are integers; probe the float32 field of the same run")
     for node in graph.node:
         if node.op_type == "Constant" or (node.input and all(name in constant for name in node.input)):
             constant.update(node.output)
@@ -67,7 +69,7 @@ def _last_layer_input(graph: onnx.GraphProto) -> tuple[str, int]:
             if given in axes and axes[given] <= _MOST_AXES:
                 last = given, axes[given]
     if last is None:
-        raise EvaluationError("probe: the graph has no linear layer with constant weights; probe a float32 field")
+        raise EvaluationError("probe: the graph has no linear layer with constant weights")
     return last
 
 

@@ -99,6 +99,20 @@ def test_a_graph_without_layers_is_refused():
         with_hidden_output(model_of(graph))
 
 
+def test_a_graph_of_integers_is_refused():
+    """Its last layers are not to be seen, and an earlier one would be taken for them."""
+    nodes, weights, _ = layers("points", 8)
+    integers = onnx.helper.make_node("MatMulInteger", ["bytes", "byte_weights"], ["sums"])
+    inputs = [
+        value("points", "batch", 3, 3),
+        onnx.helper.make_tensor_value_info("bytes", onnx.TensorProto.INT8, [1, 2]),
+    ]
+    weights.append(onnx.numpy_helper.from_array(np.ones((2, 2), np.int8), "byte_weights"))
+    graph = onnx.helper.make_graph([*nodes, integers], "g", inputs, [value("answer", "batch", 3, 2)], weights)
+    with pytest.raises(EvaluationError, match="integers"):
+        with_hidden_output(model_of(graph))
+
+
 def test_features_do_not_depend_on_how_many_poses_are_asked_for(tiny_bundle, poses):
     features = HiddenFeatures(tiny_bundle, "factorised")
     values = [np.tile(value, (3, *(1,) * (value.ndim - 1))) for value in poses.values()]
