@@ -13,7 +13,8 @@ from server.scene.manifest import QualityLevel
 from server.session import Session
 from server.stream import Stream
 
-BLOCK_S = 256 / 24_000
+BLOCK = 1024  # long ones, since many seconds are rendered here
+BLOCK_S = BLOCK / 24_000
 
 
 class Room:
@@ -61,9 +62,9 @@ class Stage:
         self.engine = AudioEngine(lambda call: call(), self.workers, time_s=self.clock)
         (self.thread,) = self.engine.threads
         levels = Levels([Room(field, "fine"), Room(field, "quick")])
-        offer = Offer((levels["quick"].level, levels["fine"].level), {"quick": 0.5, "fine": 5.0})
+        offer = Offer((levels["quick"].level, levels["fine"].level), {"quick": 0.5, "fine": 1.0})
         ladder = offer.ladder(level, block_s=BLOCK_S)
-        hello = Hello(protocol=PROTOCOL, scene="flat")
+        hello = Hello(protocol=PROTOCOL, scene="flat", block_size=BLOCK)
         clip = np.ones(64, np.float32)
         session = Session(hello, levels, filters, lambda _: clip, rung=ladder.rung, window=100_000)
         self.delivered = []
@@ -113,7 +114,7 @@ def test_slow_responses_lower_the_rate_then_the_level_and_quick_ones_raise_them_
     # Some steps follow before the one before is heard, and are told as one.
     assert stage.engine.steps["load"] == len(stage.stream.ladder.rungs) - 1 >= len(stage.changes)
     stage.workers.delay_s = 0.001
-    stage.run(60.0)
+    stage.run(30.0)
     assert stage.changes[-1] == ("fine", "recovered")
     assert stage.stream.session.rung.ir_rate_hz is None
     assert stage.engine.steps["recovered"] == stage.engine.steps["load"]
