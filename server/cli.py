@@ -34,6 +34,7 @@ app = typer.Typer(
 app.add_typer(bench.app, name="bench")
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
+Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]
 AsJson = Annotated[bool, typer.Option("--json", help="Say what was done as JSON, for programs.")]
 
 
@@ -110,9 +111,7 @@ def ir(
     yaw_deg: Annotated[
         float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
     ] = 0.0,
-    level: Annotated[
-        str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")
-    ] = None,
+    level: Level = None,
     as_json: AsJson = False,
 ) -> None:
     """Write the binaural impulse response between two places."""
@@ -160,6 +159,7 @@ def render(
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32, stereo.")],
     block_size: Annotated[int, typer.Option(help="Poses take effect at multiples of it, samples.", min=16)] = 256,
+    level: Level = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
     hrtf: Annotated[
         Path | None, typer.Option(help="SOFA file with the head to hear through, instead of KEMAR.")
@@ -174,6 +174,7 @@ def render(
 
     from server.direct_sound import DirectSound
     from server.field.field import AcousticField
+    from server.field.levels import require_level
     from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
     from server.render import MAX_RENDER_S, read_path
     from server.render import render as render_path
@@ -181,7 +182,8 @@ def render(
 
     if output.suffix != ".wav":
         raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
-    field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    bundle = Bundle.load(find_bundle(scene))
+    field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
     if duration_s is not None and not 1 / field.sample_rate <= duration_s <= MAX_RENDER_S:
         raise RequestError(
             "malformed_duration",

@@ -210,7 +210,8 @@ async def listen(arguments: argparse.Namespace) -> None:
             )
     print(f"{recording.late} blocks late")
     print(
-        f"Render it again:\n  nafir render {arguments.scene} --emitter {arguments.clip}@{x:g},{y:g},{z:g} --loop "
+        f"Render it again:\n  nafir render {arguments.scene} --level {welcome['level']} "
+        f"--emitter {arguments.clip}@{x:g},{y:g},{z:g} --loop "
         f"--path {arguments.path} --duration-s {len(recording.samples()) / recording.sample_rate:.6f} -o again.wav"
     )
 
