@@ -62,11 +62,16 @@ def test_ir_writes_what_http_answers(nafir, bundle, field, tmp_path, suffix):
     assert output.read_bytes() == ImpulseResponse.compute(field, query).encode(suffix)
 
 
-def test_ir_of_a_level_is_that_levels(nafir, bundle, tmp_path):
+@pytest.fixture
+def levels(bundle, tmp_path):
+    """The scene's own, and one that leaves out most frames."""
     rough = QualityLevel(name="rough", field="arithmetic", frames=8)
     files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
     manifest = bundle.manifest.model_copy(update={"levels": (*bundle.manifest.levels, rough)})
-    levels = Levels.load(write_bundle(tmp_path / "scene", manifest, files))
+    return Levels.load(write_bundle(tmp_path / "scene", manifest, files))
+
+
+def test_ir_of_a_level_is_that_levels(nafir, levels, tmp_path):
     output = tmp_path / "ir.npy"
     code, _, _ = nafir("ir", levels.bundle.folder, *PLACES, "--level", "rough", "-o", output)
     assert code == 0
@@ -121,6 +126,22 @@ def test_render_writes_what_a_still_listener_hears(nafir, bundle, field, filters
     still = [PathPoint.at(0, Pose((2.0, 2.0, 1.5)))]
     expected = render(field, DirectSound.of(bundle, filters), [emitter], still)
     np.testing.assert_array_equal(heard, expected.T)
+
+
+def test_render_of_a_level_is_that_levels(nafir, levels, filters, tmp_path):
+    path, output = tmp_path / "path.csv", tmp_path / "out.wav"
+    path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
+    arguments = ("--emitter", "trumpet@6,3,1.5", "--path", path, "--duration-s", 0.5, "-o", output)
+    assert nafir("render", levels.bundle.folder, *arguments, "--level", "rough")[0] == 0
+    emitter = RenderedEmitter(ClipLibrary(24_000).load("trumpet"), Pose((6.0, 3.0, 1.5)))
+    still = [PathPoint.at(0, Pose((2.0, 2.0, 1.5)))]
+    direct_sound = DirectSound.of(levels.bundle, filters)
+    rough, standard = (
+        render(levels[name], direct_sound, [emitter], still, length=12_000).T for name in ("rough", "standard")
+    )
+    heard, _ = soundfile.read(output, dtype="float32")
+    np.testing.assert_array_equal(heard, rough)
+    assert not np.array_equal(heard, standard)
 
 
 def test_render_hears_through_the_head_it_is_given(nafir, bundle, tmp_path):
