@@ -1,5 +1,8 @@
 """Many paths at once against direct paths, one after the other."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -75,3 +78,15 @@ def test_no_paths_add_nothing(kemar_at):
     out = np.zeros((2, SAMPLES), np.float32)
     paths.add(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 7)), (0.0, 0.0, 0.0, 1.0), out)
     assert not out.any()
+
+
+def test_after_a_warm_up_nothing_is_left_to_compile():
+    pytest.importorskip("numba")
+    warmed = """
+from server.rendering.renderer import warm_up
+from server.rendering.still_paths_kernel import add_still_paths
+warm_up([])
+print(len(add_still_paths.signatures))
+"""
+    shown = subprocess.run([sys.executable, "-c", warmed], check=True, capture_output=True, text=True).stdout
+    assert int(shown) == 1
