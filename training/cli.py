@@ -131,6 +131,7 @@ def export(
     output: Folder,
     data: Annotated[Path | None, typer.Option(help="Dataset folder, if it has moved since training.")] = None,
     precision: Annotated[str, typer.Option(help="float32 or int8, or both, comma by comma.")] = "float32",
+    ranks: Annotated[str, typer.Option(help="Lower ranks, 64,32 say, to write factorised fields at too.")] = "",
     exact_tables: Annotated[
         bool, typer.Option("--exact-tables", help="Add every naf once more, with less arithmetic for the same numbers.")
     ] = False,
@@ -144,10 +145,13 @@ def export(
     chosen = [known for name in precision.split(",") for known in PRECISIONS if known == name.strip()]
     if len(chosen) != len(precision.split(",")):
         raise typer.BadParameter(f"knows {', '.join(PRECISIONS)}", param_hint="--precision")
+    if not all(rank.strip().isdigit() and int(rank) > 0 for rank in ranks.split(",") if ranks):
+        raise typer.BadParameter("takes whole numbers above zero, comma by comma", param_hint="--ranks")
+    lower = [int(rank) for rank in ranks.split(",") if ranks]
     for talkative in (None, "torch.onnx"):
         logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or dataset_folder(runs[0]))
-    bundle = export_bundle(responses, runs, output, precisions=chosen, exact_tables=exact_tables)
+    bundle = export_bundle(responses, runs, output, precisions=chosen, ranks=lower, exact_tables=exact_tables)
     size = sum(path.stat().st_size for path in output.iterdir())
     fields = ", ".join(bundle.manifest.fields)
     typer.echo(f"{output}: scene {bundle.id}, {fields}, {size / 1e6:.1f} MB, digest {bundle.digest[:12]}")

@@ -37,6 +37,7 @@ DEFAULT_LEVEL = "standard"
 
 _CHECK_POSES = {"factorised": 64, "naf": 2}
 _INT8_LEAST_WEIGHTS = 100_000
+_TRUNCATION_POSES = 3000
 # Rounded weights are the only difference; phases of uncertain bins may turn, so frequency is compared where it matters.
 # Largest differences for float32 (float16 weights), root mean squares for int8.
 _TOLERANCES: dict[Precision, dict[str, float]] = {
@@ -67,10 +68,12 @@ def export(
     folder: Path,
     *,
     precisions: Sequence[Precision] = ("float32",),
+    ranks: Sequence[int] = (),
     exact_tables: bool = False,
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision; the first field is the
-    default. With `exact_tables` a `naf` is also written with less arithmetic for the same numbers.
+    default. Factorised fields are also written at every lower one of `ranks`, with the least loss. With `exact_tables`
+    a `naf` is also written with less arithmetic for the same numbers.
 
     Raises RunError for an unfinished run, and ExportError for a graph that disagrees and for data that are no simulated
     scene: a bundle's fields are binaural, in rooms of known geometry, and leave the direct sound to the server.
@@ -80,7 +83,7 @@ def export(
     exported: list[_Exported] = []
     # All are opened before the first graph is made, which takes a while.
     for learner, run in [(load_learner(responses, run), run) for run in runs]:
-        exported += _graphs(learner, Configuration.read(run), precisions, exact_tables=exact_tables)
+        exported += _graphs(learner, Configuration.read(run), precisions, ranks, exact_tables=exact_tables)
     names = [each.name for each in exported]
     if doubled := {name for name in names if names.count(name) > 1}:
         raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
@@ -108,30 +111,39 @@ def export(
 
 
 def _graphs(
-    learner: Learner, configuration: Configuration, precisions: Sequence[Precision], *, exact_tables: bool
+    learner: Learner,
+    configuration: Configuration,
+    precisions: Sequence[Precision],
+    ranks: Sequence[int],
+    *,
+    exact_tables: bool,
 ) -> list[_Exported]:
     """All graphs of a run, each checked."""
     if isinstance(learner, FactorisedLearner):
-        return _factorised(learner, configuration, precisions)
+        return _factorised(learner, configuration, precisions, ranks)
     if isinstance(learner, NafLearner):
         return _naf(learner, configuration, precisions, exact_tables=exact_tables)
     raise TypeError(f"{type(learner)} has no graph")
 
 
 def _factorised(
-    learner: FactorisedLearner, configuration: Configuration, precisions: Sequence[Precision]
+    learner: FactorisedLearner, configuration: Configuration, precisions: Sequence[Precision], ranks: Sequence[int]
 ) -> list[_Exported]:
-    cells, rank = learner.cells, learner.field.basis.shape[0]
-    module = ExportedField(learner.field, cells).eval()
+    cells, whole = learner.cells, learner.field
+    trained_at = _tensors(_poses(learner.responses, _TRUNCATION_POSES, configuration.seed), _TRUNCATION_POSES)
+    lower = sorted({rank for rank in ranks if rank < len(whole.basis)}, reverse=True)
     poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
     codec = _codec_parameters(learner, cells.known_frames)
     exported = []
-    graph = to_onnx(module, _tensors(poses, 2), OUTPUTS)
-    for precision in precisions:
-        least_weights = min(_INT8_LEAST_WEIGHTS, learner.field.basis.numel())
-        model = halve_weights(to_int8(graph, least_weights=least_weights) if precision == "int8" else graph)
-        _check(model, module, poses, OUTPUTS, precision)
-        exported.append(_Exported(f"factorised-r{rank}{_suffix(precision)}", model, "factorised", rank, codec))
+    for field in (whole, *(whole.truncated(rank, *trained_at) for rank in lower)):
+        rank = len(field.basis)
+        module = ExportedField(field, cells).eval()
+        graph = to_onnx(module, _tensors(poses, 2), OUTPUTS)
+        for precision in precisions:
+            least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
+            model = halve_weights(to_int8(graph, least_weights=least_weights) if precision == "int8" else graph)
+            _check(model, module, poses, OUTPUTS, precision)
+            exported.append(_Exported(f"factorised-r{rank}{_suffix(precision)}", model, "factorised", rank, codec))
     return exported
 
 

@@ -251,3 +251,16 @@ def test_fields_of_the_same_name_do_not_share_a_bundle(dataset, run, tmp_path):
     with pytest.raises(ExportError, match="factorised-r16: more than one run"):
         export(SimulatedResponses(dataset), [run, run], tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
+
+
+def test_lower_ranks_become_fields_that_cost_less(dataset, run, tmp_path):
+    bundle = export(SimulatedResponses(dataset), [run], tmp_path, ranks=(4, 8, 64))
+    fields = bundle.manifest.fields
+    assert [(name, field.rank) for name, field in fields.items()] == [
+        ("factorised", 16),
+        ("factorised-r8", 8),
+        ("factorised-r4", 4),
+    ]
+    sizes = [len(bundle.models[field.file]) for field in fields.values()]
+    assert sizes == sorted(sizes, reverse=True)
+    assert list(Levels.load(bundle)) == ["standard", "factorised-r8", "factorised-r4"]

@@ -10,6 +10,7 @@ known frames, and mean interaural phasors of all cells (see `training.models.cel
 microphone in place of a head) has no interaural head and no such output.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,10 +162,38 @@ class FactorisedField(nn.Module):
         self.register_buffer("level_correction", torch.zeros(self.heads.size))
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
+        return self.coefficients(listener, emitter, yaw) @ self.basis
+
+    def coefficients(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
+        """(B, rank), of the basis."""
         hidden = nn.functional.gelu(self._inputs(self.encoder(listener, emitter, yaw)))
         for layer in self._hidden:
             hidden = hidden + nn.functional.gelu(layer(hidden))
-        return self._coefficients(hidden) @ self.basis
+        return self._coefficients(hidden)
+
+    @torch.no_grad()
+    def truncated(self, rank: int, listener: Tensor, emitter: Tensor, yaw: Tensor) -> "FactorisedField":
+        """A field of lower rank: of all linear maps of this one's coefficients the one that differs least from it, in
+        the mean square over these poses (Eckart and Young, 1936). What is lost of levels is added to their correction.
+
+        Raises ValueError unless the rank is lower.
+        """
+        if not 0 < rank < len(self.basis):
+            raise ValueError(f"rank: {rank} is not between 1 and {len(self.basis) - 1}")
+        coefficients = self.coefficients(listener, emitter, yaw)
+        root = torch.linalg.qr(coefficients / len(coefficients) ** 0.5).R
+        directions = torch.linalg.svd(root @ self.basis, full_matrices=False).Vh[:rank]
+        turn = self.basis @ directions.T
+        field = copy.deepcopy(self)
+        layer = field._coefficients = nn.Linear(self._coefficients.in_features, rank)
+        layer.weight.copy_(turn.T @ self._coefficients.weight)
+        layer.bias.copy_(turn.T @ self._coefficients.bias)
+        field.basis = nn.Parameter(directions)
+        lost = (coefficients @ self.basis - coefficients @ turn @ directions) * self.spread
+        for name in ("fine", "late"):
+            part = self.heads.slices[name]
+            field.level_correction[part] += 0.5 * torch.log(torch.exp(2 * lost[:, part]).mean(dim=0))
+        return field
 
     def in_physical_units(self, flat: Tensor) -> Tensor:
         return flat * self.spread + self.mean
@@ -177,7 +206,9 @@ class ExportedField(nn.Module):
     def __init__(self, field: FactorisedField, cells: Cells) -> None:
         super().__init__()
         self._field = field
-        self._cells = cells
+        # Units and level correction cost nothing where the basis and one offset have them.
+        self.register_buffer("_basis", field.basis.detach() * field.spread, persistent=False)
+        self.register_buffer("_offset", field.mean + field.level_correction, persistent=False)
         for name, matrix in (
             ("bands", cells.bands.spread().T),
             ("late_frames", cells.late_frames.spread()),
@@ -189,8 +220,8 @@ class ExportedField(nn.Module):
         self._silence = float(np.log(cells.codec.log_floor))
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
-        field, heads = self._field, self._field.heads
-        flat = field.in_physical_units(field(listener, emitter, yaw)) + field.level_correction
+        heads = self._field.heads
+        flat = torch.addmm(self._offset, self._field.coefficients(listener, emitter, yaw), self._basis)
 
         def head(name: str) -> Tensor:
             return flat[:, heads.slices[name]].reshape(-1, *heads.shapes[name])

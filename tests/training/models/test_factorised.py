@@ -120,3 +120,19 @@ def test_predictions_stay_above_silence(field):
         field.mean.fill_(-100.0)
     log_magnitude, *_ = ExportedField(field, CELLS)(*poses(2))
     assert (log_magnitude >= np.log(CELLS.codec.log_floor) - 1e-5).all()
+
+
+def test_a_truncated_field_loses_what_no_field_of_its_rank_could_keep(field):
+    """Over the poses it was truncated at, the error is that of the singular values left out (Eckart and Young)."""
+    at = poses(200)
+    with torch.no_grad():
+        whole = field(*at).numpy()
+        singular = np.linalg.svd(whole, compute_uv=False)
+        for rank in (6, 3):
+            lower = field.truncated(rank, *at)
+            assert lower.basis.shape == (rank, whole.shape[1])
+            lost = np.linalg.norm(lower(*at).numpy() - whole)
+            assert lost == pytest.approx(np.sqrt(np.sum(singular[rank:8] ** 2)), rel=1e-3)
+    assert bool((lower.level_correction >= field.level_correction).any())
+    with pytest.raises(ValueError, match="rank"):
+        field.truncated(8, *at)
