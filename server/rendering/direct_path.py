@@ -7,7 +7,6 @@ World axes are those of the scene; the head's are x ahead, y left, z up.
 """
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -79,15 +78,6 @@ class DirectPath:
         self.slots = slots
         self.block_size = block_size
         self.sample_rate = sample_rate
-        self._alike = partial(
-            DirectPath,
-            block_size=block_size,
-            sample_rate=sample_rate,
-            filters=filters,
-            speed_of_sound=speed_of_sound,
-            air_db_per_m=air_db_per_m,
-            max_distance_m=max_distance_m,
-        )
         self.state = _state(slots, block_size, filters, speed_of_sound, air_db_per_m, max_distance_m)
         self._blocks = np.zeros((slots, block_size), np.float32)
         self._heard = np.zeros((2, block_size), np.float32)
@@ -157,22 +147,6 @@ class DirectPath:
         """Whether this slot has rung out: it adds exactly nothing until it is fed a sample that is not zero."""
         record = self.state.slots[slot]
         return not record["present"] or bool(record["silent"] == self.state.quiet)
-
-    def impulse_response(
-        self, target: PathTarget, orientation: Sequence[float] | npt.NDArray[np.floating], samples: int
-    ) -> FloatArray:
-        """(2, samples) of an emitter at rest; sample 0 is emission."""
-        alone = self._alike(slots=1)
-        alone.set_target(0, target)
-        alone.set_orientation(orientation)
-        size = self.block_size
-        response = np.zeros((2, -(-samples // size) * size), np.float32)
-        block = np.zeros((1, size), np.float32)
-        block[0, 0] = 1
-        for start in range(0, samples, size):
-            alone.process(block, response[:, start : start + size])
-            block[0, 0] = 0
-        return response[:, :samples]
 
 
 def _state(

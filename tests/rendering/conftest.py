@@ -34,6 +34,26 @@ def no_head(sample_rate: int, taps: int) -> HeadFilters:
     return HeadFilters(sample_rate, axes, cepstra, delays_s, triangulate(axes))
 
 
+class MeasuredPath(DirectPath):
+    """A direct path that a response can be taken of, at rest."""
+
+    def __init__(self, **settings):
+        super().__init__(**settings)
+        self._settings = settings
+
+    def impulse_response(self, target, orientation, samples):
+        """(2, samples); sample 0 is emission."""
+        alone = DirectPath(**(self._settings | {"slots": 1}))
+        alone.set_target(0, target)
+        alone.set_orientation(orientation)
+        impulse = np.zeros((-(-samples // self.block_size), 1, self.block_size), np.float32)
+        impulse[0, 0, 0] = 1
+        heard = np.zeros((2, impulse.size), np.float32)
+        for number, block in enumerate(impulse):
+            alone.process(block, heard[:, number * self.block_size : (number + 1) * self.block_size])
+        return heard[:, :samples]
+
+
 @pytest.fixture
 def headless():
     return no_head
@@ -43,7 +63,7 @@ def headless():
 def make_path(kemar_at):
     def make(*, head=True, slots=1, block_size=256, sample_rate=48_000, taps=64, air_db_per_m=0.0, **rest):
         filters = kemar_at(sample_rate)[1] if head else no_head(sample_rate, taps)
-        return DirectPath(
+        return MeasuredPath(
             slots=slots,
             block_size=block_size,
             sample_rate=sample_rate,

@@ -16,7 +16,7 @@ from server.acoustics.room_parameters import measure
 from server.early_reflections import EarlyReflections
 from server.field.field import AcousticField
 from server.render import RenderedEmitter
-from server.rendering.direct_path import DirectPath, PathTarget
+from server.rendering.still_paths import StillPaths
 from server.scene.bundle import BUNDLED, Bundle
 from server.whole_field import WholeField, kemar
 from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
@@ -98,20 +98,15 @@ def field():
 
 
 def direct_paths(pair, air):
-    """(yaw, ear, sample) by the code of the renderer, along a straight line."""
-    path = DirectPath(
-        slots=1,
-        block_size=256,
-        sample_rate=RATE,
-        filters=kemar(RATE),
-        speed_of_sound=SPEED_OF_SOUND,
-        air_db_per_m=air.absorption_db_per_m,
-    )
+    """(yaw, ear, sample) by the code of the server, along a straight line."""
+    paths = StillPaths(kemar(RATE), speed_of_sound=SPEED_OF_SOUND, air_db_per_m=air.absorption_db_per_m)
     offset = pair.emitter - pair.listener
     distance = np.linalg.norm(offset)
-    target = PathTarget(float(distance), offset / distance, np.zeros(7, np.float32))
-    turned = [(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)) for yaw in YAWS]
-    return np.stack([path.impulse_response(target, quaternion, pair.direct.shape[-1]) for quaternion in turned])
+    responses = np.zeros(pair.direct.shape, np.float32)
+    for response, yaw in zip(responses, YAWS, strict=True):
+        turned = (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+        paths.add(np.array([distance]), offset[None] / distance, np.zeros((1, 7)), turned, response)
+    return responses
 
 
 def first_reflections(pair, scene):
