@@ -49,8 +49,7 @@ def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) 
         raise AblationError(f"field: {base.name} has no levers; the factorised field has")
     changed = {
         "no level correction": replace(recipe, level_correction=False),
-        "energies 1": replace(recipe, energy_weight=1.0),
-        "energies 3": replace(recipe, energy_weight=3.0),
+        "no error of energies": replace(recipe, energy_weight=0.0),
         "half the fine frames": replace(recipe, fine_frames=recipe.fine_frames // 2),
     }
     if isinstance(responses, SimulatedResponses):

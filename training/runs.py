@@ -37,7 +37,7 @@ class FactorisedRecipe:
 
     fine_frames: int = 24
     level_correction: bool = True
-    energy_weight: float = 0.0
+    energy_weight: float = 3.0
     swap: bool = False
     expected: bool = False
     teacher: str | None = None
@@ -66,7 +66,7 @@ class Configuration:
     """
 
     seed: int = 0
-    epochs: int = 14
+    epochs: int = 8
     minutes: float | None = None
     share: float = 1.0
     batch: int = 128

@@ -22,7 +22,9 @@ def test_field_bench_reports_the_scene_it_was_given(bundle):
     assert outcome.exit_code == 0, outcome.output
     measured = json.loads(outcome.output)
     assert measured["ir_s"] == pytest.approx(4_000 / 24_000)
-    assert 0 < measured["median_ms"] <= measured["p99_ms"]
+    assert [level["name"] for level in measured["levels"]] == list(Levels.load(bundle))
+    for level in measured["levels"]:
+        assert 0 < level["ms_p50"] <= level["ms_p99"]
 
 
 def test_listen_bench_hears_what_it_does(served):
