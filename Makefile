@@ -5,6 +5,7 @@ HOST ?= 127.0.0.1
 PORT ?= 8000
 SCENE ?= apartment
 RUNS ?= runs/$(SCENE)
+MINUTES ?= 4
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,7 +13,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle container-test clean
+.PHONY: help serve test lint format bundle scenes table container-test clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,11 +33,21 @@ format: $(VENV)/installed-dev ## format the code and apply safe lint fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bundle: $(VENV)/installed-training ## simulate, train, export and evaluate a scene (SCENE=apartment); resumes where it stopped
+bundle: $(VENV)/installed-training ## simulate, train, export and measure a scene (SCENE=apartment); resumes where it stopped
 	$(BIN)/nafir-train simulate training/scenes/$(SCENE).toml -o $(RUNS)/data
 	$(BIN)/nafir-train train $(RUNS)/data -o $(RUNS)/run
-	$(BIN)/nafir-train export $(RUNS)/run -o $(RUNS)/bundle
+	$(BIN)/nafir-train export $(RUNS)/run -o $(RUNS)/bundle --precision float32,int8 --ranks 64,32,16
+	$(BIN)/nafir-train frontier $(RUNS)/bundle $(RUNS)/data -o $(RUNS)/frontier --phases-of factorised --record
 	$(BIN)/nafir-train evaluate $(RUNS)/bundle $(RUNS)/data --record --figure $(RUNS)/errors.png
+
+scenes: ## all of that for the six scenes after the paper
+	for scene in large1 large2 medium1 medium2 small1 small2; do $(MAKE) bundle SCENE=$$scene || exit 1; done
+
+table: $(VENV)/installed-training ## the paper's table of a scene (SCENE=small1), with the paper's network trained for MINUTES=4
+	$(BIN)/nafir-train train $(RUNS)/data -o $(RUNS)/naf --field naf --minutes $(MINUTES) --points 100
+	$(BIN)/nafir-train export $(RUNS)/run $(RUNS)/naf -o $(RUNS)/with-naf
+	$(BIN)/nafir-train evaluate $(RUNS)/with-naf $(RUNS)/data --pairs 16 --yaws 2 --markdown \
+		--methods nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear,image-sources,helmholtz
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh

@@ -116,7 +116,7 @@ def scaled_up(data, name):
 
 
 def test_a_graph_that_disagrees_is_not_written(dataset, run, tiny_bundle, tmp_path, monkeypatch):
-    damaged = scaled_up(tiny_bundle.models[MODEL_FILE], "_field.basis")
+    damaged = scaled_up(tiny_bundle.models[MODEL_FILE], "_basis")
     monkeypatch.setattr(export_module, "to_onnx", lambda *_, **__: damaged)
     with pytest.raises(ExportError, match="differs from torch"):
         export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
@@ -125,7 +125,7 @@ def test_a_graph_that_disagrees_is_not_written(dataset, run, tiny_bundle, tmp_pa
 
 def test_a_field_of_numbers_too_large_for_float16_is_not_written(dataset, run, tiny_bundle, tmp_path, monkeypatch):
     model = onnx.load_from_string(tiny_bundle.models[MODEL_FILE])
-    tensor = next(t for t in model.graph.initializer if t.name.startswith("_field.mean"))
+    tensor = next(t for t in model.graph.initializer if t.name.startswith("_offset"))
     values = numpy_helper.to_array(tensor).astype(np.float32)
     values[0] = np.inf
     tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), tensor.name))

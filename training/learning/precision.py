@@ -9,6 +9,9 @@ import torch
 
 _GAIN = 1.15
 _ROUNDS = 3
+_WORTHWHILE_S = 0.02
+"""Steps shorter than that are over before anything is gained, and a busy machine could decide about them by chance: the
+same seed should give the same result."""
 
 
 def autocast(device: torch.device, *, bfloat16: bool) -> AbstractContextManager[None]:
@@ -17,9 +20,12 @@ def autocast(device: torch.device, *, bfloat16: bool) -> AbstractContextManager[
 
 
 def bfloat16_gains(step: Callable[[bool], object], device: torch.device) -> bool:
-    """Whether `step(True)`, forward and backward in bfloat16, is faster than `step(False)` by 15 % at least."""
+    """Whether `step(True)`, forward and backward in bfloat16, is faster than `step(False)` by 15 % at least, where that
+    takes long enough to matter."""
     step(False)  # libraries choose their kernels with the first call
     plain = min(_seconds(step, device, bfloat16=False) for _ in range(_ROUNDS))
+    if plain < _WORTHWHILE_S:
+        return False
     # Once is enough to see that a processor only pretends.
     if _seconds(step, device, bfloat16=True) > _ROUNDS * plain:
         return False

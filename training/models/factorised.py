@@ -183,13 +183,15 @@ class FactorisedField(nn.Module):
         coefficients = self.coefficients(listener, emitter, yaw)
         root = torch.linalg.qr(coefficients / len(coefficients) ** 0.5).R
         directions = torch.linalg.svd(root @ self.basis, full_matrices=False).Vh[:rank]
-        turn = self.basis @ directions.T
+        # Coefficients of equal size, so that eight bits do for all of them together.
+        size = (coefficients @ self.basis @ directions.T).square().mean(dim=0).sqrt().clamp(min=1e-9)
+        turn = self.basis @ directions.T / size
         field = copy.deepcopy(self)
         layer = field._coefficients = nn.Linear(self._coefficients.in_features, rank)
         layer.weight.copy_(turn.T @ self._coefficients.weight)
         layer.bias.copy_(turn.T @ self._coefficients.bias)
-        field.basis = nn.Parameter(directions)
-        lost = (coefficients @ self.basis - coefficients @ turn @ directions) * self.spread
+        field.basis = nn.Parameter(directions * size[:, None])
+        lost = (coefficients @ self.basis - coefficients @ turn @ field.basis) * self.spread
         for name in ("fine", "late"):
             part = self.heads.slices[name]
             field.level_correction[part] += 0.5 * torch.log(torch.exp(2 * lost[:, part]).mean(dim=0))
