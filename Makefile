@@ -6,6 +6,8 @@ PORT ?= 8000
 SCENE ?= apartment
 RUNS ?= runs/$(SCENE)
 MINUTES ?= 4
+# Tests that watch the clock, and so have the machine to themselves.
+TIMED := tests/integration tests/bench tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -22,7 +24,8 @@ serve: $(VENV)/installed-server ## install the server and open a scene at http:/
 	$(BIN)/nafir serve --host $(HOST) --port $(PORT)
 
 test: lint ## install what tests need, then lint, check types and run every test
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses auto --dist loadfile $(TIMED:%=--ignore %)
+	$(BIN)/pytest $(TIMED)
 
 lint: $(VENV)/installed-dev ## lint and check types
 	$(BIN)/ruff check .

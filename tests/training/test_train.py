@@ -205,7 +205,7 @@ def test_without_progress_on_what_is_held_back_a_run_stops_and_keeps_the_best(da
     # With such a rate it only gets worse.
     hasty = dataclasses.replace(configuration, epochs=60, patience=3, learning_rate=0.05)
     train(SimulatedResponses(dataset), tmp_path, hasty, Progress(disable=True))
-    sums = np.sum([losses(tmp_path, name) for name in ("fine", "late", "phasor", "interaural")], axis=0)
+    sums = np.sum([losses(tmp_path, name) for name in ("fine", "late", "phasor", "interaural", "energy")], axis=0)
     assert len(sums) < 60
     assert np.argmin(sums) == len(sums) - 4
     learner = trained(dataset, tmp_path)
