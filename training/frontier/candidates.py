@@ -1,4 +1,8 @@
-"""Which quality levels a bundle could offer: every field with every way of finding its phase and every length."""
+"""Which quality levels a bundle could offer: every field with every way of finding its phase.
+
+Shorter responses are not among them: room parameters are taken from the first 35 dB of a decay and would not hear that
+the rest was cut off, so cutting it would always seem to be worth the time it saves.
+"""
 
 from collections.abc import Iterable, Iterator
 
@@ -6,14 +10,13 @@ from server.scene.bundle import Bundle
 from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel
 
 GRIFFIN_LIM_ITERATIONS = (1, 4, 16, 64)
-FRAME_SHARES = (0.5, 0.25)
 
 
 def candidates(bundle: Bundle, phases_of: Iterable[str] | None = None) -> list[QualityLevel]:
     """One level per combination worth measuring, named after what sets it apart.
 
-    Every field is swept over frames; over phases those that `phases_of` names (by default all), since what
-    Griffin and Lim's iteration adds in time does not depend on the field beneath.
+    Swept over phases are the fields that `phases_of` names, by default all: what Griffin and Lim's iteration adds in
+    time does not depend on the field beneath.
     """
     fields = bundle.manifest.fields
     swept = set(fields) if phases_of is None else set(phases_of)
@@ -22,15 +25,11 @@ def candidates(bundle: Bundle, phases_of: Iterable[str] | None = None) -> list[Q
 
 def _levels(manifest: Manifest, name: str, file: FieldFile, with_phases: bool) -> Iterator[QualityLevel]:
     yield QualityLevel(name=name, field=name)
-    if file.architecture.endswith("time-domain"):
-        return  # it predicts samples: there is no phase to choose and no frame to leave out
-    codec = file.codec or manifest.codec
-    frames = codec.codec.frames
-    for share in FRAME_SHARES:
-        yield QualityLevel(name=f"{name}-{share:.0%}".replace("%", "pct"), field=name, frames=round(share * frames))
-    if not with_phases:
+    # A field in the time domain predicts samples: there is no phase to choose.
+    if not with_phases or file.architecture.endswith("time-domain"):
         return
-    if codec.known_frames == frames:
+    codec = file.codec or manifest.codec
+    if codec.known_frames == codec.codec.frames:
         yield QualityLevel(name=f"{name}-if", field=name, phase=Phase(kind="integrated"))
     for iterations in GRIFFIN_LIM_ITERATIONS:
         for warm, suffix in ((False, ""), (True, "-warm")):

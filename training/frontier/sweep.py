@@ -77,9 +77,9 @@ class Effort:
 
     pairs: int = 40
     yaws: int = 3
-    rounds: int = 200
+    rounds: int = 40
     budget_s: float = 10.0
-    default_ms: float = 1.0
+    default_ms: float = 2.0
     seed: int = 0
 
 
