@@ -39,7 +39,7 @@ format: $(VENV)/installed-dev ## format the code and apply safe lint fixes
 bundle: $(VENV)/installed-training ## simulate, train, export and measure a scene (SCENE=apartment); resumes where it stopped
 	$(BIN)/nafir-train simulate training/scenes/$(SCENE).toml -o $(RUNS)/data
 	$(BIN)/nafir-train train $(RUNS)/data -o $(RUNS)/run
-	$(BIN)/nafir-train export $(RUNS)/run -o $(RUNS)/bundle --precision float32,int8 --ranks 32,16,8,4,2
+	$(BIN)/nafir-train export $(RUNS)/run -o $(RUNS)/bundle --ranks 32,16,8,4,2
 	$(BIN)/nafir-train frontier $(RUNS)/bundle $(RUNS)/data -o $(RUNS)/frontier --phases-of factorised --record
 	$(BIN)/nafir-train evaluate $(RUNS)/bundle $(RUNS)/data --record --figure $(RUNS)/errors.png
 
