@@ -87,13 +87,13 @@ class Levels(Mapping[str, AcousticField]):
         for number in range(-1, poses):
             listener, emitter = places[number], places[number - 1]
             for name, field in self.items():
-                if sum(times_ms[name]) > _CALIBRATION_MS:
+                # The first time warms up, compiling where nothing is compiled yet, and says nothing of the others.
+                if sum(times_ms[name][1:]) > _CALIBRATION_MS:
                     continue
                 started_s = time.thread_time()
                 field.impulse_responses([listener], [emitter], [float(number)])
                 times_ms[name].append((time.thread_time() - started_s) * 1000)
-        # The first time warms up, where there is another.
-        return {name: statistics.median(times[1:] or times) for name, times in times_ms.items()}
+        return {name: statistics.median(times[1:]) for name, times in times_ms.items()}
 
     def _places(self, count: int) -> list[tuple[float, ...]]:
         """Between the two places a visitor starts from, along a line."""

@@ -131,7 +131,6 @@ export class Frontier extends EventTarget {
       draw("path", { class: "grid", d: `M${at.toFixed(1)} ${below}v4` }, this.#chart);
       draw("text", { x: at, y: HEIGHT - 5, class: "tick" }, this.#chart, `${+(10 ** power).toPrecision(1)}`);
     }
-    draw("text", { x: WIDTH, y: HEIGHT - 5, class: "tick end" }, this.#chart, "ms");
     return { x, y };
   }
 

@@ -122,8 +122,8 @@ def sweep(
 
 
 def with_levels(bundle: Bundle, levels: Sequence[QualityLevel], folder: Path) -> Bundle:
-    """The bundle written to `folder` with these levels in place of its own, and without the fields none of them
-    needs."""
+    """The bundle written to `folder`, its own or another, with these levels in place of its own, and without the fields
+    none of them needs."""
     manifest = bundle.manifest
     fields = {name: file for name, file in manifest.fields.items() if name in {level.field for level in levels}}
     names = {ARRAYS_FILE, *(file.file for file in fields.values())}
@@ -131,7 +131,10 @@ def with_levels(bundle: Bundle, levels: Sequence[QualityLevel], folder: Path) ->
     offered = manifest.model_copy(
         update={"levels": tuple(levels), "fields": fields, "files": {name: manifest.files[name] for name in files}}
     )
-    return write_bundle(folder, offered, files)
+    written = write_bundle(folder, offered, files)
+    for name in manifest.files.keys() - files.keys():
+        (folder / name).unlink(missing_ok=True)
+    return written
 
 
 def offered_levels(frontier: Frontier) -> list[QualityLevel]:

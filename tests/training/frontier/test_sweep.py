@@ -5,7 +5,7 @@ import pytest
 from rich.progress import Progress
 
 from server.field.levels import Levels
-from server.scene.bundle import Bundle
+from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Phase
 from training.frontier import sweep as sweep_module
 from training.frontier.accuracy import HeldOutSample
@@ -93,3 +93,20 @@ def test_the_document_names_every_point_and_the_picture_is_drawn(frontier, tmp_p
     assert sum(entry["is_pareto_optimal"] for entry in document["points"]) == len(frontier.best)
     draw_frontier(frontier, tmp_path / "frontier.png")
     assert (tmp_path / "frontier.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_fields_that_no_level_needs_leave_the_folder(tiny_bundle, tmp_path) -> None:
+    manifest = tiny_bundle.manifest
+    (name, field), *_ = manifest.fields.items()
+    other = field.model_copy(update={"file": "other.onnx"})
+    files = {each: (tiny_bundle.folder / each).read_bytes() for each in manifest.files}
+    files["other.onnx"] = files[field.file]
+    both = manifest.model_copy(
+        update={"fields": {name: field, "other": other}, "files": dict.fromkeys(files, "0" * 64)}
+    )
+    bundle = write_bundle(tmp_path, both, files)
+    assert (tmp_path / "other.onnx").exists()
+    with_levels(bundle, manifest.levels, tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"scene.json", *Bundle.load(tmp_path).manifest.files}
+    assert "other.onnx" not in left
