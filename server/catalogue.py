@@ -52,7 +52,7 @@ def playable_clips(clips: ClipLibrary) -> list[Clip]:
 
 def describe_scene(levels: Levels) -> SceneDescription:
     field, manifest = levels.default, levels.bundle.manifest
-    start = manifest.start
+    start, plan = manifest.start, levels.bundle.floor_plan
     return SceneDescription(
         id=manifest.id,
         name=manifest.name,
@@ -62,9 +62,10 @@ def describe_scene(levels: Levels) -> SceneDescription:
         channels=manifest.channels,
         speed_of_sound=manifest.speed_of_sound,
         bounds=manifest.bounds,
-        corners=manifest.geometry.corners,
-        height_m=manifest.geometry.height_m,
-        openings=manifest.geometry.openings,
+        walls_known=manifest.geometry is not None,
+        corners=plan.corners,
+        height_m=plan.height_m - plan.floor_m,
+        openings=() if manifest.geometry is None else manifest.geometry.openings,
         listener=Place(position=start.listener, yaw=math.radians(start.listener_yaw_deg)),
         emitter=Place(position=start.emitter),
         level=field.level.name,

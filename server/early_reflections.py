@@ -50,11 +50,12 @@ class EarlyReflections:
     def of(cls, bundle: Bundle, filters: HeadFilters) -> "EarlyReflections | None":
         """None where the bundle's fields hold the first reflections themselves."""
         manifest = bundle.manifest
-        if manifest.image_order == 0:
+        geometry = manifest.geometry
+        if manifest.image_order == 0 or geometry is None:
             return None
         return cls(
             bundle.floor_plan,
-            manifest.geometry.materials,
+            geometry.materials,
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
             filters=filters,

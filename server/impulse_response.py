@@ -1,7 +1,8 @@
 """Single impulse responses (IRs), direct sound included: one way to compute and write them, for the command line and
 for HTTP alike.
 
-Metres; angles in degrees, since these are human edges. Samples are (channel, sample) float32, channel 0 the left ear.
+Metres; angles in degrees, since these are human edges. Samples are (channel, sample) float32, channel 0 the left ear;
+of a scene that one microphone heard there is one channel, and the head's yaw changes nothing.
 """
 
 import hashlib
@@ -74,12 +75,13 @@ def entity_tag(field: AcousticField, kind: str, parameters: dict[str, object], n
 
 @dataclass(frozen=True)
 class ImpulseResponse:
-    """A computed IR: `samples` (2, n) at `sample_rate`, sample 0 the moment of emission."""
+    """A computed IR: `samples` (channel, n) at `sample_rate`, sample 0 the moment of emission."""
 
     scene: str
     level: str
     query: IrQuery
     sample_rate: int
+    channels: tuple[str, ...]
     samples: npt.NDArray[np.float32]
 
     @classmethod
@@ -89,7 +91,8 @@ class ImpulseResponse:
         query.require_inside(field)
         whole = WholeField.through_kemar(field)
         samples = whole.impulse_responses([query.listener], [query.emitter], [math.radians(query.yaw_deg)])[0]
-        return cls(field.bundle.id, field.level.name, query, field.sample_rate, samples)
+        channels = field.bundle.manifest.channels
+        return cls(field.bundle.id, field.level.name, query, field.sample_rate, channels, samples)
 
     def encode(self, name: IrFormat) -> bytes:
         """The same samples in any format, and the same bytes for the same IR."""
@@ -110,6 +113,6 @@ class ImpulseResponse:
             "level": self.level,
             **asdict(self.query),
             "sample_rate": self.sample_rate,
-            "channels": ["left", "right"],
+            "channels": list(self.channels),
             "samples": self.samples.tolist(),
         }

@@ -1,7 +1,7 @@
 """How loud an emitter is everywhere in a scene: a map of listener positions, for people to look at.
 
 Level is that of both ears together, averaged over head orientations, in dB relative to the emitter's free field at one
-metre.
+metre; of measured scenes relative to the square of the unit that they were measured in.
 """
 
 import io
@@ -92,7 +92,8 @@ def loudness_map(
 def _reflected_power(
     field: AcousticField, listeners: npt.NDArray[np.float64], emitter: Vector3
 ) -> npt.NDArray[np.float64]:
-    """(listener,) energy per ear, averaged over ears and head orientations, straight from the predicted magnitudes."""
+    """(listener,) energy per channel, averaged over channels and head orientations, straight from what the field
+    says."""
     yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
     positions, heads = np.repeat(listeners, _YAWS, axis=0), np.tile(yaws, len(listeners))
     power = np.empty(len(heads))

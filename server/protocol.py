@@ -262,7 +262,8 @@ class Place(_Message):
 
 
 class SceneDescription(_Message):
-    """What a client needs to know of a scene; `corners` is the floor plan, counter-clockwise.
+    """What a client needs to know of a scene; `corners` is the floor plan, counter-clockwise, or where no walls are
+    known the outline of the bounds. Of `channels` a scene has two ears or one microphone; a stream always has two.
 
     `listener` and `emitter` are where to put a visitor and what he hears first.
     """
@@ -275,6 +276,7 @@ class SceneDescription(_Message):
     channels: tuple[str, ...]
     speed_of_sound: float
     bounds: Bounds
+    walls_known: bool
     corners: tuple[tuple[float, float], ...]
     height_m: float
     openings: tuple[Opening, ...]

@@ -167,7 +167,7 @@ class Connection:
                 scene=describe_scene(levels),
                 sample_rate=field.sample_rate,
                 block_size=hello.block_size,
-                channels=field.channels,
+                channels=2,
                 encoding=hello.encoding,
                 buffer_blocks=hello.buffer_blocks,
                 window=window,

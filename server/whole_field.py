@@ -1,7 +1,7 @@
 """A scene's whole impulse responses: the direct path from geometry, with it the first reflections where the field
-leaves them out, and what follows from the field.
+leaves them out, and what follows from the field; or all of it from the field, where that holds the direct sound.
 
-Axes: B poses; responses (B, ear, sample). Metres, radians.
+Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians.
 """
 
 from functools import cache, cached_property
@@ -68,9 +68,11 @@ class WholeField:
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
     ) -> npt.NDArray[np.float32]:
-        """(B, 2, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
+        """(B, channel, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
         responses = self.field.impulse_responses(listeners, emitters, yaws)
+        if self.bundle.manifest.direct_sound == "field":
+            return responses
         for response, listener, emitter, yaw in zip(responses, listeners, emitters, yaws, strict=True):
             head = Pose.from_yaw(tuple(listener), float(yaw))
             paths = self._paths.find(listener, emitter[None])
@@ -82,6 +84,8 @@ class WholeField:
     def path_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """(B,) energy per ear of what `impulse_responses` adds to those of the field, averaged over all orientations of
         the head."""
+        if self.bundle.manifest.direct_sound == "field":
+            return np.zeros(len(listeners))
         # A path is the same both ways, and here are many listeners to one emitter.
         paths = self._paths.find(emitter, listeners)
         spread = np.maximum(paths.length_m, NEAR_LIMIT_M)[:, None] ** 2

@@ -40,3 +40,30 @@ def in_jnd(errors: Mapping[str, _Floats], reference: RoomParameters) -> dict[str
         reference_ms = 1e3 * reference.early_decay_time_s.mean(axis=-1)
         audible["edt"] = audible["edt"] * 100 / reference_ms
     return audible
+
+
+HEARD: Mapping[str, Threshold] = {
+    **THRESHOLDS,
+    "spectrum": Threshold(1.0, "that of level, ISO 3382-1:2009, table A.1, in every third of an octave"),
+    "itd": Threshold(10.0, "Mills, J. Acoust. Soc. Am. 30 (1958): 10 us about straight ahead"),
+    "ild": Threshold(0.5, "Mills, J. Acoust. Soc. Am. 32 (1960): 0.5 to 1 dB"),
+    "pitch": Threshold(0.2, "Wier, Jesteadt and Green, J. Acoust. Soc. Am. 61 (1977): 0.2 % about 1 kHz"),
+    "onset": Threshold(2.0, "Hirsh, J. Acoust. Soc. Am. 31 (1959): 2 ms until two onsets are heard apart"),
+}
+"""Thresholds of everything that leaving out an effect can change. Pitch is in percent, onset in ms, ITD in us."""
+
+# A ratio of energies is heard best about even shares. From there on the JND grows by e every 8 dB, which takes it from
+# 2 to 7 dB within 10 dB: Larsen et al. (2008) found 2 to 3 dB at 0 and 10 dB and 6 to 9 dB at -10 and 20 dB. So it is a
+# finite number of JND to where one of the two is absent.
+_GROWTH_DB = 8.0
+_EVEN_DB: Mapping[str, tuple[float, float]] = {"drr": (0.0, 10.0), "c50": (-10.0, 10.0)}
+
+
+def ratio_in_jnd(name: str, ratio_db: npt.ArrayLike) -> _Floats:
+    """(...) DRR or C50 on a scale whose unit is one JND wherever one is; of two ratios, how far apart they are on it is
+    how different they are heard to be. -inf and inf have places."""
+    low, high = _EVEN_DB[name]
+    ratio = np.asarray(ratio_db, dtype=np.float64)
+    beyond = _GROWTH_DB * (np.exp((np.minimum(ratio, low) - low) / _GROWTH_DB) - 1)
+    above = _GROWTH_DB * (1 - np.exp((high - np.maximum(ratio, high)) / _GROWTH_DB))
+    return np.asarray((np.clip(ratio, low, high) + beyond + above) / HEARD[name].amount)

@@ -59,10 +59,11 @@ class Pose:
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """A simple polygon of walls, counter-clockwise, extruded from the floor at z = 0 to `height_m`."""
+    """A simple polygon of walls, counter-clockwise, extruded from the floor at z = `floor_m` to z = `height_m`."""
 
     corners: tuple[tuple[float, float], ...]
     height_m: float
+    floor_m: float = 0.0
 
     @cached_property
     def walls(self) -> npt.NDArray[np.float64]:
@@ -112,12 +113,12 @@ class FloorPlan:
         crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
         inside = np.sum(straddles & (x < crossing), axis=-1) % 2 == 1
         touches = self.wall_distance_m(points) < TOUCH_M
-        return np.asarray((inside | touches) & (points[..., 2] >= 0) & (points[..., 2] <= self.height_m))
+        return np.asarray((inside | touches) & (points[..., 2] >= self.floor_m) & (points[..., 2] <= self.height_m))
 
     def holds(self, position: Vector3) -> bool:
         """`contains` of one point: twenty times as fast in scalars, for whoever asks at every pose."""
         x, y, z = position
-        if not 0 <= z <= self.height_m:
+        if not self.floor_m <= z <= self.height_m:
             return False
         is_inside = False
         ax, ay = self.corners[-1]
@@ -158,7 +159,8 @@ class FloorPlan:
         )
         # A sight line through the inside of a wall block may pass exactly through its corners: its midpoint tells.
         middle = (a + b) / 2
-        inside = self.contains(np.concatenate([middle[..., :2], np.zeros((*middle.shape[:-1], 1))], axis=-1))
+        level = np.full((*middle.shape[:-1], 1), self.floor_m)
+        inside = self.contains(np.concatenate([middle[..., :2], level], axis=-1))
         return np.asarray(~np.any(crosses, axis=-1) & inside)
 
     def path_length_m(self, a: Points, b: Points) -> npt.NDArray[np.float64]:

@@ -53,7 +53,7 @@ class BankField(AcousticField):
             manifest=_MANIFEST,
             digest="",
             models={},
-            frozen_noise=np.zeros((self.channels, _SAMPLES), np.float32),
+            frozen_noise=np.zeros((2, _SAMPLES), np.float32),
         )
         self.level = _MANIFEST.levels[0]
         self._bank = np.stack([_LEVEL * room(seed, _SAMPLES) for seed in range(_BANK)])

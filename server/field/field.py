@@ -1,9 +1,10 @@
-"""A trained acoustic field: poses in, binaural impulse responses of the reflected sound out.
+"""A trained acoustic field: poses in, impulse responses of the reflected sound out.
 
 Reflected sound is all that follows the direct sound, which is not in here: it is computed from geometry
-(`server.whole_field` adds it). So are the first reflections, where the bundle's `image_order` is 1.
+(`server.whole_field` adds it). So are the first reflections, where the bundle's `image_order` is 1. Of measured scenes,
+whose `direct_sound` is the field's, responses are whole.
 
-Axes: B poses; responses (B, ear, sample). Metres, radians, seconds.
+Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
 """
 
 import numpy as np
@@ -31,8 +32,6 @@ class AcousticField:
     `noise` is that of the graph's codec, where somebody has it already.
     """
 
-    channels = 2
-
     def __init__(
         self, bundle: Bundle, level: QualityLevel, graph: FieldGraph, noise: FrozenNoise | None = None
     ) -> None:
@@ -40,7 +39,11 @@ class AcousticField:
         self.level = level
         self.graph = graph
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
-        self._gate = onset_gate(graph.parameters)
+        opening = graph.parameters
+        if bundle.manifest.direct_sound == "field":
+            # Measured sound may arrive before geometry has it: the gate opens with the first sample that is coded.
+            opening = opening.model_copy(update={"lead_samples": 0})
+        self._gate = onset_gate(opening)
         self._decoder: Decoder | None = None
         if graph.gives_responses:
             if level.frames is not None or level.phase != Phase():
@@ -49,7 +52,7 @@ class AcousticField:
                 )
         else:
             self._decoder = Decoder(
-                graph.parameters,
+                opening,
                 noise or frozen_noise(bundle, graph),
                 ir_samples=self.ir_samples,
                 phase=level.phase,
@@ -69,6 +72,10 @@ class AcousticField:
         return cls(bundle, chosen, FieldGraph(bundle, chosen.field, session))
 
     @property
+    def channels(self) -> int:
+        return len(self.bundle.manifest.channels)
+
+    @property
     def sample_rate(self) -> int:
         return self.bundle.manifest.codec.sample_rate
 
@@ -79,13 +86,13 @@ class AcousticField:
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike, *, remember: bool = False
     ) -> Float32:
-        """(B, 2, ir_samples) without what geometry adds; sample 0 is emission, unit pressure at one metre.
+        """(B, channel, ir_samples) without what geometry adds; sample 0 is emission, unit pressure at one metre.
 
         The same for the same poses, always; but with `remember` a level whose phase is warm starts from the phase that
         it last found near a pose, and leaves its own to the next: for streams, which go from each pose to one near it.
         """
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
-        responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
+        responses = np.empty((len(yaws), self.channels, self.ir_samples), dtype=np.float32)
         cache = self._cache if remember else None
         for start in range(0, len(yaws), _CHUNK):
             part = slice(start, start + _CHUNK)
@@ -97,8 +104,8 @@ class AcousticField:
         return self.graph.spectrograms(listeners, emitters, yaws)
 
     def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:
-        """(B, 2) sum of the squared samples at each ear, as predicted: without decoding where there is something to
-        decode."""
+        """(B, channel) sum of the squared samples of each, as predicted: without decoding where there is something
+        to decode."""
         if self.graph.gives_responses:
             aligned = self.graph.impulse_responses(listeners, emitters, yaws)
             return np.asarray(np.sum(aligned.astype(np.float64) ** 2, axis=-1))
@@ -120,15 +127,18 @@ class AcousticField:
         if self._decoder is None:
             return self._placed(self.graph.impulse_responses(listeners, emitters, yaws), aligned)
         predicted = self.graph.spectrograms(listeners, emitters, yaws)
+        if self.channels == 1:
+            # Decoders have two ears; a lone microphone is the left one.
+            predicted = predicted.twice()
         if cache is None:
-            return self._decoder.decode(predicted, aligned)
+            return self._decoder.decode(predicted, aligned)[:, : self.channels]
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
         # One after the other: each may start from the one before it.
         for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
             rows = slice(row, row + 1)
             responses[rows] = self._decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
             cache.keep(*pose, responses[row])
-        return responses
+        return responses[:, : self.channels]
 
     def _placed(self, coded: Float32, aligned: Floats) -> Float32:
         """Responses whose first sample belongs at `aligned`: later by whole samples and a fraction of one."""
@@ -136,7 +146,7 @@ class AcousticField:
         size = next_fast_len(coded.shape[-1] + 1, real=True)
         turns = -2j * np.pi * np.arange(size // 2 + 1) / size * (aligned - start)[:, None, None]
         shifted = irfft(rfft(coded, size) * np.exp(turns).astype(np.complex64), size)[..., : coded.shape[-1]]
-        responses = np.zeros((len(coded), 2, self.ir_samples), dtype=np.float32)
+        responses = np.zeros((len(coded), self.channels, self.ir_samples), dtype=np.float32)
         for response, part, at in zip(responses, shifted, start, strict=True):
             add_from(part, response, at)
             apply_gate(self._gate, response, at)

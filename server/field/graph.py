@@ -3,7 +3,8 @@
 A graph answers in one of two ways. Most give spectrograms, to be decoded; some give impulse responses outright. Either
 is aligned: sample `lead_samples` of the coded response is the earliest arrival.
 
-Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians.
+Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians. Of scenes heard by
+one microphone there is one channel in place of the ears, and no coherence between them.
 """
 
 from collections.abc import Mapping
@@ -31,9 +32,9 @@ _TENSOR = "tensor(float)"
 
 @dataclass(frozen=True)
 class Spectrograms:
-    """What the network says: `log_magnitude` (B, 2, frequency, frame); `instantaneous_frequency` and `certainty` of
-    the first frames (B, 2, frequency, known frame); `interaural` (B, 2, frequency, frame) the coherence between the
-    ears, real part and imaginary."""
+    """What the network says: `log_magnitude` (B, channel, frequency, frame); `instantaneous_frequency` and `certainty`
+    of the first frames (B, channel, frequency, known frame); `interaural` (B, 2, frequency, frame) the coherence
+    between the ears, real part and imaginary, nothing where there is one channel."""
 
     log_magnitude: Float32
     instantaneous_frequency: Float32
@@ -44,6 +45,15 @@ class Spectrograms:
     def coherence(self) -> npt.NDArray[np.complex64]:
         """(B, frequency, frame)"""
         return np.asarray(self.interaural[:, 0] + 1j * self.interaural[:, 1], dtype=np.complex64)
+
+    def twice(self) -> "Spectrograms":
+        """Of one channel: as of two ears that have nothing to do with each other."""
+        return Spectrograms(
+            np.repeat(self.log_magnitude, 2, axis=1),
+            np.repeat(self.instantaneous_frequency, 2, axis=1),
+            np.repeat(self.certainty, 2, axis=1),
+            self.interaural,
+        )
 
     def __getitem__(self, rows: slice) -> "Spectrograms":
         return Spectrograms(
@@ -79,13 +89,16 @@ class FieldGraph:
         outputs = {output.name: output.type for output in session.get_outputs()}
         self.gives_responses = RESPONSE in outputs
         """Impulse responses and not spectrograms."""
-        self._outputs = (RESPONSE,) if self.gives_responses else OUTPUTS
+        self.channels = len(bundle.manifest.channels)
+        self._outputs = (RESPONSE,) if self.gives_responses else OUTPUTS[: 2 + self.channels]
         inputs = {given.name: given.shape[1:] for given in session.get_inputs()}
         if inputs != INPUTS:
             raise BundleError(self._path, "inputs", f"are {inputs}, expected {INPUTS} after the batch axis")
         if any(outputs.get(output) != _TENSOR for output in self._outputs):
             raise BundleError(
-                self._path, "outputs", f"are {outputs}, expected {_TENSOR} {OUTPUTS}, or {RESPONSE} alone"
+                self._path,
+                "outputs",
+                f"are {outputs}, expected {_TENSOR} {OUTPUTS[: 2 + self.channels]}, or {RESPONSE} alone",
             )
         self._check_outputs(bundle)
 
@@ -94,15 +107,20 @@ class FieldGraph:
         return self._path
 
     def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> list[Float32]:
-        """The outputs, OUTPUTS or RESPONSE alone, for B poses; positions (B, 3), yaws (B,)."""
+        """The outputs, OUTPUTS (of one channel without the last) or RESPONSE alone, for B poses; positions (B, 3),
+        yaws (B,)."""
         return list(self._session.run(self._outputs, _feed(listeners, emitters, yaws)))
 
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
         """Not of a graph that gives responses."""
-        return Spectrograms(*self.run(listeners, emitters, yaws))
+        said = self.run(listeners, emitters, yaws)
+        if self.channels == 1:
+            rows, _, *axes = said[0].shape
+            said.append(np.zeros((rows, 2, *axes), np.float32))
+        return Spectrograms(*said)
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
-        """(B, 2, samples), aligned. Only of a graph that gives responses."""
+        """(B, channel, samples), aligned. Only of a graph that gives responses."""
         return self.run(listeners, emitters, yaws)[0]
 
     def _check_outputs(self, bundle: Bundle) -> None:
@@ -121,10 +139,10 @@ class FieldGraph:
     def _shapes(self) -> Mapping[str, tuple[int, ...]]:
         """Of the outputs for one pose."""
         if self.gives_responses:
-            return {RESPONSE: (1, 2, self.parameters.samples)}
+            return {RESPONSE: (1, self.channels, self.parameters.samples)}
         codec, known = self.parameters.codec, self.parameters.known_frames
-        every, first = (1, 2, codec.bins, codec.frames), (1, 2, codec.bins, known)
-        return dict(zip(OUTPUTS, (every, first, first, every), strict=True))
+        every, first = (1, self.channels, codec.bins, codec.frames), (1, self.channels, codec.bins, known)
+        return dict(zip(self._outputs, (every, first, first, every), strict=False))
 
 
 def _feed(listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> dict[str, Float32]:

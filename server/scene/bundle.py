@@ -67,7 +67,7 @@ class Bundle:
 
     @cached_property
     def floor_plan(self) -> FloorPlan:
-        return self.manifest.geometry.floor_plan
+        return self.manifest.floor_plan
 
     def require_inside(self, position: Vector3, field: str) -> None:
         """Raises RequestError `position_out_of_bounds` unless the position is finite, within the bounds and not

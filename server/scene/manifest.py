@@ -2,7 +2,9 @@
 
 Since format 2 the responses of a bundle's fields hold what follows the direct sound and not the direct sound itself,
 which the server computes from geometry. With `image_order` 1 it computes the first reflections too, and the fields hold
-what follows those.
+what follows those. Where responses were measured nobody can take the direct sound out of them: `direct_sound` says that
+the fields hold all of it, through one microphone or two ears. Of such a place often no walls are known either; then
+there is no `geometry`, and the place is what lies within `bounds`.
 """
 
 from typing import Annotated, Literal
@@ -14,6 +16,7 @@ from pydantic import Field, field_validator, model_validator
 from server.acoustics.air import absorption_db_per_m
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.codec import Codec
+from server.acoustics.geometry import FloorPlan
 from server.scene.geometry import Finite, Geometry, Point, Strict
 
 ARRAYS_FILE = "arrays.npz"
@@ -138,14 +141,40 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Cost(Strict):
-    """What one binaural impulse response takes on one core of `host`, phase included; `storage_mb` is that of the
-    field's file, `memory_mb` what serving it adds to a process."""
+    """What a pose takes on one core of `host` until its binaural response is ready to be convolved.
+
+    `ms_p50`, `ms_p99` and `ms_mean` are over the poses of a walk; `ms_miss` is the median of those that found nothing
+    kept to reuse, which is what a deadline has to bear. The last two are the median where they were not measured.
+    `storage_mb` is that of the field's file, `memory_mb` what serving it adds to a process.
+    """
 
     ms_p50: Positive
     ms_p99: Positive
+    ms_mean: Positive
+    ms_miss: Positive
     storage_mb: Positive
     memory_mb: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     host: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _takes_as_long_every_time(cls, values: object) -> object:
+        if isinstance(values, dict) and "ms_p50" in values:
+            return {"ms_mean": values["ms_p50"], "ms_miss": values["ms_p50"], **values}
+        return values
+
+
+class Reuse(Strict):
+    """Responses are computed for the nodes of a lattice alone and kept: poses near a node have its response.
+
+    Nodes are `spacing_m` apart at most along each axis, for listener and emitter alike, and headings at most
+    `turn_deg`. The first reflections that geometry computes are those of the `pose` itself, or, kept with all else,
+    those of its `node`. The direct sound is always the pose's own.
+    """
+
+    spacing_m: Positive
+    turn_deg: Annotated[float, Field(gt=0, le=360)]
+    first_reflections: Literal["pose", "node"] = "pose"
 
 
 class QualityLevel(Strict):
@@ -153,13 +182,14 @@ class QualityLevel(Strict):
 
     Of the response all is computed, or only the first `frames`, and the rest is silent; an emitter gets `ir_rate_hz`
     responses per second at most, or one with every pose; with `shared_tail` all emitters of a listener share one late
-    tail.
+    tail; with `reuse` poses near each other share responses.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
     field: str
     phase: Phase = Phase()
     frames: Annotated[int, Field(ge=1)] | None = None
+    reuse: Reuse | None = None
     ir_rate_hz: Positive | None = None
     shared_tail: bool = False
     accuracy: Accuracy | None = None
@@ -173,14 +203,16 @@ class Manifest(Strict):
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
     name: str
     description: str = ""
-    geometry: Geometry
+    geometry: Geometry | None = None
     bounds: Bounds
     speed_of_sound: Annotated[float, Field(gt=100, lt=1000)]
     air: Air = Air()
     image_order: Literal[0, 1] = 0
     """Mirrored reflections of up to so many surfaces are not in the fields: the server computes them from geometry."""
     start: Start
-    channels: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+    direct_sound: Literal["geometry", "field"] = "geometry"
+    """Where it comes from."""
+    channels: tuple[Literal["left"], Literal["right"]] | tuple[Literal["mono"]] = ("left", "right")
     codec: CodecParameters
     fields: Annotated[dict[str, FieldFile], Field(min_length=1)]
     levels: Annotated[tuple[QualityLevel, ...], Field(min_length=1)]
@@ -213,9 +245,27 @@ class Manifest(Strict):
         return self
 
     @model_validator(mode="after")
+    def _computes_what_can_be_computed(self) -> "Manifest":
+        if self.image_order > 0 and self.geometry is None:
+            raise ValueError("image_order: reflections cannot be computed without geometry")
+        if self.image_order > 0 and self.direct_sound == "field":
+            raise ValueError("image_order: fields that hold the direct sound hold the first reflections too")
+        if len(self.channels) == 1 and self.direct_sound == "geometry":
+            raise ValueError("direct_sound: what one microphone heard holds it; it is computed for two ears only")
+        return self
+
+    @property
+    def floor_plan(self) -> FloorPlan:
+        """Where sound travels: that of the geometry, or the box of the bounds, in which all see each other."""
+        if self.geometry is not None:
+            return self.geometry.floor_plan
+        (west, south, low), (east, north, high) = self.bounds.minimum, self.bounds.maximum
+        return FloorPlan(((west, south), (east, south), (east, north), (west, north)), high, low)
+
+    @model_validator(mode="after")
     def _fits_into_the_room(self) -> "Manifest":
-        plan = self.geometry.floor_plan
-        room = (*np.min(plan.corners, axis=0), 0.0), (*np.max(plan.corners, axis=0), plan.height_m)
+        plan = self.floor_plan
+        room = (*np.min(plan.corners, axis=0), plan.floor_m), (*np.max(plan.corners, axis=0), plan.height_m)
         if not _within(self.bounds.minimum, *room) or not _within(self.bounds.maximum, *room):
             raise ValueError("bounds: must lie in the box around geometry.corners, up to geometry.height_m")
         for name, position in (("listener", self.start.listener), ("emitter", self.start.emitter)):

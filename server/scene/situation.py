@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import FloorPlan, Pose, Vector3
 from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
@@ -24,28 +25,29 @@ Bands = npt.NDArray[np.float64]
 WALKING_M_S = 1.4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reverberation:
     """What a field's responses hold of one emitter: the sound after the direct sound and the reflections that are
     computed from geometry, over both ears.
 
-    `energy` (band,); of it the share `early` in the first 50 ms; `late` in what emitters can share a tail of.
-    `t60_s` (band,), `early_decay_s`. `late_iacc` is the interaural cross-correlation of the late part. Between two ways the head may be turned, `turn_db` is
-    by how much an ear's third-octave spectrum differs and `turn_iacc` by how much the interaural cross-correlation does.
+    `energy` (band,), of which the share `early` comes within 50 ms; `t60_s` (band,); `late_iacc` is the interaural
+    cross-correlation of the late part. Between two ways the head may be turned the level at an ear differs by up to
+    `turn_db`, in that octave where it does most.
     """
 
     energy: Bands
     early: float
-    late: float
     t60_s: Bands
     late_iacc: float
     turn_db: float
-    turn_iacc: float
 
 
 @dataclass(frozen=True)
 class Emitter:
-    """Radiates from `pose`; moves at `speed_m_s` at most, 0 at rest."""
+    """Radiates from `pose`; moves at `speed_m_s` at most, 0 at rest.
+
+    `reverberation` is of this emitter where it is; None where nobody knows, and the place's own stands for it.
+    """
 
     pose: Pose
     directivity: Directivity = OMNIDIRECTIONAL
@@ -54,7 +56,6 @@ class Emitter:
     turns: bool = False
     is_live: bool = False
     reverberation: Reverberation | None = None
-    """Of this emitter where it is; None where nobody knows, and the place's own stands for it."""
 
 
 @dataclass(frozen=True)
@@ -67,23 +68,31 @@ class Listener:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """What stays the same in a scene. `plan` is None in the open, and where nobody measured the walls; `materials`,
-    where there are any and the first reflections come from them; `reverberation`, None where the scene has no field.
+    """What stays the same in a scene; two places are equal only if they are one. Safe to share between threads.
 
-    Safe to share between threads; two are equal only if they are one.
+    `minimum` and `maximum` bound where anybody can be. Nearer than `nearest_m`, sound gets no louder. `plan` is None in
+    the open, and where nobody measured the walls; `materials` are there where first reflections come from geometry;
+    `reverberation`, typical of the place, where it has a field. The late tails that emitters could share begin
+    `tail_start_s` after emission; None where responses are too short to share any.
     """
 
     minimum: Vector3
     maximum: Vector3
+    sample_rate: int
     speed_of_sound: float
     air_db_per_m: Bands
+    nearest_m: float
     plan: FloorPlan | None = None
     materials: Materials | None = None
     reverberation: Reverberation | None = None
+    tail_start_s: float | None = None
 
     @cached_property
     def paths(self) -> SoundPathFinder | None:
-        return None if self.plan is None else SoundPathFinder(self.plan, self.speed_of_sound)
+        """None where nothing can stand in the way."""
+        if self.plan is None or not len(self.plan.bend_corners):
+            return None
+        return SoundPathFinder(self.plan, self.speed_of_sound)
 
     @cached_property
     def reflections(self) -> ReflectionFinder | None:
@@ -92,6 +101,12 @@ class Place:
         surfaces = self.materials.walls, self.materials.floor, self.materials.ceiling
         gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
         return ReflectionFinder(self.plan, gains_db)
+
+    @cached_property
+    def band_shares(self) -> Bands:
+        """(band,) of the energy of an impulse: the first band reaches down to 0 Hz, the last up to all there is."""
+        edges = np.asarray(OCTAVE_BANDS_HZ[1:]) / np.sqrt(2)
+        return np.diff(np.clip([0.0, *edges, np.inf], 0, self.sample_rate / 2)) / (self.sample_rate / 2)
 
 
 @dataclass(frozen=True)
