@@ -12,6 +12,7 @@ import numpy.typing as npt
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.sound_path import SoundPathFinder
+from server.binaural import Binauralization
 from server.early_reflections import EarlyReflections
 from server.radiation import Placed, departure_gain_db
 from server.rendering.hrtf import HeadFilters
@@ -22,7 +23,9 @@ from server.scene.bundle import Bundle
 class DirectSound:
     """One scene's floor plan and air, heard through one head; `air_db_per_m` (7,) per octave band.
 
-    `early_reflections` are what the impulse responses of the scene's fields leave out, None where they hold it.
+    `early_reflections` are what the impulse responses of the scene's fields leave out, None where they hold it. Fields
+    that hold the direct sound too leave nothing to a renderer: then there are no `filters` for it, and where those
+    fields have no ears either, `binauralization` gives them the listener's.
     """
 
     def __init__(
@@ -31,10 +34,12 @@ class DirectSound:
         *,
         speed_of_sound: float,
         air_db_per_m: npt.NDArray[np.float64],
-        filters: HeadFilters,
+        filters: HeadFilters | None,
         early_reflections: EarlyReflections | None = None,
+        binauralization: Binauralization | None = None,
     ) -> None:
         self.early_reflections = early_reflections
+        self.binauralization = binauralization
         self._finder = SoundPathFinder(plan, speed_of_sound)
         self._speed_of_sound = speed_of_sound
         self._air_db_per_m = air_db_per_m
@@ -47,8 +52,9 @@ class DirectSound:
             bundle.floor_plan,
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
-            filters=filters,
+            filters=filters if manifest.direct_sound == "geometry" else None,
             early_reflections=EarlyReflections.of(bundle, filters),
+            binauralization=Binauralization.of(bundle, filters),
         )
 
     def renderer(
@@ -75,7 +81,7 @@ class DirectSound:
 
     def aim(self, renderer: Renderer, listener: Pose, emitters: Mapping[str, Placed]) -> None:
         """Have `renderer` hear `emitters`, by id, where they are now."""
-        if not emitters:
+        if not emitters or self._filters is None:
             return
         places = np.asarray([emitter.pose.position for emitter in emitters.values()])
         paths = self._finder.find(np.asarray(listener.position), places)

@@ -7,6 +7,7 @@ import numpy as np
 
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
+from server.binaural import Binauralization
 from server.blocks import FloatArray
 from server.early_reflections import EarlyReflections
 from server.field.levels import Levels
@@ -33,6 +34,8 @@ class IrRequest:
     """Those whose IR is out of date."""
     early_reflections: EarlyReflections | None
     """What the field's IRs leave out, as this session's head hears it; None where they hold it."""
+    binauralization: Binauralization | None = None
+    """How this session's head hears the IRs of a field that has no ears."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +48,15 @@ class IrResponse:
 def compute_irs(levels: Levels, request: IrRequest, prepare: Callable[[FloatArray], PartitionedIr]) -> IrResponse:
     """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
     count = len(request.emitters)
+    places = [emitter.pose.position for emitter in request.emitters]
     irs = levels[request.level].impulse_responses(
         np.tile(np.asarray(request.listener.position), (count, 1)),
-        np.asarray([emitter.pose.position for emitter in request.emitters]),
+        np.asarray(places),
         np.full(count, request.listener.yaw),
         remember=True,
     )
     if request.early_reflections is not None:
         request.early_reflections.add(irs, request.listener, request.emitters)
+    if request.binauralization is not None:
+        irs = request.binauralization.hear(irs, request.listener, places)
     return IrResponse(request, tuple(prepare(ir) for ir in irs))

@@ -18,7 +18,6 @@ import numpy.typing as npt
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose
 from server.direct_sound import DirectSound
-from server.early_reflections import EarlyReflections
 from server.errors import NafirError
 from server.radiation import reverberation_gain
 from server.rendering.renderer import render_all
@@ -41,7 +40,7 @@ class PathError(NafirError):
 
 
 class ImpulseResponses(Protocol):
-    """What an acoustic field gives: IRs (batch, ear, `ir_samples`) for poses in metres and radians."""
+    """What an acoustic field gives: IRs (batch, channel, `ir_samples`) for poses in metres and radians."""
 
     @property
     def ir_samples(self) -> int: ...
@@ -227,7 +226,7 @@ def render(
             direct_sound.aim(renderer, direct[block], named)
             renderer.set_orientation(direct[block].orientation)
         if block in reverberation:
-            irs = _irs(field, direct_sound.early_reflections, emitters, reverberation[block])
+            irs = _irs(field, direct_sound, emitters, reverberation[block])
             for name, ir in zip(named, irs, strict=True):
                 renderer.set_ir(name, ir)
         (output[:, block],) = render_all([renderer])
@@ -242,11 +241,13 @@ def _block_at(sample: int, block_size: int) -> int:
 
 
 def _irs(
-    field: ImpulseResponses, early: EarlyReflections | None, emitters: Sequence[RenderedEmitter], listener: Pose
+    field: ImpulseResponses, direct_sound: DirectSound, emitters: Sequence[RenderedEmitter], listener: Pose
 ) -> FloatArray:
     count = len(emitters)
     places = [emitter.pose.position for emitter in emitters]
     irs = field.impulse_responses([listener.position] * count, places, [listener.yaw] * count)
-    if early is not None:
-        early.add(irs, listener, emitters)
+    if direct_sound.early_reflections is not None:
+        direct_sound.early_reflections.add(irs, listener, emitters)
+    if direct_sound.binauralization is not None:
+        irs = direct_sound.binauralization.hear(irs, listener, places)
     return irs

@@ -194,6 +194,7 @@ class Session:
             self._listener,
             tuple(EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity) for emitter in outdated),
             self._direct_sound.early_reflections,
+            self._direct_sound.binauralization,
         )
         return self._in_flight
 
@@ -326,6 +327,9 @@ class Session:
 
     def _add_emitter(self, message: AddEmitter) -> None:
         self._bundle.require_inside(message.position, "position")
+        if self._bundle.manifest.direct_sound == "field" and message.directivity is not None:
+            problem = f"scene {self._bundle.id} was measured: its emitters beam as the loudspeakers did; leave it out"
+            raise RequestError("fixed_directivity", problem, field="directivity")
         live, source = self._open_source(message)
         try:
             self.renderer.add_emitter(message.id, source, gain=float(db_to_amplitude(message.gain_db)))

@@ -140,6 +140,66 @@ def mirrored_field(mirrored_bundle) -> AcousticField:
     return AcousticField.load(mirrored_bundle)
 
 
+MEASURED = MANIFEST.model_copy(
+    update={
+        "id": "measured",
+        "name": "A measured place",
+        "geometry": None,
+        "direct_sound": "field",
+        "channels": ("mono",),
+        "bounds": Bounds(minimum=(-0.2, -0.2, -0.1), maximum=(1.8, 1.0, 0.1)),
+        "start": Start(listener=(0.0, 0.4, 0.0), emitter=(1.5, 0.4, 0.0)),
+        "fields": {"measured": FieldFile(file="measured.onnx", architecture="measured")},
+        "levels": (QualityLevel(name="standard", field="measured"),),
+        "files": {"measured.onnx": "0" * 64, "arrays.npz": "0" * 64},
+    }
+)
+
+
+def measured_response() -> np.ndarray:
+    """(sample,) aligned, heard at one metre: a smooth pulse as the direct sound, then a diffuse tail."""
+    after = np.arange(CODEC.samples) - CODEC.lead_samples
+    pulse = np.exp(-0.5 * (after / 3.0) ** 2)
+    tail = 0.05 * np.random.default_rng(8).standard_normal(CODEC.samples) * np.exp(-np.maximum(after, 0) / 600.0)
+    return (pulse + np.where(after > 0.004 * CODEC.sample_rate, tail, 0.0)).astype(np.float32)
+
+
+def measured_graph() -> bytes:
+    """Answers with `measured_response`, louder nearby (1 / distance)."""
+    floats = TensorProto.FLOAT
+    poses = [helper.make_tensor_value_info(name, floats, ["B", 3]) for name in ("listener", "emitter")]
+    graph = helper.make_graph(
+        [
+            helper.make_node("Sub", ["emitter", "listener"], ["offset"]),
+            helper.make_node("ReduceL2", ["offset", "axis"], ["range"]),
+            helper.make_node("Max", ["range", "nearest"], ["distance"]),
+            helper.make_node("Reshape", ["distance", "cube"], ["spread"]),
+            helper.make_node("Div", ["response", "spread"], ["impulse_response"]),
+        ],
+        "measured",
+        [*poses, helper.make_tensor_value_info("yaw", floats, ["B"])],
+        [helper.make_tensor_value_info("impulse_response", floats, ["B", 1, CODEC.samples])],
+        [
+            numpy_helper.from_array(measured_response()[None, None], "response"),
+            numpy_helper.from_array(np.array([1]), "axis"),
+            numpy_helper.from_array(np.array([-1, 1, 1]), "cube"),
+            numpy_helper.from_array(np.float32(0.1), "nearest"),
+        ],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+@pytest.fixture(scope="session")
+def measured_bundle(tmp_path_factory) -> Bundle:
+    """A scene as it is measured: one microphone, the direct sound in the responses, and no walls known."""
+    noise = io.BytesIO()
+    np.savez(noise, frozen_noise=np.zeros((2, CODEC.samples), np.float32))
+    files = {"measured.onnx": measured_graph(), "arrays.npz": noise.getvalue()}
+    return write_bundle(tmp_path_factory.mktemp("scenes") / "measured", MEASURED, files)
+
+
 @pytest.fixture
 def levels(field) -> Levels:
     """The scene's only level, whose field is `field`."""
