@@ -120,5 +120,5 @@ def _warm_up(host: StreamHost) -> None:
         for turn in range(1, 9):
             session.receive(ListenerPose(pose_id=turn, position=start.listener, yaw=0.1 * turn))
             if (request := session.take_request()) is not None:
-                session.accept(compute_irs(levels, request, session.prepare))
+                session.accept(compute_irs(levels, request, session.renderer))
             session.render_block()

@@ -9,6 +9,7 @@ part of, and those are crossfaded.
 Axes: B poses; responses (B, ear, sample). Metres; positions and directions in the world's axes.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,7 @@ from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
 from server.radiation import Placed, departure_gain_db, reverberation_gain
 from server.rendering.direct_path import NEAR_LIMIT_M
+from server.rendering.fractional_delay import TAPS
 from server.rendering.hrtf import HeadFilters
 from server.rendering.still_paths import StillPaths
 from server.scene.bundle import Bundle
@@ -42,7 +44,13 @@ class EarlyReflections:
     ) -> None:
         surfaces = materials.walls, materials.floor, materials.ceiling
         gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
+        self.filters = filters
         self._finder = ReflectionFinder(plan, gains_db)
+        # Each of the two legs of a path is no longer than the room.
+        (west, south), (east, north) = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
+        longest_s = 2 * math.hypot(east - west, north - south, plan.height_m) / speed_of_sound
+        self.end_samples = math.ceil((longest_s + filters.longest_delay_s) * filters.sample_rate) + filters.taps + TAPS
+        """From this sample of a response on, none of them is heard."""
         self._air_db_per_m = air_db_per_m
         self._paths = StillPaths(filters, speed_of_sound=speed_of_sound, air_db_per_m=air_db_per_m)
 

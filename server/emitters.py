@@ -1,5 +1,6 @@
 """What a session knows of one emitter: where it is, how it radiates, what it plays, and what is out of date."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
@@ -25,6 +26,8 @@ class Emitter:
     """Whether its impulse response is of another pose."""
     is_displaced: bool = True
     """Whether its direct path is of another pose."""
+    identity: Hashable | None = None
+    """Of its impulse response, where poses share responses."""
     token: int | None = None
     """Pose id of the newest impulse response handed to the renderer; None before the first."""
 

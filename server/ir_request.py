@@ -1,6 +1,6 @@
 """Impulse responses (IRs) that a session asks for, and how they are computed."""
 
-from collections.abc import Callable
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +8,9 @@ import numpy as np
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
 from server.binaural import Binauralization
-from server.blocks import FloatArray
 from server.early_reflections import EarlyReflections
 from server.field.levels import Levels
+from server.kept_irs import Preparer, prepared_irs
 from server.rendering.convolver import PartitionedIr
 
 
@@ -21,6 +21,8 @@ class EmitterSnapshot:
     serial: int
     pose: Pose
     directivity: Directivity
+    identity: Hashable | None = None
+    """Of the response asked for, where poses share responses."""
 
 
 @dataclass(frozen=True)
@@ -45,18 +47,22 @@ class IrResponse:
     """One per emitter of the request."""
 
 
-def compute_irs(levels: Levels, request: IrRequest, prepare: Callable[[FloatArray], PartitionedIr]) -> IrResponse:
+def compute_irs(levels: Levels, request: IrRequest, preparer: Preparer) -> IrResponse:
     """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
+    field, early = levels[request.level], request.early_reflections
+    if field.level.reuse is not None:
+        irs_at_nodes = prepared_irs(field, levels.kept, early, preparer, request.listener, request.emitters)
+        return IrResponse(request, irs_at_nodes)
     count = len(request.emitters)
     places = [emitter.pose.position for emitter in request.emitters]
-    irs = levels[request.level].impulse_responses(
+    irs = field.impulse_responses(
         np.tile(np.asarray(request.listener.position), (count, 1)),
         np.asarray(places),
         np.full(count, request.listener.yaw),
         remember=True,
     )
-    if request.early_reflections is not None:
-        request.early_reflections.add(irs, request.listener, request.emitters)
+    if early is not None:
+        early.add(irs, request.listener, request.emitters)
     if request.binauralization is not None:
         irs = request.binauralization.hear(irs, request.listener, places)
-    return IrResponse(request, tuple(prepare(ir) for ir in irs))
+    return IrResponse(request, tuple(preparer.prepare(ir) for ir in irs))

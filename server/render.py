@@ -16,12 +16,15 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
-from server.acoustics.geometry import Pose
+from server.acoustics.geometry import Pose, Vector3
 from server.direct_sound import DirectSound
 from server.errors import NafirError
+from server.field.lattice import Snapped
+from server.node_reflections import add_first_reflections
 from server.radiation import reverberation_gain
 from server.rendering.renderer import render_all
 from server.rendering.sources import ClipPlayer
+from server.scene.manifest import QualityLevel
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -47,6 +50,11 @@ class ImpulseResponses(Protocol):
 
     @property
     def sample_rate(self) -> int: ...
+
+    @property
+    def level(self) -> QualityLevel: ...
+
+    def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped: ...
 
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
@@ -247,7 +255,7 @@ def _irs(
     places = [emitter.pose.position for emitter in emitters]
     irs = field.impulse_responses([listener.position] * count, places, [listener.yaw] * count)
     if direct_sound.early_reflections is not None:
-        direct_sound.early_reflections.add(irs, listener, emitters)
+        add_first_reflections(field, direct_sound.early_reflections, irs, listener, emitters)
     if direct_sound.binauralization is not None:
         irs = direct_sound.binauralization.hear(irs, listener, places)
     return irs

@@ -12,7 +12,7 @@ A `Session` belongs to the thread that renders it. Positions are metres, clocks 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 from server.acoustics.decibels import db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
@@ -23,6 +23,7 @@ from server.emitters import Emitter, LiveInput
 from server.errors import RequestError
 from server.field.levels import Levels
 from server.ir_request import EmitterSnapshot, IrRequest, IrResponse
+from server.kept_irs import response_identity
 from server.load import Reason, Rung
 from server.pacing import SendWindow
 from server.protocol import (
@@ -92,6 +93,7 @@ class Session:
         self.ir_exchanges = 0
         self.blocks_dropped = 0
         self._bundle = levels.bundle
+        self._levels = levels
         self._rung = self._heard = rung
         self._reason: Reason = "chosen"
         self._sample_rate = field.sample_rate
@@ -106,7 +108,6 @@ class Session:
             switches_tail=any(level.level.shared_tail for level in levels.values()),
         )
         self.renderer.share_tail(rung.shared_tail)
-        self.prepare = self.renderer.prepare
         self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
         self._bundle.require_inside(self._listener.position, "listener.position")
         self._emitters: dict[str, Emitter] = {}
@@ -179,7 +180,7 @@ class Session:
         """The IRs to compute now. None while an earlier request is unanswered, or when every IR is up to date."""
         if self._in_flight is not None or self._waits_for_change:
             return None
-        outdated = [emitter for emitter in self._emitters.values() if emitter.is_outdated]
+        outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter)]
         if not outdated:
             self._accepted_pose_id = self._newest_pose_id
             return None
@@ -192,7 +193,10 @@ class Session:
             self._newest_pose_id,
             self._rung.level,
             self._listener,
-            tuple(EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity) for emitter in outdated),
+            tuple(
+                EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity, self._identity(emitter))
+                for emitter in outdated
+            ),
             self._direct_sound.early_reflections,
             self._direct_sound.binauralization,
         )
@@ -204,12 +208,14 @@ class Session:
         if response.request.level not in {self._rung.level, self._heard.level}:
             return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
         pose_id = response.request.pose_id
-        arrived = {emitter.serial: ir for emitter, ir in zip(response.request.emitters, response.irs, strict=True)}
+        asked = response.request.emitters
+        arrived = {each.serial: (ir, each.identity) for each, ir in zip(asked, response.irs, strict=True)}
         events: list[ServerMessage] = []
         for identifier, emitter in self._emitters.items():
             if emitter.serial not in arrived:
                 continue
-            self.renderer.set_ir(identifier, arrived[emitter.serial], token=pose_id)
+            ir, emitter.identity = arrived[emitter.serial]
+            self.renderer.set_ir(identifier, ir, token=pose_id)
             if emitter.token is None:
                 events.append(EmitterAdded(id=identifier, sample_clock=self.sample_clock))
             emitter.token = pose_id
@@ -274,6 +280,16 @@ class Session:
         """What was wrong with live samples since this was asked last."""
         refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
+
+    def _needs_ir(self, emitter: Emitter) -> bool:
+        """Whether its IR is of another pose, which where poses share responses need not make it another."""
+        if emitter.is_outdated and emitter.identity is not None:
+            emitter.is_outdated = self._identity(emitter) != emitter.identity
+        return emitter.is_outdated
+
+    def _identity(self, emitter: Emitter) -> Hashable | None:
+        field = self._levels[self._rung.level]
+        return response_identity(field, self._direct_sound.early_reflections, self._listener, emitter)
 
     def _change(self) -> list[ServerMessage]:
         """Stand on the rung that was asked for last, with the block that follows."""

@@ -280,5 +280,5 @@ class _Computed:
 
 def _compute_timed(levels: Levels, request: IrRequest, session: Session) -> _Computed:
     started_s, started_cpu_s = time.perf_counter(), time.thread_time()
-    response = compute_irs(levels, request, session.prepare)
+    response = compute_irs(levels, request, session.renderer)
     return _Computed(response, time.perf_counter() - started_s, time.thread_time() - started_cpu_s)

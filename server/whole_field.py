@@ -17,6 +17,7 @@ from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.early_reflections import EarlyReflections
 from server.field.field import AcousticField
+from server.node_reflections import add_first_reflections
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 from server.rendering.sphere import solid_angles
@@ -78,7 +79,7 @@ class WholeField:
             paths = self._paths.find(listener, emitter[None])
             self._direct.add(paths.length_m, paths.arrival, paths.screen_db, head.orientation, response)
             if self._early is not None:
-                self._early.add(response[None], head, [_AllRound(Pose(tuple(emitter)))])
+                add_first_reflections(self.field, self._early, response[None], head, [_AllRound(Pose(tuple(emitter)))])
         return responses
 
     def path_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -128,7 +128,7 @@ def test_a_directive_emitter_that_turns_is_mirrored_anew(name, turned, filters, 
     place = tuple(EMITTER)
     for identifier, pattern in (("all-round", None), ("ahead", {"pattern": "cardioid"})):
         session.receive(AddEmitter(id=identifier, clip="click", position=place, directivity=pattern))
-    session.accept(compute_irs(levels, session.take_request(), session.prepare))
+    session.accept(compute_irs(levels, session.take_request(), session.renderer))
     for pose_id, identifier in enumerate(("all-round", "ahead"), 1):
         session.receive(MoveEmitter(pose_id=pose_id, id=identifier, position=place, yaw=1.0))
     wanted = session.take_request()

@@ -58,7 +58,7 @@ def add(session, **changes):
 
 def answer(session, levels):
     request = session.take_request()
-    return [] if request is None else session.accept(compute_irs(levels, request, session.prepare))
+    return [] if request is None else session.accept(compute_irs(levels, request, session.renderer))
 
 
 def hear(session, blocks):
@@ -75,7 +75,7 @@ def test_a_level_is_heard_from_when_it_says_so(open_session, levels):
     for number, each in enumerate((session, silent)):
         add(each, loop=False)
         request = each.take_request()
-        response = compute_irs(levels, request, each.prepare)
+        response = compute_irs(levels, request, each.renderer)
         assert each.accept(response) == [EmitterAdded(id="talker", sample_clock=0)]
         if number == 1:  # the direct sound alone
             each.renderer.set_reverberation_gain("talker", 0.0)
@@ -137,7 +137,7 @@ def test_an_answer_of_a_level_nobody_wants_any_more_is_not_heard(open_session, l
     request = session.take_request()
     assert request.level == "fast"
     assert session.hear(GOOD, "recovered") == []  # it never was anything else
-    assert session.accept(compute_irs(levels, request, session.prepare)) == []
+    assert session.accept(compute_irs(levels, request, session.renderer)) == []
     assert session.rung == GOOD
     assert session.take_request().level == "good"
 
@@ -150,7 +150,7 @@ def test_responses_come_no_faster_than_they_may_but_a_new_emitter_gets_its_first
         session.receive(ListenerPose(pose_id=number, position=HERE, yaw=0.01 * number))
         if (request := session.take_request()) is not None:
             asked_at.append(session.sample_clock / RATE)
-            session.accept(compute_irs(levels, request, session.prepare))
+            session.accept(compute_irs(levels, request, session.renderer))
         session.render_block()
     gaps = np.diff(asked_at)
     assert gaps.min() >= 0.2 - 1e-9

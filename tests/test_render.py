@@ -15,6 +15,7 @@ from server.load import Rung
 from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
 from server.render import PathError, PathPoint, RenderedEmitter, read_path, render
 from server.rendering.fade import raised_cosine
+from server.scene.manifest import QualityLevel
 from server.session import Session
 
 SAMPLE_RATE = 24_000
@@ -28,6 +29,7 @@ class NoiseField:
 
     ir_samples = 1_500
     sample_rate = SAMPLE_RATE
+    level = QualityLevel(name="noise", field="noise")
 
     def impulse_responses(self, listeners, emitters, yaws):
         return np.stack([self.one(*poses) for poses in zip(listeners, emitters, yaws, strict=True)])
@@ -204,7 +206,7 @@ def test_a_live_session_replayed_is_equal_to_the_bit(name, filters, request):
                 ListenerPose(pose_id=pose_id, position=poses[pose_id].position, orientation=poses[pose_id].orientation)
             )
         if request is not None and rng.random() < 0.5:
-            session.accept(compute_irs(Levels([field]), request, session.prepare))
+            session.accept(compute_irs(Levels([field]), request, session.renderer))
             request = None
         request = session.take_request() or request
         blocks.append(session.render_block())

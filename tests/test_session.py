@@ -56,7 +56,7 @@ def add(session, identifier="talker", **changes):
 def answer(session, field):
     """Compute what the session wants, at once, and hand it in."""
     request = session.take_request()
-    return [] if request is None else session.accept(compute_irs(Levels([field]), request, session.prepare))
+    return [] if request is None else session.accept(compute_irs(Levels([field]), request, session.renderer))
 
 
 def poses(block):
@@ -202,7 +202,7 @@ def test_poses_that_arrive_during_a_computation_become_one_request(session, fiel
     for pose_id in range(1, 100):
         session.receive(ListenerPose(pose_id=pose_id, position=(2.0 + pose_id / 100, 2.0, 1.5)))
     assert session.take_request() is None
-    session.accept(compute_irs(Levels([field]), first, session.prepare))
+    session.accept(compute_irs(Levels([field]), first, session.renderer))
     second = session.take_request()
     assert (second.pose_id, second.listener.position) == (99, (2.99, 2.0, 1.5))
 
@@ -216,7 +216,7 @@ def test_a_block_carries_the_pose_of_its_direct_paths_and_the_one_whose_irs_it_f
     assert poses(session.render_block()) == (7, 0)
     session.receive(ListenerPose(pose_id=8, position=HERE))
     session.receive(ListenerPose(pose_id=9, position=HERE))
-    session.accept(compute_irs(Levels([field]), request, session.prepare))
+    session.accept(compute_irs(Levels([field]), request, session.renderer))
     exchange, after = session.render_block(), session.render_block()
     assert (*poses(exchange), exchange.is_exchange) == (9, 7, True)
     assert (*poses(after), after.is_exchange) == (9, 7, False)
@@ -260,7 +260,7 @@ def test_an_answer_for_an_emitter_that_left_is_ignored_even_if_its_id_is_taken_a
     request = session.take_request()
     assert session.receive(RemoveEmitter(id="talker")) == [EmitterRemoved(id="talker")]
     add(session, position=HERE)
-    assert session.accept(compute_irs(Levels([field]), request, session.prepare)) == []
+    assert session.accept(compute_irs(Levels([field]), request, session.renderer)) == []
     assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
 
 
@@ -379,7 +379,7 @@ def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
     field.impulse_responses = lambda *_, **__: np.full(shape, np.nan, np.float32)
     add(session)
     with pytest.raises(ValueError):
-        compute_irs(Levels([field]), session.take_request(), session.prepare)
+        compute_irs(Levels([field]), session.take_request(), session.renderer)
 
 
 def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
@@ -439,7 +439,7 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
                 return
             request, self.request = self.request, None
             if succeeds:
-                self.session.accept(compute_irs(Levels([field]), request, self.session.prepare))
+                self.session.accept(compute_irs(Levels([field]), request, self.session.renderer))
             else:
                 self.session.give_up(request)
 

@@ -11,12 +11,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 
+from server.acoustics.geometry import Vector3
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.sound_path import SoundPathFinder
+from server.bounded_cache import BoundedCache
 from server.errors import BundleError
 from server.field.decoder import Decoder, add_from, apply_gate, onset_gate, resized
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
+from server.field.lattice import Node, Snapped
 from server.field.phase_cache import PhaseCache
+from server.field.reuse import KEPT_BYTES, Kept, NodeResponses
 from server.scene.bundle import Bundle
 from server.scene.manifest import Phase, QualityLevel
 
@@ -29,11 +33,17 @@ _CHUNK = 32
 class AcousticField:
     """One scene's field at one quality level. Thread-safe: every call works on its own arrays.
 
-    `noise` is that of the graph's codec, where somebody has it already.
+    `noise` is that of the graph's codec, where somebody has it already. A level that reuses responses keeps them in
+    `kept`, shared with other levels of the scene.
     """
 
     def __init__(
-        self, bundle: Bundle, level: QualityLevel, graph: FieldGraph, noise: FrozenNoise | None = None
+        self,
+        bundle: Bundle,
+        level: QualityLevel,
+        graph: FieldGraph,
+        noise: FrozenNoise | None = None,
+        kept: Kept | None = None,
     ) -> None:
         self.bundle = bundle
         self.level = level
@@ -59,6 +69,11 @@ class AcousticField:
                 frames=level.frames,
             )
         self._cache = PhaseCache() if level.phase.warm else None
+        self.nodes: NodeResponses | None = None
+        """Where this level's responses are computed, if not at every pose."""
+        if level.reuse is not None:
+            kept = BoundedCache(KEPT_BYTES) if kept is None else kept
+            self.nodes = NodeResponses(bundle, level, self._paths, self._compute_all, kept)
 
     @classmethod
     def load(cls, bundle: Bundle, *, level: str | None = None, threads: int = 1) -> "AcousticField":
@@ -92,8 +107,20 @@ class AcousticField:
         it last found near a pose, and leaves its own to the next: for streams, which go from each pose to one near it.
         """
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        if self.nodes is not None:
+            return self.nodes.responses(listeners, emitters, yaws)
+        return self._compute_all(listeners, emitters, yaws, self._cache if remember else None)
+
+    def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
+        """What stands for a pair of poses at this level: they themselves, unless it reuses responses."""
+        if self.nodes is None:
+            return Snapped(Node(listener, emitter, yaw), 0)
+        return self.nodes.lattice.snap(listener, emitter, yaw)
+
+    def _compute_all(
+        self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None = None
+    ) -> Float32:
         responses = np.empty((len(yaws), self.channels, self.ir_samples), dtype=np.float32)
-        cache = self._cache if remember else None
         for start in range(0, len(yaws), _CHUNK):
             part = slice(start, start + _CHUNK)
             responses[part] = self._compute(listeners[part], emitters[part], yaws[part], cache)
@@ -106,6 +133,9 @@ class AcousticField:
     def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:
         """(B, channel) sum of the squared samples of each, as predicted: without decoding where there is something
         to decode."""
+        if self.nodes is not None:
+            places = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+            listeners, emitters, yaws = self.nodes.nodes(*places)
         if self.graph.gives_responses:
             aligned = self.graph.impulse_responses(listeners, emitters, yaws)
             return np.asarray(np.sum(aligned.astype(np.float64) ** 2, axis=-1))

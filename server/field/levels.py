@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from server.acoustics.phase import FrozenNoise
+from server.bounded_cache import BoundedCache
 from server.errors import RequestError
 from server.field.field import AcousticField, frozen_noise
 from server.field.graph import FieldGraph, open_graph
+from server.field.reuse import KEPT_BYTES, Kept
 from server.field.runtime import InferenceSession
 from server.scene.bundle import Bundle
 from server.scene.manifest import CodecParameters
@@ -22,8 +24,9 @@ _CALIBRATION_MS = 50.0
 class Levels(Mapping[str, AcousticField]):
     """Quality levels by name, in the manifest's order; the first is the default."""
 
-    def __init__(self, fields: Sequence[AcousticField]) -> None:
-        """`fields` of one bundle, one at least."""
+    def __init__(self, fields: Sequence[AcousticField], kept: Kept | None = None) -> None:
+        """`fields` of one bundle, one at least; those that reuse responses keep them in `kept`."""
+        self.kept: Kept = BoundedCache(KEPT_BYTES) if kept is None else kept
         self._fields = {field.level.name: field for field in fields}
 
     @classmethod
@@ -37,13 +40,14 @@ class Levels(Mapping[str, AcousticField]):
                 sessions[file] = open_graph(bundle, file, threads=threads)
             graphs[name] = FieldGraph(bundle, name, sessions[file])
         noises: dict[CodecParameters, FrozenNoise] = {}
+        kept: Kept = BoundedCache(KEPT_BYTES)
         fields = []
         for level in bundle.manifest.levels:
             graph = graphs[level.field]
             if graph.parameters not in noises:
                 noises[graph.parameters] = frozen_noise(bundle, graph)
-            fields.append(AcousticField(bundle, level, graph, noises[graph.parameters]))
-        return cls(fields)
+            fields.append(AcousticField(bundle, level, graph, noises[graph.parameters], kept))
+        return cls(fields, kept)
 
     def __getitem__(self, name: str) -> AcousticField:
         return self._fields[name]
@@ -64,9 +68,9 @@ class Levels(Mapping[str, AcousticField]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Cheapest first, by the cost that was measured for each; where one was not, the manifest's order reversed."""
+        """Cheapest first, by the mean cost measured for each; where one was not, the manifest's order reversed."""
         costs = {name: field.level.cost for name, field in self._fields.items()}
-        measured = {name: cost.ms_p50 for name, cost in costs.items() if cost is not None}
+        measured = {name: cost.ms_mean for name, cost in costs.items() if cost is not None}
         if len(measured) < len(costs):
             return tuple(reversed(costs))
         return tuple(sorted(measured, key=measured.__getitem__))

@@ -49,11 +49,21 @@ class PackedFilter:
         return _address(self.header)
 
 
-def pack(ir: FloatArray, partitioning: Partitioning) -> PackedFilter:
-    """Transform an IR (channels, n), n >= 1, n <= the partitioning's; on any thread."""
+def pack(
+    ir: FloatArray, partitioning: Partitioning, like: PackedFilter | None = None, same_from: int = 0
+) -> PackedFilter:
+    """Transform an IR (channels, n), n >= 1, n <= the partitioning's; on any thread.
+
+    From sample `same_from` on it is that of which `like` was made, and so are the stages that begin there or later.
+    """
     channels, samples = ir.shape
     header, spectra, digests = [], [], []
-    for stage in partitioning.stages:
+    for number, stage in enumerate(partitioning.stages):
+        if like is not None and stage.start >= same_from:
+            header += like.header[3 * number : 3 * number + 3].tolist()
+            spectra.append(like.spectra[number])
+            digests.append(like.digests[number])
+            continue
         count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
         padded = np.zeros((channels, count * stage.size), np.float32)
         piece = ir[:, stage.start : stage.start + padded.shape[1]]
@@ -180,8 +190,8 @@ class CompiledConvolver:
     def blocks(self) -> int:
         return int(self._record["blocks"][0])
 
-    def prepare(self, ir: FloatArray) -> PackedFilter:
-        return pack(ir, self._partitioning)
+    def prepare(self, ir: FloatArray, like: PackedFilter | None = None, same_from: int = 0) -> PackedFilter:
+        return pack(ir, self._partitioning, like, same_from)
 
     def want(self, source: int, filters: PackedFilter) -> None:
         self._wanted[source] = self._own_tails_wanted[source] = filters.address

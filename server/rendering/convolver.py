@@ -14,6 +14,7 @@ Compiled where numba is installed (`server.rendering.convolver_kernel`), NumPy e
 """
 
 from collections import deque
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,11 @@ class PartitionedIr:
     filters: Any
     tail_energy: float
     """Sum of squares of the samples that a shared tail stands for, over both channels."""
+
+    @property
+    def nbytes(self) -> int:
+        """What its spectra take, including any that it shares with another."""
+        return sum(int(part.nbytes) for part in self.filters.spectra)
 
 
 class Convolver:
@@ -94,8 +100,13 @@ class Convolver:
         self._retires_after = 4 * stages[-1].ticks
         self._tail: PartitionedIr | None = None
 
-    def prepare(self, ir: npt.NDArray[np.floating]) -> PartitionedIr:
+    def prepare(
+        self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None = None, same_from: int = 0
+    ) -> PartitionedIr:
         """Cut and transform an IR (channels, 1..ir_samples) for `set_ir`: most of its cost, on any thread.
+
+        Where the IR is known to be, from sample `same_from` on, the one of the same length that `like` was made of, the
+        stages that begin there or later are taken from it, and an exchange of the two leaves them alone.
 
         Raises ValueError for another shape, and for a sample that is not finite, which would spoil every output to
         come.
@@ -105,8 +116,16 @@ class Convolver:
         if not np.isfinite(ir).all():
             raise ValueError("impulse response has samples that are not finite")
         samples = ir.astype(np.float32, copy=False)
+        if like is not None and like.layout != self._layout:
+            raise ValueError("the IR that it is like was prepared for another convolver")
         tail_energy = float(np.sum(samples[:, self._tail_start :].astype(np.float64) ** 2))
-        return PartitionedIr(self._layout, self._engine.prepare(samples), tail_energy)
+        prepared = self._engine.prepare(samples, None if like is None else like.filters, same_from)
+        return PartitionedIr(self._layout, prepared, tail_energy)
+
+    @property
+    def preparation(self) -> Hashable:
+        """Convolvers of which this is equal prepare IRs alike, and may share them."""
+        return self._layout, self._tail_start
 
     def set_ir(self, source: int, ir: npt.NDArray[np.floating] | PartitionedIr) -> None:
         """Give a source its IR: at once before its first block, and by a crossfade from the next block on after it.

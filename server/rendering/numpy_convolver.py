@@ -55,9 +55,12 @@ class NumpyConvolver:
         self._own_tails = self._stages[-1] if has_own_tails else None
         self._shared_tail = _StageState(stages[last], last, 1, channels) if has_shared_tail else None
 
-    def prepare(self, ir: FloatArray) -> SpectralFilter:
+    def prepare(self, ir: FloatArray, like: SpectralFilter | None = None, same_from: int = 0) -> SpectralFilter:
         spectra = []
-        for stage in self._partitioning.stages:
+        for number, stage in enumerate(self._partitioning.stages):
+            if like is not None and stage.start >= same_from:
+                spectra.append(like.spectra[number])
+                continue
             piece = ir[:, stage.start : stage.end]
             count = -(-piece.shape[1] // stage.size)
             padded = np.pad(piece, ((0, 0), (0, count * stage.size - piece.shape[1])))

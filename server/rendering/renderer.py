@@ -13,7 +13,7 @@ first sample of its source.
 `render_all` renders many listeners in one call without the interpreter's lock.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,12 +122,20 @@ class Renderer:
         """Token of the IR in effect, in its head, at the end of the block last rendered; None before the first."""
         return self._emitter(emitter_id).token
 
-    def prepare(self, ir: npt.NDArray[np.floating]) -> PartitionedIr:
-        """Make an IR (2, 1..ir_samples) ready for `set_ir`: most of its cost, on any thread.
+    def prepare(
+        self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None = None, same_from: int = 0
+    ) -> PartitionedIr:
+        """Make an IR (2, 1..ir_samples) ready for `set_ir`: most of its cost, on any thread; less of it where the IR
+        is, from sample `same_from` on, that of which `like` was made.
 
         Raises ValueError for another shape or a sample that is not finite.
         """
-        return self._convolver.prepare(ir)
+        return self._convolver.prepare(ir, like=like, same_from=same_from)
+
+    @property
+    def preparation(self) -> Hashable:
+        """Renderers of which this is equal prepare IRs alike, and may share them."""
+        return self._convolver.preparation
 
     def add_emitter(self, emitter_id: str, source: Source, *, gain: float = 1.0) -> None:
         """Add an emitter that plays `source`, scaled by `gain` (linear amplitude).

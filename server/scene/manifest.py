@@ -250,6 +250,8 @@ class Manifest(Strict):
             raise ValueError("image_order: reflections cannot be computed without geometry")
         if self.image_order > 0 and self.direct_sound == "field":
             raise ValueError("image_order: fields that hold the direct sound hold the first reflections too")
+        if self.direct_sound == "field" and any(level.reuse is not None for level in self.levels):
+            raise ValueError("levels: responses that hold the direct sound cannot be those of another place (reuse)")
         if len(self.channels) == 1 and self.direct_sound == "geometry":
             raise ValueError("direct_sound: what one microphone heard holds it; it is computed for two ears only")
         return self

@@ -1,0 +1,93 @@
+"""Nodes that stand for the poses around them: where a quality level that reuses responses has them computed.
+
+A node has other walls about it than a pose on the far side of a corner, so poses are never given a node that they
+cannot see, or whose ends see each other where theirs do not. Poses along a wall's edge find none in the cell they are
+in, and are given one of a smaller cell; within centimetres of it, they are nodes themselves.
+
+Metres, radians; positions in the world's axes.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.geometry import Vector3
+from server.acoustics.sound_path import SoundPathFinder
+from server.field.lattice_kernel import find_node
+from server.scene.bundle import Bundle
+from server.scene.manifest import Reuse
+
+_LEAST_STEP_M = 0.25
+"""Responses are moved in time by no less than what sound takes for this: 0.4 ms off at most is less than anybody hears
+of reflected sound, and every step is an exchange."""
+_ARRIVALS = 4096
+
+
+class Node(NamedTuple):
+    """Where listener and emitter stand, and where the listener looks."""
+
+    listener: Vector3
+    emitter: Vector3
+    yaw: float
+
+
+class Snapped(NamedTuple):
+    """What stands for a pair of poses: the response of `node`, so many samples later (or earlier, negative), so that
+    reflected sound follows the direct sound of the poses as it does there."""
+
+    node: Node
+    later_samples: int
+
+
+class Lattice:
+    """The nodes of one scene for one `Reuse`; safe to share between threads.
+
+    Cells fill the bounds evenly, nodes are in their middles. `offset` (3,) moves them, by less than half a cell.
+    """
+
+    def __init__(self, bundle: Bundle, reuse: Reuse, paths: SoundPathFinder, offset: Vector3 = (0.0, 0.0, 0.0)) -> None:
+        manifest = bundle.manifest
+        self._paths = paths
+        self._spacing_m = reuse.spacing_m
+        self._turns = math.ceil(360 / reuse.turn_deg - 1e-9)
+        self._corners = np.ascontiguousarray(bundle.floor_plan.walls[:, 0])
+        self._low, self._high = np.array(manifest.bounds.minimum), np.array(manifest.bounds.maximum)
+        self._offset = np.array(offset)
+        self._step_m = max(_LEAST_STEP_M, reuse.spacing_m / 4)
+        self._samples_per_step = self._step_m / manifest.speed_of_sound * manifest.codec.sample_rate
+        self._bent_m = lru_cache(_ARRIVALS)(self._length_m)
+
+    def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
+        """What stands for poses within the bounds; a function of them alone, in a few microseconds."""
+        in_sight, (*place, ex, ey, ez) = find_node(
+            self._corners, self._low, self._high, self._offset, self._spacing_m, *listener, *emitter
+        )
+        there: Vector3 = (place[0], place[1], place[2])
+        node = Node(there, (ex, ey, ez), self._heading(yaw))
+        if in_sight:
+            farther_m = math.dist(listener, emitter) - math.dist(there, node.emitter)
+        else:
+            farther_m = self._length_m(listener, emitter) - self._bent_m(there, node.emitter)
+        return Snapped(node, round(round(farther_m / self._step_m) * self._samples_per_step))
+
+    def _heading(self, yaw: float) -> float:
+        turn = math.tau / self._turns
+        return (round(yaw / turn) % self._turns) * turn
+
+    def _length_m(self, listener: Vector3, emitter: Vector3) -> float:
+        return float(self._paths.find(np.array(listener), np.array([emitter])).length_m[0])
+
+
+def moved(response: npt.NDArray[np.float32], later_samples: int) -> npt.NDArray[np.float32]:
+    """(channel, sample) a response so many samples later, silent before; what comes after its end or before its
+    beginning is lost."""
+    later_samples = max(-response.shape[1], min(later_samples, response.shape[1]))
+    result = np.zeros_like(response)
+    if later_samples >= 0:
+        result[:, later_samples:] = response[:, : response.shape[1] - later_samples]
+    else:
+        result[:, :later_samples] = response[:, -later_samples:]
+    return result
