@@ -97,11 +97,15 @@ class WholeField:
 
     @cached_property
     def _diffuse_energy(self) -> npt.NDArray[np.float64]:
-        """(band,) energy per ear of a unit impulse from everywhere, by octave band."""
-        spectra = np.abs(np.exp(np.fft.rfft(self._filters.cepstra, _N_FFT))) ** 2
-        everywhere = np.einsum("d,def->f", solid_angles(self._filters.directions), spectra) / 2
-        frequency = np.maximum(np.fft.rfftfreq(_N_FFT, 1 / self.sample_rate), 1.0)
-        band = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
-        # Bins between DC and Nyquist stand for two.
-        weight = np.r_[1, np.full(len(frequency) - 2, 2), 1] / _N_FFT
-        return np.asarray(np.bincount(band, everywhere * weight, len(OCTAVE_BANDS_HZ)), dtype=np.float64)
+        return diffuse_energy(self._filters)
+
+
+def diffuse_energy(filters: HeadFilters) -> npt.NDArray[np.float64]:
+    """(band,) energy per ear of a unit impulse from everywhere, by octave band."""
+    spectra = np.abs(np.exp(np.fft.rfft(filters.cepstra, _N_FFT))) ** 2
+    everywhere = np.einsum("d,def->f", solid_angles(filters.directions), spectra) / 2
+    frequency = np.maximum(np.fft.rfftfreq(_N_FFT, 1 / filters.sample_rate), 1.0)
+    band = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
+    # Bins between DC and Nyquist stand for two.
+    weight = np.r_[1, np.full(len(frequency) - 2, 2), 1] / _N_FFT
+    return np.asarray(np.bincount(band, everywhere * weight, len(OCTAVE_BANDS_HZ)), dtype=np.float64)

@@ -71,7 +71,7 @@ CATALOGUE: Mapping[EffectName, Effect] = {
             "propagation delay",
             "the delay follows the length of the path, hence Doppler",
             "the delay stands still, as part of the impulse response",
-            ("pitch", "onset"),
+            ("pitch", "onset", "itd"),
             "the speed along the path over that of sound, and the change of the path's length",
         ),
         Effect(
@@ -103,7 +103,7 @@ CATALOGUE: Mapping[EffectName, Effect] = {
             "head",
             "each ear hears through the head",
             "both ears hear the same",
-            ("itd", "ild", "spectrum"),
+            ("itd", "ild", "spectrum", "iacc"),
             "a sphere of the size of a head for the difference between the ears, and the least that outer ears colour",
             is_shared=True,
         ),
@@ -136,7 +136,7 @@ CATALOGUE: Mapping[EffectName, Effect] = {
             "own late tails",
             "each emitter's late tail is its own",
             "all emitters share the late tail of one, each at its own level",
-            ("t60", "edt", "c50", "iacc"),
+            ("t60", "iacc"),
             "how the decays and late coherences of the emitters differ",
             is_shared=True,
         ),
@@ -145,12 +145,25 @@ CATALOGUE: Mapping[EffectName, Effect] = {
             "head rotation",
             "impulse responses are those of the way the head is turned",
             "they are those of one orientation; only the direct sound turns",
-            ("ild", "iacc", "spectrum"),
-            "how the field's responses differ between orientations",
+            ("ild",),
+            "how the field's responses differ between orientations, and from which side first reflections come",
             is_shared=True,
         ),
     )
 }
+
+OF_DIRECT_SOUND = frozenset(
+    {
+        EffectName.DIRECT_PATH,
+        EffectName.DISTANCE_ATTENUATION,
+        EffectName.PROPAGATION_DELAY,
+        EffectName.OCCLUSION,
+        EffectName.DIFFRACTION,
+    }
+)
+"""What means nothing without the direct sound."""
+OF_RESPONSES = frozenset({EffectName.PER_SOURCE_TAIL, EffectName.HEAD_ROTATION})
+"""What means nothing where nothing is convolved."""
 
 
 def read_overrides(given: Mapping[str, bool]) -> dict[EffectName, bool]:

@@ -32,7 +32,7 @@ class Reverberation:
 
     `energy` (band,), of which the share `early` comes within 50 ms; `t60_s` (band,); `late_iacc` is the interaural
     cross-correlation of the late part. Between two ways the head may be turned the level at an ear differs by up to
-    `turn_db`, in that octave where it does most.
+    `turn_db`.
     """
 
     energy: Bands
@@ -57,6 +57,10 @@ class Emitter:
     is_live: bool = False
     reverberation: Reverberation | None = None
 
+    @property
+    def is_omnidirectional(self) -> bool:
+        return self.directivity == OMNIDIRECTIONAL
+
 
 @dataclass(frozen=True)
 class Listener:
@@ -72,8 +76,9 @@ class Place:
 
     `minimum` and `maximum` bound where anybody can be. Nearer than `nearest_m`, sound gets no louder. `plan` is None in
     the open, and where nobody measured the walls; `materials` are there where first reflections come from geometry;
-    `reverberation`, typical of the place, where it has a field. The late tails that emitters could share begin
-    `tail_start_s` after emission; None where responses are too short to share any.
+    `reverberation`, typical of the place, where it has a field; with `holds_direct_sound` that is all there is to hear.
+    The late tails that emitters could share begin `tail_start_s` after emission; None where responses are too short to
+    share any.
     """
 
     minimum: Vector3
@@ -85,6 +90,7 @@ class Place:
     plan: FloorPlan | None = None
     materials: Materials | None = None
     reverberation: Reverberation | None = None
+    holds_direct_sound: bool = False
     tail_start_s: float | None = None
 
     @cached_property
@@ -106,7 +112,7 @@ class Place:
     def band_shares(self) -> Bands:
         """(band,) of the energy of an impulse: the first band reaches down to 0 Hz, the last up to all there is."""
         edges = np.asarray(OCTAVE_BANDS_HZ[1:]) / np.sqrt(2)
-        return np.diff(np.clip([0.0, *edges, np.inf], 0, self.sample_rate / 2)) / (self.sample_rate / 2)
+        return np.asarray(np.diff(np.clip([0.0, *edges, np.inf], 0, self.sample_rate / 2)) / (self.sample_rate / 2))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,274 @@
+"""What is heard of each emitter, in energies: of the direct sound along the paths within reach, of the first
+reflections, and of what a field holds; and so what changes where an effect is left out.
+
+Energies add up, except where first reflections meet the direct sound, whose interference is computed. A head is a
+sphere with outer ears. Axes as in `server.scene.reach`, and v variants, in each of which some effects are left out;
+energies are relative to the direct sound at one metre.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.audibility import HEARD, ratio_in_jnd
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import db_to_power, power_to_db
+from server.scene.effects import EffectName
+from server.scene.reach import Reach, facing
+from server.scene.situation import Emitter, Reverberation, Situation
+
+Floats = npt.NDArray[np.float64]
+Off = frozenset[EffectName]
+
+ALL_ON: Off = frozenset()
+MOST_JND = 100.0
+"""Where something is missing altogether; numbers stay finite."""
+
+_SILENCE = 1e-12
+_DIRECT_S = 0.0015
+_DECAY_POINTS = 48
+_THIRDS_HZ = 1000 * 2 ** (np.arange(-9, 11) / 3)
+_PER_THIRD = 2 ** (np.linspace(-0.5, 0.5, 7) / 3)
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Of the direct sound (v, n, band), the first reflections (v, e, band), the rest (v, e, band), and of that what
+    comes within 50 ms (v, e, band)."""
+
+    direct: Floats
+    mirrored: Floats
+    held: Floats
+    early: Floats
+
+
+@dataclass(frozen=True)
+class Mirrored:
+    """m paths by way of one surface, as everybody is now: whose, how long, at what gain (m, band) of surface and of
+    departure, and from where (m, 3)."""
+
+    owner: npt.NDArray[np.int64]
+    length_m: Floats
+    surface_db: Floats
+    departure_db: Floats
+    arrival: Floats
+
+
+@dataclass(frozen=True)
+class Change:
+    """What leaving out an effect changes most, in JND."""
+
+    jnd: float
+    parameter: str
+
+
+UNCHANGED = Change(0.0, "level")
+
+
+class Prediction:
+    """Of all emitters of a situation, one at least."""
+
+    def __init__(self, situation: Situation) -> None:
+        self.situation = situation
+        self.place, self.listener = situation.place, situation.listener
+        self.emitters: list[Emitter] = list(situation.emitters.values())
+        self.reach = Reach.of(situation)
+        self.mirrored = self._mirror()
+        self.shares = self.place.band_shares
+        self.reverberation: list[Reverberation | None] = [
+            each.reverberation or self.place.reverberation for each in self.emitters
+        ]
+        self._held = np.zeros((len(self.emitters), len(OCTAVE_BANDS_HZ)))
+        self._early, self._diffuse = np.zeros_like(self._held), np.ones_like(self._held)
+        for number, (emitter, rest) in enumerate(zip(self.emitters, self.reverberation, strict=True)):
+            if not emitter.is_omnidirectional:
+                self._diffuse[number] = np.mean(db_to_power(emitter.directivity.diffuse_gain_db))
+            if rest is not None:
+                self._held[number], self._early[number] = rest.energy, rest.early
+        self._decays = _Decays.of(self)
+        self.whole = self.energies([ALL_ON])
+        self._heard = self._parameters(self.whole)
+
+    def energies(self, variants: Sequence[Off]) -> Energies:
+        """What is heard without some effects, in each of v variants."""
+        reach, place = self.reach, self.place
+        lengths_m = {False: reach.paths.length_m, True: reach.straight_m}
+        air = {way: db_to_power(-length_m[:, None] * place.air_db_per_m) for way, length_m in lengths_m.items()}
+        spread = {way: np.maximum(length_m, place.nearest_m)[:, None] ** -2.0 for way, length_m in lengths_m.items()}
+        departure = {False: db_to_power(reach.departure_db), True: db_to_power(reach.straight_departure_db)}
+        screen = db_to_power(reach.paths.screen_db)
+        mirror = self.mirrored_energies(variants)
+        direct = np.zeros((len(variants), len(reach.owner), len(OCTAVE_BANDS_HZ)))
+        mirrored = np.zeros((len(variants), *self._held.shape))
+        held = np.zeros_like(mirrored)
+        for variant, off in enumerate(variants):
+            straight = EffectName.OCCLUSION in off
+            if EffectName.DIRECT_PATH not in off and not place.holds_direct_sound:
+                row = direct[variant]
+                row += 1
+                if EffectName.DISTANCE_ATTENUATION not in off:
+                    row *= spread[straight]
+                if EffectName.AIR_ABSORPTION not in off:
+                    row *= air[straight]
+                if EffectName.DIRECTIVITY not in off:
+                    row *= departure[straight]
+                if EffectName.DIFFRACTION in off and not straight:
+                    row *= reach.paths.in_sight[:, None]
+                elif not straight:
+                    row *= screen
+            if EffectName.EARLY_REFLECTIONS not in off:
+                np.add.at(mirrored[variant], self.mirrored.owner, mirror[variant])
+            if EffectName.LATE_REVERBERATION not in off:
+                held[variant] = self._held if EffectName.DIRECTIVITY in off else self._held * self._diffuse
+        return Energies(direct, mirrored, held, held * self._early)
+
+    def mirrored_energies(self, variants: Sequence[Off]) -> Floats:
+        """(v, m, band) where there are any."""
+        paths = self.mirrored
+        surface = db_to_power(paths.surface_db) / np.maximum(paths.length_m, self.place.nearest_m)[:, None] ** 2
+        departure = db_to_power(paths.departure_db)
+        air = db_to_power(-paths.length_m[:, None] * self.place.air_db_per_m)
+        return np.array(
+            [
+                surface
+                * (1.0 if EffectName.DIRECTIVITY in off else departure)
+                * (1.0 if EffectName.AIR_ABSORPTION in off else air)
+                for off in variants
+            ]
+        )
+
+    def changes(self, variants: Sequence[Off]) -> dict[str, Floats]:
+        """(v, e) change of each parameter in each variant, in JND, the worst within reach."""
+        without = self._parameters(self.energies(variants))
+        changes = {}
+        for name, heard in self._heard.items():
+            if name == "edt":
+                # A decay that cannot be told, with or without, changes nothing: energies tell the rest.
+                told = (heard > 0) & (without[name] > 0)
+                ratio = np.divide(without[name], heard, out=np.ones_like(without[name]), where=told)
+                changes[name] = np.abs(ratio - 1) * 100 / HEARD[name].amount
+            else:
+                difference = np.abs(without[name] - heard) / (1 if name in {"drr", "c50"} else HEARD[name].amount)
+                changes[name] = self.reach.most(difference.max(axis=-1) if difference.ndim > 2 else difference)
+        for number, off in enumerate(variants):
+            quiet = all(change[number].min() < 1 for change in changes.values())
+            if EffectName.EARLY_REFLECTIONS in off and quiet:
+                beats = self._interference(off) / HEARD["spectrum"].amount
+                changes["spectrum"][number] = np.maximum(changes["spectrum"][number], beats)
+        return {name: np.minimum(change, MOST_JND) for name, change in changes.items()}
+
+    def _parameters(self, energies: Energies) -> dict[str, Floats]:
+        """Level (v, n) in dB, spectrum (v, n, band) in dB, DRR and C50 (v, n) in JND, EDT (v, e) in seconds."""
+        owner = self.reach.owner
+        after = energies.mirrored + energies.held
+        late = (energies.held - energies.early) @ self.shares
+        direct, early = energies.direct @ self.shares, (after @ self.shares) - late
+        spectrum = power_to_db(energies.direct + after[:, owner] + _SILENCE)
+
+        def ratio_db(above: Floats, below: Floats) -> Floats:
+            return power_to_db((above + _SILENCE) / (below + _SILENCE))
+
+        return {
+            "level": power_to_db(direct + (early + late)[:, owner] + _SILENCE),
+            "spectrum": spectrum,
+            "drr": ratio_in_jnd("drr", ratio_db(direct, (early + late)[:, owner])),
+            "c50": ratio_in_jnd("c50", ratio_db(direct + early[:, owner], late[:, owner])),
+            "edt": self._decays.early_decay_s(energies),
+        }
+
+    def _interference(self, off: Off) -> Floats:
+        """(e,) the greatest change in dB, in a third of an octave, that the first reflections make by their phase."""
+        without_them = self.energies([off])
+        paths, change = self.mirrored, np.zeros(len(self.emitters))
+        if not len(paths.owner):
+            return change
+        frequency = (_THIRDS_HZ[0.45 * self.place.sample_rate > _THIRDS_HZ, None] * _PER_THIRD).ravel()
+        to_bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
+        amplitude = np.sqrt(self.mirrored_energies([off])[0])[:, to_bands]
+        for number in range(len(self.emitters)):
+            mine = paths.owner == number
+            later_s = (paths.length_m[mine] - self.reach.paths.length_m[number]) / self.place.speed_of_sound
+            direct = np.sqrt(without_them.direct[0, number])[to_bands]
+            waves = np.sum(amplitude[mine] * np.exp(-2j * np.pi * later_s[:, None] * frequency), axis=0)
+            rest = without_them.held[0, number][to_bands] + _SILENCE
+            with_them, without = (
+                (np.abs(wave) ** 2 + rest).reshape(-1, len(_PER_THIRD)).mean(axis=-1)
+                for wave in (direct + waves, direct)
+            )
+            change[number] = np.max(np.abs(power_to_db(with_them / without)))
+        return change
+
+    def _mirror(self) -> Mirrored:
+        bands = len(OCTAVE_BANDS_HZ)
+        if self.place.reflections is None:
+            none = np.zeros((0, bands))
+            return Mirrored(np.zeros(0, np.int64), np.zeros(0), none, none, np.zeros((0, 3)))
+        places = np.array([emitter.pose.position for emitter in self.emitters])
+        found = self.place.reflections.find(self.listener.pose.position, places)
+        departure_db = np.zeros((len(found.emitter), bands))
+        for number, emitter in enumerate(self.emitters):
+            if not emitter.is_omnidirectional:
+                mine = found.emitter == number
+                departure_db[mine] = emitter.directivity.gain_db(
+                    found.departure[mine] @ facing(emitter.pose.orientation).T
+                )
+        return Mirrored(found.emitter, found.length_m, found.gain_db, departure_db, found.arrival)
+
+
+@dataclass(frozen=True)
+class _Decays:
+    """Energy decay curves of all emitters as everybody is now, over the times in which a decay is read; (e, time) each,
+    `held` (e, band, time) and `mirrored` (m, time) for energies that are 1."""
+
+    prediction: "Prediction"
+    time_s: Floats
+    held: Floats
+    direct: Floats
+    mirrored: Floats
+    whose: Floats
+    """(e, m) 1 where a mirrored path is of an emitter."""
+
+    @classmethod
+    def of(cls, prediction: "Prediction") -> "_Decays":
+        longest, paths = np.ones((len(prediction.emitters), len(OCTAVE_BANDS_HZ))), prediction.mirrored
+        for number, rest in enumerate(prediction.reverberation):
+            if rest is not None:
+                longest[number] = rest.t60_s
+        time_s = (longest @ prediction.shares)[:, None] * np.linspace(0, 1 / 6, _DECAY_POINTS)
+        later_s = (paths.length_m - prediction.reach.paths.length_m[paths.owner]) / prediction.place.speed_of_sound
+        return cls(
+            prediction,
+            time_s,
+            held=np.exp(-6 * np.log(10) * time_s[:, None] / longest[..., None]) * prediction.shares[:, None],
+            direct=np.clip(1 - time_s / _DIRECT_S, 0, 1),
+            mirrored=(time_s[paths.owner] < later_s[:, None]).astype(np.float64),
+            whose=(paths.owner == np.arange(len(longest))[:, None]).astype(np.float64),
+        )
+
+    def early_decay_s(self, energies: Energies) -> Floats:
+        """(v, e); 0 where the direct sound alone is the first 10 dB, or nothing decays."""
+        shares, paths = self.prediction.shares, self.prediction.mirrored
+        count = len(self.time_s)
+        curve = np.einsum("veb,ebt->vet", energies.held, self.held)
+        curve += (energies.direct[:, :count] @ shares)[..., None] * self.direct
+        if len(paths.owner):
+            # All paths of an emitter in the proportion they have together.
+            energy = self.prediction.mirrored_energies([ALL_ON])[0] @ shares
+            whole = self.whose @ energy
+            steps = self.whose @ (energy[:, None] * self.mirrored) / np.maximum(whole, _SILENCE)[:, None]
+            curve += (energies.mirrored @ shares)[..., None] * steps
+        curve_db = power_to_db((curve + _SILENCE) / (curve[..., :1] + _SILENCE))
+        first = (curve_db >= -10).astype(np.float64)
+        points = first.sum(axis=-1)
+        middle_s = np.sum(first * self.time_s, axis=-1) / points
+        off_s = (self.time_s - middle_s[..., None]) * first
+        slope = np.sum(off_s * curve_db, axis=-1) / np.maximum(np.sum(off_s**2, axis=-1), _SILENCE)
+        told = (points > _DECAY_POINTS // 8) & (slope < 0) & energies.held.any(axis=-1)
+        return np.where(told, -60 / np.where(told, slope, -1.0), 0.0)
+
+
+def worst(changes: Mapping[str, Floats], variant: int, emitter: int) -> Change:
+    name = max(changes, key=lambda parameter: float(changes[parameter][variant, emitter]))
+    return Change(float(changes[name][variant, emitter]), name)
