@@ -53,7 +53,7 @@ def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) 
         "half the fine frames": replace(recipe, fine_frames=recipe.fine_frames // 2),
     }
     if isinstance(responses, SimulatedResponses):
-        changed["expected power"] = replace(recipe, expected=True)
+        changed["drawn responses"] = replace(recipe, expected=False)
     if responses.channels == 1:
         changed["swapped ends"] = replace(recipe, swap=True)
     if teacher is not None:

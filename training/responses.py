@@ -82,6 +82,11 @@ class ResponseSet(Protocol):
         """(row,) when sound can first arrive, by geometry."""
         ...
 
+    @property
+    def file(self) -> Path:
+        """The one they are kept in."""
+        ...
+
     def read(self, rows: npt.ArrayLike) -> _Responses:
         """(n, channel, sample)"""
         ...
@@ -111,6 +116,15 @@ class SimulatedResponses:
     @property
     def samples(self) -> int:
         return self.dataset.samples
+
+    @property
+    def file(self) -> Path:
+        return self.dataset.folder / "pairs.h5"
+
+    def ends(self, row: int) -> tuple[int, int]:
+        """Emitter and listener of a row, numbers of probes."""
+        emitter, listener = self._pairs[self.pair[row]]
+        return int(emitter), int(listener)
 
     def read(self, rows: npt.ArrayLike) -> _Responses:
         rows = np.asarray(rows, dtype=np.int64)
@@ -157,6 +171,10 @@ class ImportedDataset:
     def onset_s(self) -> _Floats:
         """Along the straight line: nothing is known of walls, so a pair out of sight hears its first sound later."""
         return np.asarray(np.linalg.norm(self.emitter - self.listener, axis=-1) / SPEED_OF_SOUND)
+
+    @property
+    def file(self) -> Path:
+        return self.folder / FILE
 
     def read(self, rows: npt.ArrayLike) -> _Responses:
         rows = np.asarray(rows, dtype=np.int64)

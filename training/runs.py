@@ -1,5 +1,5 @@
 """The run folder: `run.json` (configuration), `dataset.json` (what the data are and where they lie), `checkpoint.pt`
-(everything needed to go on), `log.csv`, `tensorboard/` and whatever targets a kind of field keeps.
+(everything needed to go on), `log.csv` and `tensorboard/`.
 """
 
 import csv
@@ -15,7 +15,7 @@ import torch
 from server.errors import NafirError
 from training.models.factorised import FieldShape
 from training.models.naf import NafShape
-from training.responses import ImportedDataset, ResponseSet, SimulatedResponses
+from training.responses import ResponseSet, SimulatedResponses
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -31,15 +31,16 @@ class FactorisedRecipe:
     `fine_frames` are predicted bin by bin, later ones in cells; `level_correction` adds what a mean of logarithms lacks
     to a mean of powers; `energy_weight` is that of the error in energies (`training.learning.energies`); `swap` also
     shows every response with its ends exchanged, which is the same response where both are omnidirectional: one channel
-    only; `expected` trains on the power that is expected of a simulated response in place of the one drawn. `teacher`
-    is the run folder of a `naf` that is asked for the levels of responses at `lessons` poses of its own.
+    only; `expected` trains on what is expected of a simulated response in place of what was drawn (measured ones are
+    what they are). `teacher` is the run folder of a `naf` that is asked for the levels of responses at `lessons` poses
+    of its own.
     """
 
     fine_frames: int = 24
     level_correction: bool = True
     energy_weight: float = 3.0
     swap: bool = False
-    expected: bool = False
+    expected: bool = True
     teacher: str | None = None
     lessons: int = 256
 
@@ -155,7 +156,7 @@ def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> No
         if Configuration.read(run) != configuration:
             raise RunError(f"{run}: holds a run of another configuration; choose an empty folder")
         require_same_data(responses, run)
-    identity = {"folder": str(_folder(responses).resolve()), **_identity(responses)}
+    identity = {"folder": str(responses.file.parent.resolve()), **_identity(responses)}
     (run / "dataset.json").write_text(json.dumps(identity, indent=2) + "\n")
     configuration.write(run)
 
@@ -165,7 +166,7 @@ def require_same_data(responses: ResponseSet, run: Path) -> None:
     recorded = read_json(run, "dataset.json")
     identity = _identity(responses)
     if {name: recorded.get(name) for name in identity} != identity:
-        raise RunError(f"{run}: was trained on another scene or seed than that of {_folder(responses)}")
+        raise RunError(f"{run}: was trained on another scene or seed than that of {responses.file.parent}")
 
 
 def read_json(run: Path, name: str) -> dict[str, Any]:
@@ -214,15 +215,6 @@ def append_log(run: Path, row: dict[str, float]) -> None:
         if fresh:
             writer.writeheader()
         writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
-
-
-def _folder(responses: ResponseSet) -> Path:
-    match responses:
-        case SimulatedResponses():
-            return responses.dataset.folder
-        case ImportedDataset():
-            return responses.folder
-    raise TypeError(f"{type(responses)} lies in no folder")
 
 
 def _identity(responses: ResponseSet) -> dict[str, Any]:

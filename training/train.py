@@ -63,10 +63,10 @@ def train(responses: ResponseSet, run: Path, configuration: Configuration, progr
         learner = learner_of(responses, configuration)
         # The first process computes what is missing, the others find it.
         if processes.first:
-            learner.prepare(run, progress)
+            learner.prepare(progress)
         processes.wait()
         if not processes.first:
-            learner.prepare(run, progress)
+            learner.prepare(progress)
         learner.field.to(processes.device)
         loop = _Loop(
             learner, run, configuration, processes, split(responses, share=configuration.share, seed=configuration.seed)

@@ -18,7 +18,8 @@ from training.learning.pairs import split
 from training.learning.precision import bfloat16_gains
 from training.models.cells import Cells
 from training.models.naf import NafShape
-from training.models.targets import codec_of, load_targets
+from training.models.stored_targets import load_targets
+from training.models.targets import codec_of
 from training.responses import SimulatedResponses
 from training.runs import Configuration, FactorisedRecipe, NafRecipe, RunError, configure, dataset_folder
 from training.train import DivergedError, load_learner, train
@@ -76,7 +77,7 @@ def test_the_loss_falls(run, configuration):
 def test_learning_beats_the_mean_of_all_poses(dataset, run, tmp_path):
     learner = trained(dataset, run)
     field, responses = learner.field, SimulatedResponses(dataset)
-    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True))
+    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True), expected=True)
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
         poses = (torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw))
@@ -91,7 +92,7 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, run, tmp_
     """Pooled over the whole set, predicted power is the targets' where the field's log would be too low."""
     learner = trained(dataset, run)
     field, responses = learner.field, SimulatedResponses(dataset)
-    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True))
+    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True), expected=True)
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
         poses = (torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw))
@@ -209,7 +210,7 @@ def test_without_progress_on_what_is_held_back_a_run_stops_and_keeps_the_best(da
     assert len(sums) < 60
     assert np.argmin(sums) == len(sums) - 4
     learner = trained(dataset, tmp_path)
-    learner.prepare(tmp_path, Progress(disable=True))
+    learner.prepare(Progress(disable=True))
     _, held_back = split(learner.responses, share=1.0, seed=hasty.seed)
     inputs, targets = learner.batch(held_back, None)
     with torch.no_grad():

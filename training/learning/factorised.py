@@ -18,7 +18,8 @@ from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
 from training.models.site import Site
-from training.models.targets import Targets, codec_of, load_targets
+from training.models.stored_targets import Targets, load_targets
+from training.models.targets import codec_of
 from training.responses import ResponseSet, SimulatedResponses
 from training.runs import Configuration, FactorisedRecipe, require_same_data, restore
 
@@ -28,6 +29,8 @@ from training.runs import Configuration, FactorisedRecipe, require_same_data, re
 _SPREADS = {"fine": 0.64, "late": 0.25, "phasor": 1.0, "interaural": 1.0}
 _HEAD_WEIGHTS = {"fine": 1.0, "late": 1.0, "phasor": 2.0, "interaural": 1.0}
 _LEVEL_HEADS = ("fine", "late")
+TARGETS = "targets"
+"""Folder of targets in that of a dataset."""
 _WEIGHT_DECAY = 1e-2
 _SAMPLE_ROWS = 3000
 # A measured response starts with the direct sound, whose phase can be learned; reflections have hardly one.
@@ -39,7 +42,7 @@ class RecipeError(NafirError):
 
 
 class FactorisedLearner:
-    """Learns from targets that are computed once and kept in the run folder."""
+    """Learns from targets that are computed once and kept beside the responses."""
 
     def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
         shape, recipe = configuration.shape, configuration.recipe
@@ -49,24 +52,25 @@ class FactorisedLearner:
             raise RecipeError(
                 "swap: a head is no loudspeaker, so binaural responses differ with their ends exchanged; leave it off"
             )
-        if recipe.expected and not isinstance(responses, SimulatedResponses):
-            raise RecipeError("expected: what is expected of a response is known of simulated ones only; leave it off")
         self.responses = responses
         self.recipe = recipe
-        known = 1 if isinstance(responses, SimulatedResponses) else _KNOWN_FRAMES_OF_WHOLE_RESPONSES
+        is_simulated = isinstance(responses, SimulatedResponses)
+        self._expected = recipe.expected and is_simulated
+        known = 1 if is_simulated else _KNOWN_FRAMES_OF_WHOLE_RESPONSES
         codec = codec_of(responses)
         self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), min(known, recipe.fine_frames))
         self.site = Site.of(responses)
         self.field = FactorisedField(self.site.plan, self.cells, shape, responses.channels)
-        deficit = 0.0 if recipe.expected else RAYLEIGH_DEFICIT
+        deficit = 0.0 if self._expected else RAYLEIGH_DEFICIT
         self._energy_error = EnergyError(self.cells, self.field.heads, deficit=deficit)
         self._targets: Targets | None = None
         self._lessons: Lessons | None = None
 
-    def prepare(self, folder: Path, progress: Progress) -> None:
+    def prepare(self, progress: Progress) -> None:
         if self.recipe.teacher is not None:
             self._lessons = self._taught(Path(self.recipe.teacher))
-        self._targets = load_targets(self.responses, self.cells, folder, progress, expected=self.recipe.expected)
+        folder = self.responses.file.parent / TARGETS
+        self._targets = load_targets(self.responses, self.cells, folder, progress, expected=self._expected)
 
     @property
     def targets(self) -> Targets:

@@ -4,7 +4,6 @@ Rows count the responses that may be trained on, from 0, in the order of the res
 most calls because some are held back to watch for overfitting.
 """
 
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,8 +21,8 @@ class Learner(Protocol):
     @property
     def field(self) -> nn.Module: ...
 
-    def prepare(self, folder: Path, progress: Progress) -> None:
-        """Brings targets within reach; whatever is costly to compute is kept in the folder."""
+    def prepare(self, progress: Progress) -> None:
+        """Brings targets within reach; whatever is costly to compute is kept beside the responses."""
         ...
 
     def initialise(self, rows: Rows, seed: int) -> None:

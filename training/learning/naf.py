@@ -1,6 +1,5 @@
 """The paper's network and its loss: random points of a few whole responses per step."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +41,7 @@ class NafLearner:
         self.field = Naf(self.site, sizes, responses.channels, shape)
         self._trainable = np.flatnonzero(~responses.held_out)
 
-    def prepare(self, folder: Path, progress: Progress) -> None:
+    def prepare(self, progress: Progress) -> None:
         """Nothing to do."""
 
     @torch.no_grad()

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import exp1
 
 from server.acoustics.codec import Codec
 from server.whole_field import kemar
@@ -18,16 +17,9 @@ from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
 
 _Floats = npt.NDArray[np.float64]
+_Singles = npt.NDArray[np.float32]
 
-
-def expected_log_magnitude(mean: npt.NDArray[np.complexfloating], variance: npt.NDArray[np.floating]) -> _Floats:
-    """E[ln |S|] of complex Gaussians S: (ln v + ln k + E1(k)) / 2 with k = |m|**2 / v (Lapidoth & Moser, "Capacity
-    bounds via duality", IEEE Trans. Inf. Theory 49(10), 2003, eq. (209)). Without variance it is ln |m|."""
-    power = np.maximum(np.abs(mean).astype(np.float64) ** 2, np.finfo(np.float64).tiny)
-    spread = np.maximum(np.asarray(variance, dtype=np.float64), np.finfo(np.float64).tiny)
-    ratio = power / spread
-    # ln k + E1(k) tends to minus Euler's constant, but its two terms do not.
-    return np.asarray(np.where(ratio < 1e-12, np.log(spread) - np.euler_gamma, np.log(power) + exp1(ratio)) / 2)
+_STEPS_PER_HOP = 4
 
 
 class ExpectedSpectrograms:
@@ -41,6 +33,7 @@ class ExpectedSpectrograms:
         self._codec = codec
         directions = sphere_directions(dataset.scene.simulation.arrival_directions)
         self._synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
+        self._images: tuple[int, list[tuple[_Floats, _Floats]]] | None = None
 
     @cached_property
     def _tracer(self) -> RoomTracer:
@@ -55,29 +48,42 @@ class ExpectedSpectrograms:
             least_order=GEOMETRIC_ORDER + 1,
         )
 
-    def specular(self, emitter: int, listener: int) -> npt.NDArray[np.float32]:
+    @cached_property
+    def _heard(self) -> _Singles:
+        return self._synthesis.arrival_products(self._codec.bins)
+
+    @cached_property
+    def _times_s(self) -> _Floats:
+        """(frame, step): a window of the codec sees what varies within it, on a grid much finer than the window."""
+        codec = self._codec
+        step = codec.hop // _STEPS_PER_HOP
+        around = np.arange(-codec.n_fft // 2, codec.n_fft // 2, step) + step / 2
+        return np.asarray(codec.frame_times_s[:, None] + around / codec.sample_rate)
+
+    @cached_property
+    def _window(self) -> _Singles:
+        """(step,)"""
+        window = np.hanning(self._times_s.shape[1] + 2)[1:-1] ** 2
+        return np.asarray(self._codec.window_energy * window / window.sum(), dtype=np.float32)
+
+    def specular(self, emitter: int, listener: int) -> _Singles:
         """(yaw, ear, sample) the part of the stored response that is the same in every draw."""
-        positions, amplitudes = self._tracer.images(self._dataset.probes[emitter])[listener]
+        if self._images is None or self._images[0] != emitter:
+            # Those of all listeners take as long as those of one, and pairs come in order of their emitters.
+            self._images = emitter, self._tracer.images(self._dataset.probes[emitter])
+        positions, amplitudes = self._images[1][listener]
         return self._synthesis.specular(positions, amplitudes, self._dataset.probes[listener])
 
-    def diffuse_power(self, emitter: int, listener: int, advance_samples: float = 0.0) -> _Floats:
-        """(yaw, ear, frequency, frame) variance of the stored response's spectrogram; `advance_samples` is how much
-        earlier than emission a response begins that was aligned.
+    def diffuse_products(self, emitter: int, listener: int, pool: _Singles, advance_samples: float = 0.0) -> _Singles:
+        """(product, yaw, frequency, cell) expected products of the ears' spectra, of the diffuse part of the stored
+        response: the squared magnitudes of left and right, and left times conjugate right, real and imaginary. Frames
+        are summed to cells with (frame, cell) `pool`; `advance_samples` is how much earlier than emission a response
+        begins that was aligned.
 
         Raises DatasetError if the dataset keeps no energies.
         """
         (energy,) = self._dataset.read_energy(np.array([[emitter, listener]]))
-        codec, onset_s = self._codec, self._dataset.onset_s[emitter, listener]
-        # A window of the codec sees what varies within it: on a grid much finer than the window.
-        step = codec.hop // 4
-        around = np.arange(-codec.n_fft // 2, codec.n_fft // 2, step) + step / 2
-        times_s = codec.frame_times_s[:, None] + (around + advance_samples) / codec.sample_rate
-        power = self._synthesis.late_power(energy, onset_s, times_s.ravel(), codec.bins)
-        window = np.hanning(len(around) + 2)[1:-1] ** 2
-        weights = codec.window_energy * window / window.sum()
-        return np.asarray(power.reshape(*power.shape[:-1], *times_s.shape) @ weights)
-
-    def log_magnitude(self, emitter: int, listener: int) -> _Floats:
-        """(yaw, ear, frequency, frame) expected ln |S| of the stored response, without the codec's floor."""
-        mean = self._codec.transform(self.specular(emitter, listener))
-        return expected_log_magnitude(mean, self.diffuse_power(emitter, listener))
+        times_s = (self._times_s + advance_samples / self._codec.sample_rate).ravel()
+        weights = (pool[:, None, :] * self._window[:, None]).reshape(len(times_s), -1)
+        onset_s = self._dataset.onset_s[emitter, listener]
+        return self._synthesis.late_covariance(energy, onset_s, times_s, weights, self._heard)

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
 from scipy.signal.windows import cosine
+from scipy.sparse import coo_array
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.minimum_phase import folded_cepstrum
@@ -73,7 +74,7 @@ class BinauralSynthesis:
 
     def render(self, arrivals: Arrivals, receiver: _Floats, onset_s: float, rng: np.random.Generator) -> _Singles:
         """Reflected sound; sample 0 is emission. Nothing diffuse is heard before `onset_s`."""
-        response = self._late(arrivals.energy, onset_s, rng)
+        response = self.late(arrivals.energy, onset_s, rng)
         self._add_specular(arrivals.image_positions, arrivals.image_amplitudes, receiver, response)
         return response
 
@@ -88,26 +89,69 @@ class BinauralSynthesis:
         amplitude = free_field_amplitude(np.linalg.norm(emitter - receiver, keepdims=True), air)
         return self.specular(emitter[None], amplitude, receiver)
 
-    def late_power(self, energy: _Singles, onset_s: float, times_s: _Floats, bins: int) -> _Floats:
-        """(yaw, ear, bin, time) expected power per sample of the diffuse part of `render`, at frequencies from 0 to
-        half the sample rate; none outside the response."""
+    def late_covariance(
+        self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles, heard: _Singles
+    ) -> _Singles:
+        """(product, yaw, bin, cell) expected products per sample of what the ears hear of the diffuse part of `render`,
+        summed over (time,) `times_s` with (time, cell) `weights`; none outside the response. `heard` is that of
+        `arrival_products`."""
         step_s = self._n_fft // 2 / self._sample_rate
-        frames_s = np.arange(-(-self.samples // (self._n_fft // 2)) + 1) * step_s
-        nyquist_shares, own_shares = np.linspace(0, 1, bins), np.linspace(0, 1, self._n_fft // 2 + 1)
-        weights = band_weights(nyquist_shares * self._sample_rate / 2).astype(np.float32)
-        per_sample = power_at(frames_s, energy) / np.float32(self._sample_rate)
-        gains = np.sqrt(np.einsum("dbt,bn->ndt", per_sample, weights, optimize=True))
-        # Windows overlap on the same noise: amplitudes add up.
-        position = np.clip(times_s / step_s, 0, len(frames_s) - 1)
-        before = np.minimum(position.astype(int), len(frames_s) - 2)
-        share = (np.sin(np.pi / 2 * (position - before)) ** 2).astype(np.float32)
-        rise = np.sin(np.pi / 2 * np.clip((times_s - onset_s) / _DIFFUSE_RISE_S, 0, 1)) ** 2
+        frames = -(-self.samples // (self._n_fft // 2)) + 1
+        per_sample = power_at(np.arange(frames) * step_s, energy) / np.float32(self._sample_rate)
+        frequencies_hz = np.linspace(0, self._sample_rate / 2, heard.shape[0])
+        power = np.einsum("dbt,bn->ndt", per_sample, band_weights(frequencies_hz).astype(np.float32), optimize=True)
+        # Windows overlap on the same noise: their amplitudes add up, and neighbours have a product too.
+        position = np.clip(times_s / step_s, 0, frames - 1)
+        before = np.minimum(position.astype(int), frames - 2)
+        share = np.sin(np.pi / 2 * (position - before)) ** 2
+        rise = np.sin(np.pi / 2 * np.clip((times_s - onset_s) / _DIFFUSE_RISE_S, 0, 1)) ** 4
         rise[times_s >= self.samples / self._sample_rate] = 0
-        over_time = (gains[..., before] * (1 - share) + gains[..., before + 1] * share) * rise.astype(np.float32)
-        heard = np.abs(self._arrival_spectra.reshape(len(own_shares), -1)) ** 2
-        heard = np.stack([np.interp(nyquist_shares, own_shares, column) for column in heard.T], axis=-1)
-        power = heard.reshape(bins, len(energy), -1).transpose(0, 2, 1) @ over_time**2
-        return np.asarray(power.transpose(1, 0, 2).reshape(len(self.yaws), 2, bins, -1))
+        at = np.arange(len(times_s))
+        own = coo_array(
+            (np.concatenate([rise * (1 - share) ** 2, rise * share**2]), (np.tile(at, 2), [*before, *(before + 1)])),
+            shape=(len(times_s), frames),
+        )
+        shared = coo_array((2 * rise * share * (1 - share), (at, before)), shape=(len(times_s), frames - 1))
+        own_weights, shared_weights = ((part.T @ weights).astype(np.float32) for part in (own, shared))
+        over_cells = power @ own_weights + np.sqrt(power[..., :-1] * power[..., 1:]) @ shared_weights
+        found = np.ascontiguousarray(heard.reshape(len(heard), -1, len(energy))) @ over_cells
+        return np.asarray(found.reshape(*heard.shape[:-1], -1).transpose(1, 2, 0, 3))
+
+    def arrival_products(self, bins: int) -> _Singles:
+        """(bin, product, yaw, direction) of the spectra of a wave from each direction at the ears, at frequencies from
+        0 to half the sample rate: the squared magnitudes of left and right, and left times conjugate right, real and
+        imaginary."""
+        own = self._arrival_spectra.reshape(self._n_fft // 2 + 1, len(self.arrival_directions), len(self.yaws), 2)
+        left, right = own[..., 0], own[..., 1]
+        cross = left * np.conj(right)
+        products = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag], axis=1)
+        position = np.linspace(0, self._n_fft // 2, bins)
+        below = np.minimum(position.astype(int), self._n_fft // 2 - 1)
+        share = (position - below)[:, None, None, None]
+        products = products[below] * (1 - share) + products[below + 1] * share
+        return np.ascontiguousarray(products.transpose(0, 1, 3, 2), dtype=np.float32)
+
+    def diffuse_noise(self, directional: _Floats, samples: int, rng: np.random.Generator) -> _Singles:
+        """(band, yaw, ear, sample) noise without beginning or end, rounded down to whole windows: in each octave band
+        of unit power per sample, divided between directions of arrival by (direction, band) shares. Bands are
+        independent of each other where they overlap, so that their powers add up, whatever they are multiplied by."""
+        step = self._n_fft // 2
+        frames = samples // step
+        heard = np.empty((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
+        for neighbours in (0, 1):  # only bands next to each other overlap
+            noise = rng.standard_normal((len(directional), frames, step), dtype=np.float32)
+            sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
+            sections *= self._window
+            spectra = np.ascontiguousarray(rfft(sections).transpose(2, 1, 0))
+            for band in range(neighbours, len(OCTAVE_BANDS_HZ), 2):
+                amplitudes = np.sqrt(directional[:, band]).astype(np.float32)
+                shape = np.sqrt(self._band_weights[band])[:, None, None]
+                shaped = np.matmul(spectra * amplitudes, self._arrival_spectra) * shape
+                sections = irfft(np.ascontiguousarray(shaped.transpose(2, 1, 0)), self._n_fft)
+                sections *= self._window
+                later = np.roll(sections[..., step:], 1, axis=1)
+                heard[band] = (sections[..., :step] + later).reshape(len(sections), -1)
+        return heard.reshape(len(heard), len(self.yaws), 2, -1)
 
     @property
     def _sample_rate(self) -> int:
@@ -163,7 +207,8 @@ class BinauralSynthesis:
         spectra = np.exp(filters + 1j * (delays[..., None] * self._turns))
         return np.ascontiguousarray(np.moveaxis(spectra.reshape(len(spectra), -1, spectra.shape[-1]), -1, 0))
 
-    def _late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
+    def late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
+        """(yaw, ear, sample) diffuse sound of (direction, band, bin) energy; nothing is heard before `onset_s`."""
         step = self._n_fft // 2
         frames = -(-self.samples // step) + 1  # the first begins one step before sample 0
         noise = rng.standard_normal((len(energy), frames + 1, step), dtype=np.float32)

@@ -1,13 +1,11 @@
 import numpy as np
 import pytest
-from rich.progress import Progress
 from scipy.signal.windows import hann
 
 from server.acoustics.codec import Codec
 from training.models.cells import Cells
 from training.models.factorised import Heads
-from training.models.targets import LEAD_SAMPLES, align, codec_of, flat_targets, load_targets
-from training.responses import SimulatedResponses
+from training.models.targets import LEAD_SAMPLES, align, flat_targets
 
 CODEC = Codec(16_000, 256, 64, 4_000, 1e-5)
 CELLS = Cells(CODEC, known_frames=12)
@@ -102,31 +100,3 @@ def test_an_earlier_left_ear_leads_in_phase():
     expected = 2 * np.pi * centres / CODEC.n_fft * 2
     phase = np.angle(np.mean(interaural[0] + 1j * interaural[1], axis=-1))
     np.testing.assert_allclose(np.exp(1j * (phase - expected))[2:-2], 1, atol=0.1)
-
-
-def test_rows_belong_to_their_poses(dataset, tmp_path):
-    cells = Cells(codec_of(dataset))
-    targets = load_targets(SimulatedResponses(dataset), cells, tmp_path, Progress(disable=True))
-    assert len(targets.flat) == len(dataset.pairs(held_out=False)) * len(dataset.yaws)
-    for row in (0, 7, len(targets.flat) - 1):
-        emitter, listener = (
-            np.flatnonzero(np.isclose(dataset.probes, end[row], atol=1e-5).all(axis=1))[0]
-            for end in (targets.emitter, targets.listener)
-        )
-        assert not dataset.held_out[emitter, listener]
-        yaw = np.flatnonzero(np.isclose(dataset.yaws, targets.yaw[row]))[0]
-        response = dataset.read(np.array([[emitter, listener]]))[0, yaw]
-        delay = dataset.onset_s[emitter, listener] * dataset.sample_rate - LEAD_SAMPLES
-        np.testing.assert_array_equal(flat_targets(align(response, delay), cells), targets.flat[row])
-
-
-def test_targets_are_computed_once(dataset, tmp_path):
-    cells = Cells(codec_of(dataset))
-    load_targets(SimulatedResponses(dataset), cells, tmp_path, Progress(disable=True))
-    before = (tmp_path / "targets.npy").stat().st_mtime_ns
-    load_targets(SimulatedResponses(dataset), cells, tmp_path, Progress(disable=True))
-    assert (tmp_path / "targets.npy").stat().st_mtime_ns == before
-    load_targets(
-        SimulatedResponses(dataset), Cells(codec_of(dataset), fine_frames=16), tmp_path, Progress(disable=True)
-    )
-    assert (tmp_path / "targets.npy").stat().st_mtime_ns != before

@@ -1,0 +1,77 @@
+"""Training targets that no draw of the noise has blurred: what is expected of a simulated response, head by head.
+
+A cell of a simulated spectrogram is a complex Gaussian of known mean and variance (`training.simulation.expected`). So
+its expected power, the coherence of the two ears and the expected phasor are known, and a network need not average them
+out of what was drawn.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import i0e, i1e
+
+from training.dataset import Dataset
+from training.models.cells import Cells
+from training.models.targets import LEAD_SAMPLES, align
+from training.simulation.expected import ExpectedSpectrograms
+
+_Complex = npt.NDArray[np.complexfloating]
+
+
+def expected_phasor(mean: _Complex, variance: npt.NDArray[np.floating]) -> npt.NDArray[np.complex128]:
+    """E[S / |S|] of complex Gaussians S: the phasor of their mean m times sqrt(pi k) / 2 * exp(-k / 2) * (I0(k / 2) +
+    I1(k / 2)) with k = |m|**2 / v (the first moment of the phase's density; Middleton, An Introduction to Statistical
+    Communication Theory, 1960, ch. 9)."""
+    magnitude = np.abs(mean).astype(np.float64)
+    least = np.finfo(np.float64).tiny
+    half = np.minimum(magnitude**2 / np.maximum(variance, least), 1e12) / 2
+    certainty = np.sqrt(np.pi * half / 2) * (i0e(half) + i1e(half))
+    return np.asarray(mean / np.maximum(magnitude, least) * certainty)
+
+
+class ExpectedTargets:
+    """Of a dataset whose responses were simulated."""
+
+    def __init__(self, dataset: Dataset, cells: Cells) -> None:
+        self._dataset, self._cells = dataset, cells
+        self._spectrograms = ExpectedSpectrograms(dataset, cells.codec)
+        self._pool = cells.all_frames.pool()
+        self._bands = cells.bands.pool().T
+
+    def of_pair(self, emitter: int, listener: int) -> npt.NDArray[np.float16]:
+        """(yaw, heads.size), in the layout of flat targets. Raises DatasetError if the dataset keeps no energies."""
+        cells, fine = self._cells, self._cells.fine_frames
+        advance = self._dataset.onset_s[emitter, listener] * self._dataset.sample_rate - LEAD_SAMPLES
+        diffuse = self._spectrograms.diffuse_products(emitter, listener, self._pool, advance)
+        mean = self._mean(emitter, listener, advance)
+        left, right = mean[:, 0], mean[:, 1]
+        cross = left * np.conj(right)
+        specular = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag])
+        products = diffuse + specular @ self._pool[: mean.shape[-1]]
+        pooled = self._bands @ products
+        levels = products[:2, ..., :fine], pooled[:2, ..., fine:]
+        of_bins, of_cells = (np.moveaxis(np.sqrt(power), 0, 1) for power in levels)
+        loudness = np.sqrt(pooled[0] * pooled[1])
+        known = np.s_[..., : cells.known_frames]
+        # What lies beneath the codec's floor has no phase worth learning.
+        variance = np.moveaxis(diffuse[:2], 0, 1)[known] + cells.codec.log_floor**2
+        phasor = expected_phasor(mean[known], variance)
+        parts = (
+            cells.codec.log_magnitude(of_bins),
+            cells.codec.log_magnitude(of_cells),
+            np.stack([phasor.real, phasor.imag], axis=1),
+            np.moveaxis(pooled[2:] / np.maximum(loudness, 1e-20), 0, 1),
+        )
+        return np.concatenate([part.reshape(len(mean), -1) for part in parts], axis=-1).astype(np.float16)
+
+    def _mean(self, emitter: int, listener: int, advance: float) -> _Complex:
+        """(yaw, ear, frequency, frame) spectrogram of the aligned specular part, up to where it ends."""
+        codec = self._cells.codec
+        response = self._spectrograms.specular(emitter, listener)
+        sounding = np.flatnonzero(response.any(axis=(0, 1)))
+        # An advance by a fraction of a sample rings on, but not beyond a window.
+        ends = int(sounding[-1] + 1 if len(sounding) else 0) - int(np.floor(advance)) + codec.n_fft
+        samples = min(max(ends, (self._cells.fine_frames + codec.n_fft // codec.hop) * codec.hop), codec.samples)
+        aligned = align(response[..., : samples + max(0, int(np.ceil(advance)))], advance)[..., :samples]
+        return replace(codec, samples=samples).transform(aligned)

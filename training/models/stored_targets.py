@@ -1,0 +1,114 @@
+"""Targets of all responses that may be trained on, computed once and kept in a file.
+
+HDF5 lets one process at a time write it; the rows, in one piece, are then read through a memory map.
+"""
+
+import hashlib
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+from rich.progress import Progress
+
+from training.dataset import DatasetError
+from training.models.cells import Cells
+from training.models.expected_targets import ExpectedTargets
+from training.models.targets import align, delay_samples, flat_targets
+from training.responses import ResponseSet, SimulatedResponses
+
+_FORMAT = 1
+_FLUSH_S = 10.0
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Poses and flat targets, one row per response that is not held out; `flat` is a memory map."""
+
+    listener: npt.NDArray[np.float32]
+    emitter: npt.NDArray[np.float32]
+    yaw: npt.NDArray[np.float32]
+    flat: npt.NDArray[np.float16]
+
+
+def load_targets(
+    responses: ResponseSet, cells: Cells, folder: Path, progress: Progress, *, expected: bool = False
+) -> Targets:
+    """Targets of all responses that are not held out, kept in `folder` in a file for each choice of `cells` and
+    `expected`. An interrupted computation goes on where it was; when the responses are written anew, so are they.
+
+    With `expected`, of simulated responses only, they are what is expected over all draws of a response's noise. Raises
+    DatasetError if the dataset keeps no energies, if another process computes the same, or if the file is damaged.
+    """
+    choice = json.dumps({"format": _FORMAT, "cells": asdict(cells), "expected": expected})
+    path = folder / f"targets-{hashlib.sha256(choice.encode()).hexdigest()[:12]}.h5"
+    rows = np.flatnonzero(~responses.held_out)
+    key = json.dumps({"written": responses.file.stat().st_mtime_ns, "rows": len(rows)})
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with h5py.File(path, "a") as file:
+            if file.attrs.get("key") != key:
+                file.clear()
+                file.attrs.update(key=key, pairs=0)
+            _complete(file, responses, cells, rows, progress, expected=expected)
+            offset, shape = file["flat"].id.get_offset(), file["flat"].shape
+    except BlockingIOError as exc:
+        raise DatasetError(f"{path}: another process is computing these targets; wait for it") from exc
+    except OSError as exc:
+        raise DatasetError(f"{path}: not a file of targets; delete it, and it is computed anew ({exc})") from exc
+    poses = (part[rows].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw))
+    return Targets(*poses, np.memmap(path, np.float16, "r", offset, shape))
+
+
+def _complete(
+    file: h5py.File,
+    responses: ResponseSet,
+    cells: Cells,
+    rows: npt.NDArray[np.int64],
+    progress: Progress,
+    *,
+    expected: bool,
+) -> None:
+    """Pair by pair, for the responses of one are stored together; `pairs` of them are there already."""
+    starts = np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))
+    done = int(file.attrs["pairs"])
+    if done == len(starts):
+        return
+    targets = _Expected(responses, cells) if expected else _Drawn(responses, cells)
+    task = progress.add_task("targets", total=len(starts), completed=done)
+    flushed_s = time.monotonic()
+    for number in range(done, len(starts)):
+        stop = starts[number + 1] if number + 1 < len(starts) else len(rows)
+        of_pair = targets.of_rows(rows[starts[number] : stop])
+        if "flat" not in file:
+            file.create_dataset("flat", (len(rows), of_pair.shape[-1]), np.float16)
+        file["flat"][starts[number] : stop] = of_pair
+        progress.advance(task)
+        if time.monotonic() - flushed_s > _FLUSH_S or number + 1 == len(starts):
+            file.flush()
+            file.attrs["pairs"] = number + 1
+            flushed_s = time.monotonic()
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    responses: ResponseSet
+    cells: Cells
+
+    def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
+        responses = self.responses
+        return flat_targets(align(responses.read(rows), delay_samples(responses, rows[0])), self.cells)
+
+
+class _Expected:
+    def __init__(self, responses: ResponseSet, cells: Cells) -> None:
+        if not isinstance(responses, SimulatedResponses):
+            raise DatasetError("what is expected of a response is known of simulated ones only")
+        self._responses, self._targets = responses, ExpectedTargets(responses.dataset, cells)
+
+    def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
+        emitter, listener = self._responses.ends(rows[0])
+        return self._targets.of_pair(emitter, listener)[rows % len(self._responses.dataset.yaws)]
