@@ -18,6 +18,7 @@ from rich.progress import Progress
 
 from server.bench import cli as bench
 from server.errors import NafirError, RequestError
+from server.health.cli import check
 
 if TYPE_CHECKING:
     from server.field.field import AcousticField
@@ -32,6 +33,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 app.add_typer(bench.app, name="bench")
+app.command()(check)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]

@@ -1,0 +1,235 @@
+"""Whole impulse responses in double precision: the oracle that what is served is compared with.
+
+The network's outputs are read as it gives them, float32; so are the tables of heads and of the windowed sinc. All that
+is done with them is done anew here, in float64 and by other algorithms where there are any: NumPy's transforms in place
+of compiled ones, the recursion of a power series in place of an unrolled kernel, all triangles of a head in place of a
+walk across them. Responses are rounded to float32 once, when all is done, which is 150 dB below them.
+
+Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample).
+"""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfft, next_fast_len, rfft
+
+from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
+from server.early_reflections import EarlyReflections
+from server.field.decoder import Decoder
+from server.field.field import AcousticField
+from server.field.graph import Spectrograms
+from server.rendering.direct_path import head_axes
+from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
+from server.rendering.hrtf import HeadFilters
+from server.rendering.still_paths import StillPaths
+from server.whole_field import WholeField
+
+_Float32 = npt.NDArray[np.float32]
+_Floats = npt.NDArray[np.float64]
+_Complex = npt.NDArray[np.complex128]
+_Number = TypeVar("_Number", np.float64, np.complex128)
+
+
+class DoubleDecoder(Decoder):
+    """A field's decoder, in float64 between the network's outputs and the response."""
+
+    def __init__(self, field: AcousticField, gate: _Float32) -> None:
+        parameters = field.graph.parameters
+        self.ir_samples = field.ir_samples
+        self._codec = parameters.codec
+        self._gate = gate
+        self._phase = field.level.phase
+        self._used = field.level.frames or self._codec.frames
+        self._known = min(parameters.known_frames, self._used)
+        signal = _fitted(field.bundle.frozen_noise, self._codec.samples)
+        self._white = self._codec.transform(signal) / np.sqrt(self._codec.window_energy)
+
+    def decode(
+        self, predicted: Spectrograms, aligned: _Floats, near: Sequence[_Float32 | None] | None = None
+    ) -> _Float32:
+        near = near or [None] * len(aligned)
+        rows = [
+            self._decode(predicted[row : row + 1], float(start), response)
+            for row, (start, response) in enumerate(zip(aligned, near, strict=True))
+        ]
+        return np.stack(rows).astype(np.float32)
+
+    def _decode(self, predicted: Spectrograms, aligned: float, near: _Float32 | None) -> _Floats:
+        codec, used = self._codec, self._used
+        start, delay = int(np.floor(aligned)), aligned / codec.hop
+        magnitude = _double(codec.magnitude(_double(predicted.log_magnitude[0])))
+        magnitude[..., used:] = 0
+        known, unknown, coherence = self._separate(predicted, magnitude)
+        turn = np.exp(-2j * np.pi * np.arange(codec.bins) / codec.n_fft * (aligned - start))
+        early = _double(codec.synthesise(known * turn[:, None]))
+        unknown, coherence = _later(unknown, delay), _later(coherence, delay)
+        independent = np.sqrt(np.maximum(1 - np.abs(coherence) ** 2, 0))
+        noise = np.stack([self._white[0], np.conj(coherence) * self._white[0] + independent * self._white[1]])
+        response = _fitted(codec.synthesise(unknown * noise), self.ir_samples)
+        first, last = max(0, start), min(self.ir_samples, start + early.shape[-1])
+        if last > first:
+            response[:, first:last] += early[:, first - start : last - start]
+        if self._phase.iterations:
+            response = self._griffin_lim(_later(magnitude, delay), response if near is None else _double(near), near)
+        _open(self._gate, response, start)
+        return response
+
+    def _separate(self, predicted: Spectrograms, magnitude: _Floats) -> tuple[_Complex, _Floats, _Complex]:
+        """As `server.acoustics.phase.separate`, of one response."""
+        known = self._known
+        phase = self._codec.integrate(_double(predicted.instantaneous_frequency[0, ..., :known]))
+        certainty = _double(predicted.certainty[0, ..., :known])
+        if self._phase.kind == "integrated":
+            certainty = np.ones_like(certainty)
+        phasors = certainty * np.exp(1j * phase)
+        left_over = np.sqrt(np.maximum(1 - certainty**2, 0))
+        coherence = _double(predicted.interaural[0, 0]) + 1j * _double(predicted.interaural[0, 1])
+        coherence[..., :known] -= phasors[0] * np.conj(phasors[1])
+        coherence[..., :known] /= np.maximum(left_over[0] * left_over[1], UNDECIDED)
+        coherence *= MOST_COHERENT / np.maximum(np.abs(coherence), 1)
+        coherence[..., self._used :] = 0
+        unknown = magnitude.copy()
+        unknown[..., :known] *= left_over
+        return magnitude[..., :known] * phasors, unknown, coherence
+
+    def _griffin_lim(self, magnitude: _Floats, response: _Floats, near: _Float32 | None) -> _Floats:
+        """Griffin and Lim's, from a response or from zero phase."""
+        codec = self._codec
+        if self._phase.warm or near is not None:
+            signal = _fitted(response, codec.samples)
+        else:
+            zero_phase = np.zeros(magnitude.shape, dtype=np.complex128)
+            zero_phase.real = magnitude * (-1.0) ** np.arange(codec.bins)[:, None]
+            signal = _double(codec.synthesise(zero_phase))
+        for _ in range(self._phase.iterations):
+            spectrogram = codec.transform(signal)
+            size = np.abs(spectrogram)
+            phasors: _Complex = np.where(size**2 >= NO_PHASE, spectrogram / np.maximum(size, NO_PHASE), 1)
+            signal = _double(codec.synthesise(np.asarray(magnitude * phasors, dtype=np.complex128)))
+        return _fitted(signal, self.ir_samples)
+
+
+class _DoubleField(AcousticField):
+    def __init__(self, field: AcousticField) -> None:
+        super().__init__(field.bundle, field.level, field.graph)
+        if self._decoder is not None:
+            self._decoder = DoubleDecoder(field, self._gate)
+
+    def _placed(self, coded: _Float32, aligned: _Floats) -> _Float32:
+        start = np.floor(aligned).astype(int)
+        size = next_fast_len(coded.shape[-1] + 1, real=True)
+        turns = np.exp(-2j * np.pi * np.arange(size // 2 + 1) / size * (aligned - start)[:, None, None])
+        shifted = irfft(rfft(_double(coded), size) * turns, size)[..., : coded.shape[-1]]
+        responses = np.zeros((len(coded), coded.shape[1], self.ir_samples))
+        for response, part, at in zip(responses, shifted, start, strict=True):
+            first, last = max(0, at), min(self.ir_samples, at + part.shape[-1])
+            if last > first:
+                response[:, first:last] += part[:, first - at : last - at]
+            _open(self._gate, response, at)
+        return responses.astype(np.float32)
+
+
+class DoubleStillPaths(StillPaths):
+    """Responses of paths at rest, added up in float64 before they are added to what is there."""
+
+    def add(
+        self,
+        lengths_m: _Floats,
+        arrivals: _Floats,
+        band_gains_db: _Floats,
+        orientation: Sequence[float],
+        out: _Float32,
+    ) -> None:
+        tables = self._tables
+        heard = np.zeros(out.shape)
+        for length, arrival, gains_db in zip(lengths_m, arrivals, band_gains_db, strict=True):
+            corners, weights = self._triangle(head_axes(orientation) @ arrival)
+            levels_db = gains_db - tables.air_db_per_m * length
+            cepstra = np.einsum("c,cen->en", weights, _double(tables.cepstra[corners]))
+            cepstra += levels_db @ _double(tables.band_cepstra)
+            delays_s = length / tables.speed_of_sound + weights @ tables.head_delays_s[corners]
+            for ear, (cepstrum, delay_s) in enumerate(zip(cepstra, delays_s, strict=True)):
+                delay = delay_s * tables.sample_rate
+                whole = int(np.ceil(delay))
+                phase = (whole - delay) * PHASES
+                row = min(PHASES - 1, int(phase))
+                sinc = _double(tables.sinc[row, :TAPS]) + (phase - row) * _double(tables.sinc[row, TAPS:])
+                part = np.convolve(_minimum_phase(cepstrum), sinc[::-1]) / max(length, tables.nearest_m)
+                begin = whole + BEFORE - (TAPS - 1)
+                first, last = max(0, begin), min(out.shape[1], begin + part.size)
+                if last > first:
+                    heard[ear, first:last] += part[first - begin : last - begin]
+        out += heard
+
+    def _triangle(self, direction: _Floats) -> tuple[npt.NDArray[np.int64], _Floats]:
+        """The three measured directions around one, and their shares: the triangle whose least share is the
+        greatest."""
+        weights = self._tables.inverses @ direction
+        best = int(np.argmax(weights.min(axis=-1)))
+        of_best = np.maximum(weights[best], 0)
+        return self._tables.triangles[best], of_best / of_best.sum()
+
+
+class _DoubleEarlyReflections(EarlyReflections):
+    def __init__(self, early: EarlyReflections, paths: DoubleStillPaths) -> None:
+        self._finder, self._air_db_per_m, self._paths = early._finder, early._air_db_per_m, paths
+
+
+class DoubleWholeField(WholeField):
+    """What `WholeField` answers with, in float64."""
+
+    def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
+        super().__init__(_DoubleField(field), filters)
+        paths = DoubleStillPaths(
+            filters, speed_of_sound=field.bundle.manifest.speed_of_sound, air_db_per_m=self._air_db_per_m
+        )
+        self._direct = paths
+        if self._early is not None:
+            self._early = _DoubleEarlyReflections(self._early, paths)
+
+
+def _double(values: npt.NDArray[np.floating]) -> _Floats:
+    return np.asarray(values, dtype=np.float64)
+
+
+def _fitted(signal: npt.NDArray[np.floating], samples: int) -> _Floats:
+    """(..., sample) cut, or silent from where it ends."""
+    fitted = np.zeros((*signal.shape[:-1], samples))
+    count = min(samples, signal.shape[-1])
+    fitted[..., :count] = signal[..., :count]
+    return fitted
+
+
+def _open(gate: _Float32, response: _Floats, at: int) -> None:
+    """Silence before sample `at`, and the gate's rise from there on."""
+    response[:, : max(0, at)] = 0
+    first, last = max(0, at), min(response.shape[-1], at + len(gate))
+    if last > first:
+        response[:, first:last] *= gate[first - at : last - at]
+
+
+def _later(values: npt.NDArray[_Number], frames: float) -> npt.NDArray[_Number]:
+    """(..., frame) values at a time later by `frames`, not necessarily whole: between those of two frames, zero where
+    there are none."""
+    at = np.arange(values.shape[-1]) - frames
+    before = np.floor(at).astype(int)
+
+    def of_frame(number: npt.NDArray[np.int64]) -> npt.NDArray[_Number]:
+        inside = (number >= 0) & (number < values.shape[-1])
+        return np.where(inside, values[..., np.where(inside, number, 0)], 0)
+
+    share = (at - before).astype(values.dtype)
+    return np.asarray(of_frame(before) + share * (of_frame(before + 1) - of_frame(before)))
+
+
+def _minimum_phase(cepstrum: _Floats) -> _Floats:
+    """(n,) taps of the filter with this folded cepstrum: h[n] = sum k / n c[k] h[n - k] (Oppenheim and Schafer,
+    "Discrete-Time Signal Processing", ch. 13)."""
+    taps = np.empty_like(cepstrum)
+    taps[0] = np.exp(cepstrum[0])
+    ordered = np.arange(cepstrum.size) * cepstrum
+    for n in range(1, cepstrum.size):
+        taps[n] = ordered[1 : n + 1] @ taps[n - 1 :: -1][:n] / n
+    return taps

@@ -1,0 +1,55 @@
+"""Energies that a field predicts, before anything is decoded: by octave band and by windows of time.
+
+Axes: (pose, channel, band, window). The sum over bands and windows is the energy of the response, unit pressure at one
+metre; windows follow the moment at which sound can first arrive.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.field.graph import FieldGraph, Spectrograms
+from server.health.poses import EMITTER, LISTENER, YAW, Poses
+
+Energies = npt.NDArray[np.float64]
+
+WINDOW_S = 0.020
+_CHUNK = 16
+
+
+class Predictions:
+    """What one field's graph says of poses; counts those asked for."""
+
+    def __init__(self, graph: FieldGraph) -> None:
+        self.graph = graph
+        self.asked = 0
+        self.faults = 0
+        """Values that were not finite, so far."""
+        codec = graph.parameters.codec
+        frequency = np.maximum(np.fft.rfftfreq(codec.n_fft, 1 / codec.sample_rate), 1.0)
+        nearest = np.argmin(np.abs(np.log2(frequency[:, None] / np.array(OCTAVE_BANDS_HZ))), axis=-1)
+        # Bins between DC and Nyquist stand for two.
+        weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
+        self._bands = (np.eye(len(OCTAVE_BANDS_HZ))[nearest] * weight[:, None]).T.astype(np.float32)
+        self._frames = max(1, round(WINDOW_S * codec.sample_rate / codec.hop))
+
+    def energies(self, poses: Poses) -> Energies:
+        """NaN where the graph's outputs are not finite."""
+        parts = [self._energies(poses[start : start + _CHUNK]) for start in range(0, len(poses), _CHUNK)]
+        return np.concatenate(parts)
+
+    def spectrograms(self, poses: Poses) -> Spectrograms:
+        return self.graph.spectrograms(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
+
+    def _energies(self, poses: Poses) -> Energies:
+        self.asked += len(poses)
+        outputs = self.graph.run(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
+        self.faults += sum(int(np.count_nonzero(~np.isfinite(output))) for output in outputs)
+        codec = self.graph.parameters.codec
+        if self.graph.gives_responses:
+            magnitude = np.abs(codec.transform(outputs[0])).astype(np.float32)
+        else:
+            magnitude = codec.magnitude(outputs[0])
+        in_bands = self._bands @ np.square(magnitude)
+        starts = np.arange(0, in_bands.shape[-1], self._frames)
+        return np.add.reduceat(in_bands.astype(np.float64), starts, axis=-1)

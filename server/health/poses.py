@@ -1,0 +1,58 @@
+"""Poses to try a scene at, all of them such as a client may ask for.
+
+A pose is a row of seven: listener x, y, z, emitter x, y, z, yaw; metres and radians.
+"""
+
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import qmc
+
+from server.scene.bundle import Bundle
+
+Poses = npt.NDArray[np.float64]
+"""(pose, 7)"""
+
+LISTENER, EMITTER, YAW = slice(0, 3), slice(3, 6), 6
+_QUARTERS = np.array([0.0, 0.5, 1.0, -0.5]) * np.pi
+
+
+def allowed(bundle: Bundle, poses: Poses) -> npt.NDArray[np.bool_]:
+    """(pose,) True where both ends are within bounds and not inside a wall."""
+    bounds, plan = bundle.manifest.bounds, bundle.floor_plan
+    return np.asarray(
+        np.logical_and.reduce(
+            [
+                np.all((ends >= bounds.minimum) & (ends <= bounds.maximum), axis=-1) & plan.contains(ends)
+                for ends in (poses[:, LISTENER], poses[:, EMITTER])
+            ]
+        )
+    )
+
+
+def corners(bundle: Bundle) -> Poses:
+    """Both ends at every corner of the bounds that a client may ask for, the head turned by a quarter each time; among
+    them those with the emitter in the listener's head."""
+    bounds = bundle.manifest.bounds
+    points = list(product(*zip(bounds.minimum, bounds.maximum, strict=True)))
+    poses = np.array([(*listener, *emitter) for listener in points for emitter in points])
+    yaws = _QUARTERS[np.arange(len(poses)) % len(_QUARTERS)]
+    return within(bundle, np.concatenate([poses, yaws[:, None]], axis=1))
+
+
+def scattered(bundle: Bundle, count: int, seed: int) -> Poses:
+    """`count` poses evenly over all that are allowed, the same ones first whatever the count (Sobol's sequence)."""
+    bounds = bundle.manifest.bounds
+    low = np.array([*bounds.minimum, *bounds.minimum, -np.pi])
+    high = np.array([*bounds.maximum, *bounds.maximum, np.pi])
+    sequence = qmc.Sobol(7, rng=np.random.default_rng([seed, 1]))
+    found = np.empty((0, 7))
+    while len(found) < count:
+        found = np.concatenate([found, within(bundle, low + sequence.random(1024) * (high - low))])
+    return found[:count]
+
+
+def within(bundle: Bundle, poses: Poses) -> Poses:
+    """Those that are allowed."""
+    return poses[allowed(bundle, poses)]

@@ -1,0 +1,83 @@
+"""What a health check found, for people and for programs."""
+
+import math
+from typing import Any
+
+from rich.table import Table
+
+from server.health.check import Health
+from server.health.findings import Finding
+
+_MOVING = {"listener": "the listener moves", "emitter": "the emitter moves", "yaw": "the head turns"}
+
+
+def table(health: Health) -> Table:
+    """A row per finding, worst pose included."""
+    title = f"Scene {health.scene}: {verdict(health)}"
+    rows = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    for column in ("", "field or level", "law"):
+        rows.add_column(column, no_wrap=True)
+    for column in ("worst", "bound", "poses"):
+        rows.add_column(column, justify="right", no_wrap=True)
+    rows.add_column("where")
+    for finding in health.findings:
+        mark = "[green]ok[/]" if finding.holds else "[bold red]broken[/]"
+        law = finding.law
+        rows.add_row(
+            mark,
+            finding.of,
+            law.label,
+            _amount(finding.value, law.unit),
+            f"{law.bound:g}",
+            str(finding.poses),
+            _where(finding),
+        )
+    return rows
+
+
+def verdict(health: Health) -> str:
+    count = len(health.findings)
+    if not health.broken:
+        return f"healthy, {count} laws hold ({health.seconds:.0f} s)"
+    return f"not healthy, {len(health.broken)} of {count} laws are broken ({health.seconds:.0f} s)"
+
+
+def reasons(health: Health) -> list[str]:
+    """Why each law that is broken has the bound that it has."""
+    broken = {finding.law.label: finding.law.reason for finding in health.broken}
+    return [f"{label}: {reason}" for label, reason in broken.items()]
+
+
+def to_json(health: Health) -> dict[str, Any]:
+    return {
+        "scene": health.scene,
+        "healthy": not health.broken,
+        "seconds": round(health.seconds, 3),
+        "findings": [
+            {
+                "law": finding.law.name,
+                "of": finding.of,
+                "holds": finding.holds,
+                # JSON knows no infinity: silence differs by minus infinity from silence, and what is NaN has no value.
+                "value": finding.value if math.isfinite(finding.value) else None,
+                "bound": finding.law.bound,
+                "unit": finding.law.unit,
+                "reason": finding.law.reason,
+                "poses": finding.poses,
+                "moving": finding.moving,
+                "pose": None if finding.pose is None else [round(float(part), 6) for part in finding.pose],
+            }
+            for finding in health.findings
+        ],
+    }
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}".rstrip()
+
+
+def _where(finding: Finding) -> str:
+    parts = [_MOVING[finding.moving]] if finding.moving else []
+    if finding.where is not None and finding.value != 0:
+        parts.append(str(finding.where))
+    return ": ".join(parts)

@@ -1,0 +1,102 @@
+"""Looking for the worst pose: from the worst of many, into ever smaller neighbourhoods."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.health.energies import Energies
+from server.health.poses import EMITTER, LISTENER, YAW, Poses, allowed
+from server.scene.bundle import Bundle
+
+Floats = npt.NDArray[np.float64]
+
+HALVINGS = 4
+_ROUNDS, _CANDIDATES = 6, 8
+NEIGHBOURS = _ROUNDS * _CANDIDATES
+STEP_M = 0.01
+STEP_RAD = np.radians(1.0)
+
+
+def climb(
+    bundle: Bundle,
+    worth: Callable[[Poses], Floats],
+    poses: Poses,
+    rng: np.random.Generator,
+) -> tuple[Poses, Floats]:
+    """Poses (n, 7) as given or better, and what they are worth (n,): eight neighbours of each are tried in every round,
+    and the neighbourhood halves, from a metre and a quarter of a turn on."""
+    best, values = poses.copy(), known(worth(poses))
+    for number in range(_ROUNDS):
+        reach = np.array([1.0] * 6 + [np.pi / 2]) / 2**number
+        shape = len(best), _CANDIDATES, 7
+        # Half of the coordinates at a time: all at once hardly ever get better.
+        tried = best[:, None] + rng.uniform(-reach, reach, shape) * (rng.random(shape) < 0.5)
+        flat = tried.reshape(-1, 7)
+        found = np.full(len(flat), -np.inf)
+        is_allowed = allowed(bundle, flat)
+        if is_allowed.any():
+            found[is_allowed] = known(worth(flat[is_allowed]))
+        of_each = found.reshape(len(best), _CANDIDATES)
+        at = np.argmax(of_each, axis=1)
+        rows = np.arange(len(best))
+        better = of_each[rows, at] > values
+        best[better], values[better] = tried[rows, at][better], of_each[rows, at][better]
+    return best, values
+
+
+def moves(poses: Poses, rng: np.random.Generator) -> dict[str, Poses]:
+    """Where listener, emitter or head are after sixteen steps in any one direction: a centimetre each, or a degree."""
+    moved = {}
+    for name, end in (("listener", LISTENER), ("emitter", EMITTER)):
+        directions = rng.standard_normal((len(poses), 3))
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        moved[name] = poses.copy()
+        moved[name][:, end] += 2**HALVINGS * STEP_M * directions
+    moved["yaw"] = poses.copy()
+    moved["yaw"][:, YAW] += 2**HALVINGS * STEP_RAD
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Poses before a step (n, 7), with the energies before and after it."""
+
+    poses: Poses
+    before: Energies
+    after: Energies
+
+
+def steepest(
+    bundle: Bundle,
+    energies: Callable[[Poses], Energies],
+    change: Callable[[Energies, Energies], Floats],
+    poses: Poses,
+    moved: Poses,
+    *,
+    kept: int,
+) -> Steps:
+    """Steps of much change. Of ways of sixteen steps the `kept` of the greatest change are halved, again and again,
+    towards the half that has more of it: a jump anywhere on a way is in one of its halves."""
+    plan = bundle.floor_plan
+    usable = allowed(bundle, poses) & allowed(bundle, moved)
+    for part in (LISTENER, EMITTER):  # nobody moves through walls
+        usable &= plan.is_visible(poses[:, part], moved[:, part])
+    start, end = poses[usable], moved[usable]
+    before, after = energies(start), energies(end)
+    order = np.argsort(-known(change(before, after)))[:kept]
+    start, end, before, after = start[order], end[order], before[order], after[order]
+    for _ in range(HALVINGS):
+        middle = (start + end) / 2
+        between = energies(middle)
+        is_first = known(change(before, between)) >= known(change(between, after))
+        rows, cubes = is_first[:, None], is_first[:, None, None, None]
+        start, before = np.where(rows, start, middle), np.where(cubes, before, between)
+        end, after = np.where(rows, middle, end), np.where(cubes, between, after)
+    return Steps(start, before, after)
+
+
+def known(values: Floats) -> Floats:
+    """What is not a number is as bad as can be."""
+    return np.where(np.isnan(values), np.inf, values)
