@@ -83,6 +83,8 @@ class AcousticField:
         chosen = next((entry for entry in manifest.levels if level in (None, entry.name)), None)
         if chosen is None:
             raise BundleError(bundle.folder, "levels", f"there is no quality level {level!r}")
+        if not manifest.fields:
+            return Silence(bundle, chosen)
         session = open_graph(bundle, manifest.fields[chosen.field].file, threads=threads)
         return cls(bundle, chosen, FieldGraph(bundle, chosen.field, session))
 
@@ -188,3 +190,26 @@ def frozen_noise(bundle: Bundle, graph: FieldGraph) -> FrozenNoise:
     scene's, of which nothing is heard."""
     codec = graph.parameters.codec
     return FrozenNoise.from_signal(codec, resized(bundle.frozen_noise, codec.samples))
+
+
+class Silence(AcousticField):
+    """What there is after the direct sound and the first reflections in a scene without a field."""
+
+    def __init__(self, bundle: Bundle, level: QualityLevel) -> None:
+        self.bundle = bundle
+        self.level = level
+        self.nodes = None
+        self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+
+    def impulse_responses(
+        self,
+        listeners: npt.ArrayLike,  # noqa: ARG002  the same everywhere
+        emitters: npt.ArrayLike,  # noqa: ARG002
+        yaws: npt.ArrayLike,
+        *,
+        remember: bool = False,  # noqa: ARG002
+    ) -> Float32:
+        return np.zeros((np.size(yaws), self.channels, self.ir_samples), dtype=np.float32)
+
+    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:  # noqa: ARG002
+        return np.zeros((np.size(yaws), self.channels))

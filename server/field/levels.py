@@ -9,7 +9,7 @@ import numpy as np
 from server.acoustics.phase import FrozenNoise
 from server.bounded_cache import BoundedCache
 from server.errors import RequestError
-from server.field.field import AcousticField, frozen_noise
+from server.field.field import AcousticField, Silence, frozen_noise
 from server.field.graph import FieldGraph, open_graph
 from server.field.reuse import KEPT_BYTES, Kept
 from server.field.runtime import InferenceSession
@@ -32,6 +32,8 @@ class Levels(Mapping[str, AcousticField]):
     @classmethod
     def load(cls, bundle: Bundle, threads: int = 1) -> "Levels":
         """Raises BundleError for a graph that does not fit the manifest."""
+        if not bundle.manifest.fields:
+            return cls([Silence(bundle, level) for level in bundle.manifest.levels])
         sessions: dict[str, InferenceSession] = {}
         graphs: dict[str, FieldGraph] = {}
         for name in dict.fromkeys(level.field for level in bundle.manifest.levels):

@@ -31,7 +31,8 @@ _ARCHIVE_ERRORS = (OSError, EOFError, KeyError, ValueError, RuntimeError, zlib.e
 
 @dataclass(frozen=True)
 class Bundle:
-    """A checked scene bundle. `models` holds the bytes of each ONNX file by name, as hashed."""
+    """A checked scene bundle. `models` holds the bytes of each ONNX file by name, as hashed; `frozen_noise` is empty
+    where there are none."""
 
     folder: Path
     manifest: Manifest
@@ -57,7 +58,9 @@ class Bundle:
                 raise BundleError(
                     folder / name, "sha256", f"differs from the one in {MANIFEST_FILE}; the file is damaged"
                 )
-        noise = _frozen_noise(folder / ARRAYS_FILE, contents[ARRAYS_FILE], manifest.codec.samples)
+        noise = np.zeros((2, 0), np.float32)
+        if manifest.fields:
+            noise = _frozen_noise(folder / ARRAYS_FILE, contents[ARRAYS_FILE], manifest.codec.samples)
         models = {name: data for name, data in contents.items() if name.endswith(".onnx")}
         return cls(folder, manifest, hashlib.sha256(text).hexdigest(), models, noise)
 

@@ -7,6 +7,7 @@ the fields hold all of it, through one microphone or two ears. Of such a place o
 there is no `geometry`, and the place is what lies within `bounds`.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -17,9 +18,12 @@ from server.acoustics.air import absorption_db_per_m
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
+from server.scene.effects import EffectName
 from server.scene.geometry import Finite, Geometry, Point, Strict
 
 ARRAYS_FILE = "arrays.npz"
+NO_FIELD = "none"
+"""What the level of a scene without fields is of."""
 FORMAT_VERSION: Literal[2] = 2
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
@@ -214,8 +218,11 @@ class Manifest(Strict):
     """Where it comes from."""
     channels: tuple[Literal["left"], Literal["right"]] | tuple[Literal["mono"]] = ("left", "right")
     codec: CodecParameters
-    fields: Annotated[dict[str, FieldFile], Field(min_length=1)]
+    fields: dict[str, FieldFile]
+    """None where nothing reverberates: in the open, or in a room that is heard by its first reflections alone."""
     levels: Annotated[tuple[QualityLevel, ...], Field(min_length=1)]
+    effects: Mapping[EffectName, bool] = Field(default_factory=dict)
+    """On or off whatever the planner would decide; those that are not named are its to decide."""
     files: dict[FileName, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
 
     @field_validator("format_version", mode="before")
@@ -232,6 +239,8 @@ class Manifest(Strict):
                 raise ValueError(f"fields.{name}.file: {field.file} is not listed in files")
             if field.codec is not None and field.codec.sample_rate != self.codec.sample_rate:
                 raise ValueError(f"fields.{name}.codec.sample_rate: must be the scene's, {self.codec.sample_rate}")
+        if not self.fields:
+            return self._has_no_field()
         for level in self.levels:
             if level.field not in self.fields:
                 raise ValueError(f"levels.{level.name}.field: there is no field {level.field}")
@@ -242,6 +251,13 @@ class Manifest(Strict):
             raise ValueError("levels: two have the same name")
         if ARRAYS_FILE not in self.files:
             raise ValueError(f"files: {ARRAYS_FILE} is not listed")
+        return self
+
+    def _has_no_field(self) -> "Manifest":
+        if len(self.levels) > 1 or self.levels[0].field != NO_FIELD or self.levels[0].reuse is not None:
+            raise ValueError(f"levels: a scene without fields has one level, of field {NO_FIELD!r}")
+        if self.direct_sound == "field":
+            raise ValueError("direct_sound: there is no field that could hold it")
         return self
 
     @model_validator(mode="after")
