@@ -27,7 +27,9 @@ from training.runs import Configuration, FactorisedRecipe, require_same_data, re
 # phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its
 # floor.
 _SPREADS = {"fine": 0.64, "late": 0.25, "phasor": 1.0, "interaural": 1.0}
-_HEAD_WEIGHTS = {"fine": 1.0, "late": 1.0, "phasor": 2.0, "interaural": 1.0}
+# Coherences are smooth in the poses, so errors of few hundredths are left; weighted alike they would be lost beside the
+# levels'.
+_HEAD_WEIGHTS = {"fine": 1.0, "late": 1.0, "phasor": 2.0, "interaural": 10.0}
 _LEVEL_HEADS = ("fine", "late")
 TARGETS = "targets"
 """Folder of targets in that of a dataset."""

@@ -138,7 +138,7 @@ def test_lessons_teach_levels_only(dataset, configuration, teacher):
     assert targets[1].tolist() == [True, False, False]
     wrong = (targets[0].float() + 1 - learner.field.mean) / learner.field.spread
     parts = learner.losses(wrong, targets)
-    for name, share in (("fine", 1), ("late", 1), ("phasor", 2 / 3), ("interaural", 1 / 3)):
+    for name, share in (("fine", 1), ("late", 1), ("phasor", 2 / 3), ("interaural", 10 / 3)):
         assert parts[name] == pytest.approx(share, rel=1e-3), name
     assert learner.field(*inputs).shape == targets[0].shape
 
