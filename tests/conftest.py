@@ -18,7 +18,7 @@ from server.load import Rung
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.geometry import Geometry, Material, Materials, Opening
-from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
+from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Reuse, Start
 
 CODEC = CodecParameters(
     sample_rate=24_000, n_fft=256, hop=64, samples=4_000, lead_samples=64, known_frames=4, log_floor=1e-3
@@ -198,6 +198,23 @@ def measured_bundle(tmp_path_factory) -> Bundle:
     np.savez(noise, frozen_noise=np.zeros((2, CODEC.samples), np.float32))
     files = {"measured.onnx": measured_graph(), "arrays.npz": noise.getvalue()}
     return write_bundle(tmp_path_factory.mktemp("scenes") / "measured", MEASURED, files)
+
+
+@pytest.fixture
+def field_at_nodes(mirrored_bundle) -> AcousticField:
+    """It reuses responses, without their first reflections."""
+    return at_nodes(mirrored_bundle, first_reflections="pose")
+
+
+@pytest.fixture
+def whole_at_nodes(mirrored_bundle) -> AcousticField:
+    """It reuses responses together with their first reflections."""
+    return at_nodes(mirrored_bundle, first_reflections="node")
+
+
+def at_nodes(bundle: Bundle, **reuse: object) -> AcousticField:
+    level = QualityLevel(name="at-nodes", field="arithmetic", reuse=Reuse(spacing_m=0.8, turn_deg=45, **reuse))
+    return AcousticField(bundle, level, AcousticField.load(bundle).graph)
 
 
 @pytest.fixture

@@ -176,7 +176,7 @@ def test_nothing_sounds_before_the_path_begins_and_the_clip_begins_with_it(open_
     assert error_db(late[:, 5 * SIZE :], prompt[:, : 15 * SIZE]) < -120
 
 
-@pytest.mark.parametrize("name", ["field", "mirrored_field"])
+@pytest.mark.parametrize("name", ["field", "mirrored_field", "field_at_nodes", "whole_at_nodes"])
 def test_a_live_session_replayed_is_equal_to_the_bit(name, filters, request):
     """Live: IRs arrive when they arrive, some poses are never heard. The replay gets what the blocks' headers say."""
     field = request.getfixturevalue(name)
