@@ -23,7 +23,7 @@ from server.load import AUTO, Offer
 from server.priority import become_background
 from server.problems import install_problems
 from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
-from server.rendering.renderer import warm_up
+from server.rendering.warm_up import warm_up
 from server.routes import api, health
 from server.session import Session
 from server.settings import Settings

@@ -41,6 +41,10 @@ class PartitionedIr:
     """Sum of squares of the samples that a shared tail stands for, over both channels."""
 
     @property
+    def channels(self) -> int:
+        return self.layout[1]
+
+    @property
     def nbytes(self) -> int:
         """What its spectra take, including any that it shares with another."""
         return sum(int(part.nbytes) for part in self.filters.spectra)

@@ -25,11 +25,13 @@ from server.rendering.direct_path_kernel import (
 )
 from server.rendering.fade import raised_cosine
 from server.rendering.fractional_delay import AFTER, TAPS, sinc_table
-from server.rendering.hrtf import HeadFilters
+from server.rendering.hrtf import HeadFilters, filter_taps
+from server.rendering.sphere import Triangulation
 
 NEAR_LIMIT_M = 0.25
 
 _FEWEST_BINS = 64
+_ASKED = ("present", "muted", "unattenuated", "airless", "goal_m", "arrival", "band_gain_db")
 _LEVEL: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -56,6 +58,33 @@ class PathTarget(NamedTuple):
     """(band,) beside distance and air."""
 
 
+class _NoHead(NamedTuple):
+    """One ear in the open: what there is of `HeadFilters` where there is no head."""
+
+    sample_rate: int
+    cepstra: npt.NDArray[np.float32]
+    delays_s: npt.NDArray[np.float64]
+    longest_advance_s: float
+    longest_delay_s: float
+    triangulation: Triangulation
+
+    @classmethod
+    def at(cls, sample_rate: int) -> "_NoHead":
+        nowhere = Triangulation(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3, 3)))
+        return cls(
+            sample_rate,
+            np.zeros((1, 1, filter_taps(sample_rate)), np.float32),
+            np.zeros((1, 1)),
+            0.0,
+            0.0,
+            nowhere,
+        )
+
+    @property
+    def taps(self) -> int:
+        return int(self.cepstra.shape[-1])
+
+
 class DirectPath:
     """Sizes everything here and allocates nothing afterwards. One thread at a time may use it.
 
@@ -68,19 +97,22 @@ class DirectPath:
         slots: int,
         block_size: int,
         sample_rate: int,
-        filters: HeadFilters,
+        filters: HeadFilters | None,
         speed_of_sound: float,
         air_db_per_m: npt.NDArray[np.floating],
         max_distance_m: float = 200.0,
     ) -> None:
-        if min(slots, block_size) < 1 or filters.sample_rate != sample_rate:
+        """`filters` are those of a head, None for one ear without one."""
+        if min(slots, block_size) < 1 or (filters is not None and filters.sample_rate != sample_rate):
             raise ValueError("slots and block_size are at least 1, and filters are of the same sample rate")
         self.slots = slots
         self.block_size = block_size
         self.sample_rate = sample_rate
-        self.state = _state(slots, block_size, filters, speed_of_sound, air_db_per_m, max_distance_m)
+        self.channels = 1 if filters is None else 2
+        ears = _NoHead.at(sample_rate) if filters is None else filters
+        self.state = _state(slots, block_size, ears, speed_of_sound, air_db_per_m, max_distance_m)
         self._blocks = np.zeros((slots, block_size), np.float32)
-        self._heard = np.zeros((2, block_size), np.float32)
+        self._heard = np.zeros((self.channels, block_size), np.float32)
         self.reset()
 
     def set_target(self, slot: int, target: PathTarget, *, jump: bool = False) -> None:
@@ -109,12 +141,27 @@ class DirectPath:
         records["arrival"][slots] = arrivals
         records["band_gain_db"][slots] = band_gains_db
 
+    def set_muted(self, slot: int, is_muted: bool) -> None:
+        """Have a slot fade out, and do nothing more for it than keep what it plays; or fade in, where it is by then."""
+        self.state.slots[slot]["muted"] = is_muted
+
+    def set_losses(self, slot: int, *, distance: bool, air: bool) -> None:
+        """Whether the length of the way attenuates the sound, and the air on it."""
+        record = self.state.slots[slot]
+        record["unattenuated"], record["airless"] = not distance, not air
+
+    def copy_slot(self, slot: int, other: "DirectPath", from_slot: int) -> None:
+        """Ask for the same as another path was asked for."""
+        for name in _ASKED:
+            self.state.slots[slot][name] = other.state.slots[from_slot][name]
+
     def set_orientation(self, quaternion: Sequence[float] | npt.NDArray[np.floating]) -> None:
         """(x, y, z, w), unit: turns the head's axes to where they are in the world. From the next block on."""
-        self.state.to_head[:] = head_axes(quaternion)
+        if self.channels == 2:
+            self.state.to_head[:] = head_axes(quaternion)
 
     def process(self, blocks: FloatArray, out: FloatArray) -> None:
-        """Add to `out` (2, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored.
+        """Add to `out` (channel, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored.
 
         Fastest where both are contiguous; other layouts are copied rather than compiled for.
         """
@@ -152,21 +199,22 @@ class DirectPath:
 def _state(
     slots: int,
     block_size: int,
-    filters: HeadFilters,
+    filters: HeadFilters | _NoHead,
     speed_of_sound: float,
     air_db_per_m: npt.NDArray[np.floating],
     max_distance_m: float,
 ) -> DirectPathState:
-    taps, sample_rate = filters.taps, filters.sample_rate
+    ears, taps, sample_rate = filters.cepstra.shape[1], filters.taps, filters.sample_rate
     wide = -(-block_size // TILE) * TILE
     shortest_m = speed_of_sound * ((AFTER + 1) / sample_rate + filters.longest_advance_s)
     longest_m = max(max_distance_m, shortest_m)
-    longest = (longest_m / speed_of_sound + filters.longest_delay_s) * sample_rate + TAPS + 2 * block_size
-    ring = -(-int(longest) // block_size) * block_size
-    again = -(-(wide + TAPS) // block_size) * block_size
     orders = np.maximum(np.arange(taps), 1)
     # Half a window of the transform: what is new, and no fewer than the filter has taps.
     bins = max(_FEWEST_BINS, 2 ** (max(taps, wide) - 1).bit_length())
+    # A window is read back from the line where a filter begins.
+    longest = (longest_m / speed_of_sound + filters.longest_delay_s) * sample_rate + TAPS + 2 * (bins + block_size)
+    ring = -(-int(longest) // block_size) * block_size
+    again = -(-(2 * bins + TAPS) // block_size) * block_size
     twist, passes, lanes = transform_tables(bins)
 
     def floats(*shape: int) -> FloatArray:
@@ -185,8 +233,9 @@ def _state(
         to_head=doubles(3, 3),
         position=integers(1),
         line=floats(slots, ring + again),
-        heard=floats(slots, 2, 2 * bins + TILE),
-        spectra=floats(slots, 2, 2, bins),
+        heard=floats(slots, ears, 2 * bins + TILE),
+        plain=floats(wide),
+        spectra=floats(slots, ears, 2, bins),
         cepstra=filters.cepstra,
         head_delays_s=filters.delays_s,
         triangles=filters.triangulation.triangles,
@@ -207,9 +256,10 @@ def _state(
         sums=floats(2, taps + 8),
         next_taps=floats(2, taps),
         padded=floats(2 * bins),
-        next_spectra=floats(2, 2, bins),
+        next_spectra=floats(ears, 2, bins),
         bins=floats(2, bins),
-        mix=floats(3, 2, 2, bins),
+        is_mixed=integers(4),
+        mix=floats(3, ears, 2, bins),
         first=integers(wide),
         row=integers(wide),
         share=floats(wide),

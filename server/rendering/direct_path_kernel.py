@@ -2,6 +2,9 @@
 
 An emitter's block goes into its delay line. Each ear reads the line at a delay of its own, the way's plus the head's,
 and hears it through one minimum-phase filter: what the head, the air and the way do to magnitude, summed as cepstra.
+Without a head there is one ear, which has no delay, and no filter either where nothing on the way calls for one.
+
+An emitter may be muted: its line goes on, nothing else is done for it, and it is there at once when it is heard again.
 
 What is asked for jumps from block to block; what is heard follows. Lengths and the head's delays go to where they are
 asked to be like critically damped springs whose anchor moves steadily through a block, and within the block the delay
@@ -13,8 +16,9 @@ than anything moves is crossfaded too, from the old delay to the new.
 Filters work on the right-angle spectra of `server.rendering.right_angle`, all slots summed before the one way back: a
 spectrum per ear of what it hears, one per filter whenever that changes.
 
-Letters: s slots, e ears, n taps, f bins, b block size, w the same in whole tiles of the loops (what is beyond b means
-nothing), r ring of the delay line. Lengths in metres, delays in samples unless their name says seconds.
+Letters: s slots, e ears (2, or 1 without a head), n taps, f bins, b block size, w the same in whole tiles of the loops
+(what is beyond b means nothing), r ring of the delay line. Lengths in metres, delays in samples unless their name says
+seconds.
 """
 
 from typing import Any, NamedTuple
@@ -45,7 +49,7 @@ _ANGLE_STEP = np.radians(0.3)
 _BAND_STEP_DB = 0.02
 _ANGLE_LEAP = np.radians(10.0)
 _BAND_LEAP_DB = 3.0
-_NONE, _STEP, _LEAP = 0, 1, 2
+_NONE, _STEP, _LEAP, _PLAIN = 0, 1, 2, 3
 _REST_M = 1e-6
 _REST_S = 3e-9
 TILE = loops.TILE
@@ -58,11 +62,17 @@ SLOT = np.dtype(
         ("present", np.bool_),
         ("asked", np.bool_),  # anew since the last block
         ("jump", np.bool_),
+        ("muted", np.bool_),
+        ("unattenuated", np.bool_),  # as loud as at one metre
+        ("airless", np.bool_),
         ("goal_m", np.float64),
         ("arrival", np.float64, 3),  # world
         ("band_gain_db", np.float64, BANDS),
         # Where things are, at the end of the last block. A spring is where its anchor is, where it is, and its speed.
         ("started", np.bool_),
+        ("sounds", np.bool_),  # not muted
+        ("filtered", np.bool_),
+        ("was_unattenuated", np.bool_),
         ("silent", np.int64),  # samples
         ("since_asked", np.int64),  # samples
         ("length", np.float64, 3),  # spring: m, m, m/s
@@ -93,6 +103,7 @@ class DirectPathState(NamedTuple):
     position: IntArray  # (1,) in the line, of the next block
     line: FloatArray  # (s, r and its beginning once more)
     heard: FloatArray  # (s, e, 2 f and room for whole tiles) delayed, the newest 2 f samples
+    plain: FloatArray  # (w,) what is heard without a filter
     spectra: FloatArray  # (s, e, part, f) of the filter in effect
 
     # Tables.
@@ -120,6 +131,7 @@ class DirectPathState(NamedTuple):
     padded: FloatArray  # (2 f,)
     next_spectra: FloatArray  # (e, part, f)
     bins: FloatArray  # (part, f)
+    is_mixed: IntArray  # (4,) whether anything was, in this block: in each mix, and without a filter
     mix: FloatArray  # (3, e, part, f) by the filters in effect; what those before add, in a step and in a leap
     first: IntArray  # (w,)
     row: IntArray  # (w,)
@@ -140,33 +152,37 @@ class DirectPathState(NamedTuple):
 
 @compiled
 def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatArray) -> None:
-    """Add what both ears (2, b) hear of the blocks (s, b) of all slots."""
+    """Add what all ears (e, b) hear of the blocks (s, b) of all slots."""
     position = state.position[0]
     size = out.shape[1]
-    sounding, steps, leaps = 0, 0, 0
+    state.is_mixed[:] = 0
     for index in range(blocks.shape[0]):
         slot = state.slots[index]
         if slot.present and _take_in(slot, state.line[index], position, state.ring, state.quiet, blocks[index]):
-            if sounding == 0:
-                state.mix[:] = 0
-            sounding += 1
-            change = _render_slot(state, slot, index, size)
-            steps += change == _STEP
-            leaps += change == _LEAP
+            _render_slot(state, slot, index, size)
     state.position[0] = (position + size) % state.ring
-    if sounding > 0:
-        _synthesise(state, 0, out)
-    if steps > 0:
-        _synthesise(state, _STEP, out)
-    if leaps > 0:
-        _synthesise(state, _LEAP, out)
+    for kind in range(_PLAIN):
+        if state.is_mixed[kind] != 0:
+            _synthesise(state, kind, out)
+    if state.is_mixed[_PLAIN] != 0:
+        loops.add_block(state.plain, out[0])
+
+
+@compiled
+def _mix_of(state: DirectPathState, kind: int) -> Any:
+    """(e, part, f) of a kind, silent before its first use in a block."""
+    mix = state.mix[kind]
+    if state.is_mixed[kind] == 0:
+        mix[:] = 0
+        state.is_mixed[kind] = 1
+    return mix
 
 
 @compiled
 def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
     """Add one of the mixes: what the filters in effect make, or what those before add to it while they fade out."""
     block = state.filtered
-    for ear in range(2):
+    for ear in range(out.shape[0]):
         loops.synthesise(state.mix[kind, ear], state.twist, state.passes, state.lanes, block)
         newest = block[block.size - out.shape[1] :]
         if kind == 0:
@@ -196,42 +212,92 @@ def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, 
 
 
 @compiled
-def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> int:
-    """Add a slot to the mix. How its filters changed: not, or by a fade along a straight line or a raised cosine."""
-    period_s = size / state.sample_rate
-    starts = not slot.started
-    jumps = slot.started and _jumps(slot, size, state.sample_rate, state.speed_of_sound)
+def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> None:
+    """Add a slot to the mixes."""
+    starts, was_muted = not slot.started, not slot.sounds
     slot.started = True
+    slot.sounds = not slot.muted
+    if slot.muted and (starts or was_muted):
+        slot.jump = slot.asked = False
+        return
+    at_once = starts or was_muted
+    was_filtered, was_plain = slot.filtered and not at_once, not (slot.filtered or at_once)
+    jumps = not at_once and _jumps(slot, size, state.sample_rate, state.speed_of_sound)
     if slot.asked:
         slot.since_asked = 0
-    slot.asked = False
-    slot.jump = False
-    _follow(slot.length, slot.goal_m, period_s, _LENGTH_TIME_S, _REST_M, starts or jumps)
-    gain = 1.0 / max(slot.length[_AT], state.nearest_m)
-    gain_before = gain if starts else slot.gain
+    slot.jump = slot.asked = False
+    slot.was_unattenuated = slot.unattenuated
+    period_s = size / state.sample_rate
+    _follow(slot.length, slot.goal_m, period_s, _LENGTH_TIME_S, _REST_M, at_once or jumps)
+    gain = 1.0 if slot.unattenuated else 1.0 / max(slot.length[_AT], state.nearest_m)
+    gain_before = gain if at_once else slot.gain
     slot.gain = gain
     change = _change(slot, state.to_head, state.air_db_per_m)
-    if jumps:
+    ears = state.cepstra.shape[1]
+    slot.filtered = not slot.muted and (ears == 2 or _colours(slot))
+    is_plain = not (slot.filtered or slot.muted)
+    if jumps or slot.filtered != was_filtered:
         change = _LEAP
-    if change != _NONE or starts:
+    if slot.filtered and (change != _NONE or at_once):
         _find_filters(state, slot)
 
     window = 2 * state.bins.shape[1]
-    for ear in range(2):
-        _follow(slot.head[ear], slot.head_goal_s[ear], period_s, _HEAD_TIME_S, _REST_S, starts or jumps)
+    for ear in range(ears):
+        _follow(slot.head[ear], slot.head_goal_s[ear], period_s, _HEAD_TIME_S, _REST_S, at_once or jumps)
         samples = state.heard[index, ear]
-        loops.shift(samples, size, window - size)
         newest = samples[window - size : window - size + state.first.size]
-        _read(state, slot, state.line[index], ear, size, starts, jumps, gain_before, newest)
-        loops.transform(samples, state.twist, state.passes, state.lanes, state.bins)
-        in_effect = state.spectra[index, ear]
-        if change != _NONE or starts:
-            if not starts:
-                fading = state.mix[change, ear]
-                loops.accumulate_change(state.bins, in_effect, state.next_spectra[ear], fading)
-            in_effect[:] = state.next_spectra[ear]
-        loops.accumulate(state.bins, in_effect, state.mix[0, ear])
-    return _NONE if starts else change
+        if was_filtered:
+            loops.shift(samples, size, window - size)
+        elif starts:
+            samples[:] = 0
+        elif slot.filtered:
+            # A filter has to know what came before.
+            past = slot.delay[ear] if was_plain else _delay(state, slot, ear)
+            _read_still(state, state.line[index], past, window - size, samples[:window])
+            samples[:window] *= np.float32(gain_before)
+        _read(state, slot, state.line[index], ear, size, at_once, jumps, gain_before, newest)
+        if was_filtered or slot.filtered:
+            loops.transform(samples, state.twist, state.passes, state.lanes, state.bins)
+            in_effect, after = state.spectra[index, ear], state.next_spectra[ear]
+            if not was_filtered:
+                in_effect[:] = 0
+            if not slot.filtered:
+                after[:] = 0
+            if starts:
+                in_effect[:] = after
+            elif change != _NONE:
+                loops.accumulate_change(state.bins, in_effect, after, _mix_of(state, change)[ear])
+                in_effect[:] = after
+            if slot.filtered:
+                loops.accumulate(state.bins, in_effect, _mix_of(state, 0)[ear])
+        if was_plain or is_plain:
+            _add_plain(state, newest[:size], was_plain or starts, is_plain)
+
+
+@compiled
+def _add_plain(state: DirectPathState, block: FloatArray, before: bool, after: bool) -> None:
+    """Add what is heard without a filter, fading where it was not or is not to be."""
+    if state.is_mixed[_PLAIN] == 0:
+        state.plain[:] = 0
+        state.is_mixed[_PLAIN] = 1
+    plain = state.plain[: block.size]
+    if before and after:
+        loops.add_block(block, plain)
+    elif before:
+        loops.add_fading(block, state.fade, plain)
+    else:
+        loops.add_block(block, plain)
+        block *= np.float32(-1)
+        loops.add_fading(block, state.fade, plain)
+
+
+@compiled
+def _colours(slot: Any) -> bool:
+    """Whether anything on the way has a gain in some band."""
+    most = 0.0
+    for band in range(BANDS):
+        most = max(most, abs(slot.bands_db[band]))
+    return most > 0.0
 
 
 @compiled
@@ -240,7 +306,8 @@ def _jumps(slot: Any, size: int, sample_rate: float, speed_of_sound: float) -> b
     longest = max(_POSE_INTERVAL_S * sample_rate, float(size))
     elapsed_s = min(float(slot.since_asked), longest) / sample_rate
     way = abs(slot.goal_m - slot.length[_ANCHOR])
-    return bool(slot.asked and (slot.jump or way > _GREATEST_SPEED_RATIO * speed_of_sound * elapsed_s))
+    too_far = way > _GREATEST_SPEED_RATIO * speed_of_sound * elapsed_s
+    return bool(slot.unattenuated != slot.was_unattenuated or (slot.asked and (slot.jump or too_far)))
 
 
 @compiled
@@ -278,7 +345,9 @@ def _change(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> int:
         turned += (along - slot.filtered_direction[axis]) ** 2
     difference_db = 0.0
     for band in range(BANDS):
-        level = slot.band_gain_db[band] - air_db_per_m[band] * slot.length[_AT]
+        level = slot.band_gain_db[band]
+        if not slot.airless:
+            level -= air_db_per_m[band] * slot.length[_AT]
         slot.bands_db[band] = level
         difference_db = max(difference_db, abs(level - slot.filtered_db[band]))
     if turned > _ANGLE_LEAP**2 or difference_db > _BAND_LEAP_DB:
@@ -293,23 +362,26 @@ def _find_filters(state: DirectPathState, slot: Any) -> None:
         slot.filtered_direction[axis] = slot.direction[axis]
     for band in range(BANDS):
         slot.filtered_db[band] = slot.bands_db[band]
-    triangle = find_triangle(state.across, state.inverses, slot.direction, slot.triangle, state.weights)
-    slot.triangle = triangle
-    count = state.next_taps.shape[1]
-    for ear in range(2):
+    count, ears = state.next_taps.shape[1], state.cepstra.shape[1]
+    triangle = 0
+    if ears == 2:
+        triangle = find_triangle(state.across, state.inverses, slot.direction, slot.triangle, state.weights)
+        slot.triangle = triangle
+    for ear in range(ears):
         delay = 0.0
         cepstrum = state.cepstrum[ear, :count]
         cepstrum[:] = 0
-        for corner in range(3):
-            direction = state.triangles[triangle, corner]
-            delay += state.weights[corner] * state.head_delays_s[direction, ear]
-            loops.add_scaled(state.cepstra[direction, ear], state.weights[corner], cepstrum)
+        if ears == 2:
+            for corner in range(3):
+                direction = state.triangles[triangle, corner]
+                delay += state.weights[corner] * state.head_delays_s[direction, ear]
+                loops.add_scaled(state.cepstra[direction, ear], state.weights[corner], cepstrum)
         for band in range(BANDS):
             loops.add_scaled(state.band_cepstra[band], slot.bands_db[band], cepstrum)
         cepstrum *= state.orders
         slot.head_goal_s[ear] = delay
     loops.series_exponential(state.cepstrum, state.reciprocals, state.sums, state.next_taps)
-    for ear in range(2):
+    for ear in range(ears):
         state.padded[:count] = state.next_taps[ear]
         loops.transform(state.padded, state.twist, state.passes, state.lanes, state.next_spectra[ear])
 
@@ -321,28 +393,28 @@ def _read(
     line: FloatArray,
     ear: int,
     size: int,
-    starts: bool,
+    at_once: bool,
     jumps: bool,
     gain_before: float,
-    heard: FloatArray,  # (s, e, 2 f and room for whole tiles) delayed, the newest 2 f samples
+    heard: FloatArray,
 ) -> None:
     """What one ear's delay makes of the line, at the gain of the distance."""
-    within = min(max(slot.length[_AT], state.shortest_m), state.longest_m)
-    speed = slot.length[_SPEED] if within == slot.length[_AT] else 0.0
-    end = (within / state.speed_of_sound + slot.head[ear, _AT]) * state.sample_rate
+    end = _delay(state, slot, ear)
+    is_within = state.shortest_m <= slot.length[_AT] <= state.longest_m
+    speed = slot.length[_SPEED] if is_within else 0.0
     end_slope = speed / state.speed_of_sound + slot.head[ear, _SPEED]
     start, slope = slot.delay[ear], slot.slope[ear]
     slot.delay[ear] = end
     slot.slope[ear] = end_slope
 
     gain = slot.gain
-    if starts or (start == end and slope == 0.0 and end_slope == 0.0 and gain_before == gain):
-        _read_still(state, line, end, heard)
+    if at_once or (start == end and slope == 0.0 and end_slope == 0.0 and gain_before == gain):
+        _read_still(state, line, end, 0, heard)
         loops.scale(heard, gain, gain, state.ramp)
     elif jumps:
         before, after = state.read[0], state.read[1]
         _read_moving(state, line, start, slope, 0.0, 0.0, before)
-        _read_still(state, line, end, after)
+        _read_still(state, line, end, 0, after)
         loops.scale(before, gain_before, gain_before, state.ramp)
         loops.scale(after, gain, gain, state.ramp)
         heard[:] = 0
@@ -356,9 +428,17 @@ def _read(
 
 
 @compiled
-def _read_still(state: DirectPathState, line: FloatArray, delay: float, out: FloatArray) -> None:
+def _delay(state: DirectPathState, slot: Any, ear: int) -> float:
+    """Where length and head are, as a delay."""
+    within = min(max(slot.length[_AT], state.shortest_m), state.longest_m)
+    return float((within / state.speed_of_sound + slot.head[ear, _AT]) * state.sample_rate)
+
+
+@compiled
+def _read_still(state: DirectPathState, line: FloatArray, delay: float, back: int, out: FloatArray) -> None:
+    """What was heard from `back` samples before this block on, had the delay always been this."""
     first, row, share = state.first[:1], state.row[:1], state.share[:1]
-    loops.locate(float(state.position[0]), state.ring, delay, 0.0, 0.0, 0.0, first, row, share)
+    loops.locate(float(state.position[0] - back), state.ring, delay, 0.0, 0.0, 0.0, first, row, share)
     loops.interpolate_reversed(state.sinc[row[0]], share[0], state.still_taps)
     begin = first[0] - BEFORE
     begin = begin if begin >= 0 else begin + state.ring

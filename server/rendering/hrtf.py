@@ -101,10 +101,14 @@ def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats
     return np.asarray(cut)
 
 
-@dataclass(frozen=True, eq=False)
+def filter_taps(sample_rate: int) -> int:
+    """How long the filters of a direct path are."""
+    return -(-round(_FILTER_S * sample_rate) // _TAPS_MULTIPLE) * _TAPS_MULTIPLE
+
+
+@dataclass(frozen=True)
 class HeadFilters:
-    """What a head does to a sound in a form that can be interpolated: minimum phase and delay, per direction. Two are
-    the same only if they are one object.
+    """What a head does to a sound in a form that can be interpolated: minimum phase and delay, per direction.
 
     `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear) after the wave passes the head's centre,
     which is when a source ahead begins to be heard. Between directions, logarithms of magnitude and delays are
@@ -121,7 +125,7 @@ class HeadFilters:
     def from_hrtf(cls, hrtf: Hrtf, taps: int | None = None) -> "HeadFilters":
         """`taps` are 4 ms unless given; a multiple of 8 is fastest."""
         if taps is None:
-            taps = -(-round(_FILTER_S * hrtf.sample_rate) // _TAPS_MULTIPLE) * _TAPS_MULTIPLE
+            taps = filter_taps(hrtf.sample_rate)
         responses = hrtf.impulse_responses
         n_fft = 8 * 2 ** int(np.ceil(np.log2(max(responses.shape[-1], taps))))
         magnitude = np.abs(np.fft.rfft(responses, n_fft))

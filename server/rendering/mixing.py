@@ -1,8 +1,10 @@
-"""One block of many renderers in one call: gains, direct paths and convolution, without the interpreter's lock.
+"""One block of many mixers in one call: gains, direct paths and convolution, without the interpreter's lock.
 
-A `Mixer` holds the arrays of one renderer. Slots are rows: what an emitter plays lies in `dry` (slot, block), is scaled
-by its gain for the direct path, and by its send besides for the convolver. Both reach what is wanted by the end of a
-block, along a raised cosine.
+A `Mixer` holds the arrays of one listener's sound in so many channels. Slots are rows: what an emitter plays lies in
+`dry` (slot, block), is scaled by its gain for the direct path, and by its send besides for the convolver. Both reach
+what is wanted by the end of a block, along a raised cosine.
+
+What nothing is sent to is not there: a mixer without a convolver has none and pays for none.
 """
 
 from collections.abc import Sequence
@@ -17,29 +19,65 @@ from server.rendering.sources import ClipPlayer, Source
 
 if HAS_NUMBA:
     from server.rendering.by_reference import Reference
-    from server.rendering.mixing_kernel import mix_mixers, record_of
+    from server.rendering.mixing_kernel import enter_convolver, mix_mixers, record_of
 
 
 class Mixer:
     """`gain` and `send` are (2, slot): in effect, and wanted. A slot that does not play adds nothing new."""
 
-    def __init__(self, convolver: Convolver, direct: DirectPath | None) -> None:
-        slots, size = convolver.sources, convolver.block_size
-        self.convolver = convolver
+    def __init__(self, *, channels: int, slots: int, block_size: int, direct: DirectPath | None) -> None:
+        self.channels = channels
+        self.slots = slots
         self.direct = direct
-        self.dry = np.zeros((slots, size), np.float32)
+        self.convolver: Convolver | None = None
+        self.free_slots = list(range(slots))
+        self.dry = np.zeros((slots, block_size), np.float32)
         self.gain = np.zeros((2, slots), np.float32)
         self.send = np.zeros((2, slots), np.float32)
         self.plays = np.zeros(slots, np.int64)
         self.clip, self.clip_samples, self.clip_at, self.clip_loops = (np.zeros(slots, np.int64) for _ in range(4))
         self._sources: dict[int, Source] = {}
         self._clips: dict[int, FloatArray] = {}
-        self.output = np.zeros((convolver.channels, size), np.float32)
-        self.fade_in = raised_cosine(size)
+        self._followed: dict[int, FloatArray] = {}
+        self.output = np.zeros((channels, block_size), np.float32)
+        self.fade_in = raised_cosine(block_size)
         if HAS_NUMBA:
             self.direct_state = Reference(direct.state) if direct is not None else None
             self.record = record_of(self)
             self.address = int(self.record.ctypes.data)
+
+    def connect(self, convolver: Convolver | None) -> None:
+        """Send to a convolver of as many sources and channels from the next block on, or to none."""
+        self.convolver = convolver
+        if HAS_NUMBA:
+            enter_convolver(self.record, None if convolver is None else convolver.compiled)
+
+    def take_slot(self) -> int | None:
+        """A slot that nothing is left of; None where there is none."""
+        if not self.free_slots:
+            return None
+        slot = min(self.free_slots)
+        self.free_slots.remove(slot)
+        return slot
+
+    def release(self, slot: int) -> None:
+        """Forget what a slot played and all that was sent on from it."""
+        self.stop(slot)
+        if self.convolver is not None:
+            self.convolver.clear(slot)
+        if self.direct is not None:
+            self.direct.clear(slot)
+        self.free_slots.append(slot)
+
+    def is_quiet(self, slot: int) -> bool:
+        """Whether a slot has rung out."""
+        return (self.convolver is None or self.convolver.is_quiet(slot)) and (
+            self.direct is None or self.direct.is_quiet(slot)
+        )
+
+    def has_no_response(self, slot: int) -> bool:
+        """Whether nothing is sent on from a slot, and all that was has rung out."""
+        return self.convolver is None or (not self.send[:, slot].any() and self.convolver.is_quiet(slot))
 
     def play(self, slot: int, source: Source) -> None:
         """Have a slot play what a source makes, from the next block on. Compiled code reads clips by itself."""
@@ -51,28 +89,55 @@ class Mixer:
         else:
             self._sources[slot] = source
 
+    def take_over(self, slot: int, other: "Mixer", from_slot: int) -> None:
+        """Play what another mixer's slot plays, from the same sample on. That slot has one more block to play of it,
+        to fade out with."""
+        self.plays[slot] = 1
+        if from_slot in other._clips:
+            for mine, theirs in zip(self._clip_fields, other._clip_fields, strict=True):
+                mine[slot] = theirs[from_slot]
+            self._clips[slot] = other._clips[from_slot]
+        else:
+            self._sources[slot] = other._sources[from_slot]
+            self._followed[slot] = other.dry[from_slot]
+
+    @property
+    def _clip_fields(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], ...]:
+        return self.clip, self.clip_samples, self.clip_at, self.clip_loops
+
     def stop(self, slot: int) -> None:
         """Have a slot fall silent."""
         self.plays[slot] = 0
         self.clip[slot] = 0
         self._clips.pop(slot, None)
         self._sources.pop(slot, None)
+        self._followed.pop(slot, None)
 
     def fill(self) -> None:
         """Have those sources play that Python has to ask."""
         for slot, source in self._sources.items():
-            source.process(self.dry[slot])
+            if slot not in self._followed:
+                source.process(self.dry[slot])
+
+    def follow(self) -> None:
+        """After all are filled: a source that another mixer asked for this block has played it already."""
+        for slot, played in self._followed.items():
+            np.copyto(self.dry[slot], played)
+        self._followed.clear()
 
 
 def mix_all(mixers: Sequence[Mixer]) -> None:
     """The next block of each, in its `output`."""
     for mixer in mixers:
         mixer.fill()
+    for mixer in mixers:
+        mixer.follow()
     if HAS_NUMBA:
         like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
         mix_mixers(np.array([mixer.address for mixer in mixers], np.int64), like)
         for mixer in mixers:
-            mixer.convolver.release()
+            if mixer.convolver is not None:
+                mixer.convolver.release()
         return
     for mixer in mixers:
         _mix(mixer)
@@ -82,10 +147,13 @@ def _mix(mixer: Mixer) -> None:
     plays = mixer.plays.astype(bool)
     mixer.dry[~plays] = 0
     mixer.dry *= _ramp(mixer.gain, mixer.fade_in)
-    sent = mixer.dry * _ramp(mixer.send, mixer.fade_in)
-    for ramp in (mixer.gain, mixer.send):
-        ramp[0, plays] = ramp[1, plays]
-    mixer.convolver.process(sent, mixer.output)
+    mixer.gain[0, plays] = mixer.gain[1, plays]
+    if mixer.convolver is not None:
+        sent = mixer.dry * _ramp(mixer.send, mixer.fade_in)
+        mixer.send[0] = mixer.send[1]
+        mixer.convolver.process(sent, mixer.output)
+    else:
+        mixer.output.fill(0)
     if mixer.direct is not None:
         mixer.direct.process(mixer.dry, mixer.output)
 

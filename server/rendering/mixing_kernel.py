@@ -11,6 +11,7 @@ from server.compiled import compiled
 from server.rendering.by_reference import Reference, reference_at
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
+from server.rendering.flush_to_zero import flush_to_zero, restore
 
 MIXER = np.dtype(
     [
@@ -27,10 +28,10 @@ MIXER = np.dtype(
             "dry",  # (slot, block_size) float32
             "gain",  # (2, slot) float32
             "send",  # (2, slot) float32
-            "sent",  # (slot, block_size) float32, the convolver's input
+            "sent",  # (slot, block_size) float32, the convolver's input; 0 for none
             "fade_in",  # (block_size,) float32
             "output",  # (channel, block_size) float32
-            "convolver",
+            "convolver",  # 0 for none
             "convolver_output",
             "direct",  # address of a reference to a DirectPathState, 0 for none
         )
@@ -42,17 +43,23 @@ MIXER = np.dtype(
 def mix_mixers(addresses: npt.NDArray[np.int64], like: Reference | None) -> None:
     """One block of every renderer, each a MIXER record at its address. `like` refers to any direct path's state, or is
     None where none of them has one."""
+    mode = flush_to_zero()
     for number in range(addresses.size):
         mixer = carray(pointer(addresses[number]), (1,), MIXER)[0]
         _play(mixer)
         _scale(mixer)
-        process_convolver(mixer.convolver)
-        for n in range(0, mixer.channels * mixer.block_size, 8):
-            store(mixer.output, n, load(mixer.convolver_output, n))
+        if mixer.convolver != 0:
+            process_convolver(mixer.convolver)
+            for n in range(0, mixer.channels * mixer.block_size, 8):
+                store(mixer.output, n, load(mixer.convolver_output, n))
+        else:
+            for n in range(0, mixer.channels * mixer.block_size, 8):
+                store(mixer.output, n, broadcast(np.float32(0)))
         if like is not None and mixer.direct != 0:
             blocks = carray(pointer(mixer.dry), (mixer.slots, mixer.block_size), np.float32)
             output = carray(pointer(mixer.output), (mixer.channels, mixer.block_size), np.float32)
             render_direct_paths(reference_at(mixer.direct, like), blocks, output)
+    restore(mode)
 
 
 @compiled
@@ -94,16 +101,18 @@ def _scale(mixer) -> None:
         if plays[slot] == 0:
             for n in range(0, size, 8):
                 store(mixer.dry, row + n, broadcast(np.float32(0)))
-                store(mixer.sent, row + n, broadcast(np.float32(0)))
+        else:
+            start, change = broadcast(gain[0, slot]), broadcast(gain[1, slot] - gain[0, slot])
+            for n in range(0, size, 8):
+                scaled = multiply_add(change, load(mixer.fade_in, n), start)
+                store(mixer.dry, row + n, multiply(load(mixer.dry, row + n), scaled))
+            gain[0, slot] = gain[1, slot]
+        if mixer.sent == 0:
             continue
-        start, change = broadcast(gain[0, slot]), broadcast(gain[1, slot] - gain[0, slot])
-        send_start, send_change = broadcast(send[0, slot]), broadcast(send[1, slot] - send[0, slot])
+        start, change = broadcast(send[0, slot]), broadcast(send[1, slot] - send[0, slot])
         for n in range(0, size, 8):
-            rise = load(mixer.fade_in, n)
-            scaled = multiply(load(mixer.dry, row + n), multiply_add(change, rise, start))
-            store(mixer.dry, row + n, scaled)
-            store(mixer.sent, row + n, multiply(scaled, multiply_add(send_change, rise, send_start)))
-        gain[0, slot] = gain[1, slot]
+            scaled = multiply_add(change, load(mixer.fade_in, n), start)
+            store(mixer.sent, row + n, multiply(load(mixer.dry, row + n), scaled))
         send[0, slot] = send[1, slot]
 
 
@@ -114,8 +123,12 @@ def record_of(mixer: Any) -> npt.NDArray[np.void]:
     record["channels"] = mixer.output.shape[0]
     for name in ("plays", "clip", "clip_samples", "clip_at", "clip_loops", "dry", "gain", "send", "fade_in", "output"):
         record[name] = getattr(mixer, name).ctypes.data
-    engine = mixer.convolver.compiled
-    record["convolver"] = engine.address
     record["direct"] = 0 if mixer.direct_state is None else mixer.direct_state.address
-    record["sent"], record["convolver_output"] = engine.input.ctypes.data, engine.output.ctypes.data
     return record
+
+
+def enter_convolver(record: npt.NDArray[np.void], engine: Any) -> None:
+    """Have a MIXER record send to a `server.rendering.compiled_convolver.CompiledConvolver`, or to none."""
+    record["convolver"] = 0 if engine is None else engine.address
+    record["sent"] = 0 if engine is None else engine.input.ctypes.data
+    record["convolver_output"] = 0 if engine is None else engine.output.ctypes.data

@@ -10,24 +10,28 @@ Whatever changes does so without a click: an IR by a crossfade, a path by Dopple
 removed emitter by a ramp of its input to zero, after which its reverberation rings out. An added emitter begins at the
 first sample of its source.
 
+What nobody asked for is not there. The convolver comes with the first IR and goes when the last has rung out; without a
+head, paths and IRs have one channel. Heard with a head and without one, an emitter fades from one to the other at the
+input: what it played before rings out the way it was heard.
+
 `render_all` renders many listeners in one call without the interpreter's lock.
 """
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import Quaternion
 from server.errors import NafirError
 from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
 from server.rendering.direct_path import DirectPath, PathTarget
-from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.hrtf import HeadFilters
+from server.rendering.limiter import Limiter
+from server.rendering.mixer_set import MixerSet
 from server.rendering.mixing import Mixer, mix_all
-from server.rendering.sources import ClipPlayer, Source
-from server.rendering.still_paths import StillPaths
+from server.rendering.sources import Source
 
 
 class UnknownEmitterError(NafirError):
@@ -44,22 +48,27 @@ class RendererFullError(NafirError):
 
 @dataclass
 class _Emitter:
+    mixer: Mixer
     slot: int
     source: Source
+    awaits_ir: bool
     token: int | None = None
     next_token: int | None = None
+    send: float = 1.0
     has_ir: bool = False
+    """Whether it has one that is to be heard; one that is not may still ring out."""
     has_path: bool = False
     has_played: bool = False
 
 
 class Renderer:
-    """One listener, at most `max_emitters` emitters, both ears (0 is the left one).
+    """One listener, at most `max_emitters` emitters, `outputs` channels: two ears (0 is the left one), or one.
 
     `filters` are the head that direct paths are heard through, at `sample_rate`; without them there are only IRs, which
-    then carry the direct sound too. `air_db_per_m` (7,) is what air absorbs per octave band.
+    then carry the direct sound too. `air_db_per_m` (7,) is what air absorbs per octave band. With a `ceiling` no sample
+    of the output is beyond it (`server.rendering.limiter`). `has_head` says whether to begin with a head.
 
-    One thread at a time may use it, except `prepare`, which any thread may call.
+    One thread at a time may use it, except `prepare` and `prepare_hearing`, which one other thread may call meanwhile.
     """
 
     def __init__(
@@ -74,38 +83,48 @@ class Renderer:
         max_emitters: int = 16,
         shared_tail: bool = False,
         switches_tail: bool = False,
+        ceiling: float | None = None,
+        outputs: int = 2,
+        has_head: bool = True,
     ) -> None:
         self.block_size = block_size
         self.ir_samples = ir_samples
         self.max_emitters = max_emitters
+        self.outputs = outputs
         # As many slots again for removed emitters, which hold theirs until their reverberation has rung out.
         slots = 2 * max_emitters
-        self._convolver = Convolver(
-            sources=slots,
-            channels=2,
-            block_size=block_size,
-            ir_samples=ir_samples,
-            shared_tail=shared_tail,
-            switches_tail=switches_tail,
-        )
-        self._direct = None
-        if filters is not None:
-            self._direct = DirectPath(
+
+        def direct_of(channels: int) -> DirectPath | None:
+            if filters is None:
+                return None
+            return DirectPath(
                 slots=slots,
                 block_size=block_size,
                 sample_rate=sample_rate,
-                filters=filters,
+                filters=filters if channels == 2 else None,
                 speed_of_sound=speed_of_sound,
                 air_db_per_m=air_db_per_m,
             )
-        self._orientation: Quaternion | None = None
-        self._mixer = Mixer(self._convolver, self._direct)
+
+        def convolver_of(channels: int) -> Convolver:
+            return Convolver(
+                sources=slots,
+                channels=channels,
+                block_size=block_size,
+                ir_samples=ir_samples,
+                shared_tail=shared_tail,
+                switches_tail=switches_tail,
+            )
+
+        self._mixers = MixerSet(slots=slots, block_size=block_size, new_direct=direct_of, new_convolver=convolver_of)
+        self._mixer = self._mixers.of(2 if has_head else 1)
+        """What new emitters are heard through."""
+        self._limiter = None
+        if ceiling is not None:
+            self._limiter = Limiter(channels=outputs, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
         self._emitters: dict[str, _Emitter] = {}
         self._changed: list[_Emitter] = []  # since the last block
         self._has_changed = False  # before the last block
-        self._leaving: list[_Emitter] = []  # ramp down in the next block
-        self._ringing: list[int] = []  # slots of those gone since
-        self._free_slots = list(range(slots))
         self._blocks_rendered = 0
 
     @property
@@ -116,7 +135,28 @@ class Renderer:
     @property
     def exchanged(self) -> bool:
         """Whether an IR was exchanged in the block last rendered."""
-        return self._has_changed and bool(self._convolver.exchanged)
+        convolvers = (mixer.convolver for mixer in self._mixers)
+        return self._has_changed and any(convolver is not None and convolver.exchanged for convolver in convolvers)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether the block last rendered would have been too loud, and was turned down."""
+        return self._limiter is not None and self._limiter.acted
+
+    @property
+    def samples_silenced(self) -> int:
+        """Rendered so far that were not finite, which none should be; they were made silence."""
+        return 0 if self._limiter is None else self._limiter.samples_silenced
+
+    @property
+    def convolvers(self) -> int:
+        """How many there are: one where IRs are heard, for a while two where a head was put on or taken off."""
+        return sum(mixer.convolver is not None for mixer in self._mixers)
+
+    @property
+    def has_head(self) -> bool:
+        """Whether new emitters are heard through a head."""
+        return self._mixer.channels == 2
 
     def applied(self, emitter_id: str) -> int | None:
         """Token of the IR in effect, in its head, at the end of the block last rendered; None before the first."""
@@ -125,33 +165,48 @@ class Renderer:
     def prepare(
         self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None = None, same_from: int = 0
     ) -> PartitionedIr:
-        """Make an IR (2, 1..ir_samples) ready for `set_ir`: most of its cost, on any thread; less of it where the IR
-        is, from sample `same_from` on, that of which `like` was made.
+        """Make an IR (1 or 2, 1..ir_samples) ready for `set_ir`: most of its cost, on any thread; less of it where the
+        IR is, from sample `same_from` on, that of which `like` was made. One channel is for ears without a head.
 
         Raises ValueError for another shape or a sample that is not finite.
         """
-        return self._convolver.prepare(ir, like=like, same_from=same_from)
+        return self._mixers.prepare(ir, like=like, same_from=same_from)
 
     @property
     def preparation(self) -> Hashable:
-        """Renderers of which this is equal prepare IRs alike, and may share them."""
-        return self._convolver.preparation
+        """Renderers of which this is equal prepare IRs of two channels alike, and may share them."""
+        return self._mixers.preparer(2).preparation
 
-    def add_emitter(self, emitter_id: str, source: Source, *, gain: float = 1.0) -> None:
+    def prepare_hearing(self, channels: int) -> None:
+        """Make ready for `hear_with`, on any thread."""
+        self._mixers.prepare_hearing(channels)
+
+    def hear_with(self, channels: int) -> None:
+        """Have emitters without IRs, and those to come, be heard by two ears of a head, or by one of none. Those that
+        have an IR follow with the first one of so many channels."""
+        self._mixer = self._mixers.of(channels)
+        for emitter in self._emitters.values():
+            if not emitter.has_ir and emitter.mixer is not self._mixer:
+                self._hand_over(emitter, self._mixer)
+
+    def can_hear_with(self, channels: int) -> bool:
+        """Whether there is room for every emitter to be heard so: what was heard that way before has rung out."""
+        return channels == self._mixer.channels or self._mixers.is_free(channels)
+
+    def add_emitter(self, emitter_id: str, source: Source, *, gain: float = 1.0, awaits_ir: bool = True) -> None:
         """Add an emitter that plays `source`, scaled by `gain` (linear amplitude).
 
-        It is silent, its source waiting, until it has an IR and, where direct paths are heard, a path. Raises
-        DuplicateEmitterError and RendererFullError.
+        It is silent, its source waiting, until it has an IR, if it `awaits_ir`, and, where direct paths are heard, a
+        path. Raises DuplicateEmitterError and RendererFullError.
         """
         if emitter_id in self._emitters:
             raise DuplicateEmitterError(f"emitter {emitter_id!r} is present already")
         if len(self._emitters) >= self.max_emitters:
             raise RendererFullError(f"at most {self.max_emitters} emitters")
-        if not self._free_slots:
+        slot = self._mixer.take_slot()
+        if slot is None:
             raise RendererFullError("too many emitters removed just now still ring out")
-        slot = min(self._free_slots)
-        self._free_slots.remove(slot)
-        self._emitters[emitter_id] = _Emitter(slot, source)
+        self._emitters[emitter_id] = _Emitter(self._mixer, slot, source, awaits_ir)
         self._mixer.gain[:, slot] = gain
         self._mixer.send[:, slot] = 1.0
 
@@ -163,23 +218,22 @@ class Renderer:
         emitter = self._emitter(emitter_id)
         del self._emitters[emitter_id]
         self._changed = [other for other in self._changed if other is not emitter]
-        if emitter.has_played:
-            self._mixer.gain[1, emitter.slot] = 0.0
-            self._leaving.append(emitter)
-        else:
-            self._release(emitter.slot)
+        self._mixers.leave(emitter.mixer, emitter.slot, has_played=emitter.has_played)
 
     def set_gain(self, emitter_id: str, gain: float) -> None:
         """Reach a linear gain by the end of the next block. Raises UnknownEmitterError."""
-        self._reach(self._mixer.gain, emitter_id, gain)
+        emitter = self._emitter(emitter_id)
+        self._reach(emitter.mixer.gain, emitter, gain)
 
     def set_reverberation_gain(self, emitter_id: str, gain: float) -> None:
         """Reach a linear gain of what is convolved, beside that of the emitter, by the end of the next block: an
         emitter that beams sends a room less than it sends ahead. Raises UnknownEmitterError."""
-        self._reach(self._mixer.send, emitter_id, gain)
-
-    def _reach(self, gains: FloatArray, emitter_id: str, gain: float) -> None:
         emitter = self._emitter(emitter_id)
+        emitter.send = gain
+        if emitter.has_ir or not emitter.has_played:
+            self._reach(emitter.mixer.send, emitter, gain)
+
+    def _reach(self, gains: FloatArray, emitter: _Emitter, gain: float) -> None:
         gains[1, emitter.slot] = gain
         if not emitter.has_played:
             gains[0, emitter.slot] = gain
@@ -187,17 +241,33 @@ class Renderer:
     def set_ir(self, emitter_id: str, ir: npt.NDArray[np.floating] | PartitionedIr, token: int | None = None) -> None:
         """Hand in an IR for the next block, which starts the emitter or, if it sounds already, crossfades to that IR.
 
-        Of several handed in before it, the newest counts. Raises UnknownEmitterError, and ValueError as `prepare`.
+        Of several handed in before it, the newest counts. One with other channels than the emitter is heard by has it
+        heard by those. Raises UnknownEmitterError, and ValueError as `prepare`.
         """
         emitter = self._emitter(emitter_id)
-        self._convolver.set_ir(emitter.slot, ir)
+        prepared = ir if isinstance(ir, PartitionedIr) else self.prepare(ir)
+        mixer = self._mixers.of(prepared.channels)
+        if emitter.mixer is not mixer:
+            self._hand_over(emitter, mixer)
+        self._mixers.convolver_of(mixer).set_ir(emitter.slot, prepared)
+        if not emitter.has_ir:
+            emitter.has_ir = True
+            self._mixers.resume(mixer, emitter.slot, emitter.send, has_played=emitter.has_played)
         emitter.next_token = token
-        emitter.has_ir = True
+        self._changed.append(emitter)
+
+    def drop_ir(self, emitter_id: str) -> None:
+        """Send an emitter to its IR no more, which rings out; it goes on without. Raises UnknownEmitterError."""
+        emitter = self._emitter(emitter_id)
+        emitter.awaits_ir = False
+        if emitter.has_ir:
+            emitter.has_ir = False
+            self._mixers.hush(emitter.mixer, emitter.slot)
         self._changed.append(emitter)
 
     def share_tail(self, is_shared: bool) -> None:
         """Have all emitters share one late tail, or none; only of a renderer that switches tails."""
-        self._convolver.share_tail(is_shared)
+        self._mixers.share_tail(is_shared)
 
     def set_path(self, emitter_id: str, target: PathTarget) -> None:
         """Have the direct sound come along a path from the next block on. Raises UnknownEmitterError."""
@@ -219,60 +289,84 @@ class Renderer:
             if not emitter.has_path:
                 emitter.has_path = True
                 self._changed.append(emitter)
-        if self._direct is not None:
-            self._direct.set_targets([emitter.slot for emitter in emitters], lengths_m, arrivals, band_gains_db)
+        for mixer in self._mixers:
+            if mixer.direct is None:
+                continue
+            rows = [number for number, emitter in enumerate(emitters) if emitter.mixer is mixer]
+            slots = [emitters[row].slot for row in rows]
+            if len(rows) == len(emitters):
+                mixer.direct.set_targets(slots, lengths_m, arrivals, band_gains_db)
+            elif rows:
+                mixer.direct.set_targets(slots, lengths_m[rows], arrivals[rows], band_gains_db[rows])
+
+    def hear_direct(self, emitter_id: str, *, is_heard: bool = True, distance: bool = True, air: bool = True) -> None:
+        """Whether an emitter's direct sound is heard by itself, and loses anything with distance and to the air; fades
+        over the next block. Raises UnknownEmitterError."""
+        emitter = self._emitter(emitter_id)
+        if emitter.mixer.direct is not None:
+            emitter.mixer.direct.set_muted(emitter.slot, not is_heard)
+            emitter.mixer.direct.set_losses(emitter.slot, distance=distance, air=air)
 
     def set_orientation(self, orientation: Quaternion) -> None:
         """Turn the listener's head: the direct sound follows with the next block."""
-        if self._direct is not None and orientation != self._orientation:
-            self._orientation = orientation
-            self._direct.set_orientation(orientation)
+        self._mixers.set_orientation(orientation)
 
     def process(self) -> FloatArray:
-        """Render the next block (2, block_size), in an array of its own."""
+        """Render the next block (channel, block_size), in an array of its own."""
         return render_all([self])[0]
 
     def reset(self) -> None:
         """Drop every emitter and its reverberation, and start the clock again."""
-        for emitter in (*self._emitters.values(), *self._leaving):
-            self._release(emitter.slot)
-        self._convolver.reset()
-        if self._direct is not None:
-            self._direct.reset()
-            self._orientation = None
+        self._mixers.clear()
+        if self._limiter is not None:
+            self._limiter.reset()
+        self._mixer = self._mixers.of(self._mixer.channels)
         self._emitters.clear()
         self._changed.clear()
-        self._leaving.clear()
-        self._ringing.clear()
-        self._free_slots = list(range(self._convolver.sources))
         self._blocks_rendered = 0
 
-    def _begin(self) -> Mixer:
+    def _begin(self) -> list[Mixer]:
         """Put into effect what was handed in since the last block."""
         for emitter in self._changed:
-            if emitter.has_ir and (emitter.has_path or self._direct is None):
+            has_response = emitter.has_ir or not emitter.awaits_ir
+            if has_response and (emitter.has_path or emitter.mixer.direct is None):
                 emitter.token = emitter.next_token
                 if not emitter.has_played:
                     emitter.has_played = True
-                    self._mixer.play(emitter.slot, emitter.source)
+                    emitter.mixer.play(emitter.slot, emitter.source)
         self._has_changed = bool(self._changed)
         self._changed.clear()
-        return self._mixer
+        return list(self._mixers)
 
     def _finish(self) -> FloatArray:
-        """Let go of what has rung out; the block just mixed."""
+        """The block just mixed; lets go of what has rung out."""
         self._blocks_rendered += 1
-        for emitter in self._leaving:
-            self._mixer.stop(emitter.slot)
-            self._ringing.append(emitter.slot)
-        self._leaving.clear()
-        for slot in [slot for slot in self._ringing if self._is_quiet(slot)]:
-            self._ringing.remove(slot)
-            self._release(slot)
-        return self._mixer.output.copy()
+        block = self._mixers.output(self.outputs)
+        if self._limiter is not None:
+            self._limiter.process(block)
+        if self._mixers.rests:
+            return block
+        emitters = self._emitters.values()
+        sending = {emitter.mixer for emitter in emitters if emitter.has_ir or emitter.awaits_ir}
+        self._mixers.let_go({self._mixer, *(emitter.mixer for emitter in emitters)}, sending)
+        return block
 
-    def _is_quiet(self, slot: int) -> bool:
-        return self._convolver.is_quiet(slot) and (self._direct is None or self._direct.is_quiet(slot))
+    def _hand_over(self, emitter: _Emitter, mixer: Mixer) -> None:
+        """Have an emitter be heard through another mixer: over the next block its sound fades out of the one and into
+        the other."""
+        slot = mixer.take_slot()
+        if slot is None:
+            raise RendererFullError("too many emitters heard this way before still ring out")
+        before, from_slot = emitter.mixer, emitter.slot
+        mixer.gain[:, slot] = before.gain[1, from_slot]
+        mixer.send[:, slot] = emitter.send
+        if mixer.direct is not None and before.direct is not None:
+            mixer.direct.copy_slot(slot, before.direct, from_slot)
+        if emitter.has_played:
+            mixer.gain[0, slot] = 0.0
+            mixer.take_over(slot, before, from_slot)
+        self._mixers.leave(before, from_slot, has_played=emitter.has_played)
+        emitter.mixer, emitter.slot = mixer, slot
 
     def _emitter(self, emitter_id: str) -> _Emitter:
         try:
@@ -280,40 +374,8 @@ class Renderer:
         except KeyError:
             raise UnknownEmitterError(f"no emitter {emitter_id!r}") from None
 
-    def _release(self, slot: int) -> None:
-        self._convolver.clear(slot)
-        if self._direct is not None:
-            self._direct.clear(slot)
-        self._mixer.stop(slot)
-        self._free_slots.append(slot)
-
 
 def render_all(renderers: Sequence[Renderer]) -> list[FloatArray]:
     """Render the next block (2, block_size) of each, all in one call without the interpreter's lock."""
-    mix_all([renderer._begin() for renderer in renderers])
+    mix_all([mixer for renderer in renderers for mixer in renderer._begin()])
     return [renderer._finish() for renderer in renderers]
-
-
-def warm_up(block_sizes: Iterable[int]) -> None:
-    """Compile what renders, or load it from disk, and compute the constants of each block size: a renderer, or a
-    response of paths at rest, made after this costs nothing more."""
-    sample_rate = 24_000
-    filters = HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
-    flat, ahead = np.zeros(len(OCTAVE_BANDS_HZ)), np.array([(1.0, 0.0, 0.0)])
-    still = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=flat)
-    still.add(np.ones(1), ahead, flat[None], (0.0, 0.0, 0.0, 1.0), np.zeros((2, 1), np.float32))
-    for block_size in block_sizes:
-        longest = 64 * block_size  # every stage
-        renderer = Renderer(
-            block_size=block_size,
-            ir_samples=longest,
-            sample_rate=sample_rate,
-            filters=filters,
-            speed_of_sound=343.0,
-            air_db_per_m=flat,
-            max_emitters=1,
-        )
-        renderer.add_emitter("", ClipPlayer(np.ones(1, np.float32), loop=True))
-        renderer.set_ir("", np.ones((2, longest), np.float32))
-        renderer.set_path("", PathTarget(1.0, (1.0, 0.0, 0.0), flat))
-        renderer.process()

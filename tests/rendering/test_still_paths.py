@@ -83,7 +83,7 @@ def test_no_paths_add_nothing(kemar_at):
 def test_after_a_warm_up_nothing_is_left_to_compile():
     pytest.importorskip("numba")
     warmed = """
-from server.rendering.renderer import warm_up
+from server.rendering.warm_up import warm_up
 from server.rendering.still_paths_kernel import add_still_paths
 warm_up([])
 print(len(add_still_paths.signatures))

@@ -1,0 +1,184 @@
+"""The last thing that happens to what a listener hears: nothing, unless it would be too loud for a converter.
+
+A peak limiter, both ears by the same gain so that nothing moves. Peaks are true peaks: of the signal between samples
+too, which a converter makes of them, estimated at four times the rate as in ITU-R BS.1770-4, Annex 2. A block below the
+ceiling passes to the last bit.
+
+It adds no latency, so it looks ahead no further than the end of its block. The gain falls in time for a peak within
+the block, at most by 1 over `_ATTACK` samples; where a block begins with a peak it falls as fast as it must, and until
+it is low enough samples are held at the ceiling. What lies between the last samples of a block and the first of the
+next is known only with the latter; a gain that recovers slowly keeps that in check while sound goes on.
+
+A sample that is not finite becomes silence here. Nothing before lets one arise; were it otherwise, a loudspeaker would
+be the wrong place to find out.
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from server.compiled import HAS_NUMBA, compiled
+
+FloatArray = npt.NDArray[np.float32]
+
+CEILING = 10 ** (-1 / 20)
+"""-1 dB of full scale, true peak: the maximum permitted by EBU R 128, with room for what codecs and resamplers add."""
+
+_TAPS = 16
+_KAISER_BETA = 6.0
+_PHASES = 3  # between two samples
+_STEP = 16
+"""Samples between the points that the gain is a straight line between."""
+_ATTACK = 64
+_RELEASE_S = 0.2
+_AT_REST = 1e-5
+"""Of a gain that is so near to 1, the rest is let go: a ten-thousandth of a decibel."""
+
+
+def _interpolators() -> FloatArray:
+    """(phase, tap): the signal a quarter, a half and three quarters of a sample after tap `_TAPS` / 2 - 1."""
+    offset = np.arange(_TAPS) - (_TAPS // 2 - 1) - np.arange(1, _PHASES + 1)[:, None] / (_PHASES + 1)
+    window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1 - (offset / (_TAPS / 2)) ** 2)))
+    rows = np.sinc(offset) * window
+    return np.asarray(rows / rows.sum(axis=-1, keepdims=True), np.float32)
+
+
+class Limiter:
+    """Of blocks (channels, block_size), whose size is a multiple of 16."""
+
+    def __init__(self, *, channels: int, block_size: int, sample_rate: int, ceiling: float = CEILING) -> None:
+        if block_size % _STEP or not 0 < ceiling < math.inf:
+            raise ValueError(f"blocks are multiples of {_STEP} samples, and a ceiling is above 0 and finite")
+        self._ceiling = np.float32(ceiling)
+        self._table = _interpolators()
+        # Up to here no signal reaches the ceiling between samples, whatever its phases.
+        self._safe = np.float32(ceiling / np.abs(self._table).sum(axis=-1).max())
+        self._keep = np.float32(math.exp(-_STEP / (_RELEASE_S * sample_rate)))
+        self._signal = np.zeros((channels, _TAPS - 1 + block_size), np.float32)
+        self._peak = np.zeros(block_size, np.float32)
+        self._gain = np.ones(block_size // _STEP + 1, np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was heard before."""
+        self._signal.fill(0)
+        self._gain.fill(1)
+        self.acted = False
+        """Whether the block last processed was changed."""
+        self.samples_silenced = 0
+        """Since the beginning, because they were not finite."""
+
+    def process(self, block: FloatArray) -> None:
+        """Limit a block in place."""
+        is_limited, silenced = _limit(
+            block, self._signal, self._table, self._ceiling, self._safe, self._keep, self._peak, self._gain
+        )
+        self.acted = bool(is_limited or silenced)
+        self.samples_silenced += silenced
+
+
+@compiled
+def _limit(
+    block: FloatArray,
+    signal: FloatArray,  # (channel, the last of the block before, and room for a block)
+    table: FloatArray,
+    ceiling: np.float32,
+    safe: np.float32,
+    keep: np.float32,
+    peak: FloatArray,
+    gain: FloatArray,  # at the ends of steps
+) -> tuple[bool, int]:
+    channels, size = block.shape
+    before = signal.shape[1] - size
+    silenced = 0
+    is_loud = not _is_within(signal[:, :before], safe)
+    if not _is_within(block, safe):
+        is_loud = True
+        silenced = _silence_what_is_not_finite(block)
+    gain[0] = gain[-1]
+    if is_loud:
+        signal[:, before:] = block
+        _find_peaks(signal, table, peak)
+        is_loud = bool(np.max(peak) > ceiling)
+    for channel in range(channels):
+        signal[channel, :before] = block[channel, size - before :]
+    if not is_loud and gain[0] == 1:
+        return False, silenced
+    if not is_loud:
+        peak[:] = 0
+    _follow(peak, ceiling, keep, gain)
+    rise = np.arange(1, _STEP + 1).astype(np.float32) / np.float32(_STEP)
+    for step in range(gain.size - 1):
+        at = step * _STEP
+        line = gain[step] + (gain[step + 1] - gain[step]) * rise
+        if step == 0:
+            line = np.minimum(line, ceiling / np.maximum(peak[:_STEP], ceiling))
+        for channel in range(channels):
+            block[channel, at : at + _STEP] *= line
+    return True, silenced
+
+
+if HAS_NUMBA:
+
+    @compiled
+    def _is_within(samples: FloatArray, limit: np.float32) -> bool:
+        """Whether none is beyond; what is no number is."""
+        beyond = 0
+        for channel in range(samples.shape[0]):
+            for value in samples[channel]:
+                beyond += not abs(value) <= limit
+        return beyond == 0
+
+else:
+
+    def _is_within(samples: FloatArray, limit: np.float32) -> bool:
+        return bool(np.all(np.abs(samples) <= limit))
+
+
+@compiled
+def _silence_what_is_not_finite(block: FloatArray) -> int:
+    silenced = 0
+    for channel in range(block.shape[0]):
+        is_finite = np.isfinite(block[channel])
+        silenced += is_finite.size - np.sum(is_finite)
+        block[channel] = np.where(is_finite, block[channel], np.float32(0))
+    return silenced
+
+
+@compiled
+def _find_peaks(signal: FloatArray, table: FloatArray, peak: FloatArray) -> None:
+    """(sample,) the loudest of both channels at a sample, and between it and its neighbours as far as those are
+    known."""
+    size = peak.size
+    ahead = _TAPS // 2
+    between = np.zeros(size, np.float32)  # after the samples from `ahead` before the block on
+    peak[:] = 0
+    for channel in range(signal.shape[0]):
+        np.maximum(peak, np.abs(signal[channel, signal.shape[1] - size :]), peak)
+        for phase in range(table.shape[0]):
+            read = np.zeros(size, np.float32)
+            for tap in range(_TAPS):
+                read += table[phase, tap] * signal[channel, tap : tap + size]
+            np.maximum(between, np.abs(read), between)
+    known = size - ahead
+    peak[:known] = np.maximum(peak[:known], between[ahead:])
+    peak[: known + 1] = np.maximum(peak[: known + 1], between[ahead - 1 :])
+
+
+@compiled
+def _follow(peak: FloatArray, ceiling: np.float32, keep: np.float32, gain: FloatArray) -> None:
+    """The gain at the ends of steps, from what it is at the beginning."""
+    steps = gain.size - 1
+    for step in range(steps):
+        allowed = ceiling / max(ceiling, np.max(peak[step * _STEP : (step + 1) * _STEP]))
+        gain[step + 1] = allowed
+        if step > 0:
+            gain[step] = min(gain[step], allowed)
+    fall = np.float32(_STEP / _ATTACK)
+    for step in range(steps - 1, 0, -1):
+        gain[step] = min(gain[step], gain[step + 1] + fall)
+    for step in range(steps):
+        gain[step + 1] = min(gain[step + 1], 1 - (1 - gain[step]) * keep)
+    if gain[steps] > 1 - _AT_REST:
+        gain[steps] = 1

@@ -1,0 +1,177 @@
+"""The mixers of one renderer: one for two ears of a head, one for one ear without, each made when it is wanted and let
+go when what was in it has rung out. The same goes for their convolvers.
+
+Making one takes milliseconds: `prepare` and `prepare_hearing` do it on another thread than the one that renders, which
+finds it made. Everything else is for the thread that renders.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.geometry import Quaternion
+from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
+from server.rendering.direct_path import DirectPath
+from server.rendering.mixing import Mixer
+
+Slot = tuple[Mixer, int]
+
+
+class MixerSet:
+    """`new_direct` and `new_convolver` make those of so many channels."""
+
+    def __init__(
+        self,
+        *,
+        slots: int,
+        block_size: int,
+        new_direct: Callable[[int], DirectPath | None],
+        new_convolver: Callable[[int], Convolver],
+    ) -> None:
+        self._slots = slots
+        self._block_size = block_size
+        self._new_direct = new_direct
+        self._new_convolver = new_convolver
+        self._spare_mixers: dict[int, Mixer] = {}
+        self._spare_convolvers: dict[int, Convolver] = {}
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop all that sounds, and all mixers with it."""
+        self._mixers: dict[int, Mixer] = {}
+        self._shares_tail = False
+        self._orientation: Quaternion | None = None
+        self._leaving: list[Slot] = []  # ramp down in the next block
+        self._ringing: list[Slot] = []  # those gone since
+        self._hushed: list[Slot] = []  # whose IRs ring out
+
+    def __iter__(self) -> Iterator[Mixer]:
+        return iter(self._mixers.values())
+
+    def prepare(self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None, same_from: int) -> PartitionedIr:
+        """An IR (1 or 2, samples) for the mixer of as many channels, as `Convolver.prepare` does.
+
+        Raises ValueError for another shape or a sample that is not finite.
+        """
+        channels = 1 if ir.ndim == 2 and ir.shape[0] == 1 else 2
+        self.prepare_hearing(channels)
+        return self.preparer(channels).prepare(ir, like=like, same_from=same_from)
+
+    def preparer(self, channels: int) -> Convolver:
+        """That of the mixer of so many channels, or the one that it is to have."""
+        known = self._mixers.get(channels)
+        convolver = None if known is None else known.convolver
+        if convolver is None:
+            convolver = self._spare_convolvers.get(channels)
+        if convolver is None:
+            convolver = self._spare_convolvers[channels] = self._new_convolver(channels)
+        return convolver
+
+    def prepare_hearing(self, channels: int) -> None:
+        """A mixer of so many channels, where there is none."""
+        if channels not in self._mixers and channels not in self._spare_mixers:
+            self._spare_mixers[channels] = self._new_mixer(channels)
+
+    def of(self, channels: int) -> Mixer:
+        """The mixer of so many channels."""
+        if channels not in self._mixers:
+            mixer = self._spare_mixers.pop(channels, None) or self._new_mixer(channels)
+            if mixer.direct is not None and self._orientation is not None:
+                mixer.direct.set_orientation(self._orientation)
+            self._mixers[channels] = mixer
+        return self._mixers[channels]
+
+    def is_free(self, channels: int) -> bool:
+        """Whether nothing sounds in the mixer of so many channels."""
+        mixer = self._mixers.get(channels)
+        return mixer is None or len(mixer.free_slots) == self._slots
+
+    def convolver_of(self, mixer: Mixer) -> Convolver:
+        """That of one of the mixers, which has one from now on."""
+        if mixer.convolver is None:
+            convolver = self._spare_convolvers.pop(mixer.channels, None) or self._new_convolver(mixer.channels)
+            convolver.share_tail(self._shares_tail)
+            mixer.connect(convolver)
+            return convolver
+        return mixer.convolver
+
+    def share_tail(self, is_shared: bool) -> None:
+        self._shares_tail = is_shared
+        for mixer in self:
+            if mixer.convolver is not None:
+                mixer.convolver.share_tail(is_shared)
+
+    def set_orientation(self, orientation: Quaternion) -> None:
+        if orientation != self._orientation:
+            self._orientation = orientation
+            for mixer in self:
+                if mixer.direct is not None:
+                    mixer.direct.set_orientation(orientation)
+
+    @property
+    def rests(self) -> bool:
+        """Whether there is nothing to let go of but what an emitter is removed or handed over for."""
+        return len(self._mixers) == 1 and not (self._leaving or self._ringing or self._hushed)
+
+    def leave(self, mixer: Mixer, slot: int, *, has_played: bool) -> None:
+        """Ramp down what a slot plays over the next block, and let it ring out."""
+        self._unhush(mixer, slot)
+        if has_played:
+            mixer.gain[1, slot] = 0.0
+            self._leaving.append((mixer, slot))
+        else:
+            mixer.release(slot)
+
+    def hush(self, mixer: Mixer, slot: int) -> None:
+        """Send a slot to its IR no more, and let that ring out."""
+        mixer.send[1, slot] = 0.0
+        self._hushed.append((mixer, slot))
+
+    def resume(self, mixer: Mixer, slot: int, send: float, *, has_played: bool) -> None:
+        """Send a slot to the IR it has from now on, over the next block from silence if it plays already."""
+        mixer.send[1, slot] = send
+        if not self._unhush(mixer, slot) and has_played:
+            mixer.send[0, slot] = 0.0
+
+    def _unhush(self, mixer: Mixer, slot: int) -> bool:
+        if is_hushed := (mixer, slot) in self._hushed:
+            self._hushed.remove((mixer, slot))
+        return is_hushed
+
+    def output(self, channels: int) -> FloatArray:
+        """The sum of the block just mixed (channels, block_size). One ear without a head is as good as either of two; a
+        head's two make one by their mean."""
+        if len(self._mixers) == 1:
+            (mixer,) = self._mixers.values()
+            if mixer.channels == channels:
+                return mixer.output.copy()
+        block = np.zeros((channels, self._block_size), np.float32)
+        for mixer in self:
+            block += mixer.output if mixer.channels <= channels else mixer.output.mean(axis=0)
+        return block
+
+    def let_go(self, heard: set[Mixer], sending: set[Mixer]) -> None:
+        """After a block, of slots and IRs that have rung out; of mixers but those `heard`, through which there are
+        emitters or are to be; and of convolvers but those of mixers that are `sending` to IRs or are about to."""
+        for mixer, slot in self._leaving:
+            mixer.stop(slot)
+            self._ringing.append((mixer, slot))
+        self._leaving.clear()
+        for mixer, slot in [each for each in self._ringing if each[0].is_quiet(each[1])]:
+            self._ringing.remove((mixer, slot))
+            mixer.release(slot)
+        for mixer, slot in [each for each in self._hushed if each[0].has_no_response(each[1])]:
+            self._hushed.remove((mixer, slot))
+            if mixer.convolver is not None:
+                mixer.convolver.clear(slot)
+        ringing = {mixer for mixer, _ in (*self._ringing, *self._hushed)}
+        for channels, mixer in tuple(self._mixers.items()):
+            if mixer not in ringing and mixer not in heard:
+                del self._mixers[channels]
+            elif mixer.convolver is not None and mixer not in ringing and mixer not in sending:
+                mixer.connect(None)
+
+    def _new_mixer(self, channels: int) -> Mixer:
+        direct = self._new_direct(channels)
+        return Mixer(channels=channels, slots=self._slots, block_size=self._block_size, direct=direct)
