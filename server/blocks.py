@@ -40,7 +40,7 @@ class AudioBlock:
     `sequence` counts blocks sent and has no gaps; `sample_clock` is the clock of the first frame and jumps over blocks
     the server skipped. `pose_id` is the newest pose that the direct paths of this block are on their way to;
     `reverberation_pose_id` is the newest pose whose impulse responses are all in effect, and with `is_exchange` this
-    block fades to them.
+    block fades to them. With `is_limited` it would have been too loud, and was turned down.
     """
 
     sequence: int
@@ -50,18 +50,20 @@ class AudioBlock:
     samples: FloatArray
     is_exchange: bool = False
     is_late: bool = False
+    is_limited: bool = False
 
     KIND: ClassVar[int] = 1
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBHIQIII")
     HEADER_BYTES: ClassVar[int] = _LAYOUT.size
     _EXCHANGE: ClassVar[int] = 1
     _LATE: ClassVar[int] = 2
+    _LIMITED: ClassVar[int] = 4
 
     def serialize(self, encoding: Encoding) -> bytes:
-        """28-byte header (kind u8 = 1, flags u8: 1 exchange, 2 late, channels u16, sequence u32, sample clock u64, pose
-        id u32, reverberation pose id u32, frames u32), then the frames with their channels interleaved."""
+        """28-byte header (kind u8 = 1, flags u8: 1 exchange, 2 late, 4 limited, channels u16, sequence u32, sample
+        clock u64, pose id u32, reverberation pose id u32, frames u32), then the frames, channels interleaved."""
         channels, frames = self.samples.shape
-        flags = self._EXCHANGE * self.is_exchange | self._LATE * self.is_late
+        flags = self._EXCHANGE * self.is_exchange | self._LATE * self.is_late | self._LIMITED * self.is_limited
         poses = self.pose_id, self.reverberation_pose_id
         header = self._LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
         return header + _encode(self.samples.T, encoding)
@@ -85,6 +87,7 @@ class AudioBlock:
             np.ascontiguousarray(interleaved.reshape(frames, channels).T),
             bool(flags & cls._EXCHANGE),
             bool(flags & cls._LATE),
+            bool(flags & cls._LIMITED),
         )
 
 

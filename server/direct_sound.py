@@ -16,6 +16,7 @@ from server.binaural import Binauralization
 from server.early_reflections import EarlyReflections
 from server.radiation import Placed, departure_gain_db
 from server.rendering.hrtf import HeadFilters
+from server.rendering.limiter import CEILING
 from server.rendering.renderer import Renderer
 from server.scene.bundle import Bundle
 
@@ -77,6 +78,7 @@ class DirectSound:
             max_emitters=max_emitters,
             shared_tail=shared_tail,
             switches_tail=switches_tail,
+            ceiling=CEILING,
         )
 
     def aim(self, renderer: Renderer, listener: Pose, emitters: Mapping[str, Placed]) -> None:

@@ -370,6 +370,7 @@ class Status(_Message):
     what was rendered with it, and how late the audio thread woke. `pose_ms` and `reverberation_ms` run from the arrival
     of a pose to the first block, ready to be sent, whose direct sound and whose reverberation has it. `level` is the
     quality level heard, and `ir_rate_hz` how many impulse responses an emitter gets per second at most.
+    `blocks_limited` would have been too loud, and were turned down.
     """
 
     type: Literal["status"] = "status"
@@ -385,6 +386,7 @@ class Status(_Message):
     pose_ms: Durations
     reverberation_ms: Durations
     ir_exchanges: int
+    blocks_limited: int
     level: str
     ir_rate_hz: float | None
     live: tuple[LiveStatus, ...] = ()

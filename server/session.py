@@ -92,6 +92,7 @@ class Session:
         self.window = SendWindow(window)
         self.ir_exchanges = 0
         self.blocks_dropped = 0
+        self.blocks_limited = 0
         self._bundle = levels.bundle
         self._levels = levels
         self._rung = self._heard = rung
@@ -252,6 +253,7 @@ class Session:
         """
         is_exchange = self.renderer.exchanged
         self.ir_exchanges += is_exchange
+        self.blocks_limited += self.renderer.is_limited
         if self._applied_pose_id != self._accepted_pose_id and self._has_applied_all():
             self._applied_pose_id = self._accepted_pose_id
         if not self.window.is_open:
@@ -264,6 +266,7 @@ class Session:
             reverberation_pose_id=self._applied_pose_id,
             samples=samples,
             is_exchange=is_exchange,
+            is_limited=self.renderer.is_limited,
         )
 
     def render_block(self) -> AudioBlock | None:

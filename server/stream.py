@@ -264,6 +264,7 @@ class Stream:
             pose_ms=Durations.of(self.pose_times.durations),
             reverberation_ms=Durations.of(self.reverberation_times.durations),
             ir_exchanges=session.ir_exchanges,
+            blocks_limited=session.blocks_limited,
             level=session.rung.level,
             ir_rate_hz=session.rung.ir_rate_hz,
             live=session.live_statuses(),

@@ -37,6 +37,8 @@ class StreamTotals:
         self.counts["late"] += stream.blocks_late
         self.counts["dropped"] += session.blocks_dropped
         self.counts["exchanges"] += session.ir_exchanges
+        self.counts["limited"] += session.blocks_limited
+        self.counts["silenced"] += session.renderer.samples_silenced
         self.durations["render"].merge(stream.render_times)
         self.durations["lateness"].merge(stream.latenesses)
         self.durations["ir"].merge(stream.ir_times)
@@ -118,6 +120,14 @@ class ServerCollector(Collector):
             "nafir_blocks_dropped",
             "Blocks not sent: too many unacknowledged.",
             value=totals.counts["dropped"],
+        )
+        yield CounterMetricFamily(
+            "nafir_blocks_limited", "Blocks that were too loud and turned down.", value=totals.counts["limited"]
+        )
+        yield CounterMetricFamily(
+            "nafir_samples_not_finite",
+            "Samples rendered as no number and sent as silence: a fault wherever it is not 0.",
+            value=totals.counts["silenced"],
         )
         yield _histogram("nafir_block_render_seconds", "What a block costs.", totals.durations["render"])
         yield _histogram(

@@ -90,6 +90,7 @@ SERVER_MESSAGES = [
         level="standard",
         ir_rate_hz=12.0,
         ir_exchanges=4,
+        blocks_limited=0,
         live=(LiveStatus(id="talker", samples_queued=1, samples_dropped=2, samples_gated=3, underruns=4),),
     ),
     Pong(id=3),
