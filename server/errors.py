@@ -29,3 +29,10 @@ class RequestError(NafirError):
         self.code = code
         self.field = field
         self.status = status
+
+
+class FieldError(RequestError):
+    """A field that has no response for poses that may be asked for: its graph, and nobody's request, is at fault."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("no_response", message, status=500)

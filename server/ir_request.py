@@ -48,7 +48,7 @@ class IrResponse:
 
 
 def compute_irs(levels: Levels, request: IrRequest, preparer: Preparer) -> IrResponse:
-    """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
+    """Answer a request: milliseconds of work, for a worker thread. Raises FieldError where the field has no finite response."""
     field, early = levels[request.level], request.early_reflections
     if field.level.reuse is not None:
         irs_at_nodes = prepared_irs(field, levels.kept, early, preparer, request.listener, request.emitters)

@@ -15,7 +15,7 @@ from server.acoustics.geometry import Vector3
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.sound_path import SoundPathFinder
 from server.bounded_cache import BoundedCache
-from server.errors import BundleError
+from server.errors import BundleError, FieldError
 from server.field.decoder import Decoder, add_from, apply_gate, onset_gate, resized
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.lattice import Node, Snapped
@@ -107,8 +107,12 @@ class AcousticField:
 
         The same for the same poses, always; but with `remember` a level whose phase is warm starts from the phase that
         it last found near a pose, and leaves its own to the next: for streams, which go from each pose to one near it.
+
+        Raises ValueError for poses that are not finite, and FieldError where a response would not be.
         """
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        if not all(np.isfinite(part).all() for part in (listeners, emitters, yaws)):
+            raise ValueError("listeners, emitters and yaws must be finite")
         if self.nodes is not None:
             return self.nodes.responses(listeners, emitters, yaws)
         return self._compute_all(listeners, emitters, yaws, self._cache if remember else None)
@@ -156,21 +160,38 @@ class AcousticField:
     def _compute(self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None) -> Float32:
         parameters = self.graph.parameters
         aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
+        if not np.isfinite(aligned).all():
+            raise FieldError(f"scene {self.bundle.id}: there is no way from emitter to listener; one is inside a wall")
         if self._decoder is None:
-            return self._placed(self.graph.impulse_responses(listeners, emitters, yaws), aligned)
+            coded = self.graph.impulse_responses(listeners, emitters, yaws)
+            return self._finite(self._placed(coded, aligned), listeners, emitters)
         predicted = self.graph.spectrograms(listeners, emitters, yaws)
         if self.channels == 1:
             # Decoders have two ears; a lone microphone is the left one.
             predicted = predicted.twice()
         if cache is None:
-            return self._decoder.decode(predicted, aligned)[:, : self.channels]
+            responses = self._decoder.decode(predicted, aligned)
+            return self._finite(responses, listeners, emitters)[:, : self.channels]
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
         # One after the other: each may start from the one before it.
         for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
             rows = slice(row, row + 1)
             responses[rows] = self._decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
+            self._finite(responses[rows], listeners[rows], emitters[rows])  # before others start from it
             cache.keep(*pose, responses[row])
         return responses[:, : self.channels]
+
+    def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
+        """The responses. Raises FieldError naming the first that is not finite."""
+        # A sum is quicker to look at than its parts; what overflows it is no response either.
+        wrong = ~np.isfinite(np.sum(np.square(responses), axis=(1, 2)))
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            raise FieldError(
+                f"scene {self.bundle.id}: field {self.graph.name} has no finite response for listener "
+                f"{listeners[at].tolist()} and emitter {emitters[at].tolist()}; nafir check finds out where else"
+            )
+        return responses
 
     def _placed(self, coded: Float32, aligned: Floats) -> Float32:
         """Responses whose first sample belongs at `aligned`: later by whole samples and a fraction of one."""

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.decibels import amplitude_to_db
-from server.errors import NafirError
-from server.field.field import AcousticField
+from server.errors import FieldError, NafirError
+from server.field.field import AcousticField, Silence
 from server.field.graph import FieldGraph
 from server.field.levels import Levels
 from server.health import laws, search
@@ -126,7 +126,7 @@ def check(
     started_s = time.perf_counter()
     effort = effort or Effort()
     levels = Levels.load(bundle)
-    graphs = {level.level.field: level.graph for level in levels.values()}
+    graphs = {level.level.field: level.graph for level in levels.values() if not isinstance(level, Silence)}
     findings: list[Finding] = []
     evidence: dict[str, FieldEvidence] = {}
     worst: dict[str, Poses] = {}
@@ -138,6 +138,8 @@ def check(
             findings += of_field
         else:
             level = levels[name.removeprefix(_LEVEL)]
+            if level.level.field not in worst:  # in a scene without a field
+                worst[level.level.field] = scattered(bundle, effort.responses, seed)
             findings += _check_level(level, worst[level.level.field])
     return Health(bundle.id, tuple(findings), evidence, time.perf_counter() - started_s)
 
@@ -213,20 +215,32 @@ def _change(before: Energies, after: Energies) -> Floats:
 def _check_level(field: AcousticField, poses: Poses) -> list[Finding]:
     """Of responses at some poses: how loud, how exact, and whether they are the same again, and alone."""
     name = field.level.name
+    answers = np.array([_answers(field, poses[row : row + 1]) for row in range(len(poses))])
+    findings = [_worst(FINITE, name, poses, np.where(answers, 0.0, 1.0))]
+    if not answers.any():
+        return findings
+    poses = poses[answers]
     together, again = _responses(field, poses), _responses(field, poses)
     alone = np.concatenate([_responses(field, poses[row : row + 1]) for row in range(len(poses))])
     head = kemar(field.sample_rate)
     whole = _responses(WholeField(field, head), poses)
     exact = _responses(DoubleWholeField(field, head), poses)
     from_zero_phase = field.level.phase.kind == "griffin_lim" and not field.level.phase.warm
-    faults = np.count_nonzero(~np.isfinite(whole), axis=(1, 2)).astype(np.float64)
     return [
-        _worst(FINITE, name, poses, faults),
+        *findings,
         _worst(PEAK, name, poses, np.abs(together).max(axis=(1, 2)).astype(np.float64)),
         _worst(REPEATABLE, name, poses, np.abs(together - again).max(axis=(1, 2)).astype(np.float64)),
         _worst(BATCH, name, poses, _difference_db(together, alone)),
         _worst(ITERATED if from_zero_phase else DOUBLE, name, poses, _difference_db(whole, exact)),
     ]
+
+
+def _answers(field: AcousticField, pose: Poses) -> bool:
+    try:
+        _responses(field, pose)
+    except FieldError:
+        return False
+    return True
 
 
 def _responses(field: AcousticField | WholeField, poses: Poses) -> Responses:

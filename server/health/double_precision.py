@@ -18,7 +18,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
 from server.early_reflections import EarlyReflections
 from server.field.decoder import Decoder
-from server.field.field import AcousticField
+from server.field.field import AcousticField, Silence
 from server.field.graph import Spectrograms
 from server.rendering.direct_path import head_axes
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
@@ -181,7 +181,7 @@ class DoubleWholeField(WholeField):
     """What `WholeField` answers with, in float64."""
 
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
-        super().__init__(_DoubleField(field), filters)
+        super().__init__(field if isinstance(field, Silence) else _DoubleField(field), filters)
         paths = DoubleStillPaths(
             filters, speed_of_sound=field.bundle.manifest.speed_of_sound, air_db_per_m=self._air_db_per_m
         )

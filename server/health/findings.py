@@ -23,7 +23,7 @@ class Law:
 
 
 FINITE = Law(
-    "finite", "values that are not finite", "", 0.0, "one of them would stay in a convolver for a response's length"
+    "finite", "answers that are not finite", "", 0.0, "one of them would stay in a convolver for a response's length"
 )
 ENERGY = Law(
     "energy",

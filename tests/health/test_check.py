@@ -31,7 +31,7 @@ def test_a_field_that_is_not_finite_in_one_corner_is_found(beyond):
     bundle = beyond(7.6, np.nan)
     health = check(bundle, SMALL)
     assert "finite" in {finding.law.name for finding in health.broken}
-    with pytest.raises(HealthError, match="values that are not finite"):
+    with pytest.raises(HealthError, match="answers that are not finite"):
         health.require()
 
 
