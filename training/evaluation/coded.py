@@ -1,8 +1,9 @@
 """Training responses coded by audio codecs, as Luo et al. (NeurIPS 2022) stored them for their baselines: AAC at 24 and
 Opus at 12 kbit/s a stream.
 
-Responses are coded one behind the other with silence in between, some hundred to a file, which costs less than a file
-each. What a codec adds in front is taken away by its container's own note of it. Files are kept beside the dataset.
+Responses are coded one behind the other with silence in between, a hundred or so to a file, which costs less than a
+file each. What a codec adds in front is taken away by its container's own note of it. Files are made when somebody asks
+for what is in them, and kept beside the dataset.
 
 Axes: one pair's responses are `(yaw, channel, sample)`.
 """
@@ -25,9 +26,10 @@ import soundfile
 from training.evaluation.held_out import EvaluationError, HeldOut
 
 _GAP_S = 0.1  # longer than the windows of either codec
-_PER_FILE = 480  # responses
+_PER_FILE = 96  # responses
+_SAMPLED_FILES = 8
 _PEAK = 0.5  # a coded wave may overshoot what went in
-_OPEN_FILES = 6
+_OPEN_FILES = 30
 
 Track = Callable[[range, str], Iterable[int]]
 
@@ -79,7 +81,8 @@ class CodedResponses:
     """The training pairs of a dataset after coding; indexed by pair. Thread-safe."""
 
     def __init__(self, codec: AudioCodec, held_out: HeldOut, *, track: Track = lambda files, _: files) -> None:
-        """Codes whatever is not coded yet. Raises EvaluationError if the codec's program is missing or fails."""
+        """Codes a few files, spread evenly over all. Raises EvaluationError if the codec's program is missing or fails,
+        as asking for a pair does."""
         self._codec = codec
         self._held_out = held_out
         self._slot = held_out.samples + round(_GAP_S * held_out.sample_rate)
@@ -93,15 +96,19 @@ class CodedResponses:
         self._lock = threading.Lock()
         self._folder = held_out.folder / "coded" / f"{codec.name}-{self._digest()[:16]}"
         self._folder.mkdir(parents=True, exist_ok=True)
-        missing = [number for number in range(len(self._pairs)) if not self._path(number).exists()]
-        for index in track(range(len(missing)), f"coding ({codec.name})"):
-            self._encode(missing[index])
+        sampled = np.linspace(0, len(self._pairs) - 1, min(_SAMPLED_FILES, len(self._pairs))).round().astype(int)
+        self._sampled = [int(number) for number in sampled]
+        for index in track(range(len(self._sampled)), f"coding ({codec.name})"):
+            self._make(self._sampled[index])
 
     @property
     def storage_bytes(self) -> int:
-        """All coded files, and a gain of four bytes for every response."""
-        gains = int(self._held_out.pairs.training.sum()) * len(self._held_out.yaws) * 4
-        return gains + sum(self._path(number).stat().st_size for number in range(len(self._pairs)))
+        """What the few files coded first take, as much for every response there is, and its gain of four bytes."""
+        sampled = sum(self._path(number).stat().st_size for number in self._sampled)
+        of_sampled, of_all = (
+            sum(len(self._pairs[number]) for number in numbers) for numbers in (self._sampled, range(len(self._pairs)))
+        )
+        return round(sampled * of_all / of_sampled) + of_all * len(self._held_out.yaws) * 4
 
     def decoding_ms(self) -> float:
         """Per response, measured now on a whole file of them."""
@@ -116,6 +123,7 @@ class CodedResponses:
             with self._lock:
                 decoded = self._decoded.get(file)
             if decoded is None:
+                self._make(file)
                 decoded = self._read(file)
             with self._lock:
                 self._decoded[file] = decoded
@@ -136,8 +144,11 @@ class CodedResponses:
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:04d}{self._codec.suffix}"
 
-    def _encode(self, number: int) -> None:
-        """Under their own names only when whole, the gains first: an interrupted run is gone on with."""
+    def _make(self, number: int) -> None:
+        """If it is not there. Under their own names only when whole, the gains first: an interrupted run is gone on
+        with."""
+        if self._path(number).exists():
+            return
         held_out = self._held_out
         responses = np.concatenate([held_out.pairs.response(int(pair)) for pair in self._pairs[number]])
         peaks = np.maximum(np.abs(responses).max(axis=(1, 2)), 1e-9)

@@ -102,6 +102,7 @@ class Evaluation:
         for result in self.results:
             columns[result.name] = {
                 "kind": result.kind,
+                "method": result.method,
                 "storage_bytes": result.storage_bytes,
                 "ms": result.ms,
                 "metrics": {

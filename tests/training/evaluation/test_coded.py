@@ -89,3 +89,21 @@ def test_a_missing_or_failing_program_is_named(make_held_out) -> None:
     failing = AudioCodec("failing", ".x", (shutil.which("python3") or "python3", "-c", "raise SystemExit('no')"), ())
     with pytest.raises(EvaluationError, match="failed: no"):
         CodedResponses(failing, make_held_out(pulse, yaws=2))
+
+
+@pytest.mark.skipif(not AAC.is_installed, reason="needs ffmpeg")
+def test_files_are_coded_when_they_are_asked_for(make_held_out, monkeypatch) -> None:
+    monkeypatch.setattr("training.evaluation.coded._PER_FILE", 2)
+    monkeypatch.setattr("training.evaluation.coded._SAMPLED_FILES", 2)
+    held_out = make_held_out(pulse, yaws=2, pairs=8, held_out=(3,))
+
+    def sizes() -> list[int]:
+        return [file.stat().st_size for file in (held_out.folder / "coded").rglob("*.m4a")]
+
+    coded = CodedResponses(AAC, held_out)
+    assert len(sizes()) == 2
+    estimate = coded.storage_bytes
+    for pair in (0, 1, 2, 4, 5, 6, 7):
+        coded[pair]
+    assert len(sizes()) == 7
+    assert estimate == coded.storage_bytes == pytest.approx(sum(sizes()) + 7 * 2 * 4, rel=0.25)
