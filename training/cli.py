@@ -127,7 +127,13 @@ def ablate(
 
 @app.command()
 def export(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders from train, all of one scene; the default first.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Run folders from train, all of one scene, the default first; for the nearest response, shaped, the "
+            "folder of imported responses itself."
+        ),
+    ],
     output: Folder,
     data: Annotated[Path | None, typer.Option(help="Dataset folder, if it has moved since training.")] = None,
     precision: Annotated[str, typer.Option(help="float32 or int8, or both, comma by comma.")] = "float32",
@@ -139,7 +145,7 @@ def export(
     """Write finished runs as the fields of a scene bundle, after checking every graph against torch."""
     from training.export import PRECISIONS
     from training.export import export as export_bundle
-    from training.responses import open_responses
+    from training.responses import FILE, open_responses
     from training.runs import dataset_folder
 
     chosen = [known for name in precision.split(",") for known in PRECISIONS if known == name.strip()]
@@ -150,7 +156,7 @@ def export(
     lower = [int(rank) for rank in ranks.split(",") if ranks]
     for talkative in (None, "torch.onnx"):
         logging.getLogger(talkative).setLevel(logging.ERROR)
-    responses = open_responses(data or dataset_folder(runs[0]))
+    responses = open_responses(data or (runs[0] if (runs[0] / FILE).is_file() else dataset_folder(runs[0])))
     bundle = export_bundle(responses, runs, output, precisions=chosen, ranks=lower, exact_tables=exact_tables)
     size = sum(path.stat().st_size for path in output.iterdir())
     fields = ", ".join(bundle.manifest.fields)

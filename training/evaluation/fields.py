@@ -40,14 +40,18 @@ def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
 
 
 def field_source(field: AcousticField, held_out: HeldOut) -> Source:
-    """Whole responses as the server renders them: of a simulated scene the direct sound is joined to what the field
-    says; a field of measured responses has it in them."""
+    """Whole responses as the server answers with them: the direct sound is joined to what the field says, unless it
+    holds that."""
     codec = field.bundle.manifest.codec.codec
     if codec.sample_rate != held_out.sample_rate:
         raise EvaluationError(
             f"{field.bundle.folder}: is for {codec.sample_rate} Hz, {held_out.name} for {held_out.sample_rate} Hz"
         )
-    whole = WholeField.through_kemar(field) if held_out.simulated is not None else field
+    if field.channels != held_out.channels:
+        raise EvaluationError(
+            f"{field.bundle.folder}: has {field.channels} channels, {held_out.name} has {held_out.channels}"
+        )
+    whole = WholeField.through_kemar(field)
     listeners, emitters = held_out.listeners, held_out.emitters
 
     def source(index: int, turns: npt.NDArray[np.integer]) -> Responses:

@@ -130,7 +130,7 @@ def _of_simulation(dataset: Dataset, file: h5py.File) -> HeldOut:
 
 
 @dataclass(frozen=True)
-class _MeasuredPairs:
+class _MeasuredResponses:
     """rows: (pair, yaw) rows of the dataset."""
 
     dataset: ImportedDataset
@@ -140,9 +140,19 @@ class _MeasuredPairs:
         return self.dataset.read(self.rows[pair])
 
 
-def _of_measurement(dataset: ImportedDataset) -> HeldOut:
-    """Of a measurement no walls are known: every pair counts as in sight. A pair without a response at every
-    orientation is left out and counted."""
+@dataclass(frozen=True)
+class MeasuredPairs:
+    """A measurement by pairs: those with a response at every one of the `yaws` (yaw,), which all others lack
+    (`left_out` of them). delays_s: (pair,) along the straight line, for of a measurement no walls are known."""
+
+    pairs: TrainingPairs
+    delays_s: _Floats
+    yaws: _Floats
+    left_out: int
+
+
+def measured_pairs(dataset: ImportedDataset) -> MeasuredPairs:
+    """Raises EvaluationError where no pair was measured at all orientations."""
     whole_turn = np.round(2 * np.pi, 6)
     yaws, turn = np.unique(np.round(dataset.yaw % (2 * np.pi), 6) % whole_turn, return_inverse=True)
     rows = np.full((int(dataset.pair.max()) + 1, len(yaws)), -1)
@@ -153,22 +163,30 @@ def _of_measurement(dataset: ImportedDataset) -> HeldOut:
         raise EvaluationError(f"{dataset.folder}: no pair was measured at all of the {len(yaws)} orientations")
     emitters, pair_emitter = _points(dataset.emitter[rows[:, 0]])
     listeners, pair_listener = _points(dataset.listener[rows[:, 0]])
-    held_out = dataset.held_out[rows[:, 0]]
+    responses, training = _MeasuredResponses(dataset, rows), ~dataset.held_out[rows[:, 0]]
+    pairs = TrainingPairs(responses, pair_listener, pair_emitter, listeners, emitters, training)
+    return MeasuredPairs(pairs, dataset.onset_s[rows[:, 0]], yaws, int((~complete).sum()))
+
+
+def _of_measurement(dataset: ImportedDataset) -> HeldOut:
+    """Every pair counts as in sight."""
+    measured = measured_pairs(dataset)
+    held_out = np.flatnonzero(~measured.pairs.training)
     return HeldOut(
         folder=dataset.folder,
         name=f"{dataset.folder.name} (measured, {dataset.layout})",
         sample_rate=dataset.sample_rate,
         samples=dataset.samples,
         channels=dataset.channels,
-        pairs=TrainingPairs(_MeasuredPairs(dataset, rows), pair_listener, pair_emitter, listeners, emitters, ~held_out),
-        held_out=np.flatnonzero(held_out),
+        pairs=measured.pairs,
+        held_out=held_out,
         repeats=None,
-        delays_s=dataset.onset_s[rows[:, 0]],
-        yaws=yaws,
-        heard=np.arange(len(yaws)),
-        visible=np.ones(int(held_out.sum()), dtype=bool),
+        delays_s=measured.delays_s,
+        yaws=measured.yaws,
+        heard=np.arange(len(measured.yaws)),
+        visible=np.ones(len(held_out), dtype=bool),
         simulated=None,
-        left_out=int((~complete).sum()),
+        left_out=measured.left_out,
     )
 
 

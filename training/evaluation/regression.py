@@ -19,7 +19,8 @@ from scipy.spatial.distance import cdist
 
 _Floats = npt.NDArray[np.float64]
 
-_SAME_M = 1e-3
+SAME_M = 1e-3
+"""Nearer than this two points are one."""
 _FITTED_ROWS = 250
 _FITTED_COMPONENTS = 30
 _ITERATIONS = 25
@@ -32,27 +33,33 @@ _BOUNDS = np.log(
 
 
 @dataclass(frozen=True)
-class _Ends:
+class Ends:
+    """(row, 3) each."""
+
     emitter: _Floats
     listener: _Floats
 
 
 class PairRegression:
-    """Of the pairs given, to all others."""
+    """Of the pairs given, to all others.
+
+    What it says is `mean` (target,) and covariances with `known` pairs times `weights` (row, target); `spread` is the
+    unit of distances at the emitter's end and the listener's, and `parameters` the logarithms that were found.
+    """
 
     def __init__(self, emitter: _Floats, listener: _Floats, values: _Floats, *, seed: int = 0) -> None:
-        self._known = _Ends(emitter, listener)
-        self._spread = [max(float(np.sqrt(end.var(axis=0).sum())), _SAME_M) for end in (emitter, listener)]
-        self._mean = values.mean(axis=0)
+        self.known = Ends(emitter, listener)
+        self.spread = [max(float(np.sqrt(end.var(axis=0).sum())), SAME_M) for end in (emitter, listener)]
+        self.mean = values.mean(axis=0)
         rows = np.random.default_rng([seed, 12]).permutation(len(values))[:_FITTED_ROWS]
-        self._parameters = self._fitted(_Ends(emitter[rows], listener[rows]), values[rows] - values[rows].mean(axis=0))
-        self._weights = cho_solve(cho_factor(self._of_known(self._known)), values - self._mean)
+        self.parameters = self._fitted(Ends(emitter[rows], listener[rows]), values[rows] - values[rows].mean(axis=0))
+        self.weights = cho_solve(cho_factor(self._of_known(self.known)), values - self.mean)
 
     def __call__(self, emitter: _Floats, listener: _Floats) -> _Floats:
         """(row, target) expected at other pairs."""
-        return np.asarray(self._mean + self._covariance(_Ends(emitter, listener), self._known) @ self._weights)
+        return np.asarray(self.mean + self._covariance(Ends(emitter, listener), self.known) @ self.weights)
 
-    def _fitted(self, ends: _Ends, centred: _Floats) -> _Floats:
+    def _fitted(self, ends: Ends, centred: _Floats) -> _Floats:
         left, singular, _ = np.linalg.svd(centred, full_matrices=False)
         components = (left * singular)[:, :_FITTED_COMPONENTS]
         rows, count = components.shape
@@ -61,7 +68,7 @@ class PairRegression:
 
         def cost(parameters: _Floats) -> float:
             """Negative logarithm of the likelihood, the common scale at its best."""
-            self._parameters = parameters
+            self.parameters = parameters
             try:
                 lower, _ = cho_factor(self._of_known(ends), lower=True)
             except np.linalg.LinAlgError:
@@ -72,17 +79,17 @@ class PairRegression:
         found = minimize(cost, _START, method="L-BFGS-B", bounds=_BOUNDS, options={"maxiter": _ITERATIONS})
         return np.asarray(found.x)
 
-    def _of_known(self, ends: _Ends) -> _Floats:
+    def _of_known(self, ends: Ends) -> _Floats:
         covariance = self._covariance(ends, ends)
-        return covariance + np.exp(self._parameters[-1]) * np.eye(len(covariance))
+        return covariance + np.exp(self.parameters[-1]) * np.eye(len(covariance))
 
-    def _covariance(self, a: _Ends, b: _Ends) -> _Floats:
+    def _covariance(self, a: Ends, b: Ends) -> _Floats:
         both, at_emitter, at_listener, one_listener, one_emitter, along, of_listener, across, _ = np.exp(
-            self._parameters
+            self.parameters
         )
         emitters, listeners = cdist(a.emitter, b.emitter), cdist(a.listener, b.listener)
-        same_emitter, same_listener = emitters < _SAME_M, listeners < _SAME_M
-        emitters, listeners = emitters / self._spread[0], listeners / self._spread[1]
+        same_emitter, same_listener = emitters < SAME_M, listeners < SAME_M
+        emitters, listeners = emitters / self.spread[0], listeners / self.spread[1]
 
         def near(distance: _Floats, length: float) -> _Floats:
             return np.asarray(np.exp(-0.5 * (distance / length) ** 2))

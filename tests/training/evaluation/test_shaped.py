@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
+from tests.training.measured_room import RATE, SAMPLES, Room
 from training.dataset import SPEED_OF_SOUND
 from training.evaluation.baselines import TrainingPairs, nearest
 from training.evaluation.run import evaluate_bundles
@@ -13,9 +14,6 @@ from training.importers.conditioning import Conditioning, conditioned
 from training.importers.meshrir import read
 from training.importers.report import ImportReport
 from training.responses import ImportedDataset
-
-RATE = 16_000
-SAMPLES = 2400
 
 
 def test_bands_add_up_to_the_response():
@@ -52,30 +50,6 @@ def test_a_moved_sound_arrives_that_much_later(later):
 
 def test_an_offset_does_not_ring_when_moved():
     np.testing.assert_allclose(moved(np.full((1, 300), 0.1), np.array([40.4])), 0.1, atol=1e-4)
-
-
-class Room:
-    """Microphones every 5 cm with gains of their own, loudspeakers that beam: smooth in place, and a diffuse tail that
-    nobody can foresee."""
-
-    def __init__(self, *, tail=0.02):
-        rng = np.random.default_rng(4)
-        self.listeners = np.column_stack([np.zeros(20), 0.05 * np.arange(20), np.zeros(20)])
-        self.emitters = np.array([[0.6, 0.1, 0.0], [0.9, 0.5, 0.0], [0.7, 0.9, 0.0]])
-        self.emitter, self.listener = np.divmod(np.arange(60), 20)
-        ends = self.emitters[self.emitter], self.listeners[self.listener]
-        offset = ends[1] - ends[0]
-        distance = np.linalg.norm(offset, axis=-1)
-        self.delays_s = distance / SPEED_OF_SOUND
-        gain = rng.uniform(0.8, 1.25, 20)[self.listener]
-        beam = 0.6 + 0.4 * np.cos(3 * np.arctan2(offset[:, 1], offset[:, 0]))
-        time = np.arange(SAMPLES) / RATE - self.delays_s[:, None]
-        direct = np.sinc(time * RATE) * (beam / distance)[:, None]
-        diffuse = tail * rng.standard_normal((60, SAMPLES)) * np.exp(-6.9 * np.maximum(time, 0) / 0.2) * (time > 0)
-        self.responses = ((direct + diffuse) * gain[:, None]).astype(np.float32)[:, None, None]  # pair, yaw, channel
-        training = np.random.default_rng(5).random(60) > 0.3
-        self.held_out = np.flatnonzero(~training)
-        self.pairs = TrainingPairs(self.responses, self.listener, self.emitter, self.listeners, self.emitters, training)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,85 @@
+"""What a bundle says of its scene: of a simulated one all that its file says, of a measured one what can be known."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from server.scene.geometry import Point
+from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
+from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.responses import ImportedDataset, SimulatedResponses
+
+_MARGIN_M = 0.1
+
+
+@dataclass(frozen=True)
+class Fields:
+    """What a manifest says of the bundle's own files."""
+
+    codec: CodecParameters
+    fields: dict[str, FieldFile]
+    levels: tuple[QualityLevel, ...]
+    files: dict[str, str]
+
+
+def simulated_manifest(responses: SimulatedResponses, fields: Fields) -> Manifest:
+    scene = responses.dataset.scene
+    low, high = np.min(scene.geometry.corners, axis=0), np.max(scene.geometry.corners, axis=0)
+    return Manifest(
+        id=scene.id,
+        name=scene.name,
+        description=scene.description,
+        geometry=scene.geometry,
+        bounds=Bounds(
+            minimum=(float(low[0]), float(low[1]), scene.probes.heights_m[0]),
+            maximum=(float(high[0]), float(high[1]), scene.probes.heights_m[1]),
+        ),
+        speed_of_sound=SPEED_OF_SOUND,
+        air=scene.air,
+        image_order=GEOMETRIC_ORDER,
+        start=scene.start,
+        codec=fields.codec,
+        fields=fields.fields,
+        levels=fields.levels,
+        files=fields.files,
+    )
+
+
+def measured_manifest(responses: ImportedDataset, fields: Fields) -> Manifest:
+    """Named after the source. The bounds are a box around all positions, with a little room: what lies in it but far
+    from where was measured is a guess. A visitor finds the most usual distance, and faces the emitter."""
+    positions = np.concatenate([responses.listener, responses.emitter])
+    name = Path(responses.source).stem
+    offset = responses.emitter - responses.listener
+    distance = np.linalg.norm(offset, axis=-1)
+    usual = int(np.argmin(np.abs(distance - np.median(distance))))
+    counts = (len(np.unique(each, axis=0)) for each in (responses.listener, responses.emitter))
+    listeners, emitters = counts
+    return Manifest(
+        id=re.sub("[^a-z0-9_-]+", "-", name.lower()).strip("-_") or "measured",
+        name=name.replace("_", " ").replace("-", " ").strip().capitalize() or "Measured",
+        description=f"Measured ({responses.layout}): {listeners} places of the listener, {emitters} of the emitter.",
+        bounds=Bounds(
+            minimum=_point(positions.min(axis=0) - _MARGIN_M), maximum=_point(positions.max(axis=0) + _MARGIN_M)
+        ),
+        speed_of_sound=SPEED_OF_SOUND,
+        direct_sound="field",
+        channels=("mono",) if responses.channels == 1 else ("left", "right"),
+        start=Start(
+            listener=_point(responses.listener[usual]),
+            listener_yaw_deg=round(float(np.degrees(np.arctan2(offset[usual, 1], offset[usual, 0]))), 1),
+            emitter=_point(responses.emitter[usual]),
+        ),
+        codec=fields.codec,
+        fields=fields.fields,
+        levels=fields.levels,
+        files=fields.files,
+    )
+
+
+def _point(position: np.ndarray) -> Point:
+    """To the tenth of a millimetre."""
+    x, y, z = (round(float(coordinate), 4) for coordinate in position)
+    return x, y, z
