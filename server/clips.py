@@ -1,7 +1,7 @@
 """Dry recordings that emitters play: the bundled ones and files of the user's.
 
-A clip is decoded once, to mono float32 (n,) at the rate of the scene, and checked there, so that whatever plays it may
-trust it: at least one sample, every one finite.
+A clip is decoded once, to mono at the rate of the scene, and checked there: at least one sample, and a file that holds
+what is no audio is refused as a whole.
 """
 
 import tomllib
@@ -17,7 +17,7 @@ import soundfile
 import soxr
 
 from server.errors import NafirError, RequestError
-from server.rendering.sources import LOUDEST
+from server.rendering.ingest import LOUDEST, DryAudio
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -51,8 +51,8 @@ class Clip:
     credit: str
 
 
-def decode(path: Path, sample_rate: int) -> FloatArray:
-    """Read an audio file (wav, flac, ogg, and whatever else libsndfile reads) as mono (n,) at `sample_rate`, read-only.
+def decode(path: Path, sample_rate: int) -> DryAudio:
+    """Read an audio file (wav, flac, ogg, and whatever else libsndfile reads) as mono at `sample_rate`.
 
     Channels are averaged. Raises DecodeError.
     """
@@ -76,8 +76,7 @@ def decode(path: Path, sample_rate: int) -> FloatArray:
         mono = soxr.resample(mono, file_rate, sample_rate, quality="VHQ")
         if mono.size == 0:
             raise DecodeError(path.name, f"too short to be heard at {sample_rate} Hz")
-    mono.flags.writeable = False
-    return mono
+    return DryAudio(mono)
 
 
 class ClipLibrary:
@@ -94,7 +93,7 @@ class ClipLibrary:
         for name, path in (files or {}).items():
             self._paths[name] = path
             self._labels[name] = {"title": name, "credit": ""}
-        self._decoded: dict[str, FloatArray] = {}
+        self._decoded: dict[str, DryAudio] = {}
         self._lock = Lock()
 
     @property
@@ -102,8 +101,8 @@ class ClipLibrary:
         """In alphabetical order."""
         return tuple(sorted(self._paths))
 
-    def load(self, name: str) -> FloatArray:
-        """Samples (n,) of a clip, read-only. Raises UnknownClipError and DecodeError."""
+    def load(self, name: str) -> DryAudio:
+        """Raises UnknownClipError and DecodeError."""
         path = self._path(name)
         with self._lock:
             if name not in self._decoded:

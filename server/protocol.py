@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from server.acoustics import directivity
 from server.acoustics.directivity import Directivity
-from server.acoustics.geometry import Pose
+from server.acoustics.geometry import Pose, Quaternion
 from server.blocks import DryBlock, Encoding
 from server.durations import DurationHistogram
 from server.errors import RequestError
@@ -31,7 +31,7 @@ BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
 PoseId = Annotated[int, Field(ge=0, lt=2**32)]
 Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Quaternion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+Orientation = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 LevelName = Annotated[str, Field(max_length=256)]
 GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
 
@@ -50,7 +50,7 @@ class _Directed(_Message):
     """A position and where front is: a quaternion, or a yaw where up is up; with neither, front is along +x."""
 
     position: Position
-    orientation: Quaternion | None = None
+    orientation: Orientation | None = None
     yaw: FiniteFloat | None = None
 
     @model_validator(mode="after")
@@ -71,7 +71,7 @@ class _Directed(_Message):
     @property
     def pose(self) -> Pose:
         if self.orientation is not None:
-            return Pose(self.position, self.orientation)
+            return Pose(self.position, Quaternion(*self.orientation))
         return Pose.from_yaw(self.position, self.yaw or 0.0)
 
 

@@ -16,12 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
-from server.acoustics.geometry import Pose, Vector3
+from server.acoustics.geometry import Pose, Quaternion, Vector3
 from server.direct_sound import DirectSound
 from server.errors import NafirError
 from server.field.lattice import Snapped
 from server.node_reflections import add_first_reflections
 from server.radiation import reverberation_gain
+from server.rendering.ingest import DryAudio, require_gain
 from server.rendering.renderer import render_all
 from server.rendering.sources import ClipPlayer
 from server.scene.manifest import QualityLevel
@@ -63,13 +64,19 @@ class ImpulseResponses(Protocol):
 
 @dataclass(frozen=True)
 class RenderedEmitter:
-    """A clip (n,) at the scene's rate, played at a place; `gain` is linear amplitude."""
+    """A clip (n,) at the scene's rate, played at a place; `gain` is linear amplitude.
 
-    clip: FloatArray
+    Raises ValueError for a gain that is not finite or beyond `LOUDEST_GAIN`.
+    """
+
+    clip: DryAudio | FloatArray
     pose: Pose
     directivity: Directivity = OMNIDIRECTIONAL
     gain: float = 1.0
     loop: bool = False
+
+    def __post_init__(self) -> None:
+        require_gain(self.gain)
 
 
 @dataclass(frozen=True)
@@ -184,7 +191,7 @@ def _pose(values: dict[str, float], where: str) -> Pose:
     if "yaw_deg" in values:
         return Pose.from_yaw(position, math.radians(values["yaw_deg"]))
     try:
-        return Pose(position, (values["qx"], values["qy"], values["qz"], values["qw"]))
+        return Pose(position, Quaternion(values["qx"], values["qy"], values["qz"], values["qw"]))
     except ValueError as exc:
         raise PathError(f"{where}, columns 'qx' to 'qw': {exc}") from exc
 

@@ -45,6 +45,7 @@ from server.protocol import (
 )
 from server.radiation import reverberation_gain
 from server.rendering.hrtf import HeadFilters
+from server.rendering.ingest import DryAudio
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
 from server.rendering.sources import ClipPlayer, Source
 from server.scene.bundle import Bundle
@@ -59,7 +60,7 @@ class Session:
     """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
 
     `levels` are the scene's, and `rung` is what to hear of them first.
-    `filters` are the head it hears through. `load_clip` gives mono float32 at the scene's rate, and is quick: it is
+    `filters` are the head it hears through. `load_clip` gives audio at the scene's rate, and is quick: it is
     called on the rendering thread.
     Raises RequestError for a hello that cannot be served.
     """
@@ -69,7 +70,7 @@ class Session:
         hello: Hello,
         levels: Levels,
         filters: HeadFilters,
-        load_clip: Callable[[str], FloatArray],
+        load_clip: Callable[[str], DryAudio],
         *,
         rung: Rung,
         max_emitters: int = 16,

@@ -19,7 +19,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.answers import Answers
 from server.audio_engine import AudioEngine
-from server.blocks import FloatArray
 from server.catalogue import describe_scene
 from server.clips import ClipLibrary, DecodeError
 from server.errors import RequestError
@@ -37,6 +36,7 @@ from server.protocol import (
     Welcome,
     parse_client_message,
 )
+from server.rendering.ingest import DryAudio
 from server.session import Session
 from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
@@ -48,8 +48,8 @@ _GOODBYE_S = 1.0
 """Even closing waits for room in the socket, and a client that does not read makes none."""
 
 
-def load_clip(clips: ClipLibrary, name: str) -> FloatArray:
-    """Samples (n,) of a clip. Raises RequestError unknown_clip, or undecodable_clip with the decoder's reason."""
+def load_clip(clips: ClipLibrary, name: str) -> DryAudio:
+    """Raises RequestError unknown_clip, or undecodable_clip with the decoder's reason."""
     try:
         return clips.load(name)
     except DecodeError as exc:

@@ -22,7 +22,7 @@ def noise(seed, *shape):
 def test_decodes_what_was_written(tmp_path, name, subtype):
     samples = noise(1, 5_000)
     soundfile.write(tmp_path / name, samples, SAMPLE_RATE, subtype=subtype)
-    decoded = decode(tmp_path / name, SAMPLE_RATE)
+    decoded = decode(tmp_path / name, SAMPLE_RATE).samples
     np.testing.assert_allclose(decoded, samples, atol=2**-23)
     assert decoded.dtype == np.float32
     assert not decoded.flags.writeable
@@ -31,7 +31,7 @@ def test_decodes_what_was_written(tmp_path, name, subtype):
 def test_channels_are_averaged(tmp_path):
     samples = noise(2, 1_000, 3)
     soundfile.write(tmp_path / "a.wav", samples, SAMPLE_RATE, subtype="FLOAT")
-    np.testing.assert_allclose(decode(tmp_path / "a.wav", SAMPLE_RATE), samples.mean(axis=1), atol=1e-7)
+    np.testing.assert_allclose(decode(tmp_path / "a.wav", SAMPLE_RATE).samples, samples.mean(axis=1), atol=1e-7)
 
 
 @pytest.mark.parametrize("file_rate", [8_000, 16_000, 44_100, 48_000])
@@ -40,7 +40,7 @@ def test_resampling_keeps_a_tone_where_it_was(tmp_path, file_rate):
         return np.sin(2 * np.pi * 997 * np.arange(rate) / rate + 0.3)
 
     soundfile.write(tmp_path / "a.wav", tone(file_rate), file_rate, subtype="FLOAT")
-    decoded = decode(tmp_path / "a.wav", SAMPLE_RATE)
+    decoded = decode(tmp_path / "a.wav", SAMPLE_RATE).samples
     assert decoded.size == SAMPLE_RATE
     middle = slice(2_000, -2_000)  # the ends of the recording are cut tones, which do not resample to cut tones
     np.testing.assert_allclose(decoded[middle], tone(SAMPLE_RATE)[middle], atol=1e-5)
@@ -51,7 +51,7 @@ def test_the_name_of_a_file_does_not_matter(tmp_path):
     soundfile.write(tmp_path / "a.wav", samples, SAMPLE_RATE, subtype="FLOAT")
     for name in ("a.raw", "a.ogg", "a"):
         renamed = (tmp_path / "a.wav").rename(tmp_path / name)
-        np.testing.assert_allclose(decode(renamed, SAMPLE_RATE), samples, atol=1e-7)
+        np.testing.assert_allclose(decode(renamed, SAMPLE_RATE).samples, samples, atol=1e-7)
         renamed.rename(tmp_path / "a.wav")
 
 
@@ -109,7 +109,7 @@ def test_every_bundled_clip_plays_and_is_fit_for_a_loop():
     library = ClipLibrary(SAMPLE_RATE)
     assert len(library.names) >= 2
     for name in library.names:
-        samples = library.load(name)
+        samples = library.load(name).samples
         level_db = 10 * np.log10(np.mean(samples**2))
         assert 2 < samples.size / SAMPLE_RATE < 60
         assert -32 < level_db < -15
@@ -141,7 +141,7 @@ def test_a_description_says_how_long_it_plays(tmp_path):
 def test_a_users_file_wins_over_a_bundled_clip_of_that_name(tmp_path):
     soundfile.write(tmp_path / "a.wav", noise(6, 100), SAMPLE_RATE, subtype="FLOAT")
     library = ClipLibrary(SAMPLE_RATE, {"trumpet": tmp_path / "a.wav"})
-    np.testing.assert_allclose(library.load("trumpet"), noise(6, 100), atol=1e-7)
+    np.testing.assert_allclose(library.load("trumpet").samples, noise(6, 100), atol=1e-7)
     assert library.describe("trumpet").credit == ""
     assert library.names == ClipLibrary(SAMPLE_RATE).names
 

@@ -5,50 +5,88 @@ whose identity looks along +x with +y to the left. Points are arrays whose last 
 broadcast.
 """
 
-import heapq
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse.csgraph import shortest_path
 
 Points = npt.NDArray[np.float64]
 Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 # Nearer than this, a point is on a wall; two points are one.
 TOUCH_M = 1e-9
 COINCIDENT_M = 1e-9
+
+FARTHEST_M = 1e7
+"""Of a coordinate: a quarter of the way round the Earth. Squares of what is no place at all overflow."""
+_SHORTEST, _LONGEST = 1e-6, 1e12
+"""Of a quaternion as given: shorter ones are rounding errors, longer ones lose their directions when squared."""
+
+
+class _Components(NamedTuple):
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class Quaternion(_Components):
+    """An orientation; one that exists is finite and has unit length, whatever length it was given with.
+
+    Raises ValueError for a component that is not finite and for one too short, or too long, to have a direction.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, x: float, y: float, z: float, w: float) -> "Quaternion":
+        length = math.hypot(x, y, z, w)
+        if not math.isfinite(length):
+            raise ValueError("orientation must be four finite numbers")
+        if not _SHORTEST < length < _LONGEST:
+            raise ValueError(f"orientation must be a quaternion of non-zero length, not of {length:g}")
+        return super().__new__(cls, x / length, y / length, z / length, w / length)
+
+    @classmethod
+    def from_yaw(cls, yaw_rad: float) -> "Quaternion":
+        """Turned counter-clockwise about the vertical; 0 looks along +x. Raises ValueError unless it is finite."""
+        if not math.isfinite(yaw_rad):
+            raise ValueError("yaw must be a finite number")
+        return cls(0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+
+
+LEVEL = Quaternion(0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Pose:
     """Position in metres and orientation; a pose that exists is finite and its quaternion has unit length.
 
-    Raises ValueError for a non-finite component or a quaternion too short to have a direction.
+    Raises ValueError for a position that is not finite or beyond `FARTHEST_M`, and as `Quaternion` does.
     """
 
     position: Vector3
-    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    orientation: Quaternion = LEVEL
 
     def __post_init__(self) -> None:
         if len(self.position) != 3 or not all(math.isfinite(c) for c in self.position):
             raise ValueError("position must be three finite numbers")
-        if len(self.orientation) != 4 or not all(math.isfinite(c) for c in self.orientation):
-            raise ValueError("orientation must be four finite numbers")
-        length = math.hypot(*self.orientation)
-        if not 1e-6 < length < 1e12:
-            raise ValueError("orientation must be a quaternion of non-zero length")
+        if any(abs(c) > FARTHEST_M for c in self.position):
+            raise ValueError(f"position must lie within {FARTHEST_M:g} m")
         x, y, z = (float(c) for c in self.position)
-        qx, qy, qz, qw = (float(c) / length for c in self.orientation)
         object.__setattr__(self, "position", (x, y, z))
-        object.__setattr__(self, "orientation", (qx, qy, qz, qw))
+        if type(self.orientation) is not Quaternion:  # what is one stays as it is, to the last bit
+            if len(self.orientation) != 4:
+                raise ValueError("orientation must be four finite numbers")
+            object.__setattr__(self, "orientation", Quaternion(*(float(c) for c in self.orientation)))
 
     @classmethod
     def from_yaw(cls, position: Vector3, yaw_rad: float) -> "Pose":
         """Level head turned counter-clockwise by `yaw_rad`; 0 looks along +x."""
-        return cls(position, (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)))
+        return cls(position, Quaternion.from_yaw(yaw_rad))
 
     @property
     def yaw(self) -> float:
@@ -91,17 +129,7 @@ class FloorPlan:
         points = np.concatenate([bends, np.zeros((len(bends), 1))], axis=-1)
         distance = np.linalg.norm(bends[:, None] - bends[None], axis=-1)
         direct = np.where(self.is_visible(points[:, None], points[None]), distance, np.inf)
-        shortest = np.full_like(direct, np.inf)
-        for start in range(len(bends)):
-            queue = [(0.0, start)]
-            while queue:
-                length, at = heapq.heappop(queue)
-                if length >= shortest[start, at]:
-                    continue
-                shortest[start, at] = length
-                for to in range(len(bends)):
-                    heapq.heappush(queue, (length + float(direct[at, to]), to))
-        return shortest
+        return np.asarray(shortest_path(direct, method="D", directed=False)) if len(bends) else direct
 
     def contains(self, points: Points) -> npt.NDArray[np.bool_]:
         """(...,) True inside the room or on its surfaces."""
@@ -165,8 +193,8 @@ class FloorPlan:
 
     def path_length_m(self, a: Points, b: Points) -> npt.NDArray[np.float64]:
         """(...,) length of the shortest path from a to b that goes through no wall; the straight distance where they
-        see each other."""
-        a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+        see each other, and where nothing leads from one to the other because either is inside a wall."""
+        a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
         straight = np.linalg.norm(a - b, axis=-1)
         bends = np.concatenate([self.bend_corners, np.zeros((len(self.bend_corners), 1))], axis=-1)
         if not len(bends):
@@ -176,6 +204,7 @@ class FloorPlan:
             plan = np.linalg.norm(points[..., None, :2] - bends[:, :2], axis=-1)
             return np.where(self.is_visible(points[..., None, :], bends), plan, np.inf)
 
-        via = reach(a)[..., :, None] + self.bend_lengths_m + reach(b)[..., None, :]
-        bent = np.hypot(np.min(via, axis=(-2, -1)), a[..., 2] - b[..., 2])
-        return np.asarray(np.where(self.is_visible(a, b), straight, bent))
+        # Once for each point, however many others it is paired with.
+        to_last = np.min(reach(a)[..., :, None] + self.bend_lengths_m, axis=-2)
+        bent = np.hypot(np.min(to_last + reach(b), axis=-1), a[..., 2] - b[..., 2])
+        return np.asarray(np.where(self.is_visible(a, b) | ~np.isfinite(bent), straight, bent))

@@ -29,6 +29,7 @@ _ERRORS_ONLY = 3
 
 def open_session(model: bytes, *, threads: int = 1) -> InferenceSession:
     """A session for the bytes of an ONNX file. Raises ValueError for bytes that are no usable graph."""
+    # Not session.set_denormal_as_zero: it reaches the runtime's own threads, and a session of one thread has none.
     options = SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

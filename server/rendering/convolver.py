@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.compiled import HAS_NUMBA
+from server.rendering.ingest import LOUDEST
 from server.rendering.partitions import Partitioning
 
 FloatArray = npt.NDArray[np.float32]
@@ -112,13 +113,13 @@ class Convolver:
         Where the IR is known to be, from sample `same_from` on, the one of the same length that `like` was made of, the
         stages that begin there or later are taken from it, and an exchange of the two leaves them alone.
 
-        Raises ValueError for another shape, and for a sample that is not finite, which would spoil every output to
-        come.
+        Raises ValueError for another shape, and for a sample that is not finite, or so large that a product might not
+        be: either would spoil every output to come.
         """
         if ir.ndim != 2 or ir.shape[0] != self.channels or not 1 <= ir.shape[1] <= self.ir_samples:
             raise ValueError(f"expected an IR ({self.channels}, 1..{self.ir_samples}), got shape {ir.shape}")
-        if not np.isfinite(ir).all():
-            raise ValueError("impulse response has samples that are not finite")
+        if not np.all(np.abs(ir) <= LOUDEST):
+            raise ValueError(f"impulse response has samples that are not finite, or beyond {LOUDEST:g}")
         samples = ir.astype(np.float32, copy=False)
         if like is not None and like.layout != self._layout:
             raise ValueError("the IR that it is like was prepared for another convolver")

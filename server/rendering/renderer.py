@@ -28,6 +28,7 @@ from server.errors import NafirError
 from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
 from server.rendering.direct_path import DirectPath, PathTarget
 from server.rendering.hrtf import HeadFilters
+from server.rendering.ingest import require_gain
 from server.rendering.limiter import Limiter
 from server.rendering.mixer_set import MixerSet
 from server.rendering.mixing import Mixer, mix_all
@@ -194,10 +195,10 @@ class Renderer:
         return channels == self._mixer.channels or self._mixers.is_free(channels)
 
     def add_emitter(self, emitter_id: str, source: Source, *, gain: float = 1.0, awaits_ir: bool = True) -> None:
-        """Add an emitter that plays `source`, scaled by `gain` (linear amplitude).
+        """Add an emitter that plays `source`, scaled by `gain` (linear amplitude, within `LOUDEST_GAIN`).
 
         It is silent, its source waiting, until it has an IR, if it `awaits_ir`, and, where direct paths are heard, a
-        path. Raises DuplicateEmitterError and RendererFullError.
+        path. Raises DuplicateEmitterError, RendererFullError, and ValueError for a gain that would overflow.
         """
         if emitter_id in self._emitters:
             raise DuplicateEmitterError(f"emitter {emitter_id!r} is present already")
@@ -207,7 +208,7 @@ class Renderer:
         if slot is None:
             raise RendererFullError("too many emitters removed just now still ring out")
         self._emitters[emitter_id] = _Emitter(self._mixer, slot, source, awaits_ir)
-        self._mixer.gain[:, slot] = gain
+        self._mixer.gain[:, slot] = require_gain(gain)
         self._mixer.send[:, slot] = 1.0
 
     def remove_emitter(self, emitter_id: str) -> None:
@@ -221,7 +222,8 @@ class Renderer:
         self._mixers.leave(emitter.mixer, emitter.slot, has_played=emitter.has_played)
 
     def set_gain(self, emitter_id: str, gain: float) -> None:
-        """Reach a linear gain by the end of the next block. Raises UnknownEmitterError."""
+        """Reach a linear gain by the end of the next block. Raises UnknownEmitterError, and ValueError for a gain that
+        would overflow."""
         emitter = self._emitter(emitter_id)
         self._reach(emitter.mixer.gain, emitter, gain)
 
@@ -234,7 +236,7 @@ class Renderer:
             self._reach(emitter.mixer.send, emitter, gain)
 
     def _reach(self, gains: FloatArray, emitter: _Emitter, gain: float) -> None:
-        gains[1, emitter.slot] = gain
+        gains[1, emitter.slot] = require_gain(gain)
         if not emitter.has_played:
             gains[0, emitter.slot] = gain
 

@@ -9,13 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from server.rendering.fade import raised_cosine
+from server.rendering.ingest import DryAudio
 
 FloatArray = npt.NDArray[np.float32]
 
-LOUDEST = 1e6
-"""Full scale is 1. Integers written as float reach 2^31, and nobody wants to hear them so."""
 FADE_SAMPLES = 64
-_TINY = np.finfo(np.float32).tiny
 
 
 class Source(Protocol):
@@ -29,12 +27,16 @@ class Source(Protocol):
 
 
 class ClipPlayer:
-    """Plays mono samples (n,), n >= 1, block by block: once and then silence, or round and round without a gap."""
+    """Plays mono samples (n,), n >= 1, block by block: once and then silence, or round and round without a gap.
 
-    def __init__(self, clip: FloatArray, *, loop: bool) -> None:
-        if clip.ndim != 1 or clip.size == 0:
-            raise ValueError(f"a clip is mono and not empty, got shape {clip.shape}")
-        self.clip = np.ascontiguousarray(clip, np.float32)
+    An array goes through the door here, which takes a while where it is long.
+    """
+
+    def __init__(self, clip: DryAudio | FloatArray, *, loop: bool) -> None:
+        audio = clip if isinstance(clip, DryAudio) else DryAudio(clip)
+        if audio.size == 0:
+            raise ValueError("a clip is mono and not empty, got no samples")
+        self.clip = audio.samples
         self.loop = loop
         self._position = 0
 
@@ -64,8 +66,7 @@ class LiveSource:
     capacity, and with the newest of them: what a stall held up would only be delay. Where too many wait, the oldest are
     dropped, and sound crossfades over the gap.
 
-    What is no audio (not finite, or beyond `LOUDEST`) becomes silence here, once, since a single NaN would stay in
-    every filter behind; so do denormal numbers, uncounted, which only cost time.
+    What is no audio becomes silence and is counted (`server.rendering.ingest`).
 
     Everything happens on the thread that renders: what a client sends reaches it with the other messages. Blocks to
     fill have at least `FADE_SAMPLES`.
@@ -93,11 +94,9 @@ class LiveSource:
 
     def push(self, samples: FloatArray) -> None:
         """Take in what a client sent, (n,)."""
-        with np.errstate(invalid="ignore"):  # a signalling NaN
-            magnitude = np.abs(samples)
-            is_audio = magnitude <= LOUDEST
-            clean = np.where(is_audio & (magnitude >= _TINY), samples, np.float32(0))
-        self.samples_gated += samples.size - int(np.count_nonzero(is_audio))
+        audio = DryAudio(samples)
+        clean = audio.samples
+        self.samples_gated += audio.silenced
         capacity = self._ring.size
         self._drop(self.queued + clean.size - capacity)
         clean = clean[-capacity:]

@@ -23,7 +23,7 @@ def live(address, *options):
 
 def test_what_is_sent_comes_back_as_the_room_has_it(served, bundle, filters, tmp_path):
     sent, wet = tmp_path / "sent.wav", tmp_path / "wet.wav"
-    clip = ClipLibrary(24_000).load("woman-reading")[:48_000]
+    clip = ClipLibrary(24_000).load("woman-reading").samples[:48_000]
     soundfile.write(sent, clip, 24_000, subtype="FLOAT")
     for _ in range(5):  # far ahead, and again where the machine was busy for longer even than that
         done = live(served, "--input", str(sent), "--ahead", "30", "-o", str(wet))

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.rendering.sources import FADE_SAMPLES, LOUDEST, ClipPlayer, LiveSource
+from server.rendering.ingest import LOUDEST
+from server.rendering.sources import FADE_SAMPLES, ClipPlayer, LiveSource
 
 SIZE = 256
 
