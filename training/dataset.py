@@ -8,8 +8,11 @@ ones are subnormal, in steps of 6e-8: there the bits run out one by one.
 
 Beside each response lies the energy that its diffuse part was drawn from, the same for all yaws: natural logarithms,
 axes direction, band, bin. They are good to 0.03 dB. `training.simulation.expected` makes spectrograms of them.
+
+The file also keeps the plan that it was simulated by; one from before there were plans has everything in it.
 """
 
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +26,7 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.errors import NafirError
 from training.scene_file import SceneFile
+from training.simulation.plan import SimulationPlan
 
 SPEED_OF_SOUND = 343.0
 FORMAT = 3
@@ -45,10 +49,11 @@ class Dataset:
     yaws: npt.NDArray[np.float64]
     held_out: npt.NDArray[np.bool_]
     """(emitter, listener) True for pairs that training never sees."""
+    effects: SimulationPlan
 
     @classmethod
-    def create(cls, folder: Path, scene_path: Path, seed: int) -> "Dataset":
-        """Opens the folder if it holds the same scene and seed (to resume), else makes it.
+    def create(cls, folder: Path, scene_path: Path, seed: int, effects: SimulationPlan) -> "Dataset":
+        """Opens the folder if it holds the same scene, seed and plan (to resume), else makes it.
 
         Raises DatasetError if it holds another.
         """
@@ -57,6 +62,8 @@ class Dataset:
             existing = cls.open(folder, finished=False)
             if existing.scene != scene or existing.seed != seed:
                 raise DatasetError(f"{folder}: holds another scene or seed; choose an empty folder")
+            if existing.remaining() and existing.effects.settings != effects.settings:
+                raise DatasetError(f"{folder}: was begun by another plan of effects; choose an empty folder")
             if existing.remaining() and not existing.keeps_energies:
                 raise DatasetError(f"{folder}: was begun when no energies were kept; choose an empty folder")
             return existing
@@ -71,6 +78,7 @@ class Dataset:
         partial = folder / "pairs.partial"
         with h5py.File(partial, "w") as file:
             file.attrs.update(format=FORMAT, seed=seed, sample_rate=scene.simulation.sample_rate)
+            file.attrs["effects"] = json.dumps(effects.to_json())
             file["probes"], file["yaws"], file["held_out"] = probes, yaws, held_out
             file.create_dataset("done", data=np.zeros(len(probes), dtype=bool))
             for name in ("reflected", "repeats"):
@@ -79,7 +87,7 @@ class Dataset:
             shape = (len(probes), len(probes), *histogram)
             file.create_dataset("log_energy", shape, np.float16, chunks=(1, 1, *histogram), fillvalue=-np.inf)
         partial.replace(folder / "pairs.h5")
-        return cls(folder, scene, seed, probes, yaws, held_out)
+        return cls(folder, scene, seed, probes, yaws, held_out, effects)
 
     @classmethod
     def open(cls, folder: Path, *, finished: bool = True) -> "Dataset":
@@ -95,9 +103,15 @@ class Dataset:
                     )
                 done = file["done"][()]
                 dataset = cls(
-                    folder, scene, int(file.attrs["seed"]), file["probes"][()], file["yaws"][()], file["held_out"][()]
+                    folder,
+                    scene,
+                    int(file.attrs["seed"]),
+                    file["probes"][()],
+                    file["yaws"][()],
+                    file["held_out"][()],
+                    _recorded(file.attrs.get("effects"), scene),
                 )
-        except (OSError, KeyError) as exc:
+        except (OSError, KeyError, TypeError, ValueError) as exc:
             raise DatasetError(f"{folder}: not a dataset folder: {exc}") from exc
         if finished and not done.all():
             raise DatasetError(f"{folder}: {np.sum(~done)} emitters are not simulated yet; run simulate again")
@@ -167,6 +181,12 @@ class Dataset:
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             logarithms = np.stack([file["log_energy"][emitter, listener] for emitter, listener in pairs])
         return np.exp(logarithms.astype(np.float32))
+
+
+def _recorded(effects: str | None, scene: SceneFile) -> SimulationPlan:
+    if effects is None:
+        return SimulationPlan.everything(scene.simulation.image_order, scene.simulation.rays, diffraction=False)
+    return SimulationPlan.from_json(json.loads(effects))
 
 
 def _choose_held_out(probes: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:

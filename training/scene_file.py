@@ -6,11 +6,13 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from server.errors import NafirError
+from server.scene.effects import EffectName
 from server.scene.geometry import Geometry, Strict
 from server.scene.manifest import Air, Start
+from training.simulation.plan import SimulatedEffect
 
 HISTOGRAM_BIN_S = 0.004
 
@@ -61,6 +63,8 @@ class SceneFile(Strict):
     start: Start
     probes: Probes
     simulation: Simulation
+    effects: dict[str, bool] = Field(default_factory=dict)
+    """On or off, whatever a plan of rendering or simulation would decide."""
 
     @classmethod
     def read(cls, path: Path) -> "SceneFile":
@@ -75,6 +79,15 @@ class SceneFile(Strict):
             first = exc.errors()[0]
             place = "".join(f"{part}: " for part in [".".join(map(str, first["loc"]))] if part)
             raise SceneFileError(f"{path}: {place}{first['msg']}") from exc
+
+    @field_validator("effects")
+    @classmethod
+    def _are_effects(cls, effects: dict[str, bool]) -> dict[str, bool]:
+        known = list(dict.fromkeys([*EffectName, *SimulatedEffect]))
+        for name in effects:
+            if name not in known:
+                raise ValueError(f"there is no effect {name!r}, only {', '.join(known)}")
+        return effects
 
     @model_validator(mode="after")
     def _fits_into_the_room(self) -> "SceneFile":

@@ -26,10 +26,12 @@ class Strict(BaseModel):
 
 
 class Material(Strict):
-    """Energy shares per octave band, 125 Hz to 8 kHz: absorbed, and scattered of what is reflected."""
+    """Energy shares per octave band, 125 Hz to 8 kHz: absorbed, and scattered of what is reflected. Sound goes through
+    a wall as its mass lets it; without one stated, not at all."""
 
     absorption: PerBand
     scattering: PerBand
+    surface_mass_kg_m2: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
 
 
 class Materials(Strict):
@@ -75,3 +77,10 @@ class Geometry(Strict):
     @property
     def floor_plan(self) -> FloorPlan:
         return FloorPlan(self.corners, self.height_m)
+
+    def without_scattering(self) -> "Geometry":
+        """All that is reflected is mirrored."""
+        smooth = {"scattering": (0.0,) * len(OCTAVE_BANDS_HZ)}
+        names = type(self.materials).model_fields
+        materials = Materials(**{name: getattr(self.materials, name).model_copy(update=smooth) for name in names})
+        return self.model_copy(update={"materials": materials})

@@ -1,5 +1,6 @@
 import multiprocessing
 import time
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -7,7 +8,10 @@ import pytest
 from rich.progress import Progress
 
 from training.dataset import Dataset, DatasetError
+from training.simulation.plan import SimulationPlan
 from training.simulation.run import simulate
+
+EVERYTHING = SimulationPlan.everything(2, 500)
 
 
 class Impatient(Progress):
@@ -61,8 +65,8 @@ def test_second_takes_share_the_mirrors_and_not_the_noise(dataset):
         assert np.corrcoef(one[..., head].ravel(), other[..., head].ravel())[0, 1] > 0.2
         tail = slice(onset + 800, None)
         assert abs(np.corrcoef(one[..., tail].ravel(), other[..., tail].ravel())[0, 1]) < 0.2
-        # Independent simulations of one room agree on its level.
-        assert np.sum(one**2) == pytest.approx(np.sum(other**2), rel=0.3)
+    # Independent simulations of one room agree on its level.
+    assert np.sum(first**2) == pytest.approx(np.sum(second**2), rel=0.3)
 
 
 def test_an_interrupted_simulation_goes_on_to_the_same_data(dataset, tiny_scene, tmp_path):
@@ -86,21 +90,37 @@ def test_an_interrupted_simulation_goes_on_to_the_same_data(dataset, tiny_scene,
 def test_a_start_interrupted_halfway_can_be_repeated(tiny_scene, tmp_path):
     (tmp_path / "scene.toml").write_text("half a fi")
     (tmp_path / "pairs.partial").write_bytes(b"\x89HDF")
-    dataset = Dataset.create(tmp_path, tiny_scene, 0)
+    dataset = Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
     assert dataset.remaining() == list(range(len(dataset.probes)))
 
 
 def test_a_folder_keeps_to_its_scene_and_seed(dataset, tiny_scene, tmp_path):
     with pytest.raises(DatasetError, match="another scene or seed"):
-        Dataset.create(dataset.folder, tiny_scene, dataset.seed + 1)
+        Dataset.create(dataset.folder, tiny_scene, dataset.seed + 1, dataset.effects)
     other = tmp_path / "other.toml"
     other.write_text(tiny_scene.read_text().replace("rays = 500", "rays = 501"))
     with pytest.raises(DatasetError, match="another scene or seed"):
-        Dataset.create(dataset.folder, other, dataset.seed)
+        Dataset.create(dataset.folder, other, dataset.seed, dataset.effects)
+
+
+def test_a_folder_keeps_to_the_plan_it_was_begun_by(tiny_scene, tmp_path):
+    Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
+    fewer = SimulationPlan.everything(2, 400)
+    with pytest.raises(DatasetError, match="another plan of effects"):
+        Dataset.create(tmp_path, tiny_scene, 0, fewer)
+    reasoned = replace(EVERYTHING, cost_s=1.5)  # the same data, whatever they were said to cost
+    assert Dataset.create(tmp_path, tiny_scene, 0, reasoned).effects == EVERYTHING
+
+
+def test_a_dataset_from_before_plans_has_everything_but_bent_sound(tiny_scene, tmp_path):
+    Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
+    with h5py.File(tmp_path / "pairs.h5", "r+") as file:
+        del file.attrs["effects"]
+    assert Dataset.open(tmp_path, finished=False).effects == replace(EVERYTHING, diffraction=False)
 
 
 def test_a_dataset_that_holds_the_first_reflections_is_refused_by_name(tiny_scene, tmp_path):
-    Dataset.create(tmp_path, tiny_scene, 0)
+    Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
     with h5py.File(tmp_path / "pairs.h5", "r+") as file:
         file.attrs["format"] = 2
     with pytest.raises(DatasetError, match="holds the first reflections too, expected 3: simulate into an empty"):
@@ -109,7 +129,7 @@ def test_a_dataset_that_holds_the_first_reflections_is_refused_by_name(tiny_scen
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "format"])
 def test_what_is_no_dataset_says_so(tiny_scene, tmp_path, damage):
-    Dataset.create(tmp_path, tiny_scene, 0)
+    Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
     path = tmp_path / "pairs.h5"
     if damage == "missing":
         path.unlink()

@@ -24,6 +24,7 @@ from server.whole_field import WholeField, kemar
 from training.dataset import SPEED_OF_SOUND, Dataset
 from training.evaluation.baselines import TrainingPairs, barycentric
 from training.evaluation.held_out import EvaluationError, HeldOut, require_same_scene
+from training.simulation.direct_paths import DirectPaths
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
@@ -153,23 +154,15 @@ def _simulated_power(dataset: Dataset, emitter: _Floats, cells: _Floats) -> _Flo
     """(cell,) energies per ear, simulated with the rays of the dataset."""
     settings = dataset.scene.simulation
     directions = sphere_directions(settings.arrival_directions)
-    tracer = RoomTracer(
-        dataset.scene.geometry,
-        dataset.scene.air,
-        cells,
-        duration_s=settings.duration_s,
-        image_order=settings.image_order,
-        arrival_directions=directions,
-    )
+    tracer = RoomTracer.of(dataset.scene, dataset.effects, cells)
+    direct = DirectPaths.of(dataset.scene, dataset.effects)
     synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, _YAWS, dataset.samples)
     rng = np.random.default_rng([dataset.seed, _SEED])
     onsets_s = dataset.plan.path_length_m(emitter, cells) / SPEED_OF_SOUND
-    visible = dataset.plan.is_visible(emitter, cells)
     power = np.empty(len(cells))
     for number, arrivals in enumerate(tracer.trace(emitter, rays=settings.rays, rng=rng)):
         response = synthesis.render(arrivals, cells[number], float(onsets_s[number]), rng)
-        if visible[number]:
-            response = response + synthesis.direct(emitter, cells[number], dataset.scene.air)
+        response += synthesis.specular(*direct.images(emitter, cells[number]), cells[number])
         power[number] = np.square(response).sum(axis=-1).mean()
     return power
 

@@ -37,16 +37,8 @@ class ExpectedSpectrograms:
 
     @cached_property
     def _tracer(self) -> RoomTracer:
-        settings = self._dataset.scene.simulation
-        return RoomTracer(
-            self._dataset.scene.geometry,
-            self._dataset.scene.air,
-            self._dataset.probes,
-            duration_s=settings.duration_s,
-            image_order=settings.image_order,
-            arrival_directions=self._synthesis.arrival_directions,
-            least_order=GEOMETRIC_ORDER + 1,
-        )
+        dataset = self._dataset
+        return RoomTracer.of(dataset.scene, dataset.effects, dataset.probes, least_order=GEOMETRIC_ORDER + 1)
 
     @cached_property
     def _heard(self) -> _Singles:

@@ -54,6 +54,13 @@ def surface_shares(geometry: Geometry) -> tuple[_Floats, _Floats]:
     return reflected, np.array([surface.scattering for surface in surfaces])
 
 
+def receiver_radii(plan: FloorPlan, receivers: _Floats) -> _Floats:
+    """(receiver,) of the spheres that count rays: one that reached into a wall would miss a part of them."""
+    heights = receivers[:, 2]
+    clearance = np.minimum(plan.wall_distance_m(receivers), np.minimum(heights, plan.height_m - heights))
+    return np.asarray(np.minimum(clearance, _LARGEST_RADIUS_M))
+
+
 class RayTracer:
     """Traces from any emitter to a fixed set of receivers (receiver, xyz). Stateless between traces."""
 
@@ -73,14 +80,16 @@ class RayTracer:
         self._blocking = not _is_convex(plan)
         self._reflected, self._scattered = surface_shares(geometry)
         self._receivers = np.ascontiguousarray(receivers, dtype=np.float64)
-        heights = self._receivers[:, 2]
-        clearance = np.minimum(plan.wall_distance_m(self._receivers), np.minimum(heights, plan.height_m - heights))
-        # A sphere that reached into a wall would miss a part of its rays.
-        self._radii = np.minimum(clearance, _LARGEST_RADIUS_M)
+        self._radii = receiver_radii(plan, self._receivers)
         self._image_order = image_order
         self._directions = len(arrival_directions)
         self._nearest = _nearest_directions(arrival_directions)
         self._bins = round(duration_s / HISTOGRAM_BIN_S)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(direction, band, bin) of a receiver's energy."""
+        return self._directions, _BANDS, self._bins
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
         """(receiver, direction, band, bin) energy; the air takes nothing here."""

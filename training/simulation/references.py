@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from server.whole_field import kemar
 from training.dataset import GEOMETRIC_ORDER, Dataset
+from training.simulation.direct_paths import DirectPaths
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
@@ -34,30 +35,20 @@ class GeometricSound:
         return BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
 
     @cached_property
-    def _visible(self) -> npt.NDArray[np.bool_]:
-        """(emitter, listener)"""
-        return self.dataset.plan.is_visible(self.dataset.probes[:, None], self.dataset.probes[None])
+    def _direct_paths(self) -> DirectPaths:
+        return DirectPaths.of(self.dataset.scene, self.dataset.effects)
 
     @cached_property
     def _images(self) -> list[list[tuple[_Floats, _Floats]]]:
         """By emitter and listener, positions and amplitudes of the first reflections."""
-        scene = self.dataset.scene
-        tracer = RoomTracer(
-            scene.geometry,
-            scene.air,
-            self.dataset.probes,
-            duration_s=scene.simulation.duration_s,
-            image_order=GEOMETRIC_ORDER,
-            arrival_directions=self._synthesis.arrival_directions,
-        )
-        return [tracer.images(emitter) for emitter in self.dataset.probes]
+        dataset = self.dataset
+        tracer = RoomTracer.of(dataset.scene, dataset.effects, dataset.probes, image_order=GEOMETRIC_ORDER)
+        return [tracer.images(emitter) for emitter in dataset.probes]
 
     def direct(self, emitter: int, listener: int) -> _Responses:
-        """(yaw, ear, sample); silent where a wall stands between."""
-        if not self._visible[emitter, listener]:
-            return np.zeros((len(self.dataset.yaws), 2, self.dataset.samples), dtype=np.float32)
+        """(yaw, ear, sample); round corners, or silent behind walls where the plan has no diffraction."""
         ends = self.dataset.probes[emitter], self.dataset.probes[listener]
-        return self._synthesis.direct(*ends, self.dataset.scene.air)
+        return self._synthesis.specular(*self._direct_paths.images(*ends), ends[1])
 
     def first_reflections(self, emitter: int, listener: int) -> _Responses:
         """(yaw, ear, sample)"""

@@ -5,13 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_amplitude, db_to_power
 from server.scene.geometry import Geometry
 from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
-from training.scene_file import HISTOGRAM_BIN_S
+from training.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation.images import images_in_height, images_in_plan
-from training.simulation.rays import RayTracer, surface_shares
+from training.simulation.plan import SimulationPlan
+from training.simulation.rays import RayTracer, sphere_directions, surface_shares
 
 _Floats = npt.NDArray[np.float64]
 
@@ -31,11 +33,15 @@ class Arrivals:
     energy: npt.NDArray[np.float32]
 
 
-def free_field_amplitude(distance_m: _Floats, air: Air) -> _Floats:
+def free_field_amplitude(distance_m: _Floats, air: Air | None) -> _Floats:
     """(..., band) pressure at (...,) distances from an emitter of unit pressure at one metre: its wave spreads, and the
-    air takes its share."""
+    air, if there is any to speak of, takes its share."""
     distance = np.asarray(distance_m)[..., None]
-    return np.asarray(db_to_amplitude(-distance * air.absorption_db_per_m) / distance)
+    return np.asarray(db_to_amplitude(-distance * _absorption_db_per_m(air)) / distance)
+
+
+def _absorption_db_per_m(air: Air | None) -> _Floats:
+    return np.zeros(len(OCTAVE_BANDS_HZ)) if air is None else air.absorption_db_per_m
 
 
 class RoomTracer:
@@ -44,7 +50,7 @@ class RoomTracer:
     def __init__(
         self,
         geometry: Geometry,
-        air: Air,
+        air: Air | None,
         receivers: _Floats,
         *,
         duration_s: float,
@@ -69,12 +75,42 @@ class RoomTracer:
             arrival_directions=arrival_directions,
         )
 
+    @classmethod
+    def of(
+        cls,
+        scene: SceneFile,
+        plan: SimulationPlan,
+        receivers: _Floats,
+        *,
+        duration_s: float | None = None,
+        image_order: int | None = None,
+        least_order: int = 1,
+    ) -> "RoomTracer":
+        """What the plan has of the scene; for its whole duration and up to its image order if none is given."""
+        settings = scene.simulation
+        return cls(
+            scene.geometry if plan.scattering else scene.geometry.without_scattering(),
+            scene.air if plan.air_absorption else None,
+            receivers,
+            duration_s=settings.duration_s if duration_s is None else duration_s,
+            image_order=plan.image_order if image_order is None else image_order,
+            arrival_directions=sphere_directions(settings.arrival_directions),
+            least_order=least_order,
+        )
+
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> list[Arrivals]:
         """One entry per receiver. The same numbers from `rng` give the same arrivals."""
+        energy = self.energy(emitter, rays=rays, rng=rng)
+        return [Arrivals(*images, late) for images, late in zip(self.images(emitter), energy, strict=True)]
+
+    def energy(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+        """(receiver, direction, band, bin) squared pressure that rays bring; none without rays."""
+        if not rays:
+            return np.zeros((len(self._receivers), *self._rays.shape), dtype=np.float32)
         energy = self._rays.trace(emitter, rays=rays, rng=rng)
         bins_m = (np.arange(energy.shape[-1]) + 0.5) * HISTOGRAM_BIN_S * SPEED_OF_SOUND
-        energy *= db_to_power(-self._air.absorption_db_per_m[:, None] * bins_m).astype(np.float32)
-        return [Arrivals(*images, late) for images, late in zip(self.images(emitter), energy, strict=True)]
+        energy *= db_to_power(-_absorption_db_per_m(self._air)[:, None] * bins_m).astype(np.float32)
+        return energy
 
     def images(self, emitter: _Floats) -> list[tuple[_Floats, _Floats]]:
         """Image positions (image, xyz) and amplitudes (image, band) per receiver, those that are heard within the

@@ -1,0 +1,101 @@
+"""What statistical room acoustics says of a room before anything is simulated.
+
+Metres and seconds; bands are OCTAVE_BANDS_HZ; power is squared pressure beside that of the direct sound at one metre.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.scene.geometry import Geometry
+from server.scene.manifest import Air
+from training.simulation.rays import surface_shares
+
+_Floats = npt.NDArray[np.float64]
+
+_SIXTY_DB = 6 * np.log(10)
+_NEPERS_PER_DB = np.log(10) / 10
+_BANDWIDTHS_HZ = np.asarray(OCTAVE_BANDS_HZ) / np.sqrt(2)
+
+
+@dataclass(frozen=True)
+class DiffuseRoom:
+    """A room taken for one diffuse field, whatever its shape; through `air` of no loss if None."""
+
+    geometry: Geometry
+    air: Air | None
+    speed_of_sound: float
+
+    @cached_property
+    def areas_m2(self) -> _Floats:
+        """(surface,) of walls, floor and ceiling."""
+        plan = self.geometry.floor_plan
+        around = np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1).sum()
+        return np.array([around * plan.height_m, plan.area_m2, plan.area_m2])
+
+    @property
+    def volume_m3(self) -> float:
+        return float(self.areas_m2[1] * self.geometry.height_m)
+
+    @property
+    def surface_m2(self) -> float:
+        return float(self.areas_m2.sum())
+
+    @property
+    def mean_free_path_m(self) -> float:
+        return 4 * self.volume_m3 / self.surface_m2
+
+    @cached_property
+    def absorption(self) -> _Floats:
+        """(band,) mean over the surfaces."""
+        return np.asarray(self.areas_m2 @ (1 - surface_shares(self.geometry)[0]) / self.surface_m2)
+
+    @cached_property
+    def scattering(self) -> _Floats:
+        """(band,) share of what is reflected that is scattered, mean over the surfaces."""
+        reflected, scattered = surface_shares(self.geometry)
+        weights = self.areas_m2[:, None] * reflected
+        total = weights.sum(axis=0)
+        return np.divide((weights * scattered).sum(axis=0), total, out=np.zeros_like(total), where=total > 0)
+
+    @cached_property
+    def reverberation_time_s(self) -> _Floats:
+        """(band,) by Eyring (J. Acoust. Soc. Am. 1, 1930), with the air's share (Kuttruff, Room Acoustics, 5.1)."""
+        with np.errstate(divide="ignore"):
+            by_walls = -self.surface_m2 * np.log(1 - self.absorption)
+        per_m = np.zeros(len(self.absorption)) if self.air is None else self.air.absorption_db_per_m * _NEPERS_PER_DB
+        lossless = np.finfo(np.float64).tiny
+        area = np.maximum(by_walls + 4 * per_m * self.volume_m3, lossless)
+        return np.asarray(4 * _SIXTY_DB * self.volume_m3 / (self.speed_of_sound * area))
+
+    def reflected_power(self, order: int) -> _Floats:
+        """(band,) of everything that was reflected so many times or more: the geometric series whose sum, from one
+        reflection on, is the reverberant power 16 pi (1 - a) / (S a) (Kuttruff, 5.5)."""
+        kept = 1 - self.absorption
+        lossless = np.finfo(np.float64).tiny
+        return np.asarray(16 * np.pi / self.surface_m2 * kept**order / np.maximum(self.absorption, lossless))
+
+    @property
+    def mixing_time_s(self) -> float:
+        """From when after the direct sound on 95 % of listeners cannot tell one place's late sound from another's:
+        Lindau, Kosanke and Weinzierl, "Perceptual evaluation of model- and signal-based predictors of the mixing time
+        in binaural room impulse responses", J. Audio Eng. Soc. 60(11), 2012; of rooms that are nearly boxes."""
+        return 0.0117e-3 * self.volume_m3 + 50.1e-3
+
+    def images_per_s(self, time_s: float) -> float:
+        """How many image sources a box has that are heard at a time (Kuttruff, 4.1)."""
+        return 4 * np.pi * self.speed_of_sound**3 * time_s**2 / self.volume_m3
+
+    def clarity_spread_db(self, early_s: float) -> float:
+        """Standard deviation of the early-to-late ratio of reverberation that is drawn from noise, over draws: energy
+        in a band of width B varies by one over sqrt(B T), T the time it lasts for (Lubman, J. Acoust. Soc. Am. 44,
+        1968)."""
+        decay_per_s = _SIXTY_DB / self.reverberation_time_s
+        power = self.reflected_power(1)
+        bandwidth_hz = (power @ _BANDWIDTHS_HZ) ** 2 / (power**2 @ _BANDWIDTHS_HZ)
+        rate = float(np.average(decay_per_s, weights=power * _BANDWIDTHS_HZ))
+        late_s, early_lasts_s = 2 / rate, 2 / rate * np.tanh(rate * early_s / 2)
+        return float(10 / np.log(10) * np.sqrt(1 / (bandwidth_hz * late_s) + 1 / (bandwidth_hz * early_lasts_s)))

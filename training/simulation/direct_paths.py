@@ -1,0 +1,63 @@
+"""The direct sound of a pair, as a renderer has it: straight in sight, else round the walls' corners, and through walls
+where those are thin.
+
+Each path is an image, (image, xyz) as a receiver takes it to be from, with (image, band) pressure there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import db_to_amplitude
+from server.acoustics.geometry import FloorPlan
+from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.transmission import transmission_loss_db, walls_between
+from server.scene.manifest import Air
+from training.dataset import SPEED_OF_SOUND
+from training.scene_file import SceneFile
+from training.simulation.plan import SimulationPlan
+from training.simulation.tracing import free_field_amplitude
+
+_Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DirectPaths:
+    """`finder` is None where sound does not bend, `wall_loss_db` (band,) None where nothing goes through walls."""
+
+    floor_plan: FloorPlan
+    air: Air | None
+    finder: SoundPathFinder | None
+    wall_loss_db: _Floats | None
+
+    @classmethod
+    def of(cls, scene: SceneFile, plan: SimulationPlan) -> "DirectPaths":
+        floor_plan = scene.geometry.floor_plan
+        mass = scene.geometry.materials.walls.surface_mass_kg_m2
+        return cls(
+            floor_plan,
+            scene.air if plan.air_absorption else None,
+            SoundPathFinder(floor_plan, SPEED_OF_SOUND) if plan.diffraction else None,
+            transmission_loss_db(mass, OCTAVE_BANDS_HZ) if plan.transmission and mass is not None else None,
+        )
+
+    def images(self, emitter: _Floats, listener: _Floats) -> tuple[_Floats, _Floats]:
+        positions, amplitudes = [], []
+        is_seen = bool(self.floor_plan.is_visible(emitter, listener))
+        straight = free_field_amplitude(np.linalg.norm(emitter - listener), self.air)
+        if self.finder is not None:
+            paths = self.finder.find(listener, emitter[None])
+            positions.append(listener + paths.length_m[0] * paths.arrival[0])
+            bent = free_field_amplitude(paths.length_m[0], self.air)
+            amplitudes.append(bent * db_to_amplitude(paths.screen_db[0]))
+        elif is_seen:
+            positions.append(emitter)
+            amplitudes.append(straight)
+        if self.wall_loss_db is not None and not is_seen:
+            walls = walls_between(self.floor_plan, emitter, listener)
+            positions.append(emitter)
+            amplitudes.append(straight * db_to_amplitude(-walls * self.wall_loss_db))
+        shape = len(positions), len(OCTAVE_BANDS_HZ)
+        return np.reshape(positions, (shape[0], 3)), np.reshape(amplitudes, shape)

@@ -1,0 +1,98 @@
+"""Decides what the simulation of a scene computes.
+
+An effect is called for where leaving it out would change some parameter by a quarter of a just-noticeable difference:
+errors of the data add to those of the fields trained on them, which are two to three times as large.
+"""
+
+from training.dataset import GEOMETRIC_ORDER
+from training.scene_file import SceneFile, SceneFileError
+from training.simulation.plan import Overrides, SimulatedEffect, SimulationDecision, SimulationPlan
+from training.simulation.predictions import Prediction, Predictions
+from training.simulation.shared_tail import FADE_S
+
+THRESHOLD_JND = 0.25
+
+
+def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
+    """For the probes that a dataset of this seed has."""
+    return SimulationPlanner(Predictions(scene, scene.probe_positions(seed)))
+
+
+class SimulationPlanner:
+    """What is predicted of one scene does not depend on what is asked for."""
+
+    def __init__(self, predictions: Predictions) -> None:
+        self._predictions = predictions
+        self._settings = predictions.scene.simulation
+        self._by_order = {
+            order: predictions.early_reflections(order)
+            for order in range(GEOMETRIC_ORDER + 1, self._settings.image_order + 1)
+        }
+
+    @property
+    def everything(self) -> SimulationPlan:
+        """With nothing left out that the scene file allows."""
+        has_mass = self._predictions.scene.geometry.materials.walls.surface_mass_kg_m2 is not None
+        never = {SimulatedEffect.DIRECTIVITY: False, SimulatedEffect.TRANSMISSION: has_mass}
+        return self.plan({**dict.fromkeys(SimulatedEffect, True), **never})
+
+    def plan(self, overrides: Overrides) -> SimulationPlan:
+        """Raises SceneFileError for an override that the scene cannot follow."""
+        predicted = self._predictions
+        self._refuse_what_cannot_be(overrides)
+        order, images = self._images(overrides)
+        decided = {
+            SimulatedEffect.EARLY_REFLECTIONS: images,
+            SimulatedEffect.LATE_REVERBERATION: predicted.late_reverberation(),
+            SimulatedEffect.SCATTERING: predicted.scattering(),
+            SimulatedEffect.PER_SOURCE_TAIL: predicted.per_source_tail(),
+            SimulatedEffect.AIR_ABSORPTION: predicted.air_absorption(),
+            SimulatedEffect.DIFFRACTION: predicted.diffraction(),
+            SimulatedEffect.TRANSMISSION: predicted.transmission(),
+            SimulatedEffect.DIRECTIVITY: Prediction(
+                0.0, "level", "fields are of emitters that radiate all round; rendering gives each its directivity"
+            ),
+        }
+        is_on = {
+            name: overrides.get(name, prediction.change_jnd >= THRESHOLD_JND) for name, prediction in decided.items()
+        }
+        has_own_tails = is_on[SimulatedEffect.PER_SOURCE_TAIL]
+        ends_before_it = predicted.tail_start_s + FADE_S >= self._settings.duration_s
+        shares_tail = is_on[SimulatedEffect.LATE_REVERBERATION] and not has_own_tails and not ends_before_it
+        rays = predicted.rays() if shares_tail else self._settings.rays
+        return SimulationPlan(
+            image_order=order,
+            rays=rays if is_on[SimulatedEffect.LATE_REVERBERATION] else 0,
+            tail_start_s=predicted.tail_start_s if shares_tail else None,
+            tail_rays=self._settings.rays if shares_tail else 0,
+            scattering=is_on[SimulatedEffect.SCATTERING],
+            air_absorption=is_on[SimulatedEffect.AIR_ABSORPTION],
+            diffraction=is_on[SimulatedEffect.DIFFRACTION],
+            transmission=is_on[SimulatedEffect.TRANSMISSION],
+            decisions=tuple(
+                SimulationDecision(name, is_on[name], **vars(prediction), overridden=name in overrides)
+                for name, prediction in decided.items()
+            ),
+        )
+
+    def _images(self, overrides: Overrides) -> tuple[int, Prediction]:
+        """The highest order that is called for, and what leaving out all beyond those left to geometry would change."""
+        called_for = [order for order, each in self._by_order.items() if each.change_jnd >= THRESHOLD_JND]
+        order = max(called_for, default=GEOMETRIC_ORDER)
+        if SimulatedEffect.EARLY_REFLECTIONS in overrides:
+            order = self._settings.image_order if overrides[SimulatedEffect.EARLY_REFLECTIONS] else GEOMETRIC_ORDER
+        if not self._by_order:
+            return order, Prediction(0.0, "spectrum", "the scene file asks for none beyond those left to geometry")
+        largest = max(self._by_order.values(), key=lambda each: each.change_jnd)
+        reason = "; ".join(f"{each.reason} ({each.change_jnd:.2f} JND)" for each in self._by_order.values())
+        return order, Prediction(largest.change_jnd, largest.parameter, reason)
+
+    def _refuse_what_cannot_be(self, overrides: Overrides) -> None:
+        scene = self._predictions.scene
+        if overrides.get(SimulatedEffect.DIRECTIVITY):
+            raise SceneFileError(
+                f"{scene.id}: effects.directivity: cannot be on: probes radiate all round, and directivity is applied "
+                "where emitters are rendered"
+            )
+        if overrides.get(SimulatedEffect.TRANSMISSION) and scene.geometry.materials.walls.surface_mass_kg_m2 is None:
+            raise SceneFileError(f"{scene.id}: effects.transmission: needs geometry.materials.walls.surface_mass_kg_m2")
