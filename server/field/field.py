@@ -28,6 +28,8 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 _CHUNK = 32
+_NEVER = 2.0**31
+"""Samples: no index reaches as far."""
 
 
 class AcousticField:
@@ -160,8 +162,8 @@ class AcousticField:
     def _compute(self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None) -> Float32:
         parameters = self.graph.parameters
         aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
-        if not np.isfinite(aligned).all():
-            raise FieldError(f"scene {self.bundle.id}: there is no way from emitter to listener; one is inside a wall")
+        if not (aligned < _NEVER).all():
+            raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, yaws)
             return self._finite(self._placed(coded, aligned), listeners, emitters)

@@ -25,6 +25,8 @@ _NEAREST_M = 0.25
 _AZIMUTH_HARMONICS = 5
 _YAW_HARMONICS = 3
 _POSITION_OCTAVES = 3
+_MOST_LOG_PRECISION = 14.0
+"""A bandwidth of a millimetre."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,9 @@ class FeatureGrid(nn.Module):
 
     def forward(self, position: Tensor) -> Tensor:
         squared = torch.sum((position[:, None, :2] - self._nodes) ** 2, dim=-1)
-        return torch.softmax(-squared * torch.exp(self._log_precision), dim=-1) @ self._features
+        # An infinite precision would be 0 times infinity on a node.
+        precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
+        return torch.softmax(-squared * precision, dim=-1) @ self._features
 
 
 class PoseEncoder(nn.Module):
