@@ -230,6 +230,54 @@ def render(
     )
 
 
+@app.command()
+def plan(
+    scene: Scene,
+    listener: Annotated[
+        str | None, typer.Option(help="x,y,z in metres. [default: where a visitor starts]", metavar="X,Y,Z")
+    ] = None,
+    emitter: Annotated[
+        list[str] | None, typer.Option(help="x,y,z in metres; repeatable. [default: the visitor's]", metavar="X,Y,Z")
+    ] = None,
+    yaw_deg: Annotated[
+        float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
+    ] = 0.0,
+    still: Annotated[bool, typer.Option("--still", help="The listener neither walks nor turns the head.")] = False,
+    moving: Annotated[bool, typer.Option("--moving", help="The emitters move.")] = False,
+    mono: Annotated[bool, typer.Option("--mono", help="One loudspeaker plays it, not headphones.")] = False,
+    effect: Annotated[
+        list[str] | None, typer.Option(help="Switch an effect on or off; repeatable.", metavar="NAME=on|off")
+    ] = None,
+    figure: Annotated[Path | None, typer.Option(help="Draw it to this file, too: .png or .svg.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Which effects a situation calls for, why, and what they cost on this host."""
+    from server.field.field import AcousticField
+    from server.impulse_response import parse_position
+    from server.plan_figure import draw
+    from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
+    from server.plan_table import print_plan
+    from server.scene.bundle import Bundle, find_bundle
+
+    query = PlanQuery(
+        listener=None if listener is None else parse_position(listener, "listener"),
+        yaw_deg=yaw_deg,
+        emitters=tuple(parse_position(text, "emitter") for text in emitter or ()),
+        walks=not still,
+        move=moving,
+        output="mono" if mono else "headphones",
+        effects=parse_effects(effect or ()),
+    )
+    field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    document = PlanDocument.of(field.bundle.id, query.plan(field))
+    if figure is not None:
+        draw(document, figure)
+    if as_json:
+        typer.echo(rounded(document))
+    else:
+        print_plan(document)
+
+
 def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "RenderedEmitter":
     """`CLIP@x,y,z`, where CLIP names a bundled clip, or else an audio file."""
     from server.acoustics.geometry import Pose

@@ -6,7 +6,7 @@ Energies as in `server.scene.situation`; positions in metres.
 import math
 import time
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,15 @@ _PAIRS = 8
 _LONGEST_S = 0.25
 """A field that takes so long for a pair or more is asked for no other."""
 _SHORTEST_T60_S = 0.01
+
+
+@lru_cache(maxsize=16)
+def place_of_field(field: AcousticField, block_size: int = 256) -> Place:
+    """That of a field's scene; asks the field once, for tens of milliseconds."""
+    has_field = bool(field.bundle.manifest.fields)
+    return place_of(
+        field.bundle, reverberation=typical_reverberation(field) if has_field else None, block_size=block_size
+    )
 
 
 def place_of(bundle: Bundle, *, reverberation: Reverberation | None, block_size: int = 256) -> Place:

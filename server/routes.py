@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import anyio.to_thread
@@ -23,6 +24,7 @@ from server.impulse_response import (
     parse_position,
 )
 from server.loudness import loudness_map
+from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
 from server.streaming import Connection, StreamHost
 from server.telemetry import ServerCollector, exposition
 from server.whole_field import WholeField
@@ -30,6 +32,7 @@ from server.whole_field import WholeField
 MAX_MAP_POINTS = 2_000
 """A point costs milliseconds."""
 MAX_MAP_S = 120.0
+MAX_PLANNED = 16
 CACHE_CONTROL = "public, max-age=3600"
 """Entity tags outlive it: after an hour an unchanged answer costs a 304."""
 
@@ -141,6 +144,41 @@ async def loudness(
     parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
     media_type = "image/png" if format == "png" else "application/json"
     return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw)
+
+
+@api.get("/scenes/{scene}/plan", response_model=PlanDocument)
+async def plan(
+    request: Request,
+    scene: str,
+    listener: Annotated[str | None, Query(description="x,y,z in metres; by default where a visitor starts")] = None,
+    yaw_deg: Annotated[FiniteFloat, Query(description="of the head, counter-clockwise, 0 looks along +x")] = 0.0,
+    emitter: Annotated[list[str] | None, Query(description="x,y,z in metres; may be repeated")] = None,
+    walks: Annotated[bool, Query(description="the listener walks and turns the head")] = True,
+    move: Annotated[bool, Query(description="the emitters move")] = False,
+    output: Annotated[str, Query(description="headphones or mono")] = "headphones",
+    effect: Annotated[list[str] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
+) -> Response:
+    """Which effects a situation calls for, why, and what they cost on this host."""
+    emitters = emitter or []
+    if len(emitters) > MAX_PLANNED:
+        raise RequestError("too_many_emitters", f"a plan is made for at most {MAX_PLANNED} emitters", field="emitter")
+    query = PlanQuery(
+        listener=None if listener is None else parse_position(listener, "listener"),
+        yaw_deg=yaw_deg,
+        emitters=tuple(parse_position(text, "emitter") for text in emitters),
+        walks=walks,
+        move=move,
+        output=output,
+        effects=parse_effects(effect or []),
+    )
+    field = _levels(request, scene).default
+    query.check(field)
+    return await _cached(
+        request,
+        entity_tag(field, "plan", asdict(query), "json"),
+        "application/json",
+        lambda: rounded(PlanDocument.of(scene, query.plan(field))).encode(),
+    )
 
 
 @api.get("/clips")

@@ -13,7 +13,7 @@ from server.scene.listening import SHARED, without_delay
 from server.scene.plan import Decision, Plan
 from server.scene.prediction import UNCHANGED, Change, Prediction, worst
 from server.scene.reasons import reason
-from server.scene.situation import Situation
+from server.scene.situation import Emitter, Situation
 
 ENTER_JND = 1.0
 LEAVE_JND = 0.7
@@ -33,10 +33,13 @@ _OF_EACH = tuple(name for name, effect in CATALOGUE.items() if not effect.is_sha
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one emitter, where an effect is on: microseconds per block and bytes."""
+    """Of one emitter, where an effect is on: microseconds per block and bytes; `moving_us` more while it or the
+    listener moves, or `turning_us` while only the head turns."""
 
     us: float
     memory_bytes: int
+    moving_us: float = 0.0
+    turning_us: float = 0.0
 
 
 Costs = Mapping[EffectName, Cost]
@@ -140,19 +143,25 @@ class _Planner:
         is_predicted = change.jnd >= (LEAVE_JND if self._was_on(name, emitter) else ENTER_JND)
         called_for = is_predicted if wanted is None else wanted and not means_nothing
         cost = self._costs.get(name)
-        times = len(self._situation.emitters) if emitter is None else 1
+        concerned = self._situation.emitters if emitter is None else {emitter: self._situation.emitters[emitter]}
         return Decision(
             name=name,
             emitter=emitter,
             called_for=called_for,
             change_jnd=change.jnd,
             parameter=change.parameter,
-            cost_us=None if cost is None else cost.us * times,
-            memory_bytes=None if cost is None else cost.memory_bytes * times,
+            cost_us=None if cost is None else sum(self._cost_us(cost, each) for each in concerned.values()),
+            memory_bytes=None if cost is None else cost.memory_bytes * len(concerned),
             reason=means_nothing
             or reason(self._situation, name, emitter, change, is_predicted, wanted, together_with or []),
             overridden=wanted is not None,
         )
+
+    def _cost_us(self, cost: Cost, emitter: Emitter) -> float:
+        listener = self._situation.listener
+        if emitter.speed_m_s or listener.speed_m_s:
+            return cost.us + cost.moving_us
+        return cost.us + cost.turning_us if listener.turns else cost.us
 
     def _was_on(self, name: EffectName, emitter: str | None) -> bool:
         if self._previous is None:

@@ -56,7 +56,7 @@ def _amount(change: Change) -> str:
 def _too_little(change: Change) -> str:
     if change.jnd < 0.005:
         return "leaving it out changes nothing"
-    return f"leaving it out is not heard: {_amount(change)}, {change.jnd:.2f} of what can be heard"
+    return f"nobody hears that {_amount(change)} without it"
 
 
 def _absence(situation: Situation, name: EffectName, emitter: str | None) -> str:

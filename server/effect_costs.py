@@ -1,0 +1,214 @@
+"""What effects cost on this host: renderers with and without each, side by side, for a fraction of a second.
+
+Microseconds of one core, per block and emitter. Bytes per emitter. They are medians of rounds in which all take turns,
+in time of the thread that measures, so that what else runs meanwhile counts little.
+"""
+
+import statistics
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.directivity import CARDIOID, OMNIDIRECTIONAL, Directivity
+from server.acoustics.geometry import Pose
+from server.acoustics.sound_path import SoundPathFinder
+from server.early_reflections import EarlyReflections
+from server.field.field import AcousticField
+from server.radiation import departure_gain_db
+from server.rendering.renderer import Renderer
+from server.rendering.sources import ClipPlayer
+from server.scene.effects import EffectName
+from server.scene.planner import Cost, Costs
+from server.whole_field import kemar
+
+RESPONSES_PER_S = 30.0
+"""Of an emitter that moves, or a listener."""
+
+_EMITTERS = 4
+_BLOCKS = 48
+_ROUNDS = 5
+_LONGEST_S = 0.25
+
+
+class _Placed(NamedTuple):
+    pose: Pose
+    directivity: Directivity
+
+
+class _Lane:
+    """A renderer that plays emitters with some effects, of which some may be walked past."""
+
+    def __init__(
+        self,
+        field: AcousticField,
+        block_size: int,
+        *,
+        head: bool = True,
+        response: bool = True,
+        direct: bool = True,
+        shared_tail: bool = False,
+        moves: bool = False,
+        distance: bool = True,
+        air: bool = True,
+    ) -> None:
+        manifest, rate = field.bundle.manifest, field.sample_rate
+        channels = 2 if head else 1
+        self._renderer = Renderer(
+            block_size=block_size,
+            ir_samples=field.ir_samples,
+            sample_rate=rate,
+            filters=kemar(rate),
+            speed_of_sound=manifest.speed_of_sound,
+            air_db_per_m=manifest.air.absorption_db_per_m,
+            max_emitters=_EMITTERS,
+            shared_tail=shared_tail,
+            outputs=channels,
+            has_head=head,
+        )
+        rng = np.random.default_rng(0)
+        decay = 10 ** (-3 * np.arange(field.ir_samples) / field.ir_samples)
+        self._names = [str(number) for number in range(_EMITTERS)]
+        self._moves, self._block = moves, 0
+        for name in self._names:
+            clip = rng.standard_normal(rate).astype(np.float32)
+            self._renderer.add_emitter(name, ClipPlayer(clip, loop=True), awaits_ir=response)
+            if response:
+                noise = rng.standard_normal((channels, field.ir_samples)) * decay
+                self._renderer.set_ir(name, noise.astype(np.float32))
+            self._renderer.hear_direct(name, is_heard=direct, distance=distance, air=air)
+        self._walk()
+
+    def play(self) -> None:
+        for _ in range(_BLOCKS):
+            if self._moves:
+                self._walk()
+            self._renderer.process()
+
+    def _walk(self) -> None:
+        """A centimetre on, and a little turned, block by block."""
+        self._block += 1
+        angle = 0.02 * self._block + np.arange(_EMITTERS)
+        arrivals = np.stack([np.cos(angle), np.sin(angle), np.zeros(_EMITTERS)], axis=-1)
+        lengths_m = 3 + np.sin(0.01 * self._block) + np.arange(_EMITTERS)
+        self._renderer.set_paths(self._names, lengths_m, arrivals, np.zeros((_EMITTERS, len(OCTAVE_BANDS_HZ))))
+
+
+@lru_cache(maxsize=16)
+def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
+    """Of a field's scene, measured once: half a second, and longer where nothing is compiled yet."""
+    made: dict[str, dict[str, Any]] = {
+        "still": {},
+        "without direct": {"direct": False},
+        "one ear": {"head": False},
+        "moving": {"moves": True},
+        "without air": {"moves": True, "air": False},
+        "without distance": {"moves": True, "distance": False},
+    }
+    if field.bundle.manifest.fields:
+        made |= {"without response": {"response": False}, "shared": {"shared_tail": True}}
+    else:
+        made = {name: {**options, "response": False} for name, options in made.items()}
+    lanes = {name: _Lane(field, block_size, **options) for name, options in made.items()}
+    us = _time_in_turns({name: lane.play for name, lane in lanes.items()}, per=_BLOCKS * _EMITTERS)
+    memory = {name: _bytes(lane) for name, lane in lanes.items()}
+    block_s = block_size / field.sample_rate
+    responses_per_block = RESPONSES_PER_S * block_s
+    response_us = _response_us(field) * responses_per_block
+
+    def between(more: str, less: str) -> float:
+        return max(0.0, us[more] - us[less])
+
+    def bytes_between(more: str, less: str) -> int:
+        return max(0, memory[more] - memory[less]) // _EMITTERS
+
+    finding = _finders(field)
+    costs = {
+        EffectName.DIRECT_PATH: Cost(between("still", "without direct"), 0),
+        EffectName.DISTANCE_ATTENUATION: Cost(0.0, 0, between("moving", "without distance")),
+        EffectName.PROPAGATION_DELAY: Cost(0.0, 0, between("moving", "still"), between("moving", "still")),
+        EffectName.AIR_ABSORPTION: Cost(0.0, 0, between("moving", "without air")),
+        EffectName.OCCLUSION: Cost(0.0, 0, finding["occlusion"]),
+        EffectName.DIRECTIVITY: Cost(0.0, 0, finding["directivity"]),
+        EffectName.HRTF: Cost(between("still", "one ear"), bytes_between("still", "one ear")),
+        EffectName.EARLY_REFLECTIONS: Cost(0.0, 0, finding["early reflections"] * responses_per_block),
+        # Responses of where one walks are of where one looks.
+        EffectName.HEAD_ROTATION: Cost(0.0, 0, 0.0, response_us),
+        # The path that is searched tells what its edges take, too.
+        EffectName.DIFFRACTION: Cost(0.0, 0),
+        EffectName.PER_SOURCE_TAIL: Cost(0.0, 0),
+        EffectName.LATE_REVERBERATION: Cost(0.0, 0),
+    }
+    if "shared" in us:
+        costs[EffectName.PER_SOURCE_TAIL] = Cost(between("still", "shared"), bytes_between("still", "shared"))
+        costs[EffectName.LATE_REVERBERATION] = Cost(
+            between("still", "without response"), bytes_between("still", "without response"), response_us
+        )
+    return costs
+
+
+def _bytes(thing: object, seen: set[int] | None = None) -> int:
+    """Of all arrays that something holds, each once."""
+    seen = set() if seen is None else seen
+    if id(thing) in seen:
+        return 0
+    seen.add(id(thing))
+    match thing:
+        case np.ndarray():
+            return _bytes(thing.base, seen) if isinstance(thing.base, np.ndarray) else thing.nbytes
+        case dict():
+            return sum(_bytes(each, seen) for each in thing.values())
+        case list() | tuple() | set() | deque():
+            return sum(_bytes(each, seen) for each in thing)
+        case _ if type(thing).__module__.startswith("server."):
+            return sum(_bytes(each, seen) for each in vars(thing).values())
+        case _:
+            return 0
+
+
+def _finders(field: AcousticField) -> dict[str, float]:
+    """Microseconds per emitter of what is computed of geometry for each pose."""
+    bundle = field.bundle
+    manifest, filters = bundle.manifest, kemar(field.sample_rate)
+    listener, emitters = np.array(manifest.start.listener), np.tile(manifest.start.emitter, (_EMITTERS, 1))
+    finder = SoundPathFinder(bundle.floor_plan, manifest.speed_of_sound)
+    beam, departure = _Placed(Pose((0.0, 0.0, 0.0)), CARDIOID), np.array([0.6, 0.8, 0.0])
+    computed: dict[str, Callable[[], object]] = {
+        "occlusion": lambda: finder.find(listener, emitters),
+        "directivity": lambda: [departure_gain_db(beam, departure) for _ in range(_EMITTERS)],
+    }
+    early = EarlyReflections.of(bundle, filters)
+    if early is not None:
+        responses = np.zeros((_EMITTERS, 2, field.ir_samples), np.float32)
+        omni = [_Placed(Pose(manifest.start.emitter), OMNIDIRECTIONAL)] * _EMITTERS
+        computed["early reflections"] = lambda: early.add(responses, Pose(manifest.start.listener), omni)
+    return {"early reflections": 0.0, **_time_in_turns(computed, per=_EMITTERS)}
+
+
+def _response_us(field: AcousticField) -> float:
+    """What the field takes for one response."""
+    if not field.bundle.manifest.fields:
+        return 0.0
+    start, times_s = field.bundle.manifest.start, []
+    for turn in range(_ROUNDS + 1):
+        started_s = time.thread_time()
+        field.impulse_responses([start.listener], [start.emitter], [0.1 * turn])
+        times_s.append(time.thread_time() - started_s)
+        if turn and sum(times_s) > _LONGEST_S:
+            break
+    return 1e6 * statistics.median(times_s[1:])
+
+
+def _time_in_turns(lanes: dict[str, Callable[[], object]], *, per: int) -> dict[str, float]:
+    """Microseconds of each, divided by `per`; a first round warms up."""
+    times_s: dict[str, list[float]] = {name: [] for name in lanes}
+    for _ in range(_ROUNDS + 1):
+        for name, lane in lanes.items():
+            started_s = time.thread_time()
+            lane()
+            times_s[name].append(time.thread_time() - started_s)
+    return {name: 1e6 * statistics.median(times[1:]) / per for name, times in times_s.items()}
