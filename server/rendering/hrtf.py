@@ -106,9 +106,10 @@ def filter_taps(sample_rate: int) -> int:
     return -(-round(_FILTER_S * sample_rate) // _TAPS_MULTIPLE) * _TAPS_MULTIPLE
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeadFilters:
-    """What a head does to a sound in a form that can be interpolated: minimum phase and delay, per direction.
+    """What a head does to a sound in a form that can be interpolated: minimum phase and delay, per direction. Two are
+    the same only if they are one object.
 
     `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear) after the wave passes the head's centre,
     which is when a source ahead begins to be heard. Between directions, logarithms of magnitude and delays are
