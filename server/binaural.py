@@ -45,7 +45,7 @@ class Binauralization:
         self._length_m = np.array([self._lead / self._rate * speed_of_sound])
         # Distance has had its say in what was measured.
         self._gain_db = np.full((1, len(OCTAVE_BANDS_HZ)), amplitude_to_db(self._length_m))
-        self._from_everywhere = _mean_over_directions(filters)
+        self._from_everywhere = mean_over_directions(filters)
 
     @classmethod
     def of(cls, bundle: Bundle, filters: HeadFilters) -> "Binauralization | None":
@@ -79,7 +79,7 @@ class Binauralization:
         return head
 
 
-def _mean_over_directions(filters: HeadFilters) -> _Float32:
+def mean_over_directions(filters: HeadFilters) -> _Float32:
     """(tap,) minimum-phase filter with the power of an ear that sound comes to from everywhere, mean of both ears."""
     power = np.abs(np.exp(np.fft.rfft(filters.cepstra, _N_FFT))) ** 2
     everywhere = np.einsum("d,def->f", solid_angles(filters.directions), power) / 2

@@ -1,24 +1,59 @@
 """Where the sound that comes before all reflections travels in a scene: what makes a renderer's direct paths follow
-poses. Beside it, where the scene wants them from geometry, the first reflections.
+poses, or a response hold those of emitters that stand still. Beside it, where the scene wants them from geometry, the
+first reflections.
 
 Metres; positions and directions in the world's axes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.acoustics.decibels import amplitude_to_db
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.binaural import Binauralization
 from server.early_reflections import EarlyReflections
-from server.radiation import Placed, departure_gain_db
-from server.rendering.hrtf import HeadFilters
+from server.radiation import departure_gain_db, reverberation_gain
+from server.rendered_effects import EmitterEffects
+from server.rendering.direct_path import NEAR_LIMIT_M
+from server.rendering.hrtf import HeadFilters, NoHead
 from server.rendering.limiter import CEILING
 from server.rendering.renderer import Renderer
+from server.rendering.still_paths import StillPaths
 from server.scene.bundle import Bundle
+
+_Floats = npt.NDArray[np.float64]
+Key = TypeVar("Key")
+
+_SILENT_DB = -100.0
+_IN_THE_OPEN = FloorPlan(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)), 1.0)
+"""A plan without a corner to go round: every path is straight."""
+
+
+class Aimed(Protocol):
+    """An emitter, as far as its direct sound is concerned; `directivity` is the one that is heard."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def directivity(self) -> Directivity: ...
+
+    @property
+    def effects(self) -> EmitterEffects: ...
+
+
+class _Paths(NamedTuple):
+    """Of n emitters: lengths (n,), directions of arrival (n, 3), gains (n, band) beside distance and air."""
+
+    length_m: _Floats
+    arrival: _Floats
+    gain_db: _Floats
 
 
 class DirectSound:
@@ -37,11 +72,14 @@ class DirectSound:
         air_db_per_m: npt.NDArray[np.float64],
         filters: HeadFilters | None,
         early_reflections: EarlyReflections | None = None,
+        early_without_head: EarlyReflections | None = None,
         binauralization: Binauralization | None = None,
     ) -> None:
         self.early_reflections = early_reflections
+        self.early_without_head = early_without_head
         self.binauralization = binauralization
         self._finder = SoundPathFinder(plan, speed_of_sound)
+        self._straight = SoundPathFinder(_IN_THE_OPEN, speed_of_sound)
         self._speed_of_sound = speed_of_sound
         self._air_db_per_m = air_db_per_m
         self._filters = filters
@@ -55,6 +93,7 @@ class DirectSound:
             air_db_per_m=manifest.air.absorption_db_per_m,
             filters=filters if manifest.direct_sound == "geometry" else None,
             early_reflections=EarlyReflections.of(bundle, filters),
+            early_without_head=EarlyReflections.of(bundle, NoHead(filters.sample_rate)),
             binauralization=Binauralization.of(bundle, filters),
         )
 
@@ -67,6 +106,8 @@ class DirectSound:
         max_emitters: int,
         shared_tail: bool = False,
         switches_tail: bool = False,
+        outputs: int = 2,
+        has_head: bool = True,
     ) -> Renderer:
         return Renderer(
             block_size=block_size,
@@ -79,16 +120,76 @@ class DirectSound:
             shared_tail=shared_tail,
             switches_tail=switches_tail,
             ceiling=CEILING,
+            outputs=outputs,
+            has_head=has_head,
         )
 
-    def aim(self, renderer: Renderer, listener: Pose, emitters: Mapping[str, Placed]) -> None:
+    def early(self, channels: int) -> EarlyReflections | None:
+        """Those that two ears hear, or one without a head."""
+        return self.early_reflections if channels == 2 else self.early_without_head
+
+    def aim(self, renderer: Renderer, listener: Pose, emitters: Mapping[str, Aimed]) -> None:
         """Have `renderer` hear `emitters`, by id, where they are now."""
-        if not emitters or self._filters is None:
+        if self._filters is None:
             return
-        places = np.asarray([emitter.pose.position for emitter in emitters.values()])
-        paths = self._finder.find(np.asarray(listener.position), places)
-        gains_db = paths.screen_db
-        for number, emitter in enumerate(emitters.values()):
+        for finder, named in self._by_finder(emitters.items()):
+            paths = self._find(finder, listener, [emitter for _, emitter in named])
+            renderer.set_paths([name for name, _ in named], *paths)
+
+    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Aimed]) -> None:
+        """Add the direct sound that `listener` hears of each emitter to its response (B, ear, sample), for emitters
+        whose direct sound stands still; sample 0 is emission.
+
+        A renderer plays these responses at the emitter's `reverberation_gain`, which this makes up for.
+        """
+        if self._filters is None:
+            return
+        for finder, rows in self._by_finder(enumerate(emitters)):
+            paths = self._find(finder, listener, [emitter for _, emitter in rows])
+            for (row, emitter), length_m, arrival, gain_db in zip(rows, *paths, strict=True):
+                effects = emitter.effects
+                gain = gain_db - amplitude_to_db(reverberation_gain(emitter.directivity))
+                if not effects.distance_attenuation:
+                    gain = gain + amplitude_to_db(max(length_m, NEAR_LIMIT_M))
+                still = self._still(responses.shape[1], has_air=effects.air_absorption)
+                still.add(
+                    np.array([length_m]), arrival[np.newaxis], gain[np.newaxis], listener.orientation, responses[row]
+                )
+
+    def _by_finder(
+        self, emitters: Iterable[tuple[Key, Aimed]]
+    ) -> list[tuple[SoundPathFinder, list[tuple[Key, Aimed]]]]:
+        """Emitters that walls may hide are looked for round corners; for others nothing is looked for."""
+        hidden: list[tuple[Key, Aimed]] = []
+        open_: list[tuple[Key, Aimed]] = []
+        for each in emitters:
+            (hidden if each[1].effects.occlusion else open_).append(each)
+        return [(finder, some) for finder, some in ((self._finder, hidden), (self._straight, open_)) if some]
+
+    def _find(self, finder: SoundPathFinder, listener: Pose, emitters: Sequence[Aimed]) -> _Paths:
+        places = np.asarray([emitter.pose.position for emitter in emitters])
+        paths = finder.find(np.asarray(listener.position), places)
+        gain_db = paths.screen_db
+        for number, emitter in enumerate(emitters):
+            if not emitter.effects.diffraction:
+                gain_db[number] = 0.0 if paths.in_sight[number] else _SILENT_DB
             if emitter.directivity != OMNIDIRECTIONAL:
-                gains_db[number] += departure_gain_db(emitter, paths.departure[number])
-        renderer.set_paths(list(emitters), paths.length_m, paths.arrival, gains_db)
+                gain_db[number] += departure_gain_db(emitter, paths.departure[number])
+        return _Paths(paths.length_m, paths.arrival, gain_db)
+
+    def _still(self, channels: int, *, has_air: bool) -> StillPaths:
+        return self._still_paths[channels - 1][has_air]
+
+    @cached_property
+    def _still_paths(self) -> tuple[tuple[StillPaths, StillPaths], tuple[StillPaths, StillPaths]]:
+        """For one ear and for two, without air and with it."""
+        assert self._filters is not None
+        airless = np.zeros_like(self._air_db_per_m)
+        one, two = (
+            tuple(
+                StillPaths(ears, speed_of_sound=self._speed_of_sound, air_db_per_m=air)
+                for air in (airless, self._air_db_per_m)
+            )
+            for ears in (NoHead(self._filters.sample_rate), self._filters)
+        )
+        return (one[0], one[1]), (two[0], two[1])

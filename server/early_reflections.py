@@ -22,7 +22,7 @@ from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
 from server.radiation import Placed, departure_gain_db, reverberation_gain
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.fractional_delay import TAPS
-from server.rendering.hrtf import HeadFilters
+from server.rendering.hrtf import HeadFilters, NoHead
 from server.rendering.still_paths import StillPaths
 from server.scene.bundle import Bundle
 from server.scene.geometry import Materials
@@ -40,7 +40,7 @@ class EarlyReflections:
         *,
         speed_of_sound: float,
         air_db_per_m: _Floats,
-        filters: HeadFilters,
+        filters: HeadFilters | NoHead,
     ) -> None:
         surfaces = materials.walls, materials.floor, materials.ceiling
         gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
@@ -55,7 +55,7 @@ class EarlyReflections:
         self._paths = StillPaths(filters, speed_of_sound=speed_of_sound, air_db_per_m=air_db_per_m)
 
     @classmethod
-    def of(cls, bundle: Bundle, filters: HeadFilters) -> "EarlyReflections | None":
+    def of(cls, bundle: Bundle, filters: HeadFilters | NoHead) -> "EarlyReflections | None":
         """None where the bundle's fields hold the first reflections themselves."""
         manifest = bundle.manifest
         geometry = manifest.geometry
@@ -70,7 +70,7 @@ class EarlyReflections:
         )
 
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Placed]) -> None:
-        """Add what `listener` hears of each emitter to its response (B, 2, sample); sample 0 is emission.
+        """Add what `listener` hears of each emitter to its response (B, ear, sample); sample 0 is emission.
 
         A renderer plays these responses at the emitter's `reverberation_gain`, as is right for sound from all sides;
         these paths have a gain of their own instead.

@@ -8,6 +8,8 @@ from server.acoustics.geometry import Pose, Vector3
 from server.blocks import DryBlock
 from server.errors import RequestError
 from server.protocol import AddEmitter, LiveStatus, MoveEmitter
+from server.rendered_effects import ALL_ON, EmitterEffects
+from server.rendering.convolver import PartitionedIr
 from server.rendering.sources import LiveSource
 
 _LIVE_LEAD_BLOCKS = 2
@@ -20,21 +22,47 @@ class Emitter:
 
     serial: int
     pose: Pose
-    directivity: Directivity = OMNIDIRECTIONAL
+    pattern: Directivity = OMNIDIRECTIONAL
+    """How it radiates, whether or not that is heard."""
     live: "LiveInput | None" = None
+    gain_db: float = 0.0
+    effects: EmitterEffects = ALL_ON
+    is_decided: bool = True
+    """Whether `effects` are those called for, or nobody has told yet."""
+    is_announced: bool = False
+    """Whether the client was told that it sounds."""
     is_outdated: bool = True
     """Whether its impulse response is of another pose."""
     is_displaced: bool = True
     """Whether its direct path is of another pose."""
     identity: Hashable | None = None
     """Of its impulse response, where poses share responses."""
+    unfolded: PartitionedIr | None = None
+    """The newest impulse response in effect that leaves the direct sound to the renderer."""
+    is_folded: bool = False
+    """Whether the response in effect holds the direct sound."""
     token: int | None = None
     """Pose id of the newest impulse response handed to the renderer; None before the first."""
 
     @classmethod
     def added_by(cls, message: AddEmitter, serial: int, live: "LiveInput | None") -> "Emitter":
         pattern = message.directivity
-        return cls(serial, message.pose, OMNIDIRECTIONAL if pattern is None else pattern.directivity, live)
+        radiates = OMNIDIRECTIONAL if pattern is None else pattern.directivity
+        return cls(serial, message.pose, radiates, live, message.gain_db)
+
+    @property
+    def directivity(self) -> Directivity:
+        """The one that is heard."""
+        return self.pattern if self.effects.directivity else OMNIDIRECTIONAL
+
+    @property
+    def is_live(self) -> bool:
+        return self.live is not None
+
+    @property
+    def wants_folding(self) -> bool:
+        """Whether the direct sound is to become part of a response that is otherwise up to date."""
+        return self.effects.folds and self.unfolded is not None and not (self.is_folded or self.is_outdated)
 
     @property
     def position(self) -> Vector3:

@@ -1,17 +1,63 @@
 """Impulse responses (IRs) that a session asks for, and how they are computed."""
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
-from server.binaural import Binauralization
-from server.early_reflections import EarlyReflections
+from server.direct_sound import DirectSound
 from server.field.levels import Levels
 from server.kept_irs import Preparer, prepared_irs
+from server.node_reflections import Snapping, add_first_reflections
+from server.one_ear import without_head
+from server.rendered_effects import ALL_ON, EmitterEffects
 from server.rendering.convolver import PartitionedIr
+
+
+class Asked(Protocol):
+    """An emitter, as far as its response is concerned; `directivity` is the one that is heard."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def directivity(self) -> Directivity: ...
+
+    @property
+    def effects(self) -> EmitterEffects: ...
+
+
+class Ask(Protocol):
+    """Impulse responses (batch, channel, sample) for poses in metres and radians."""
+
+    def __call__(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
+    ) -> npt.NDArray[np.float32]: ...
+
+
+class Field(Snapping, Protocol):
+    """What an acoustic field gives."""
+
+    @property
+    def ir_samples(self) -> int: ...
+
+    @property
+    def sample_rate(self) -> int: ...
+
+    def impulse_responses(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
+    ) -> npt.NDArray[np.float32]: ...
+
+
+class Hearing(Preparer, Protocol):
+    """A renderer, as far as it makes anything ready on any thread."""
+
+    def prepare_hearing(self, channels: int) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -23,21 +69,22 @@ class EmitterSnapshot:
     directivity: Directivity
     identity: Hashable | None = None
     """Of the response asked for, where poses share responses."""
+    effects: EmitterEffects = ALL_ON
 
 
 @dataclass(frozen=True)
 class IrRequest:
-    """IRs of a quality level wanted for the poses as they were when `pose_id` was the newest."""
+    """IRs of a quality level wanted for the poses as they were when `pose_id` was the newest, for two ears of a head or
+    for one without."""
 
     pose_id: int
     level: str
     listener: Pose
     emitters: tuple[EmitterSnapshot, ...]
     """Those whose IR is out of date."""
-    early_reflections: EarlyReflections | None
-    """What the field's IRs leave out, as this session's head hears it; None where they hold it."""
-    binauralization: Binauralization | None = None
-    """How this session's head hears the IRs of a field that has no ears."""
+    direct_sound: DirectSound
+    """What the field's IRs leave out, as this session's head hears it."""
+    channels: int = 2
 
 
 @dataclass(frozen=True)
@@ -47,22 +94,60 @@ class IrResponse:
     """One per emitter of the request."""
 
 
-def compute_irs(levels: Levels, request: IrRequest, preparer: Preparer) -> IrResponse:
-    """Answer a request: milliseconds of work, for a worker thread. Raises FieldError where the field has no finite response."""
-    field, early = levels[request.level], request.early_reflections
-    if field.level.reuse is not None:
-        irs_at_nodes = prepared_irs(field, levels.kept, early, preparer, request.listener, request.emitters)
-        return IrResponse(request, irs_at_nodes)
-    count = len(request.emitters)
-    places = [emitter.pose.position for emitter in request.emitters]
-    irs = field.impulse_responses(
-        np.tile(np.asarray(request.listener.position), (count, 1)),
-        np.asarray(places),
-        np.full(count, request.listener.yaw),
-        remember=True,
-    )
-    if early is not None:
-        early.add(irs, request.listener, request.emitters)
-    if request.binauralization is not None:
-        irs = request.binauralization.hear(irs, request.listener, places)
-    return IrResponse(request, tuple(preparer.prepare(ir) for ir in irs))
+def compute_irs(levels: Levels, request: IrRequest, hearing: Hearing) -> IrResponse:
+    """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
+    field, direct = levels[request.level], request.direct_sound
+    hearing.prepare_hearing(request.channels)
+    is_whole = all(emitter.effects.late and emitter.effects.early for emitter in request.emitters)
+    folds = any(emitter.effects.folds for emitter in request.emitters)
+    if field.level.reuse is not None and is_whole and not folds and request.channels == 2:
+        early = direct.early_reflections
+        kept = prepared_irs(field, levels.kept, early, hearing, request.listener, request.emitters)
+        return IrResponse(request, kept)
+    ask = partial(field.impulse_responses, remember=True)
+    irs = composed_irs(field, direct, request.listener, request.emitters, request.channels, ask=ask)
+    return IrResponse(request, tuple(hearing.prepare(ir if is_whole else _without_end(ir)) for ir in irs))
+
+
+def composed_irs(
+    field: Field,
+    direct: DirectSound,
+    listener: Pose,
+    emitters: Sequence[Asked],
+    channels: int = 2,
+    *,
+    ask: Ask | None = None,
+) -> npt.NDArray[np.float32]:
+    """(B, channel, sample) the responses of emitters, of the parts that their effects call for: the field is asked for
+    none but those whose late part is, or somebody else in its place is if there is one to `ask`."""
+    count = len(emitters)
+    places = [emitter.pose.position for emitter in emitters]
+    late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
+    held_channels = 2 if direct.binauralization is None else 1
+    held = np.zeros((count, held_channels, field.ir_samples), np.float32)
+    if late:
+        heads = np.tile(np.asarray(listener.position), (len(late), 1))
+        held[late] = (ask or field.impulse_responses)(heads, np.asarray(places)[late], np.full(len(late), listener.yaw))
+    if direct.binauralization is not None:
+        return direct.binauralization.hear(held, listener, places) if channels == 2 else held
+    irs = without_head(held, field.sample_rate) if channels == 1 else held
+    early = direct.early(channels)
+    mirrored = [row for row, emitter in enumerate(emitters) if emitter.effects.early]
+    if early is not None and len(mirrored) == count:
+        add_first_reflections(field, early, irs, listener, emitters)
+    elif early is not None and mirrored:
+        reflected = irs[mirrored]
+        add_first_reflections(field, early, reflected, listener, [emitters[row] for row in mirrored])
+        irs[mirrored] = reflected
+    standing = [row for row, emitter in enumerate(emitters) if emitter.effects.folds]
+    if standing:
+        whole = irs[standing]
+        direct.add(whole, listener, [emitters[row] for row in standing])
+        irs[standing] = whole
+    return irs
+
+
+def _without_end(ir: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """(channel, sample) up to the last sample that is not zero, one at least."""
+    heard = np.flatnonzero(ir.any(axis=0))
+    return ir[:, : heard[-1] + 1 if heard.size else 1]

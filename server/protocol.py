@@ -24,6 +24,8 @@ from server.errors import RequestError
 from server.load import AUTO, Reason
 from server.scene.geometry import Opening
 from server.scene.manifest import Bounds, QualityLevel
+from server.scene.plan import Plan
+from server.scene.situation import Output
 
 PROTOCOL: Final = 2
 
@@ -83,7 +85,8 @@ class Hello(_Message):
     """First message. `sample_rate` may be left out; given, it has to be the scene's. `buffer_blocks` is how many blocks
     ahead of real time the server runs: more survives a worse network, less is heard sooner. `hrtf` names the head to
     hear through, one of GET /v1/hrtfs. `level` names a quality level of the scene, or leaves it to the server (auto):
-    the best that its host computes in time, and a cheaper one under load."""
+    the best that its host computes in time, and a cheaper one under load. `output` is what the sound is heard from: a
+    mono loudspeaker gets blocks of one channel. `effects` switches some on or off whatever the plan would decide."""
 
     type: Literal["hello"] = "hello"
     protocol: int
@@ -94,6 +97,8 @@ class Hello(_Message):
     listener: ListenerStart | None = None
     hrtf: Annotated[str, Field(max_length=256)] | None = None
     level: LevelName = AUTO
+    output: Output = "headphones"
+    effects: Annotated[dict[str, bool], Field(max_length=32)] = {}
     buffer_blocks: Annotated[int, Field(ge=1, le=32)] = 8
 
 
@@ -174,6 +179,15 @@ class SetLevel(_Message):
     level: LevelName
 
 
+class SetEffects(_Message):
+    """Effects to switch on or off whatever the plan of effects would decide, or, with null, to leave to it; and what
+    the sound is heard from, from now on. A plan changed says what came of it."""
+
+    type: Literal["set_effects"] = "set_effects"
+    effects: Annotated[dict[str, bool | None], Field(max_length=32)] = {}
+    output: Output | None = None
+
+
 class RemoveEmitter(_Message):
     type: Literal["remove_emitter"] = "remove_emitter"
     id: EmitterId
@@ -221,7 +235,18 @@ class Ping(_Message):
     id: Annotated[int, Field(ge=0, lt=2**53)]  # what JavaScript counts exactly
 
 
-TextMessage = Hello | AddEmitter | MoveEmitter | SetGain | SetLevel | RemoveEmitter | ListenerPose | Acknowledge | Ping
+TextMessage = (
+    Hello
+    | AddEmitter
+    | MoveEmitter
+    | SetGain
+    | SetLevel
+    | SetEffects
+    | RemoveEmitter
+    | ListenerPose
+    | Acknowledge
+    | Ping
+)
 ClientMessage = TextMessage | DryBlock
 _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(discriminator="type")])
 
@@ -335,6 +360,43 @@ class LevelChanged(_Message):
     sample_clock: int
 
 
+class EffectDecision(_Message):
+    """One effect on or off, of an emitter or, with null, of all that is heard. `change_jnd` is by how many
+    just-noticeable differences the `parameter` that changes most would change without it; `cost_us` per block and
+    `memory_bytes` are what it costs, or saves, null where that was not measured."""
+
+    name: str
+    emitter: str | None
+    called_for: bool
+    change_jnd: float
+    parameter: str
+    cost_us: float | None
+    memory_bytes: int | None
+    reason: str
+    overridden: bool
+
+
+class PlanChanged(_Message):
+    """From `sample_clock` on these effects are heard, or their change is under way. Microseconds per block."""
+
+    type: Literal["plan_changed"] = "plan_changed"
+    decisions: tuple[EffectDecision, ...]
+    cost_us: float
+    saved_us: float
+    sample_clock: int
+
+    @classmethod
+    def of(cls, plan: Plan, sample_clock: int) -> "PlanChanged":
+        # Not validated: a plan of many emitters is long, and this is made on the audio thread.
+        decisions = tuple(
+            EffectDecision.model_construct(**{**vars(each), "change_jnd": round(each.change_jnd, 3)})
+            for each in plan.decisions
+        )
+        return cls.model_construct(
+            decisions=decisions, cost_us=plan.cost_us, saved_us=plan.saved_us, sample_clock=sample_clock
+        )
+
+
 class Durations(_Message):
     """Milliseconds that a half, 99 % and 99.9 % did not exceed; None before the first."""
 
@@ -410,7 +472,7 @@ class Error(_Message):
         return cls(code=refusal.code, message=str(refusal), field=refusal.field)
 
 
-ServerMessage = Welcome | EmitterAdded | EmitterRemoved | LevelChanged | Status | Pong | Error
+ServerMessage = Welcome | EmitterAdded | EmitterRemoved | LevelChanged | PlanChanged | Status | Pong | Error
 _SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
 
 

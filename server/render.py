@@ -10,28 +10,32 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
-from server.acoustics.geometry import Pose, Quaternion, Vector3
+from server.acoustics.geometry import Pose, Quaternion
 from server.direct_sound import DirectSound
+from server.effects_in_force import EffectsInForce, as_asked
+from server.emitters import Emitter
 from server.errors import NafirError
-from server.field.lattice import Snapped
-from server.node_reflections import add_first_reflections
+from server.field.field import Silence
+from server.ir_request import EmitterSnapshot, Field, composed_irs
+from server.planned_effects import PlannedEffects
 from server.radiation import reverberation_gain
 from server.rendering.ingest import DryAudio, require_gain
 from server.rendering.renderer import render_all
 from server.rendering.sources import ClipPlayer
-from server.scene.manifest import QualityLevel
 
 FloatArray = npt.NDArray[np.float32]
 
 MAX_RENDER_S = 2 * 3600
 """A render is held in memory as a whole: two hours of stereo at 48 kHz are 2.8 GB."""
 
+_LEAST_GAIN = 1e-6
+"""A plan takes what is softer for this."""
 _CLOCKS = ("sample", "time_s")
 _REVERBERATION = "reverberation_sample"
 _POSITION = ("x", "y", "z")
@@ -41,25 +45,6 @@ _YAW = ("yaw_deg",)
 
 class PathError(NafirError):
     """A path file that cannot be followed; the message names the line and the column."""
-
-
-class ImpulseResponses(Protocol):
-    """What an acoustic field gives: IRs (batch, channel, `ir_samples`) for poses in metres and radians."""
-
-    @property
-    def ir_samples(self) -> int: ...
-
-    @property
-    def sample_rate(self) -> int: ...
-
-    @property
-    def level(self) -> QualityLevel: ...
-
-    def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped: ...
-
-    def impulse_responses(
-        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
-    ) -> FloatArray: ...
 
 
 @dataclass(frozen=True)
@@ -197,7 +182,7 @@ def _pose(values: dict[str, float], where: str) -> Pose:
 
 
 def render(
-    field: ImpulseResponses,
+    field: Field,
     direct_sound: DirectSound,
     emitters: Sequence[RenderedEmitter],
     path: Sequence[PathPoint],
@@ -205,64 +190,141 @@ def render(
     block_size: int = 256,
     length: int | None = None,
     progress: Callable[[float], None] | None = None,
+    planned: PlannedEffects | None = None,
 ) -> FloatArray:
-    """What a listener on `path` (one point or more, by rising sample) hears of `emitters` (one or more): (2, length).
+    """What a listener on `path` (one point or more, by rising sample) hears of `emitters` (one or more): (channel,
+    length), two ears or, from a mono loudspeaker, one channel.
 
     A point takes effect with the first block that begins at its sample or later, unless a later point does too. The
     emitters start where the path begins. `length` in samples defaults to the end of the path or of the longest clip,
-    whichever is later, and the reverberation after it. `progress` is told the fraction done.
+    whichever is later, and the reverberation after it. `progress` is told the fraction done. Only the effects are
+    rendered that are `planned`, or all.
     """
     if not path or not emitters:
         raise ValueError("a render needs a path and an emitter")
     if length is None:
         last_start = max(path[-1].sample, path[0].sample + max(emitter.clip.size for emitter in emitters))
         length = _block_at(last_start, block_size) * block_size + field.ir_samples
-    renderer = direct_sound.renderer(
-        block_size=block_size,
-        ir_samples=field.ir_samples,
-        sample_rate=field.sample_rate,
-        max_emitters=len(emitters),
-    )
-    named = {str(number): emitter for number, emitter in enumerate(emitters)}
-    for name, emitter in named.items():
-        renderer.add_emitter(name, ClipPlayer(emitter.clip, loop=emitter.loop), gain=emitter.gain)
-        if emitter.directivity != OMNIDIRECTIONAL:
-            renderer.set_reverberation_gain(name, reverberation_gain(emitter.directivity))
     direct = {_block_at(point.sample, block_size): point.pose for point in path}
     reverberation = {
         _block_at(point.reverberation_sample, block_size): point.pose
         for point in path
         if point.reverberation_sample is not None
     }
+    walk = _Walk(field, direct_sound, emitters, path[0].pose, block_size, planned)
     blocks = -(-length // block_size)
-    output = np.empty((2, blocks, block_size), np.float32)
+    output = np.empty((walk.renderer.outputs, blocks, block_size), np.float32)
     for block in range(blocks):
-        if block in direct:
-            direct_sound.aim(renderer, direct[block], named)
-            renderer.set_orientation(direct[block].orientation)
-        if block in reverberation:
-            irs = _irs(field, direct_sound, emitters, reverberation[block])
-            for name, ir in zip(named, irs, strict=True):
-                renderer.set_ir(name, ir)
-        (output[:, block],) = render_all([renderer])
+        walk.go_on(direct.get(block), reverberation.get(block))
+        (output[:, block],) = render_all([walk.renderer])
         if progress:
             progress((block + 1) / blocks)
-    return output.reshape(2, -1)[:, :length]
+    return output.reshape(len(output), -1)[:, :length]
+
+
+class _Walk:
+    """A renderer and what it is told, block by block, as a session would: plans and responses at once."""
+
+    def __init__(
+        self,
+        field: Field,
+        direct_sound: DirectSound,
+        emitters: Sequence[RenderedEmitter],
+        start: Pose,
+        block_size: int,
+        planned: PlannedEffects | None,
+    ) -> None:
+        self.renderer = direct_sound.renderer(
+            block_size=block_size,
+            ir_samples=field.ir_samples,
+            sample_rate=field.sample_rate,
+            max_emitters=len(emitters),
+            switches_tail=planned is not None,
+            outputs=1 if planned is not None and planned.output == "mono" else 2,
+            has_head=planned is None or planned.shared.head,
+        )
+        self._field = field
+        self._direct_sound = direct_sound
+        self._effects = EffectsInForce(
+            self.renderer,
+            planned,
+            sample_rate=field.sample_rate,
+            has_early=direct_sound.early_reflections is not None,
+            has_late=not isinstance(field, Silence),
+        )
+        self._listener = start
+        self._has_begun = False
+        self._emitters: dict[str, Emitter] = {}
+        for number, emitter in enumerate(emitters):
+            name = str(number)
+            self.renderer.add_emitter(name, ClipPlayer(emitter.clip, loop=emitter.loop), gain=emitter.gain)
+            if emitter.directivity != OMNIDIRECTIONAL:
+                self.renderer.set_reverberation_gain(name, reverberation_gain(emitter.directivity))
+            gain_db = float(amplitude_to_db(max(emitter.gain, _LEAST_GAIN)))
+            self._emitters[name] = Emitter(number, emitter.pose, emitter.directivity, gain_db=gain_db)
+            self._emitters[name].is_decided = planned is None
+            if planned is not None:
+                planned.follow_emitter(name, emitter.pose, 0.0)
+
+    def go_on(self, direct: Pose | None, reverberation: Pose | None) -> None:
+        """What is heard from the next block on: direct sound and responses of these poses, or as before."""
+        if direct is not None:
+            self._move(direct)
+        self._plan()
+        displaced = {name: emitter for name, emitter in self._emitters.items() if emitter.is_displaced}
+        if self._has_begun and displaced:
+            self._direct_sound.aim(self.renderer, self._listener, displaced)
+            for emitter in displaced.values():
+                emitter.is_displaced = False
+        if reverberation is not None:
+            for emitter in self._emitters.values():
+                emitter.is_outdated = True
+            self._respond(reverberation)
+        elif self._effects.planned is not None and self._has_begun:
+            self._respond(self._listener)
+
+    def _move(self, pose: Pose) -> None:
+        moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
+        for name, emitter in self._emitters.items():
+            emitter.is_displaced |= moves
+            if moves or (turns and self._effects.shared.head):
+                self._effects.unfold(name, emitter)
+        self._listener, self._has_begun = pose, True
+        self.renderer.set_orientation(pose.orientation)
+        if self._effects.planned is not None:
+            self._effects.planned.follow_listener(pose, self._effects.clock_s)
+
+    def _plan(self) -> None:
+        planned = self._effects.planned
+        if planned is None:
+            return
+        request = planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+        if request is not None:
+            planned.accept(request.plan())
+            self._effects.enforce(self._emitters)
+            self._effects.share_tail(False, self._emitters)
+
+    def _respond(self, listener: Pose) -> None:
+        """Hand in the responses that are out of date."""
+        named = {
+            name: emitter
+            for name, emitter in self._emitters.items()
+            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_folding)
+        }
+        if self._effects.awaits_ears:
+            self.renderer.hear_with(self._effects.channels)
+        if not named:
+            return
+        asked = [
+            EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity, effects=as_asked(emitter))
+            for emitter in named.values()
+        ]
+        irs = composed_irs(self._field, self._direct_sound, listener, asked, self._effects.channels)
+        for (name, emitter), snapshot, ir in zip(named.items(), asked, irs, strict=True):
+            emitter.is_outdated = False
+            self._effects.hear(name, emitter, self.renderer.prepare(ir), snapshot.effects, 0)
 
 
 def _block_at(sample: int, block_size: int) -> int:
     """The first block that begins at `sample` or later."""
     return -(-sample // block_size)
-
-
-def _irs(
-    field: ImpulseResponses, direct_sound: DirectSound, emitters: Sequence[RenderedEmitter], listener: Pose
-) -> FloatArray:
-    count = len(emitters)
-    places = [emitter.pose.position for emitter in emitters]
-    irs = field.impulse_responses([listener.position] * count, places, [listener.yaw] * count)
-    if direct_sound.early_reflections is not None:
-        add_first_reflections(field, direct_sound.early_reflections, irs, listener, emitters)
-    if direct_sound.binauralization is not None:
-        irs = direct_sound.binauralization.hear(irs, listener, places)
-    return irs

@@ -19,6 +19,7 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.blocks import AudioBlock, DryBlock, FloatArray
 from server.direct_sound import DirectSound
+from server.effects_in_force import EffectsInForce, as_asked
 from server.emitters import Emitter, LiveInput
 from server.errors import RequestError
 from server.field.levels import Levels
@@ -26,6 +27,7 @@ from server.ir_request import EmitterSnapshot, IrRequest, IrResponse
 from server.kept_irs import response_identity
 from server.load import Reason, Rung
 from server.pacing import SendWindow
+from server.planned_effects import PlannedEffects, PlanRequest
 from server.protocol import (
     PROTOCOL,
     Acknowledge,
@@ -39,8 +41,10 @@ from server.protocol import (
     ListenerPose,
     LiveStatus,
     MoveEmitter,
+    PlanChanged,
     RemoveEmitter,
     ServerMessage,
+    SetEffects,
     SetGain,
 )
 from server.radiation import reverberation_gain
@@ -49,6 +53,10 @@ from server.rendering.ingest import DryAudio
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
 from server.rendering.sources import ClipPlayer, Source
 from server.scene.bundle import Bundle
+from server.scene.effects import read_overrides, require_effect
+from server.scene.plan import Plan
+from server.scene.planner import Costs
+from server.scene.situation import Place
 
 
 def _start_pose(bundle: Bundle) -> Pose:
@@ -76,6 +84,8 @@ class Session:
         max_emitters: int = 16,
         shared_tail: bool = False,
         window: int = 40,
+        place: Place | None = None,
+        costs: Costs | None = None,
     ) -> None:
         field = levels.default
         if hello.protocol != PROTOCOL:
@@ -101,17 +111,30 @@ class Session:
         self._sample_rate = field.sample_rate
         self._load_clip = load_clip
         self._direct_sound = DirectSound.of(self._bundle, filters)
+        self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
+        self._bundle.require_inside(self._listener.position, "listener.position")
+        planned = None
+        if place is not None:
+            scene, own = self._bundle.manifest.effects, read_overrides(hello.effects)
+            planned = PlannedEffects(place, self._listener, output=hello.output, scene=scene, own=own, costs=costs)
         self.renderer = self._direct_sound.renderer(
             block_size=hello.block_size,
             ir_samples=max(level.ir_samples for level in levels.values()),
             sample_rate=field.sample_rate,
             max_emitters=max_emitters,
             shared_tail=shared_tail,
-            switches_tail=any(level.level.shared_tail for level in levels.values()),
+            switches_tail=planned is not None or any(level.level.shared_tail for level in levels.values()),
+            outputs=1 if hello.output == "mono" else 2,
+            has_head=planned is None or planned.shared.head,
         )
         self.renderer.share_tail(rung.shared_tail)
-        self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
-        self._bundle.require_inside(self._listener.position, "listener.position")
+        self._effects = EffectsInForce(
+            self.renderer,
+            planned,
+            sample_rate=field.sample_rate,
+            has_early=self._direct_sound.early_reflections is not None,
+            has_late=bool(self._bundle.manifest.fields),
+        )
         self._emitters: dict[str, Emitter] = {}
         self._next_serial = 0
         self._newest_pose_id = 0
@@ -164,10 +187,12 @@ class Session:
                 case AddEmitter():
                     self._add_emitter(message)
                 case SetGain():
-                    self._require_emitter(message.id)
+                    self._require_emitter(message.id).gain_db = message.gain_db
                     self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)))
                 case DryBlock():
                     self._push(message)
+                case SetEffects():
+                    self._wish(message)
                 case RemoveEmitter():
                     return self._remove_emitter(message)
                 case Acknowledge():
@@ -183,12 +208,13 @@ class Session:
         if self._in_flight is not None or self._waits_for_change:
             return None
         outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter)]
-        if not outdated:
+        if not outdated and not self._effects.awaits_ears:
             self._accepted_pose_id = self._newest_pose_id
             return None
         if self.sample_clock < self._next_request_clock and all(emitter.token is not None for emitter in outdated):
             return None
         self._next_request_clock = self.sample_clock + round(self._ir_interval_s * self._sample_rate)
+        asked = {emitter.serial: as_asked(emitter) for emitter in outdated}
         for emitter in outdated:
             emitter.is_outdated = False
         self._in_flight = IrRequest(
@@ -196,11 +222,17 @@ class Session:
             self._rung.level,
             self._listener,
             tuple(
-                EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity, self._identity(emitter))
+                EmitterSnapshot(
+                    emitter.serial,
+                    emitter.pose,
+                    emitter.directivity,
+                    self._identity(emitter),
+                    asked[emitter.serial],
+                )
                 for emitter in outdated
             ),
-            self._direct_sound.early_reflections,
-            self._direct_sound.binauralization,
+            self._direct_sound,
+            self._effects.channels,
         )
         return self._in_flight
 
@@ -211,20 +243,49 @@ class Session:
             return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
         pose_id = response.request.pose_id
         asked = response.request.emitters
-        arrived = {each.serial: (ir, each.identity) for each, ir in zip(asked, response.irs, strict=True)}
+        arrived = {each.serial: (ir, each) for each, ir in zip(asked, response.irs, strict=True)}
         events: list[ServerMessage] = []
+        if response.request.channels != self.renderer.channels:
+            self.renderer.hear_with(response.request.channels)
         for identifier, emitter in self._emitters.items():
             if emitter.serial not in arrived:
                 continue
-            ir, emitter.identity = arrived[emitter.serial]
-            self.renderer.set_ir(identifier, ir, token=pose_id)
-            if emitter.token is None:
-                events.append(EmitterAdded(id=identifier, sample_clock=self.sample_clock))
-            emitter.token = pose_id
+            ir, snapshot = arrived[emitter.serial]
+            if self._effects.hear(identifier, emitter, ir, snapshot.effects, pose_id):
+                emitter.identity = snapshot.identity
+                events += self._announce(identifier)
         self._accepted_pose_id = pose_id
         if response.request.level == self._rung.level:
             events += self._change()
         return events
+
+    def take_plan_request(self) -> PlanRequest | None:
+        """The plan of effects to make now. None while an earlier one is unanswered, or where nothing has changed."""
+        planned = self._effects.planned
+        if planned is None:
+            return None
+        return planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+
+    def adopt(self, plan: Plan) -> list[ServerMessage]:
+        """Put the plan asked for last into effect, with the block that follows."""
+        planned = self._effects.planned
+        assert planned is not None
+        is_other = planned.accept(plan)
+        events: list[ServerMessage] = []
+        for identifier in self._effects.enforce(self._emitters):
+            events += self._announce(identifier)
+        self._effects.share_tail(self._heard.shared_tail, self._emitters)
+        self._waits_for_change = False
+        return [*events, PlanChanged.of(plan, self.sample_clock)] if is_other else events
+
+    def keep_effects(self) -> list[ServerMessage]:
+        """No plan came of the one asked for last: what is on stays on; of who has just come, everything."""
+        planned = self._effects.planned
+        assert planned is not None
+        planned.give_up()
+        for emitter in self._emitters.values():
+            emitter.is_decided = True
+        return [Error(code="plan_failure", message="no plan of effects could be made")]
 
     def give_up(self, request: IrRequest) -> list[ServerMessage]:
         """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
@@ -286,13 +347,18 @@ class Session:
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
 
     def _needs_ir(self, emitter: Emitter) -> bool:
-        """Whether its IR is of another pose, which where poses share responses need not make it another."""
+        """Whether its IR is of another pose, which where poses share responses need not make it another; or is to hold
+        the direct sound, too."""
+        if not (emitter.is_decided and emitter.effects.has_response):
+            return False
         if emitter.is_outdated and emitter.identity is not None:
             emitter.is_outdated = self._identity(emitter) != emitter.identity
-        return emitter.is_outdated
+        return emitter.is_outdated or emitter.wants_folding
 
     def _identity(self, emitter: Emitter) -> Hashable | None:
         field = self._levels[self._rung.level]
+        if emitter.effects.folds:
+            return None
         return response_identity(field, self._direct_sound.early_reflections, self._listener, emitter)
 
     def _change(self) -> list[ServerMessage]:
@@ -300,7 +366,7 @@ class Session:
         if self._rung == self._heard:
             return []
         self._heard = self._rung
-        self.renderer.share_tail(self._heard.shared_tail)
+        self._effects.share_tail(self._heard.shared_tail, self._emitters)
         return [
             LevelChanged(
                 level=self._heard.level,
@@ -310,6 +376,23 @@ class Session:
                 sample_clock=self.sample_clock,
             )
         ]
+
+    def _announce(self, identifier: str) -> list[ServerMessage]:
+        """That an emitter sounds from the next block on, if it has not been said."""
+        emitter = self._emitters[identifier]
+        if emitter.is_announced:
+            return []
+        emitter.is_announced = True
+        return [EmitterAdded(id=identifier, sample_clock=self.sample_clock)]
+
+    def _follow(self, identifier: str, emitter: Emitter) -> None:
+        if self._effects.planned is not None:
+            self._effects.planned.follow_emitter(identifier, emitter.pose, self._effects.clock_s)
+
+    def _wish(self, message: SetEffects) -> None:
+        if self._effects.planned is not None:
+            wishes = {require_effect(name): is_on for name, is_on in message.effects.items()}
+            self._effects.planned.wish(wishes, message.output)
 
     def _has_applied_all(self) -> bool:
         return all(
@@ -322,10 +405,16 @@ class Session:
         pose = message.pose
         self._bundle.require_inside(pose.position, "position")
         self._advance_pose_id(message.pose_id)
-        for emitter in self._emitters.values():
-            emitter.is_outdated = True
-            emitter.is_displaced |= pose.position != self._listener.position
+        moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
+        shared = self._effects.shared
+        for identifier, emitter in self._emitters.items():
+            emitter.is_outdated |= moves or (turns and shared.head and shared.head_rotation)
+            emitter.is_displaced |= moves
+            if moves or (turns and shared.head):
+                self._effects.unfold(identifier, emitter)
         self._listener = pose
+        if self._effects.planned is not None:
+            self._effects.planned.follow_listener(pose, self._effects.clock_s)
 
     def _move_emitter(self, message: MoveEmitter) -> None:
         emitter = self._require_emitter(message.id)
@@ -336,6 +425,8 @@ class Session:
         # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
         is_mirrored = self._direct_sound.early_reflections is not None and emitter.directivity != OMNIDIRECTIONAL
         emitter.is_outdated |= is_mirrored and emitter.pose.orientation != before
+        self._effects.unfold(message.id, emitter)
+        self._follow(message.id, emitter)
 
     def _advance_pose_id(self, pose_id: int) -> None:
         if pose_id <= self._newest_pose_id:
@@ -358,9 +449,11 @@ class Session:
         except RendererFullError as exc:
             raise RequestError("too_many_emitters", str(exc)) from exc
         emitter = Emitter.added_by(message, self._next_serial, live)
+        emitter.is_decided = self._effects.planned is None
         if emitter.directivity != OMNIDIRECTIONAL:
             self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.directivity))
         self._emitters[message.id] = emitter
+        self._follow(message.id, emitter)
         self._next_serial += 1
         self._waits_for_change = False
 
@@ -379,6 +472,8 @@ class Session:
     def _remove_emitter(self, message: RemoveEmitter) -> list[ServerMessage]:
         self._require_emitter(message.id)
         del self._emitters[message.id]
+        if self._effects.planned is not None:
+            self._effects.planned.forget_emitter(message.id)
         self.renderer.remove_emitter(message.id)
         return [EmitterRemoved(id=message.id), *([] if self._emitters else self._change())]
 

@@ -18,6 +18,7 @@ from server.field.levels import Levels
 from server.ir_request import IrRequest, IrResponse, compute_irs
 from server.load import Ladder, Offer, Reason, Strain, ir_interval_s
 from server.pacing import StreamClock
+from server.planned_effects import PlanRequest
 from server.protocol import (
     AddEmitter,
     ClientMessage,
@@ -29,6 +30,7 @@ from server.protocol import (
     SetLevel,
     Status,
 )
+from server.scene.plan import Plan
 from server.session import Session
 
 MAX_WAITING_MESSAGES = 256
@@ -113,6 +115,7 @@ class Stream:
         self._time_s: Callable[[], float] = time.monotonic
         self._messages: deque[tuple[float, ClientMessage]] = deque()
         self._answers: deque[tuple[IrRequest, Future[_Computed]]] = deque()
+        self._plans: deque[Future[Plan]] = deque()
         self._next_status_s = 1.0
 
     @property
@@ -156,13 +159,15 @@ class Stream:
 
     @property
     def has_news(self) -> bool:
-        return bool(self._messages or self._answers)
+        return bool(self._messages or self._answers or self._plans)
 
     def take_in(self, workers: Executor) -> list[Outgoing]:
         """Heed what waits and ask for impulse responses."""
         outgoing: list[Outgoing] = []
         while self._answers:
             outgoing += self._take_answer(*self._answers.popleft())
+        while self._plans:
+            outgoing += self._take_plan(self._plans.popleft())
         for _ in range(len(self._messages)):
             arrived_s, message = self._messages.popleft()
             refused = self._choose(message) if isinstance(message, SetLevel) else self.session.receive(message)
@@ -170,6 +175,8 @@ class Stream:
                 self.pose_times.arrive(message.pose_id, arrived_s)
                 self.reverberation_times.arrive(message.pose_id, arrived_s)
             outgoing += refused
+        if (wanted := self.session.take_plan_request()) is not None:
+            workers.submit(PlanRequest.plan, wanted).add_done_callback(self._keep_plan)
         if (request := self.session.take_request()) is not None:
             self._asked_s = self._time_s()
             answer = workers.submit(_compute_timed, self._levels, request, self.session)
@@ -236,6 +243,16 @@ class Stream:
     def _keep_answer(self, request: IrRequest, answer: "Future[_Computed]") -> None:
         self._answers.append((request, answer))  # on the worker's thread
         self._wake()
+
+    def _keep_plan(self, plan: "Future[Plan]") -> None:
+        self._plans.append(plan)  # on the worker's thread
+        self._wake()
+
+    def _take_plan(self, plan: "Future[Plan]") -> list[ServerMessage]:
+        if (failure := plan.exception()) is not None:
+            _logger.error("no plan of effects", exc_info=failure)
+            return self.session.keep_effects()
+        return self.session.adopt(plan.result())
 
     def _take_answer(self, request: IrRequest, answer: "Future[_Computed]") -> list[ServerMessage]:
         if self._asked_s is not None:

@@ -24,7 +24,8 @@ from server.clips import ClipLibrary, DecodeError
 from server.errors import RequestError
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
-from server.load import Offer
+from server.load import Offer, Rung
+from server.places import place_of_field
 from server.protocol import (
     AddEmitter,
     ClientMessage,
@@ -148,17 +149,7 @@ class Connection:
             block_s = hello.block_size / field.sample_rate
             offer = self._host.offers[hello.scene]
             ladder = offer.ladder(hello.level, block_s=block_s)
-            session = await asyncio.to_thread(
-                Session,
-                hello,
-                levels,
-                self._host.hrtfs.filters(hrtf, field.sample_rate),
-                lambda name: load_clip(self._host.clips[hello.scene], name),
-                rung=ladder.rung,
-                max_emitters=settings.max_emitters,
-                shared_tail=settings.shared_tail,
-                window=window,
-            )
+            session = await asyncio.to_thread(self._open_session, hello, levels, hrtf, ladder.rung, window)
         except RequestError as refusal:
             raise ClosingError(POLICY_VIOLATION, Error.from_refusal(refusal)) from refusal
         await self._send_message(
@@ -167,7 +158,7 @@ class Connection:
                 scene=describe_scene(levels),
                 sample_rate=field.sample_rate,
                 block_size=hello.block_size,
-                channels=2,
+                channels=session.renderer.outputs,
                 encoding=hello.encoding,
                 buffer_blocks=hello.buffer_blocks,
                 window=window,
@@ -184,6 +175,20 @@ class Connection:
             block_s=block_s,
             lead=hello.buffer_blocks,
             deliver=self._enqueue,
+        )
+
+    def _open_session(self, hello: Hello, levels: Levels, hrtf: str, rung: Rung, window: int) -> Session:
+        host, field = self._host, levels.default
+        return Session(
+            hello,
+            levels,
+            host.hrtfs.filters(hrtf, field.sample_rate),
+            lambda name: load_clip(host.clips[hello.scene], name),
+            rung=rung,
+            max_emitters=host.settings.max_emitters,
+            shared_tail=host.settings.shared_tail,
+            window=window,
+            place=place_of_field(field, hello.block_size),
         )
 
     async def _pump(self, stream: Stream, hello: Hello) -> None:

@@ -25,8 +25,7 @@ from server.rendering.direct_path_kernel import (
 )
 from server.rendering.fade import raised_cosine
 from server.rendering.fractional_delay import AFTER, TAPS, sinc_table
-from server.rendering.hrtf import HeadFilters, filter_taps
-from server.rendering.sphere import Triangulation
+from server.rendering.hrtf import HeadFilters, NoHead
 
 NEAR_LIMIT_M = 0.25
 
@@ -58,33 +57,6 @@ class PathTarget(NamedTuple):
     """(band,) beside distance and air."""
 
 
-class _NoHead(NamedTuple):
-    """One ear in the open: what there is of `HeadFilters` where there is no head."""
-
-    sample_rate: int
-    cepstra: npt.NDArray[np.float32]
-    delays_s: npt.NDArray[np.float64]
-    longest_advance_s: float
-    longest_delay_s: float
-    triangulation: Triangulation
-
-    @classmethod
-    def at(cls, sample_rate: int) -> "_NoHead":
-        nowhere = Triangulation(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3, 3)))
-        return cls(
-            sample_rate,
-            np.zeros((1, 1, filter_taps(sample_rate)), np.float32),
-            np.zeros((1, 1)),
-            0.0,
-            0.0,
-            nowhere,
-        )
-
-    @property
-    def taps(self) -> int:
-        return int(self.cepstra.shape[-1])
-
-
 class DirectPath:
     """Sizes everything here and allocates nothing afterwards. One thread at a time may use it.
 
@@ -109,7 +81,7 @@ class DirectPath:
         self.block_size = block_size
         self.sample_rate = sample_rate
         self.channels = 1 if filters is None else 2
-        ears = _NoHead.at(sample_rate) if filters is None else filters
+        ears = NoHead(sample_rate) if filters is None else filters
         self.state = _state(slots, block_size, ears, speed_of_sound, air_db_per_m, max_distance_m)
         self._blocks = np.zeros((slots, block_size), np.float32)
         self._heard = np.zeros((self.channels, block_size), np.float32)
@@ -199,7 +171,7 @@ class DirectPath:
 def _state(
     slots: int,
     block_size: int,
-    filters: HeadFilters | _NoHead,
+    filters: HeadFilters | NoHead,
     speed_of_sound: float,
     air_db_per_m: npt.NDArray[np.floating],
     max_distance_m: float,

@@ -154,6 +154,19 @@ class HeadFilters:
         return float(max(0.0, self.delays_s.max()))
 
 
+class NoHead:
+    """One ear in the open: what there is of `HeadFilters` without a head."""
+
+    longest_advance_s = longest_delay_s = 0.0
+
+    def __init__(self, sample_rate: int) -> None:
+        self.sample_rate = sample_rate
+        self.taps = filter_taps(sample_rate)
+        self.cepstra = np.zeros((1, 1, self.taps), np.float32)
+        self.delays_s = np.zeros((1, 1))
+        self.triangulation = Triangulation(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3, 3)))
+
+
 def _smooth(directions: _Floats, common_s: _Floats) -> _Floats:
     """(d,) the delay common to both ears without the errors of measuring it, counted from straight ahead.
 

@@ -155,9 +155,9 @@ class Renderer:
         return sum(mixer.convolver is not None for mixer in self._mixers)
 
     @property
-    def has_head(self) -> bool:
-        """Whether new emitters are heard through a head."""
-        return self._mixer.channels == 2
+    def channels(self) -> int:
+        """What new emitters are heard with: two ears of a head, or one without."""
+        return self._mixer.channels
 
     def applied(self, emitter_id: str) -> int | None:
         """Token of the IR in effect, in its head, at the end of the block last rendered; None before the first."""

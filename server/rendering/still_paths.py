@@ -14,7 +14,7 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.minimum_phase import band_cepstra
 from server.rendering.direct_path import NEAR_LIMIT_M, head_axes
 from server.rendering.fractional_delay import sinc_table
-from server.rendering.hrtf import HeadFilters
+from server.rendering.hrtf import HeadFilters, NoHead
 from server.rendering.still_paths_kernel import DoubleArray, FloatArray, StillPathTables, add_still_paths
 
 
@@ -29,9 +29,14 @@ def _sinc_table() -> FloatArray:
 
 
 class StillPaths:
-    """A head and the air around it; safe to share between threads. `air_db_per_m` (band,) >= 0."""
+    """A head and the air around it; safe to share between threads. `air_db_per_m` (band,) >= 0.
 
-    def __init__(self, filters: HeadFilters, *, speed_of_sound: float, air_db_per_m: npt.NDArray[np.floating]) -> None:
+    Without a head there is one ear, and responses have one channel.
+    """
+
+    def __init__(
+        self, filters: HeadFilters | NoHead, *, speed_of_sound: float, air_db_per_m: npt.NDArray[np.floating]
+    ) -> None:
         orders = np.maximum(np.arange(filters.taps), 1)
         self._tables = StillPathTables(
             cepstra=filters.cepstra,
@@ -57,7 +62,7 @@ class StillPaths:
         orientation: Sequence[float],
         out: FloatArray,
     ) -> None:
-        """Add to `out` (2, sample), where sample 0 is emission, what a head turned by the quaternion `orientation`
+        """Add to `out` (ear, sample), where sample 0 is emission, what a head turned by the quaternion `orientation`
         hears of paths: lengths (n,), unit vectors (n, 3) in the world towards where they come from, gains (n, band)
         beside distance and air. What would be heard before sample 0 or after the last is left out."""
         # One layout of each, so that one version is ever compiled.

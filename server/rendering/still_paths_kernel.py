@@ -51,7 +51,7 @@ def add_still_paths(
     out: FloatArray,
 ) -> None:
     """Add to `out` (e, sample) what paths (path,), (path, 3), (path, band) make of a unit impulse at sample 0."""
-    count, bands = tables.cepstra.shape[2], tables.band_cepstra.shape[0]
+    ears, count, bands = tables.cepstra.shape[1], tables.cepstra.shape[2], tables.band_cepstra.shape[0]
     wide = -(-(count + TAPS - 1) // loops.TILE) * loops.TILE
     cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)
     taps, padded = np.zeros((2, count), np.float32), np.zeros(wide + TAPS - 1, np.float32)
@@ -64,23 +64,26 @@ def add_still_paths(
             direction[axis] = 0.0
             for world in range(3):
                 direction[axis] += to_head[axis, world] * arrivals[path, world]
-        triangle = find_triangle(tables.across, tables.inverses, direction, triangle, weights)
-        for ear in range(2):
+        if ears == 2:
+            triangle = find_triangle(tables.across, tables.inverses, direction, triangle, weights)
+        for ear in range(ears):
             of_ear = cepstrum[ear, :count]
             of_ear[:] = 0
-            for corner in range(3):
-                measured = tables.triangles[triangle, corner]
-                loops.add_scaled(tables.cepstra[measured, ear], weights[corner], of_ear)
+            if ears == 2:
+                for corner in range(3):
+                    measured = tables.triangles[triangle, corner]
+                    loops.add_scaled(tables.cepstra[measured, ear], weights[corner], of_ear)
             for band in range(bands):
                 level_db = gains_db[path, band] - tables.air_db_per_m[band] * length
                 loops.add_scaled(tables.band_cepstra[band], level_db, of_ear)
             of_ear *= tables.orders
         loops.series_exponential(cepstrum, tables.reciprocals, sums, taps)
         gain = np.float32(1.0 / max(length, tables.nearest_m))
-        for ear in range(2):
+        for ear in range(ears):
             delay_s = length / tables.speed_of_sound
-            for corner in range(3):
-                delay_s += weights[corner] * tables.head_delays_s[tables.triangles[triangle, corner], ear]
+            if ears == 2:
+                for corner in range(3):
+                    delay_s += weights[corner] * tables.head_delays_s[tables.triangles[triangle, corner], ear]
             delay = delay_s * tables.sample_rate
             whole = int(np.ceil(delay))
             phase = (whole - delay) * PHASES

@@ -1,25 +1,37 @@
-"""What quality levels cost: milliseconds per binaural response on one core, memory and storage."""
+"""What quality levels cost: milliseconds per pose on one core, memory and storage."""
 
 import math
 import multiprocessing
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import psutil
 
+from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.acoustics.geometry import Pose
+from server.bounded_cache import BoundedCache
+from server.direct_sound import DirectSound
 from server.field.field import AcousticField
+from server.field.levels import Levels
+from server.field.reuse import KEPT_BYTES, Kept
+from server.ir_request import EmitterSnapshot, IrRequest, compute_irs
+from server.kept_irs import response_identity
 from server.scene.bundle import Bundle
 from server.scene.manifest import Cost, QualityLevel
+from server.whole_field import kemar
+from training.frontier.walk import POSES_PER_S, walk
 
-_STEP_M = 0.05
+BLOCK_SIZE = 256
+STRETCH_S = 5
+_FEW = 12
 _WARM_UP = 3
-_TURN = 8
 
 
 @contextmanager
@@ -36,44 +48,105 @@ def one_core() -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def measure_ms(
-    fields: Mapping[str, AcousticField],
+class Listener:
+    """Somebody who hears one emitter at one level, as a stream serves them: what happens between a pose and a response
+    that is ready to be convolved. Nothing is kept from before."""
+
+    def __init__(self, field: AcousticField) -> None:
+        bundle = field.bundle
+        self._kept: Kept = BoundedCache(KEPT_BYTES)
+        self._field = AcousticField(bundle, field.level, field.graph, kept=self._kept)
+        self._levels = Levels([self._field], self._kept)
+        self._direct_sound = DirectSound.of(bundle, kemar(field.sample_rate))
+        self._renderer = self._direct_sound.renderer(
+            block_size=BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
+        )
+        self._emitter = EmitterSnapshot(0, Pose(bundle.manifest.start.emitter), OMNIDIRECTIONAL)
+        self._heard: Hashable | None = None
+
+    @property
+    def kept_bytes(self) -> int:
+        return self._kept.bytes
+
+    def time_ms(self, listener: Pose) -> float:
+        """Milliseconds that a pose takes."""
+        started_s = time.perf_counter()
+        early = self._direct_sound.early_reflections
+        identity = response_identity(self._field, early, listener, self._emitter)
+        if identity is None or identity != self._heard:
+            request = IrRequest(0, self._field.level.name, listener, (self._emitter,), self._direct_sound)
+            compute_irs(self._levels, request, self._renderer)
+            self._heard = identity
+        return 1000 * (time.perf_counter() - started_s)
+
+    def forget(self) -> None:
+        self._kept.clear()
+        self._heard = None
+
+
+@dataclass(frozen=True)
+class Times:
+    """Milliseconds: `walk` (pose,) of a walk that begins with nothing kept, `miss` (pose,) of poses that find nothing;
+    `kept_mb` is what was kept in the end."""
+
+    walk: npt.NDArray[np.float64]
+    miss: npt.NDArray[np.float64]
+    kept_mb: float
+
+
+def measure(
+    levels: Levels,
     *,
-    rounds: int,
+    walk_s: float,
     budget_s: float,
     seed: int = 0,
     advance: Callable[[], None] = lambda: None,
-) -> dict[str, npt.NDArray[np.float64]]:
-    """Milliseconds of single responses by level, (response,).
+) -> dict[str, Times]:
+    """What a pose takes at each level, on a `walk` of `walk_s` through the scene.
 
-    All levels take turns of several, so that whatever else the machine does meets all of them, and each finds its
-    numbers in the processor's caches, as a stream does.
-
-    A listener walks, through walls if need be, and asks for a response every 5 cm: warm starts live from that. A level
-    that has had its `budget_s` sits out the remaining rounds, but for three.
+    All levels walk a few seconds each in turn, so that whatever else the machine does meets all of them, and each finds
+    its numbers in the processor's caches, as a stream does. To a level that computes every response anew one pose is
+    like another: it takes the first few of each stretch, and none once it has had its `budget_s`, but for three
+    stretches.
     """
+    poses = walk(levels.bundle, duration_s=walk_s, seed=seed)
+    listeners = {name: Listener(field) for name, field in levels.items()}
+    times: dict[str, list[float]] = {name: [] for name in levels}
+    misses: dict[str, list[float]] = {name: [] for name in levels}
+    for listener in listeners.values():
+        for pose in poses[:_WARM_UP]:
+            listener.time_ms(pose)
+        listener.forget()
     rng = np.random.default_rng(seed)
-    times: dict[str, list[float]] = {name: [] for name in fields}
-    walks = {name: _walk(field, np.random.default_rng(seed)) for name, field in fields.items()}
-    for name, field in fields.items():
-        for _ in range(_WARM_UP):
-            _time_ms(field, next(walks[name]))
-    for _ in range(rounds):
-        for name in rng.permutation(list(fields)):
-            for _ in range(_TURN):
-                if math.fsum(times[name]) <= 1000 * budget_s or len(times[name]) < _WARM_UP:
-                    times[name].append(_time_ms(fields[name], next(walks[name])))
+    stretch = STRETCH_S * POSES_PER_S
+    starts = range(0, len(poses), stretch)
+    for start in starts:
+        for name in rng.permutation(list(levels)):
+            listener = listeners[name]
+            if levels[name].level.reuse is not None:
+                times[name] += [listener.time_ms(pose) for pose in poses[start : start + stretch]]
+            elif math.fsum(times[name]) <= 1000 * budget_s or start < 3 * stretch:
+                times[name] += [listener.time_ms(pose) for pose in poses[start : start + _FEW]]
         advance()
-    return {name: np.array(values) for name, values in times.items()}
+    kept_mb = {name: listener.kept_bytes / 1e6 for name, listener in listeners.items()}
+    for start in starts:
+        for name, level in levels.items():
+            if level.level.reuse is not None:
+                listeners[name].forget()
+                misses[name].append(listeners[name].time_ms(poses[start]))
+    return {name: Times(np.array(times[name]), np.array(misses[name] or times[name]), kept_mb[name]) for name in levels}
 
 
-def cost_of(bundle: Bundle, level: QualityLevel, times_ms: npt.NDArray[np.float64], memory_mb: float) -> Cost:
+def cost_of(bundle: Bundle, level: QualityLevel, times: Times, memory_mb: float) -> Cost:
+    """`memory_mb` is that of the level's field."""
     file = bundle.manifest.fields[level.field].file
     return Cost(
-        ms_p50=float(np.median(times_ms)),
-        ms_p99=float(np.percentile(times_ms, 99)),
+        ms_p50=float(np.median(times.walk)),
+        ms_p99=float(np.percentile(times.walk, 99)),
+        ms_mean=float(np.mean(times.walk)),
+        ms_miss=float(np.median(times.miss)),
         storage_mb=len(bundle.models[file]) / 1e6,
-        memory_mb=memory_mb,
+        memory_mb=memory_mb + times.kept_mb,
         host=_processor(),
     )
 
@@ -110,37 +183,6 @@ def _added_mb(folder: Path, level: str) -> float:
 
 def _serving(bundle: Bundle, level: str | None) -> AcousticField:
     field = AcousticField.load(bundle, level=level)
-    _time_ms(field, next(_walk(field, np.random.default_rng(0))))
+    start = bundle.manifest.start
+    field.impulse_responses([start.listener], [start.emitter], [0.0])
     return field
-
-
-_Pose = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]
-
-
-def _walk(field: AcousticField, rng: np.random.Generator) -> Iterator[_Pose]:
-    """Listener, emitter and yaw, for ever: a walk between random places, with the emitter where it is until it ends."""
-    bounds = field.bundle.manifest.bounds
-    while True:
-        start, end, emitter = (_place(field, bounds.minimum, bounds.maximum, rng) for _ in range(3))
-        steps = max(1, math.ceil(float(np.linalg.norm(end - start)) / _STEP_M))
-        yaw = rng.uniform(-math.pi, math.pi)
-        for share in np.linspace(0, 1, steps):
-            place = start + share * (end - start)
-            if field.bundle.floor_plan.contains(place):
-                yield place, emitter, yaw
-
-
-def _place(
-    field: AcousticField, low: Sequence[float], high: Sequence[float], rng: np.random.Generator
-) -> npt.NDArray[np.float64]:
-    while True:
-        place = rng.uniform(low, high)
-        if field.bundle.floor_plan.contains(place):
-            return np.asarray(place)
-
-
-def _time_ms(field: AcousticField, pose: _Pose) -> float:
-    listener, emitter, yaw = pose
-    started_s = time.perf_counter()
-    field.impulse_responses([listener], [emitter], [yaw])
-    return 1000 * (time.perf_counter() - started_s)

@@ -1,0 +1,219 @@
+"""When a session asks which effects its situation calls for, and what it was told last.
+
+A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
+One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, and four times a second
+at most while poses change. Clocks are seconds of sound.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from server.acoustics.directivity import Directivity
+from server.acoustics.geometry import Pose
+from server.motion import Motion
+from server.rendered_effects import EmitterEffects, SharedEffects
+from server.scene.effects import EffectName, Overrides
+from server.scene.plan import Decision, Plan
+from server.scene.planner import Costs, make_plan
+from server.scene.situation import Emitter, Listener, Output, Place, Situation
+
+PERIOD_S = 0.25
+_GRID_M = 0.25
+"""Poses that differ by less call for no new plan."""
+
+
+class Placed(Protocol):
+    """An emitter, as far as a plan is concerned; `pattern` is how it radiates, heard or not."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def pattern(self) -> Directivity: ...
+
+    @property
+    def gain_db(self) -> float: ...
+
+    @property
+    def is_live(self) -> bool: ...
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """A plan to make; `corrections` are effects that were switched off and turned out to be heard, with the reason why
+    they are on."""
+
+    situation: Situation
+    previous: Plan | None
+    overrides: Overrides
+    corrections: Mapping[EffectName, str]
+    costs: Costs
+
+    def plan(self) -> Plan:
+        """A millisecond or so: not for the audio thread."""
+        overrides = {**dict.fromkeys(self.corrections, True), **self.overrides}
+        plan = make_plan(self.situation, previous=self.previous, overrides=overrides, costs=self.costs)
+        return _explained(plan, {name: why for name, why in self.corrections.items() if name not in self.overrides})
+
+
+class PlannedEffects:
+    """Of one session in `place`. `scene` are the wishes of who made the scene, which `own` ones, of who listens,
+    override."""
+
+    def __init__(
+        self,
+        place: Place,
+        listener: Pose,
+        *,
+        output: Output = "headphones",
+        scene: Overrides | None = None,
+        own: Overrides | None = None,
+        costs: Costs | None = None,
+    ) -> None:
+        self.place = place
+        self.output = output
+        self.plan: Plan | None = None
+        self.corrections: dict[EffectName, str] = {}
+        self._scene = dict(scene or {})
+        self._own = dict(own or {})
+        self._costs = costs or {}
+        self._listener = Motion(listener, 0.0)
+        self._emitters: dict[str, Motion] = {}
+        self._is_stale = False
+        self._in_flight = False
+        self._next_look_s = 0.0
+        self._seen: object = None
+
+    @property
+    def overrides(self) -> dict[EffectName, bool]:
+        return {**self._scene, **self._own}
+
+    @property
+    def shared(self) -> SharedEffects:
+        """Without a plan, whether there is a head is told from the output."""
+        if self.plan is None or not self.plan.shared:
+            return SharedEffects(head=self.overrides.get(EffectName.HRTF, self.output == "headphones"))
+        return SharedEffects.of(self.plan)
+
+    def wish(self, wishes: Mapping[EffectName, bool | None], output: Output | None) -> None:
+        """On, off, or, with None, as the plan or the scene has it."""
+        for name, is_on in wishes.items():
+            if is_on is None:
+                self._own.pop(name, None)
+            else:
+                self._own[name] = is_on
+        self.output = output or self.output
+        self._is_stale = True
+
+    def correct(self, corrections: Mapping[EffectName, str]) -> None:
+        """Have effects be on from now on, for the reasons given."""
+        self.corrections.update(corrections)
+        self._is_stale = True
+
+    def follow_listener(self, pose: Pose, clock_s: float) -> None:
+        before = self._listener.moves(clock_s), self._listener.turns(clock_s)
+        self._listener.follow(pose, clock_s)
+        self._is_stale |= before != (self._listener.moves(clock_s), self._listener.turns(clock_s))
+
+    def follow_emitter(self, name: str, pose: Pose, clock_s: float) -> None:
+        """One that comes is at rest until it moves."""
+        motion = self._emitters.get(name)
+        if motion is None:
+            self._emitters[name] = Motion(pose, clock_s)
+            self._is_stale = True
+            return
+        before = motion.moves(clock_s)
+        motion.follow(pose, clock_s)
+        self._is_stale |= before != motion.moves(clock_s)
+
+    def forget_emitter(self, name: str) -> None:
+        self._emitters.pop(name, None)
+        self._is_stale = True
+
+    def take_request(self, listener: Pose, emitters: Mapping[str, Placed], clock_s: float) -> PlanRequest | None:
+        """None where an earlier one is unanswered, or nothing has changed."""
+        if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
+            return None
+        self._next_look_s = clock_s + PERIOD_S
+        motion = self._listener
+        situation = Situation(
+            self.place,
+            Listener(listener, motion.speed_m_s(clock_s), motion.turns(clock_s), self.output),
+            {name: self._emitter(name, emitter, clock_s) for name, emitter in emitters.items()},
+        )
+        seen = _coarse(situation)
+        if not self._is_stale and seen == self._seen:
+            return None
+        self._is_stale, self._seen, self._in_flight = False, seen, True
+        return PlanRequest(situation, self.plan, self.overrides, dict(self.corrections), self._costs)
+
+    def accept(self, plan: Plan) -> bool:
+        """Put the plan asked for last into effect. Whether it switches anything."""
+        self._in_flight = False
+        before, self.plan = self.plan, plan
+        return before is None or _switched_on(before) != _switched_on(plan)
+
+    def give_up(self) -> None:
+        """No plan came of the request: what is on stays on."""
+        self._in_flight = False
+
+    def of_emitter(self, name: str, clock_s: float, *, has_early: bool, has_late: bool) -> EmitterEffects | None:
+        """None of one that came after the plan was asked for."""
+        if self.plan is None or name not in self.plan.by_emitter:
+            return None
+        effects = EmitterEffects.of(self.plan, name, has_early=has_early, has_late=has_late)
+        holds_still = self.overrides.get(EffectName.PROPAGATION_DELAY) is False
+        # It may have begun to move since the plan was asked for.
+        follows = effects.propagation_delay or (self._is_under_way(name, clock_s) and not holds_still)
+        return dataclasses.replace(effects, propagation_delay=follows, holds_still=holds_still)
+
+    def _is_under_way(self, name: str, clock_s: float) -> bool:
+        """Whether the direct sound of an emitter changes with poses."""
+        listener = self._listener
+        turns = listener.turns(clock_s) and self.output == "headphones"
+        return self._emitters[name].moves(clock_s) or listener.moves(clock_s) or turns
+
+    def _emitter(self, name: str, emitter: Placed, clock_s: float) -> Emitter:
+        motion = self._emitters[name]
+        return Emitter(
+            emitter.pose,
+            emitter.pattern,
+            emitter.gain_db,
+            motion.speed_m_s(clock_s),
+            motion.turns(clock_s),
+            emitter.is_live,
+        )
+
+
+def _coarse(situation: Situation) -> object:
+    """What a plan depends on, as far as it matters."""
+
+    def cell(pose: Pose) -> tuple[int, ...]:
+        return tuple(round(coordinate / _GRID_M) for coordinate in pose.position)
+
+    listener = situation.listener
+    emitters = tuple(
+        (name, cell(emitter.pose), emitter.speed_m_s, emitter.turns, emitter.gain_db)
+        for name, emitter in situation.emitters.items()
+    )
+    return cell(listener.pose), listener.speed_m_s, listener.turns, emitters
+
+
+def _switched_on(plan: Plan) -> frozenset[tuple[str | None, EffectName, bool, bool]]:
+    return frozenset((each.emitter, each.name, each.called_for, each.overridden) for each in plan.decisions)
+
+
+def _explained(plan: Plan, reasons: Mapping[EffectName, str]) -> Plan:
+    """With other reasons for some effects than that somebody wished for them."""
+
+    def explain(decisions: Mapping[EffectName, Decision]) -> dict[EffectName, Decision]:
+        return {
+            name: dataclasses.replace(each, reason=reasons[name], overridden=False)
+            if name in reasons and each.overridden
+            else each
+            for name, each in decisions.items()
+        }
+
+    return Plan(explain(plan.shared), {name: explain(each) for name, each in plan.by_emitter.items()})
