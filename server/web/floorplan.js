@@ -72,7 +72,8 @@ export class FloorPlan extends EventTarget {
   #resize() {
     const width = Math.floor(this.#svg.parentElement.clientWidth);
     if (width === 0 || width === this.#view?.width) return;
-    this.#view = new View({ corners: this.#world.scene.corners, width });
+    const { corners, walls_known: walled } = this.#world.scene;
+    this.#view = new View({ corners, walled, width });
     this.#svg.setAttribute("viewBox", `0 0 ${width} ${this.#view.height}`);
     this.#svg.style.height = `${this.#view.height}px`;
     this.#paper.resize(this.#view);

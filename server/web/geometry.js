@@ -37,7 +37,8 @@ function nearestOnEdge([a, b], point) {
   return [a[0] + clamped * along[0], a[1] + clamped * along[1]];
 }
 
-/** Where a person or a source may stand: inside the walls by `clearance` metres and inside the field's bounds. */
+/** Where a person or a source may stand: inside the walls by `clearance` metres and inside the field's bounds. With a clearance of
+    null there are no walls. */
 export class Floor {
   constructor({ corners, minimum, maximum, clearance = 0.15 }) {
     this.corners = corners;
@@ -52,6 +53,7 @@ export class Floor {
 
   allows(point) {
     const inBounds = point.every((value, axis) => value >= this.minimum[axis] && value <= this.maximum[axis]);
+    if (this.clearance === null) return inBounds;
     const clear = (edge) => distance(point, nearestOnEdge(edge, point)) >= this.clearance - 1e-6;
     return inBounds && contains(this.corners, point) && edges(this.corners).every(clear);
   }

@@ -18,6 +18,7 @@ import { World } from "./world.js";
 
 const RETRY_MS = 2000;
 const MAP_SPACING_M = 0.25;
+const FINEST_MAP_M = 0.1; // that a server draws
 
 const find = (id) => document.getElementById(id);
 const epochNow = () => performance.timeOrigin + performance.now();
@@ -86,7 +87,7 @@ class Page {
     const ys = scene.corners.map(([, y]) => y);
     const size = [xs, ys].map((values) => +(Math.max(...values) - Math.min(...values)).toFixed(1));
     find("scene-name").textContent = scene.name;
-    find("scene-size").textContent = `${size[0]} × ${size[1]} × ${scene.height_m} m`;
+    find("scene-size").textContent = `${size[0]} × ${size[1]} × ${+scene.height_m.toFixed(2)} m`;
     document.documentElement.style.setProperty("--aspect", (size[0] / size[1]).toFixed(3));
     document.title = `${scene.name} · Nafir`;
     if (scenes.length < 2) return;
@@ -103,7 +104,7 @@ class Page {
     this.world = new World(scene);
     if (clips.length > 0) this.world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });
     else this.notices.show("clips", "The server has no clip to play.", { lasting: true });
-    this.paper = new Paper(find("paper"), scene.corners);
+    this.paper = new Paper(find("paper"), scene);
     this.plan = new FloorPlan({ svg: find("marks"), paper: this.paper, world: this.world });
     this.sources = new Sources({ world: this.world, clips, list: find("sources"), add: find("add-source") });
     new Walking(this.world, { focusedEmitter: () => this.plan.focusedEmitter, dropped: () => this.map() });
@@ -288,7 +289,8 @@ class Page {
       this.paper.show(this.field, this.scale);
       this.legend.show(this.scale);
       const whose = emitters.length > 1 ? "of all sources together" : `of source ${emitters[0].id}`;
-      this.legend.note = `${whose}; 0 dB is 1 m in the open`;
+      const zero = this.scene.direct_sound === "field" ? "a response of unit energy" : "1 m in the open";
+      this.legend.note = `${whose}; 0 dB is ${zero}`;
       this.#pointNeedle();
     } catch (error) {
       if (error.name === "AbortError") return;
@@ -302,7 +304,10 @@ class Page {
     const known = this.grids.get(id);
     if (known?.key === key) return known.grid;
     const heightM = this.world.listener.position[2];
-    const grid = parseGrid(await fetchLoudness(this.scene.id, { position, heightM, spacingM: MAP_SPACING_M, signal }));
+    const { minimum, maximum } = this.scene.bounds;
+    const shorter = Math.min(maximum[0] - minimum[0], maximum[1] - minimum[1]);
+    const spacingM = Math.max(FINEST_MAP_M, Math.min(MAP_SPACING_M, shorter / 8));
+    const grid = parseGrid(await fetchLoudness(this.scene.id, { position, heightM, spacingM, signal }));
     this.grids.set(id, { key, grid });
     return grid;
   }

@@ -1,4 +1,5 @@
-// The still part of the floor plan, drawn on a canvas: walls, the loudness map on the floor, and measures along the edges.
+// The still part of the floor plan, drawn on a canvas: walls, or the bounds where no walls are known, the loudness map on the floor,
+// and measures along the edges.
 
 import { colour, loudnessRamp } from "./palette.js";
 
@@ -8,7 +9,7 @@ const FINEST_MAP = 200; // pixels per metre
 
 /** Placement of a plan in a box: world [x, y] in metres to CSS pixels and back. */
 export class View {
-  constructor({ corners, width }) {
+  constructor({ corners, walled, width }) {
     const xs = corners.map(([x]) => x);
     const ys = corners.map(([, y]) => y);
     this.west = Math.min(...xs);
@@ -16,12 +17,12 @@ export class View {
     this.east = Math.max(...xs);
     this.north = Math.max(...ys);
     this.margin = width < 520 ? 26 : 36;
-    this.wall = width < 520 ? 6 : 10;
+    this.wall = walled ? (width < 520 ? 6 : 10) : 0;
     this.width = width;
     const [left, right, above, below] = [this.margin, this.wall + 3, this.wall + 3, this.margin];
     this.scale = (width - left - right) / (this.east - this.west);
     // Inner walls are gaps in the polygon, closed by the strokes along both their sides.
-    this.wall = Math.max(this.wall, 0.5 * WALL_M * this.scale + 1);
+    if (walled) this.wall = Math.max(this.wall, 0.5 * WALL_M * this.scale + 1);
     this.left = left;
     this.top = above;
     this.height = Math.round(above + below + this.scale * (this.north - this.south));
@@ -39,6 +40,7 @@ export class View {
 export class Paper {
   #canvas;
   #corners;
+  #walled;
   #view = null;
   #field = null;
   #scale = null;
@@ -47,9 +49,10 @@ export class Paper {
   #fadeStart = 0;
   #stale = false;
 
-  constructor(canvas, corners) {
+  constructor(canvas, { corners, walls_known: walled }) {
     this.#canvas = canvas;
     this.#corners = corners;
+    this.#walled = walled;
   }
 
   resize(view) {
@@ -117,7 +120,7 @@ export class Paper {
     const ratio = this.#canvas.width / view.width;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, view.width, view.height);
-    this.#drawWalls(context);
+    if (this.#walled) this.#drawWalls(context);
     context.save();
     this.#outline(context);
     context.clip();
@@ -126,6 +129,7 @@ export class Paper {
     if (this.#before) this.#drawMap(context, this.#before, 1);
     if (this.#map) this.#drawMap(context, this.#map, (this.#before ? progress : 1) * (this.#stale ? 0.45 : 1));
     context.restore();
+    if (!this.#walled) this.#drawBounds(context);
     this.#drawMeasures(context);
   }
 
@@ -145,6 +149,15 @@ export class Paper {
     context.strokeStyle = colour("--wall");
     context.lineWidth = 2 * this.#view.wall;
     context.stroke();
+  }
+
+  #drawBounds(context) {
+    this.#outline(context);
+    context.strokeStyle = colour("--faint");
+    context.lineWidth = 1;
+    context.setLineDash([5, 5]);
+    context.stroke();
+    context.setLineDash([]);
   }
 
   #drawMeasures(context) {

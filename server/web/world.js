@@ -10,7 +10,8 @@ export class World extends EventTarget {
     super();
     this.scene = scene;
     const { minimum, maximum } = scene.bounds;
-    this.floor = new Floor({ corners: scene.corners, minimum: minimum.slice(0, 2), maximum: maximum.slice(0, 2) });
+    const clearance = scene.walls_known ? undefined : null;
+    this.floor = new Floor({ corners: scene.corners, minimum: minimum.slice(0, 2), maximum: maximum.slice(0, 2), clearance });
     this.listener = { position: [...scene.listener.position], yaw: scene.listener.yaw ?? 0 };
     this.emitters = new Map();
   }
@@ -70,7 +71,7 @@ export class World extends EventTarget {
 
   #roomiest() {
     const { minimum, maximum, corners } = this.floor;
-    const open = new Floor({ corners, minimum, maximum, clearance: 0.7 });
+    const open = this.floor.clearance === null ? this.floor : new Floor({ corners, minimum, maximum, clearance: 0.7 });
     const taken = [this.listener.position, ...[...this.emitters.values()].map(({ position }) => position)];
     const spread = ([x, y]) => Math.min(...taken.map((position) => distance(position, [x, y])));
     let best = null;
