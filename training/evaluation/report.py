@@ -110,7 +110,7 @@ def _cell(evaluation: Evaluation, result: Result, metric: Metric, best: str | No
 
 def _figure(result: Result, metric: Metric) -> str:
     mean = result.summaries[metric.name].mean
-    return "–" if mean is None else _short(mean)
+    return "–" if mean is None else short(mean)
 
 
 def _unexpected(evaluation: Evaluation, result: Result, metric: Metric) -> int:
@@ -132,13 +132,13 @@ def _published_cells(published: PublishedTable, method: str) -> list[Text]:
 
 
 def _storage(result: Result) -> str:
-    return "" if result.storage_bytes is None else _short(result.storage_bytes / 1e6)
+    return "" if result.storage_bytes is None else short(result.storage_bytes / 1e6)
 
 
 def _time(result: Result) -> str:
-    return "" if result.ms is None else _short(result.ms)
+    return "" if result.ms is None else short(result.ms)
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
     """Three significant digits, never an exponent."""
     return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:#.3g}".rstrip(".")

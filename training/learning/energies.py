@@ -47,7 +47,7 @@ class EnergyError(nn.Module):
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Of flat (B, heads.size) levels in physical units."""
         ours, theirs = self._energies(predicted, self._deficit), self._energies(target, 0.0)
-        return torch.stack([(a - b).square().mean() for a, b in zip(ours, theirs, strict=True)]).sum()
+        return torch.stack([nn.functional.mse_loss(a, b) for a, b in zip(ours, theirs, strict=True)]).sum()
 
     def _energies(self, flat: Tensor, deficit: float) -> list[Tensor]:
         """Half the logarithm of what is to come by octave, of the same in all, and of runs of fine frames by octave."""

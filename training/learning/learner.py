@@ -25,6 +25,11 @@ class Learner(Protocol):
         """Brings targets within reach; whatever is costly to compute is kept beside the responses."""
         ...
 
+    @property
+    def prepared_s(self) -> float:
+        """Seconds that preparing took, whenever that was."""
+        ...
+
     def initialise(self, rows: Rows, seed: int) -> None:
         """Once, before the first step: normalisation, and whatever training should start from."""
         ...

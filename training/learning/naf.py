@@ -44,6 +44,10 @@ class NafLearner:
     def prepare(self, progress: Progress) -> None:
         """Nothing to do."""
 
+    @property
+    def prepared_s(self) -> float:
+        return 0.0
+
     @torch.no_grad()
     def initialise(self, rows: Rows, seed: int) -> None:
         """Mean and three standard deviations of every point over responses and ears, and mean interaural coherence."""

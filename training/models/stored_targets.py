@@ -26,12 +26,14 @@ _FLUSH_S = 10.0
 
 @dataclass(frozen=True)
 class Targets:
-    """Poses and flat targets, one row per response that is not held out; `flat` is a memory map."""
+    """Poses and flat targets, one row per response that is not held out; `flat` is a memory map. `seconds` is how long
+    it once took to compute them."""
 
     listener: npt.NDArray[np.float32]
     emitter: npt.NDArray[np.float32]
     yaw: npt.NDArray[np.float32]
     flat: npt.NDArray[np.float16]
+    seconds: float
 
 
 def load_targets(
@@ -52,15 +54,16 @@ def load_targets(
         with h5py.File(path, "a") as file:
             if file.attrs.get("key") != key:
                 file.clear()
-                file.attrs.update(key=key, pairs=0)
+                file.attrs.update(key=key, pairs=0, seconds=0.0)
             _complete(file, responses, cells, rows, progress, expected=expected)
             offset, shape = file["flat"].id.get_offset(), file["flat"].shape
+            seconds = float(file.attrs["seconds"])
     except BlockingIOError as exc:
         raise DatasetError(f"{path}: another process is computing these targets; wait for it") from exc
     except OSError as exc:
         raise DatasetError(f"{path}: not a file of targets; delete it, and it is computed anew ({exc})") from exc
     poses = (part[rows].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw))
-    return Targets(*poses, np.memmap(path, np.float16, "r", offset, shape))
+    return Targets(*poses, np.memmap(path, np.float16, "r", offset, shape), seconds)
 
 
 def _complete(
@@ -89,8 +92,10 @@ def _complete(
         progress.advance(task)
         if time.monotonic() - flushed_s > _FLUSH_S or number + 1 == len(starts):
             file.flush()
+            now_s = time.monotonic()
             file.attrs["pairs"] = number + 1
-            flushed_s = time.monotonic()
+            file.attrs["seconds"] += now_s - flushed_s
+            flushed_s = now_s
 
 
 @dataclass(frozen=True)

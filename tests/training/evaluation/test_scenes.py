@@ -1,0 +1,93 @@
+import json
+
+import pytest
+
+from training.evaluation.evaluate import METRICS
+from training.evaluation.scenes import ResultError, SceneResult, markdown, step_times, times_markdown
+
+
+def column(kind, method, error, ms=None):
+    summary = {"mean": error, "median": error, "count": 4, "missing": 0}
+    metrics = {metric.name: dict(summary) for metric in METRICS}
+    return {"kind": kind, "method": method, "storage_bytes": 1000, "ms": ms, "metrics": metrics}
+
+
+@pytest.fixture
+def result(tmp_path):
+    columns = {
+        "bundle factorised-r16": column("field", "", 1.0, ms=2.0),
+        "bundle factorised-r8": column("field", "", 1.5, ms=1.0),
+        "naf": column("field", "naf", 2.0, ms=3000.0),
+        "nearest": column("baseline", "nearest", 3.0, ms=0.1),
+        "floor": column("floor", "", 0.5),
+    }
+    columns["naf"]["metrics"]["edt"]["mean"] = 0.75
+    columns["nearest"]["metrics"]["t60"]["mean"] = None
+
+    def write(**changes):
+        path = tmp_path / "table.json"
+        values = {"data": "flat (simulated)", "pairs": 2, "visible_pairs": 1, "yaws": 2, "columns": columns, **changes}
+        path.write_text(json.dumps(values))
+        return path
+
+    return write
+
+
+def test_the_default_level_stands_first_and_is_bold_where_nobody_errs_less(result):
+    lines = markdown([SceneResult.read(result())]).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    heads, _, ours, naf, nearest, floor = cells
+    assert [row[:2] for row in (ours, naf, nearest, floor)] == [
+        ["flat", "factorised-r16"],
+        ["", "naf"],
+        ["", "nearest"],
+        ["", "floor"],
+    ]
+    edt, t60 = (heads.index(head) for head in ("EDT (ms)", "T60 (%)"))
+    assert (ours[t60], nearest[t60]) == ("**1.00**", "")
+    assert (ours[edt], naf[edt]) == ("1.00", "0.750")
+    assert lines[-1] == ("- flat (2 pairs, 1 in sight, 2 orientations): errs more than naf in EDT, 1500 times as fast.")
+
+
+def test_the_record_says_what_naf_does_better(result):
+    record = SceneResult.read(result()).to_json()
+    assert record["worse_than_naf"] == ["edt"]
+    assert record["methods"]["naf"]["ms"] == 3000.0
+    assert "t60" not in record["methods"]["nearest"]["errors"]
+
+
+def test_without_naf_there_is_no_remark(result):
+    read = SceneResult.read(result(columns={"standard": column("field", "", 1.0), "floor": column("floor", "", 0.5)}))
+    assert read.level == "standard"
+    assert not [line for line in markdown([read]).splitlines() if line.startswith("-")]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [({"columns": {"floor": column("floor", "", 1.0)}}, "no level"), ({"columns": {"x": {}}}, "not what")],
+)
+def test_what_is_no_result_is_told(result, tmp_path, changes, told):
+    with pytest.raises(ResultError, match=told):
+        SceneResult.read(result(**changes))
+    with pytest.raises(ResultError, match="cannot be read"):
+        SceneResult.read(tmp_path / "absent.json")
+
+
+def test_times_of_pieces_add_up(tmp_path):
+    log = tmp_path / "times.jsonl"
+    pieces = [("train", 30, 50, -2), ("naf", 60, 60, 0), ("train", 90, 70, 0)]
+    log.write_text(
+        "".join(
+            json.dumps({"step": step, "wall_s": wall, "cpu_s": cpu, "rc": rc}) + "\n" for step, wall, cpu, rc in pieces
+        )
+    )
+    lines = times_markdown({"flat": step_times(log), "hut": step_times(log)[:1]}).splitlines()
+    assert lines[0] == "| minutes | train | naf | all |"
+    assert lines[2:] == [
+        "| flat | 2.0 (2.0) | 1.0 (1.0) | 3.0 (3.0) |",
+        "| hut | 2.0 (2.0) |  | 2.0 (2.0) |",
+        "| all | 4.0 (4.0) | 1.0 (1.0) | 5.0 (5.0) |",
+    ]
+    log.write_text("{}\n")
+    with pytest.raises(ResultError, match="stopwatch"):
+        step_times(log)

@@ -1,0 +1,184 @@
+"""One table over scenes: what the default level of each bundle gets wrong, beside the paper's network, the nearest
+response and the repeatability floor, and what they take.
+
+Reads what `nafir-train evaluate --json` wrote for each scene.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from server.errors import NafirError
+from training.evaluation.evaluate import FLOOR, METRICS
+from training.evaluation.report import short
+
+TIMES = "times.jsonl"
+"""What each step took, beside the results of a scene."""
+
+_NAF = "naf"
+_NEAREST = "nearest"
+
+
+class ResultError(NafirError):
+    """A file that holds no evaluation of a bundle."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """Mean errors by metric, those that could be measured, and milliseconds per response."""
+
+    errors: Mapping[str, float]
+    ms: float | None
+    storage_bytes: int | None
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """`methods` by what they are in the table: the default level first, under its own name."""
+
+    scene: str
+    pairs: int
+    visible_pairs: int
+    yaws: int
+    level: str
+    methods: Mapping[str, Method]
+
+    @classmethod
+    def read(cls, path: Path) -> "SceneResult":
+        """Raises ResultError."""
+        try:
+            values = json.loads(path.read_text())
+            columns: dict[str, dict[str, Any]] = values["columns"]
+            fields = [name for name, column in columns.items() if column["kind"] == "field"]
+            ours = next(name for name in fields if not _is_naf(columns[name]))
+            # Of several bundles, columns are named by folder and level.
+            level = ours.split()[-1]
+            naf = next((name for name in fields if _is_naf(columns[name])), None)
+            names = {ours: level, naf: _NAF}
+            methods = {names.get(name, name): _method(column) for name, column in columns.items()}
+            scene = str(values["data"]).removesuffix(" (simulated)")
+            return cls(scene, values["pairs"], values["visible_pairs"], values["yaws"], level, methods)
+        except OSError as exc:
+            raise ResultError(f"{path}: cannot be read: {exc.strerror}") from exc
+        except StopIteration as exc:
+            raise ResultError(f"{path}: holds no level of a factorised field") from exc
+        except (ValueError, KeyError, TypeError) as exc:
+            raise ResultError(f"{path}: not what nafir-train evaluate --json writes: {exc!r}") from exc
+
+    @property
+    def ours(self) -> Method:
+        return self.methods[self.level]
+
+    def to_json(self) -> dict[str, Any]:
+        naf = self.methods.get(_NAF)
+        return {
+            "scene": self.scene,
+            "pairs": self.pairs,
+            "visible_pairs": self.visible_pairs,
+            "yaws": self.yaws,
+            "level": self.level,
+            "worse_than_naf": [] if naf is None else self.worse_than(naf),
+            "methods": {
+                name: {"errors": dict(method.errors), "ms": method.ms, "storage_bytes": method.storage_bytes}
+                for name, method in self.methods.items()
+            },
+        }
+
+    def worse_than(self, other: Method) -> list[str]:
+        """Metrics in which the default level errs more."""
+        return [name for name, error in self.ours.errors.items() if error > other.errors.get(name, float("inf"))]
+
+
+def _is_naf(column: Mapping[str, Any]) -> bool:
+    return str(column["method"]).startswith(_NAF)
+
+
+def _method(column: Mapping[str, Any]) -> Method:
+    means = {name: summary["mean"] for name, summary in column["metrics"].items()}
+    return Method(
+        {name: mean for name, mean in means.items() if mean is not None}, column["ms"], column["storage_bytes"]
+    )
+
+
+def markdown(results: Sequence[SceneResult]) -> str:
+    """A row per scene and method; bold is the default level where neither naf nor nearest errs less. Below it, scene by
+    scene, what the paper's network does better."""
+    heads = [f"{metric.label} ({metric.unit})" if metric.unit else metric.label for metric in METRICS]
+    lines = [
+        "| scene | method | " + " | ".join([*heads, "ms"]) + " |",
+        "| --- | --- |" + " ---: |" * (len(heads) + 1),
+    ]
+    for result in results:
+        shown = {name: result.methods[name] for name in (result.level, _NAF, _NEAREST, FLOOR) if name in result.methods}
+        rivals = [method for name, method in shown.items() if name not in {result.level, FLOOR}]
+        for name, method in shown.items():
+            cells = []
+            for metric in METRICS:
+                error = method.errors.get(metric.name)
+                cell = "" if error is None else short(error)
+                if error is not None and method is result.ours:
+                    is_best = all(error <= rival.errors.get(metric.name, float("inf")) for rival in rivals)
+                    cell = f"**{cell}**" if is_best else cell
+                cells.append(cell)
+            first = result.scene if method is result.ours else ""
+            cells.append("" if method.ms is None else short(method.ms))
+            lines.append(f"| {first} | {name} | " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", *_remarks(results)])
+
+
+def _remarks(results: Sequence[SceneResult]) -> list[str]:
+    remarks = []
+    for result in results:
+        naf = result.methods.get(_NAF)
+        if naf is None:
+            continue
+        worse = [metric.label for metric in METRICS if metric.name in result.worse_than(naf)]
+        faster = "" if naf.ms is None or result.ours.ms is None else f", {short(naf.ms / result.ours.ms)} times as fast"
+        said = f"errs more than naf in {', '.join(worse)}" if worse else "errs less than naf in every metric"
+        drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {result.yaws} orientations"
+        remarks.append(f"- {result.scene} ({drawn}): {said}{faster}.")
+    return remarks
+
+
+@dataclass(frozen=True)
+class StepTime:
+    """Seconds that one step of one scene took, all its pieces together."""
+
+    step: str
+    wall_s: float
+    cpu_s: float
+
+
+def step_times(log: Path) -> list[StepTime]:
+    """Of a log that `training.stopwatch` wrote, in order of first appearance. Raises ResultError."""
+    totals: dict[str, list[float]] = {}
+    try:
+        for line in log.read_text().splitlines():
+            values = json.loads(line)
+            wall_s, cpu_s = totals.get(values["step"], [0.0, 0.0])
+            totals[values["step"]] = [wall_s + values["wall_s"], cpu_s + values["cpu_s"]]
+    except OSError as exc:
+        raise ResultError(f"{log}: cannot be read: {exc.strerror}") from exc
+    except (ValueError, KeyError, TypeError) as exc:
+        raise ResultError(f"{log}: not what training.stopwatch writes: {exc!r}") from exc
+    return [StepTime(step, *seconds) for step, seconds in totals.items()]
+
+
+def times_markdown(times: Mapping[str, Sequence[StepTime]]) -> str:
+    """A row per scene, a column per step: minutes of wall time, CPU minutes in parentheses, and the sums."""
+    steps = list(dict.fromkeys(step.step for of_scene in times.values() for step in of_scene))
+    rows = {scene: {step.step: step for step in of_scene} for scene, of_scene in times.items()}
+    lines = ["| minutes | " + " | ".join([*steps, "all"]) + " |", "| --- |" + " ---: |" * (len(steps) + 1)]
+    for scene, of_scene in rows.items():
+        cells = [_minutes([of_scene[step]]) if step in of_scene else "" for step in steps]
+        lines.append(f"| {scene} | " + " | ".join([*cells, _minutes(list(of_scene.values()))]) + " |")
+    everything = [step for of_scene in times.values() for step in of_scene]
+    sums = [_minutes([step for step in everything if step.step == name]) for name in steps]
+    return "\n".join([*lines, "| all | " + " | ".join([*sums, _minutes(everything)]) + " |"])
+
+
+def _minutes(steps: Sequence[StepTime]) -> str:
+    wall, cpu = (sum(getattr(step, name) for step in steps) / 60 for name in ("wall_s", "cpu_s"))
+    return f"{wall:.1f} ({cpu:.1f})"
