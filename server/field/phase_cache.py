@@ -45,7 +45,9 @@ class PhaseCache:
             return self._responses[place]
 
     def keep(self, listener: Floats, emitter: Floats, yaw: float, response: Float32) -> None:
-        """Copies the response."""
+        """Copies the response; one that is silent has no phase to give, and is not kept."""
+        if not response.any():
+            return
         pose, own = _pose(listener, emitter, yaw), response.copy()
         cell = _cell(pose)
         with self._lock:

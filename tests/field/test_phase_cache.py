@@ -64,10 +64,10 @@ def test_the_one_unused_for_longest_makes_room():
     cache = PhaseCache(capacity=3)
     places = [HERE + np.array([number, 0, 0]) for number in range(4)]
     for number in range(3):
-        cache.keep(places[number], THERE, 0.0, _response(number))
-    assert _found(cache, places[0], THERE) == 0
-    cache.keep(places[3], THERE, 0.0, _response(3))
-    assert [_found(cache, place, THERE) for place in places] == [0, None, 2, 3]
+        cache.keep(places[number], THERE, 0.0, _response(10 + number))
+    assert _found(cache, places[0], THERE) == 10
+    cache.keep(places[3], THERE, 0.0, _response(13))
+    assert [_found(cache, place, THERE) for place in places] == [10, None, 12, 13]
 
 
 def test_what_is_found_is_the_response_itself():
