@@ -4,8 +4,13 @@ PYTHON ?= python3
 HOST ?= 127.0.0.1
 PORT ?= 8000
 SCENE ?= apartment
+SCENES ?= small1 small2 medium1 medium2 large1 large2
 RUNS ?= runs/$(SCENE)
-MINUTES ?= 4
+# What the paper's table compares with, and on how many held-out pairs: naf takes seconds for each of their responses.
+METHODS ?= nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear,image-sources,helmholtz
+PAIRS ?= 16
+# How much of the frontier is measured: all ranks, with frozen phase.
+SWEEP ?= --phases-of none
 # Tests that watch the clock, and so have the machine to themselves.
 TIMED := tests/integration tests/bench tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
 
@@ -15,7 +20,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle scenes table container-test clean
+.PHONY: help serve test lint format bundle scenes table tables container-test clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -36,21 +41,18 @@ format: $(VENV)/installed-dev ## format the code and apply safe lint fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bundle: $(VENV)/installed-training ## simulate, train, export and measure a scene (SCENE=apartment); resumes where it stopped
-	$(BIN)/nafir-train simulate training/scenes/$(SCENE).toml -o $(RUNS)/data
-	$(BIN)/nafir-train train $(RUNS)/data -o $(RUNS)/run
-	$(BIN)/nafir-train export $(RUNS)/run -o $(RUNS)/bundle --ranks 32,16,8,4,2
-	$(BIN)/nafir-train frontier $(RUNS)/bundle $(RUNS)/data -o $(RUNS)/frontier --phases-of factorised --record
-	$(BIN)/nafir-train evaluate $(RUNS)/bundle $(RUNS)/data --record --figure $(RUNS)/errors.png
+bundle: $(RUNS)/measured ## simulate, train, export and measure a scene (SCENE=apartment); goes on where it stopped
 
-scenes: ## all of that for the six scenes after the paper
-	for scene in large1 large2 medium1 medium2 small1 small2; do $(MAKE) bundle SCENE=$$scene || exit 1; done
+table: $(RUNS)/table.md ## the paper's table of a scene (SCENE=): its bundle beside naf trained for as long, codecs and more
+	@cat $<
 
-table: $(VENV)/installed-training ## the paper's table of a scene (SCENE=small1), with the paper's network trained for MINUTES=4
-	$(BIN)/nafir-train train $(RUNS)/data -o $(RUNS)/naf --field naf --minutes $(MINUTES) --points 100
-	$(BIN)/nafir-train export $(RUNS)/run $(RUNS)/naf -o $(RUNS)/with-naf
-	$(BIN)/nafir-train evaluate $(RUNS)/with-naf $(RUNS)/data --pairs 16 --yaws 2 --markdown \
-		--methods nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear,image-sources,helmholtz
+scenes: ## bundles of the six scenes after the paper (SCENES=)
+	for scene in $(SCENES); do $(MAKE) bundle SCENE=$$scene || exit 1; done
+
+tables: ## the paper's tables of all six, and one over them; goes on where it stopped
+	for scene in $(SCENES); do $(MAKE) table SCENE=$$scene || exit 1; done
+	$(BIN)/nafir-train tabulate --json $(SCENES:%=runs/%/table.json) > runs/tables.json
+	$(BIN)/nafir-train tabulate $(SCENES:%=runs/%/table.json) | tee runs/tables.md
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh
@@ -58,6 +60,34 @@ container-test: ## build the container image and try it read-only (needs buildah
 clean: ## remove .venv and caches; keeps runs/
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Steps of one scene, a stamp for each that is finished; what an interrupted one has done is kept and gone on with. What
+# each takes is written to times.jsonl.
+STEP = $(BIN)/python -m training.stopwatch $(RUNS)/times.jsonl
+TRAIN = $(BIN)/nafir-train
+
+$(RUNS)/simulated: | $(VENV)/installed-training
+	$(STEP) simulate $(TRAIN) simulate training/scenes/$(SCENE).toml -o $(RUNS)/data
+	@touch $@
+
+$(RUNS)/trained: $(RUNS)/simulated
+	$(STEP) train $(TRAIN) train $(RUNS)/data -o $(RUNS)/run
+	@touch $@
+
+$(RUNS)/measured: $(RUNS)/trained
+	$(STEP) export $(TRAIN) export $(RUNS)/run -o $(RUNS)/bundle --ranks 32,16,8,4,2
+	$(STEP) frontier $(TRAIN) frontier $(RUNS)/bundle $(RUNS)/data -o $(RUNS)/frontier $(SWEEP) --record
+	$(STEP) evaluate $(TRAIN) evaluate $(RUNS)/bundle $(RUNS)/data --record --figure $(RUNS)/errors.png
+	@touch $@
+
+$(RUNS)/naf-trained: $(RUNS)/trained
+	$(STEP) naf $(TRAIN) train $(RUNS)/data -o $(RUNS)/naf --field naf --as-long-as $(RUNS)/run --points 100
+	@touch $@
+
+$(RUNS)/table.md: $(RUNS)/measured $(RUNS)/naf-trained
+	$(STEP) export-naf $(TRAIN) export $(RUNS)/naf -o $(RUNS)/naf-bundle
+	$(STEP) table $(TRAIN) evaluate $(RUNS)/bundle $(RUNS)/naf-bundle $(RUNS)/data --methods $(METHODS) \
+		--pairs $(PAIRS) --yaws 2 --output $(RUNS)/table.json --markdown > $@
 
 # Stamps: one per set of dependencies, each larger one satisfying the smaller.
 $(BIN)/python:

@@ -12,9 +12,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from server.errors import NafirError
 from training.importers.cli import importing
+from training.simulation import cli as simulation
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(importing, name="import")
+app.command()(simulation.plan)
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
@@ -36,17 +38,21 @@ def _progress() -> Progress:
 
 @app.command()
 def simulate(
-    scene: Annotated[Path, typer.Argument(help="Scene file (TOML).")],
+    scene: simulation.Scene,
     output: Folder,
+    effects: simulation.Effects = "plan",
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
-    """Simulate all pairs of probes of a scene. Run again after an interruption to go on."""
+    """Simulate what a scene calls for, between all pairs of probes. Run again after an interruption to go on."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from training.simulation.run import simulate as simulate_scene
 
+    planned = simulation.plan_of(scene, seed, effects)
+    Console(stderr=True).print(simulation.plan_table(planned))
+    processes = workers or os.cpu_count() or 1
     with _progress() as progress:
-        dataset = simulate_scene(scene, output, seed=seed, workers=workers or os.cpu_count() or 1, progress=progress)
+        dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, plan=planned)
     trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
     typer.echo(f"{output}: {trained} pairs to train on and {held_out} held out, {len(dataset.yaws)} orientations each")
 
@@ -64,6 +70,9 @@ def train(
     seed: Seed = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the training set.")] = None,
     minutes: Annotated[float | None, typer.Option(min=0.001, help="Time to train for, in place of epochs.")] = None,
+    as_long_as: Annotated[
+        Path | None, typer.Option(help="Finished run: train for the time that it took, its targets included.")
+    ] = None,
     share: Annotated[float, typer.Option(min=0.001, max=1, help="Share of the training pairs to use.")] = 1.0,
     patience: Annotated[
         int | None, typer.Option(min=1, help="Stop after so many rounds (epochs, or twentieths of the time) in vain.")
@@ -78,9 +87,13 @@ def train(
 ) -> None:
     """Train a field on a dataset. Run again after an interruption to go on; with torchrun, in several processes."""
     from training.responses import open_responses
-    from training.runs import configure
+    from training.runs import configure, minutes_of
     from training.train import train as train_field
 
+    if as_long_as is not None:
+        if minutes is not None:
+            raise typer.BadParameter("says as much as --minutes; leave one out", param_hint="--as-long-as")
+        minutes = minutes_of(as_long_as)
     given = {"epochs": epochs, "minutes": minutes, "patience": patience, "learning_rate": learning_rate}
     configuration = configure(
         field,
@@ -178,6 +191,7 @@ def evaluate(
     yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
     figure: Annotated[Path | None, typer.Option(help="Draw decays and errors to this PNG.")] = None,
     record: Annotated[bool, typer.Option(help="Write the measured errors of every level into the bundle.")] = False,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the results as JSON, too.")] = None,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
@@ -209,12 +223,36 @@ def evaluate(
     )
     if record:
         record_accuracy(bundles[0], evaluation)
+    if output is not None:
+        output.write_text(json.dumps(evaluation.to_json(), indent=1) + "\n")
     if as_json:
         typer.echo(json.dumps(evaluation.to_json(), indent=2))
     elif as_markdown:
         typer.echo(markdown(evaluation, published))
     else:
         Console(width=None if console.is_terminal else 170).print(report(evaluation, published))
+
+
+@app.command()
+def tabulate(
+    results: Annotated[list[Path], typer.Argument(help="What evaluate --json wrote, a file per scene.")],
+    as_json: Json = False,
+) -> None:
+    """One Markdown table of the default levels over scenes, and what every step took where its times lie beside."""
+    from dataclasses import asdict
+
+    from training.evaluation.scenes import TIMES, SceneResult, markdown, step_times, times_markdown
+
+    scenes = [SceneResult.read(path) for path in results]
+    logs = {result.scene: path.parent / TIMES for result, path in zip(scenes, results, strict=True)}
+    times = {scene: step_times(log) for scene, log in logs.items() if log.exists()}
+    if as_json:
+        records = [{**result.to_json(), "times": list(map(asdict, times.get(result.scene, [])))} for result in scenes]
+        typer.echo(json.dumps(records, indent=1))
+        return
+    typer.echo(markdown(scenes))
+    if times:
+        typer.echo("\n" + times_markdown(times))
 
 
 @app.command()
