@@ -16,6 +16,7 @@ settings.register_profile(
     "hard_cases",
     deadline=None,
     derandomize=True,
+    max_examples=40,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
@@ -32,12 +33,17 @@ def pytest_configure(config):
         config.pluginmanager.register(_Table(config.getoption(_OPTION)))
 
 
-@pytest.fixture(autouse=True)
-def _profile():
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """`given` takes the profile that is in effect where it stands: as its module is imported."""
+    if not isinstance(collector, pytest.Module):
+        return (yield)
     before = settings.get_current_profile_name()
     settings.load_profile("hard_cases")
-    yield
-    settings.load_profile(before)
+    try:
+        return (yield)
+    finally:
+        settings.load_profile(before)
 
 
 @pytest.fixture
