@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from training.simulation.check import PlanCheck
     from training.simulation.plan import SimulationPlan
 
 Scene = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
@@ -61,17 +62,58 @@ def _named(effects: str) -> dict[str, bool]:
 def plan(
     scene: Scene,
     effects: Effects = "plan",
+    check: Annotated[
+        int | None,
+        typer.Option(min=1, help="Simulate so many emitters by the plan and with everything on, and compare."),
+    ] = None,
     seed: Seed = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
-    """What simulating a scene calls for, why, and what it will take; nothing is simulated."""
+    """What simulating a scene calls for, why, and what it will take."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     planned = plan_of(scene, seed, effects)
+    checked = None if check is None else _check(scene, planned, check, seed)
     if as_json:
-        typer.echo(json.dumps(planned.to_json(), indent=2))
-    else:
-        console = Console()
-        Console(width=None if console.is_terminal else 150).print(plan_table(planned))
+        content = planned.to_json() if checked is None else {"plan": planned.to_json(), "check": checked.to_json()}
+        typer.echo(json.dumps(content, indent=2))
+        return
+    console = Console(width=None if Console().is_terminal else 150)
+    console.print(plan_table(planned))
+    if checked is not None:
+        console.print(_check_table(checked))
+
+
+def _check(scene: Path, planned: "SimulationPlan", emitters: int, seed: int) -> "PlanCheck":
+    from rich.progress import track
+
+    from training.scene_file import SceneFile
+    from training.simulation.check import check_plan
+    from training.simulation.planner import planner_of
+
+    read, console = SceneFile.read(scene), Console(stderr=True)
+    return check_plan(
+        read,
+        planned,
+        planner_of(read, seed).everything,
+        emitters=emitters,
+        seed=seed,
+        track=lambda steps: track(steps, "simulating emitters", console=console),
+    )
+
+
+def _check_table(checked: "PlanCheck") -> Table:
+    title = f"{checked.pairs} pairs of {checked.emitters} emitters against everything on"
+    seconds = (
+        f"{checked.plan_s:.1f} s for these emitters and {checked.once_s:.1f} s once, with everything on "
+        f"{checked.everything_s:.1f} s: the whole scene {checked.speedup:.1f} times as fast"
+    )
+    table = Table(title=title, title_justify="left", caption=seconds, caption_justify="left")
+    table.add_column("mean error")
+    for column in ("plan", "floor"):
+        table.add_column(column, justify="right")
+    for name, error in checked.errors.items():
+        table.add_row(name, f"{error:.3g}", f"{checked.floor[name]:.3g}")
+    return table
 
 
 def plan_table(plan: "SimulationPlan") -> Table:

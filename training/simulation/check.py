@@ -1,0 +1,141 @@
+"""Whether a plan keeps its promise: some emitters of a scene simulated by it, and with everything on by two seeds.
+
+The difference of the latter two is the repeatability floor: what lies within it cannot be told from another draw.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from time import process_time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.metrics import parameter_errors, summarise
+from server.acoustics.room_parameters import RoomParameters, measure
+from server.whole_field import kemar
+from training.dataset import GEOMETRIC_ORDER
+from training.scene_file import SceneFile
+from training.simulation.direct_paths import DirectPaths
+from training.simulation.pairs import PairSimulation
+from training.simulation.plan import SimulationPlan
+from training.simulation.rays import sphere_directions
+from training.simulation.synthesis import BinauralSynthesis
+from training.simulation.tracing import RoomTracer
+
+_Floats = npt.NDArray[np.float64]
+_Responses = npt.NDArray[np.float32]
+
+_YAWS_HEARD = 4
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    """`errors` of the plan against everything on and `floor` of everything on against itself, means by metric in its
+    unit. Seconds of one core are `everything_s` and `plan_s` for the emitters simulated, and `once_s` what the plan
+    prepares once for all `probes` that a whole simulation has as emitters."""
+
+    scene: str
+    emitters: int
+    probes: int
+    pairs: int
+    everything_s: float
+    plan_s: float
+    once_s: float
+    errors: dict[str, float]
+    floor: dict[str, float]
+
+    @property
+    def speedup(self) -> float:
+        """Of a whole simulation."""
+        everything, plan = (seconds / self.emitters * self.probes for seconds in (self.everything_s, self.plan_s))
+        return everything / (plan + self.once_s)
+
+    def to_json(self) -> dict[str, Any]:
+        return {**asdict(self), "speedup": self.speedup}
+
+
+def check_plan(
+    scene: SceneFile,
+    plan: SimulationPlan,
+    everything: SimulationPlan,
+    *,
+    emitters: int,
+    seed: int,
+    track: Callable[[Iterable[int]], Iterable[int]],
+) -> PlanCheck:
+    """Second takes, as of held-out pairs, are simulated and timed too, and not compared."""
+    probes = scene.probe_positions(seed)
+    yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
+    began = process_time()
+    planned = PairSimulation.prepare(scene, probes, yaws, seed=seed, plan=plan)
+    once_s = process_time() - began
+    simulations = {
+        "plan": planned,
+        "everything": PairSimulation.prepare(scene, probes, yaws, seed=seed, plan=everything),
+        "again": PairSimulation.prepare(scene, probes, yaws, seed=seed + 1, plan=everything),
+    }
+    for name, simulation in simulations.items():
+        began = process_time()
+        for _ in simulation.take(0, np.array([1]), 0):  # makes what serves all emitters
+            pass
+        if name == "plan":
+            once_s += process_time() - began
+    seconds = dict.fromkeys(simulations, 0.0)
+    measured: dict[str, list[RoomParameters]] = {name: [] for name in simulations}
+    geometry = _Geometric(scene, everything, probes, yaws)
+    for emitter in track(np.unique(np.linspace(0, len(probes) - 1, emitters).astype(int)).tolist()):
+        listeners = np.delete(np.arange(len(probes)), emitter)
+        known = geometry.responses(emitter, listeners)
+        repeated = listeners[:: round(1 / scene.simulation.held_out_share)]
+        for name, simulation in simulations.items():
+            began = process_time()
+            responses = np.stack([response for _, _, response in simulation.take(emitter, listeners, 0)])
+            for _ in simulation.take(emitter, repeated, 1):
+                pass
+            seconds[name] += process_time() - began
+            heard = responses[:, :: max(1, len(yaws) // _YAWS_HEARD)].astype(np.float32) + known
+            measured[name].append(measure(heard, scene.simulation.sample_rate))
+    return PlanCheck(
+        scene=scene.id,
+        emitters=len(measured["plan"]),
+        probes=len(probes),
+        pairs=len(measured["plan"]) * (len(probes) - 1),
+        everything_s=seconds["everything"],
+        plan_s=seconds["plan"],
+        once_s=once_s,
+        errors=_mean_errors(measured["everything"], measured["plan"]),
+        floor=_mean_errors(measured["everything"], measured["again"]),
+    )
+
+
+class _Geometric:
+    """What datasets leave to geometry, at the orientations that are compared."""
+
+    def __init__(self, scene: SceneFile, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
+        settings = scene.simulation
+        heard = yaws[:: max(1, len(yaws) // _YAWS_HEARD)]
+        samples = round(settings.duration_s * settings.sample_rate)
+        directions = sphere_directions(settings.arrival_directions)
+        self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, heard, samples)
+        self._probes = probes
+        self._direct = DirectPaths.of(scene, plan)
+        self._tracer = RoomTracer.of(scene, plan, probes, image_order=GEOMETRIC_ORDER)
+
+    def responses(self, emitter: int, listeners: npt.NDArray[np.integer]) -> _Responses:
+        """(listener, yaw, ear, sample)"""
+        place, reflections = self._probes[emitter], self._tracer.images(self._probes[emitter])
+        return np.stack(
+            [
+                self._synthesis.specular(*self._direct.images(place, self._probes[listener]), self._probes[listener])
+                + self._synthesis.specular(*reflections[listener], self._probes[listener])
+                for listener in listeners
+            ]
+        )
+
+
+def _mean_errors(reference: list[RoomParameters], estimate: list[RoomParameters]) -> dict[str, float]:
+    """By metric; those that nothing could be measured of are left out."""
+    each = [parameter_errors(first, second) for first, second in zip(reference, estimate, strict=True)]
+    means = {name: summarise(np.concatenate([of_one[name] for of_one in each])).mean for name in each[0]}
+    return {name: mean for name, mean in means.items() if mean is not None}
