@@ -6,6 +6,7 @@ PORT ?= 8000
 SCENE ?= apartment
 SCENES ?= small1 small2 medium1 medium2 large1 large2
 RUNS ?= runs/$(SCENE)
+OFFICE ?= runs/office
 # What the paper's table compares with, and on how many held-out pairs: naf takes seconds for each of their responses.
 METHODS ?= nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear,image-sources,helmholtz
 PAIRS ?= 16
@@ -20,7 +21,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle scenes table tables container-test clean
+.PHONY: help serve test lint format bundle scenes table tables office container-test clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -53,6 +54,14 @@ tables: ## the paper's tables of all six, and one over them; goes on where it st
 	for scene in $(SCENES); do $(MAKE) table SCENE=$$scene || exit 1; done
 	$(BIN)/nafir-train tabulate --json $(SCENES:%=runs/%/table.json) > runs/tables.json
 	$(BIN)/nafir-train tabulate $(SCENES:%=runs/%/table.json) | tee runs/tables.md
+
+office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere (DATA=folder in MeshRIR's layout), and its table
+	@test -f "$(DATA)/pos_mic.npy" || { echo "make office: DATA= names no folder with pos_mic.npy, pos_src.npy, ir_<number>.npy"; exit 2; }
+	$(BIN)/nafir-train import meshrir "$(DATA)" -o $(OFFICE)/data
+	$(BIN)/nafir-train export $(OFFICE)/data -o $(OFFICE)/bundle
+	$(BIN)/nafir-train evaluate $(OFFICE)/bundle $(OFFICE)/data --record --markdown \
+		--methods nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear > $(OFFICE)/table.md
+	@cat $(OFFICE)/table.md
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh
