@@ -85,7 +85,8 @@ class Offer:
         # The most expensive is the best, but what shares a tail comes last.
         own_tails = [level for level in reversed(fitting) if not level.shared_tail]
         best, *cheaper = (*own_tails, *(level for level in reversed(fitting) if level.shared_tail))
-        down = [self._rung(level, _RATES_HZ[-1]) for level in cheaper]
+        # What reuses responses has fewer to compute, however often it is asked.
+        down = [self._rung(level, _RATES_HZ[-1] if level.reuse is None else _RATES_HZ[0]) for level in cheaper]
         return (*self._slower(best), *down, self._rung((best, *cheaper)[-1], _LEAST_RATE_HZ))
 
     def _slower(self, level: QualityLevel) -> tuple[Rung, ...]:

@@ -5,7 +5,7 @@ from server.app import create_app
 from server.field.levels import Levels
 from server.frontier import Frontier, mean_jnd
 from server.scene.bundle import write_bundle
-from server.scene.manifest import Accuracy, Cost, Phase, QualityLevel
+from server.scene.manifest import Accuracy, Cost, FrontierPoint, Phase, QualityLevel, Reuse
 from server.settings import Settings
 
 ACCURACY = Accuracy(
@@ -15,6 +15,7 @@ ACCURACY = Accuracy(
     floor={"t60": 2.5, "edt": 20.0, "c50": 1.1, "level": 0.25, "spectral_loss": 0.3},
 )
 COST = Cost(ms_p50=1.5, ms_p99=2.5, storage_mb=0.7, memory_mb=3.0, host="somewhere")
+REUSE = Reuse(spacing_m=0.5, turn_deg=30)
 
 
 @pytest.fixture
@@ -22,19 +23,25 @@ def levels(bundle, tmp_path):
     """Two levels of the one field: `good` is the default and measured, `fast` neither."""
     good = QualityLevel(name="good", field="arithmetic", accuracy=ACCURACY, cost=COST)
     fast = QualityLevel(name="fast", field="arithmetic", ir_rate_hz=12.0, shared_tail=True, phase=Phase())
-    manifest = bundle.manifest.model_copy(update={"levels": (good, fast)})
+    near = QualityLevel(name="near", field="gone", accuracy=ACCURACY, cost=COST, reuse=REUSE)
+    measured = (FrontierPoint(level=near, architecture="factorised", rank=4),)
+    manifest = bundle.manifest.model_copy(update={"levels": (good, fast), "frontier": measured})
     files = {name: (bundle.folder / name).read_bytes() for name in manifest.files}
     return Levels.load(write_bundle(tmp_path / "two", manifest, files))
 
 
 def test_a_frontier_tells_what_was_measured_and_none_of_the_rest(levels):
     frontier = Frontier.of(levels, {"good": 1.9})
-    fast, good = frontier.levels
+    fast, good, near = frontier.levels
     assert (frontier.default, fast.name, good.name) == ("good", "fast", "good")
     assert (good.ms_p50, good.ms_p99, good.ms_here, good.measured_on) == (1.5, 2.5, 1.9, "somewhere")
     assert (good.errors, good.floor) == (ACCURACY.errors, ACCURACY.floor)
     assert (fast.ms_p50, fast.ms_here, fast.errors, fast.audible) == (None, None, None, None)
     assert (fast.ir_rate_hz, fast.shared_tail, good.rank) == (12.0, True, 1)
+    assert (good.ms_mean, good.ms_miss) == (1.5, 1.5)  # of a level that reuses nothing, one is like the other
+    assert (near.is_offered, near.rank, near.reuse, near.ms_here) == (False, 4, REUSE, None)
+    assert fast.is_offered
+    assert good.is_offered
 
 
 def test_errors_as_one_number_are_in_just_noticeable_differences():
@@ -49,8 +56,10 @@ def test_over_http_with_the_cost_here_once_the_server_is_ready(levels, hrtfs):
         while client.get("/readyz").status_code != 200:
             pass
         frontier = client.get("/v1/scenes/flat/frontier").json()
-        assert [(level["name"], level["ms_p50"]) for level in frontier["levels"]] == [("fast", None), ("good", 1.5)]
-        assert all(level["ms_here"] > 0 for level in frontier["levels"])
+        levels = {level["name"]: level for level in frontier["levels"]}
+        assert {name: level["ms_p50"] for name, level in levels.items()} == {"fast": None, "good": 1.5, "near": 1.5}
+        assert all(levels[name]["ms_here"] > 0 for name in ("fast", "good"))
+        assert levels["near"]["reuse"] == {"spacing_m": 0.5, "turn_deg": 30.0, "first_reflections": "pose"}
         assert client.get("/v1/scenes/attic/frontier").json()["code"] == "unknown_scene"
         described = client.get("/openapi.json").json()
         answer = described["paths"]["/v1/scenes/{scene}/frontier"]["get"]["responses"]["200"]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from server.errors import RequestError
 from server.load import AUTO, PERIOD_S, Ladder, LoadControl, Offer, Rung, Strain, ir_interval_s
-from server.scene.manifest import QualityLevel
+from server.scene.manifest import QualityLevel, Reuse
 
 BLOCK_S = 256 / 24_000
 
@@ -62,6 +62,19 @@ def test_down_a_ladder_come_fewer_responses_then_cheaper_levels_then_a_shared_ta
         ("fast", 5.0, False),
         ("shared", 5.0, True),
         ("shared", 2.0, True),
+    ]
+
+
+def test_levels_that_reuse_responses_may_ask_more_often():
+    reuse = Reuse(spacing_m=0.5, turn_deg=30)
+    levels = (QualityLevel(name="whole", field="any", reuse=reuse), QualityLevel(name="good", field="any"))
+    rungs = Offer(levels, {"whole": 1.0, "good": 1.1}).rungs(AUTO, block_s=BLOCK_S)
+    assert [(rung.level, rung.ir_rate_hz) for rung in rungs] == [
+        ("good", None),
+        ("good", 12.0),
+        ("good", 5.0),
+        ("whole", 12.0),
+        ("whole", 2.0),
     ]
 
 

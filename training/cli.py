@@ -336,10 +336,11 @@ def frontier(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for frontier.json and frontier.png.")],
     pairs: Annotated[int, typer.Option(min=2, help="Held-out pairs to measure.")] = 40,
     yaws: Annotated[int, typer.Option(min=1, help="Head orientations of each.")] = 3,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of timing, eight responses of each level.")] = 40,
+    walk_s: Annotated[float, typer.Option(min=10, help="Seconds of the walk that costs are measured on.")] = 300.0,
     phases_of: Annotated[list[str] | None, typer.Option(help="Fields to sweep over phases; all if not given.")] = None,
-    default_ms: Annotated[float, typer.Option(help="The default level takes no longer.")] = 2.0,
-    record: Annotated[bool, typer.Option(help="Write the Pareto-optimal levels into the bundle.")] = False,
+    reuse_of: Annotated[list[str] | None, typer.Option(help="Fields to sweep over reuse of responses.")] = None,
+    default_ms: Annotated[float, typer.Option(help="A response of the default level takes no longer.")] = 2.5,
+    record: Annotated[bool, typer.Option(help="Write a few of the Pareto-optimal levels into the bundle.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -348,17 +349,19 @@ def frontier(
     from training.dataset import Dataset
     from training.frontier.candidates import candidates
     from training.frontier.figure import draw_frontier
-    from training.frontier.sweep import Effort, offered_levels, sweep, with_levels
+    from training.frontier.sweep import Effort, sweep
+    from training.frontier.sweep import record as record_frontier
     from training.frontier.table import report
 
     loaded = Bundle.load(bundle)
-    effort = Effort(pairs=pairs, yaws=yaws, rounds=rounds, default_ms=default_ms, seed=seed)
+    effort = Effort(pairs=pairs, yaws=yaws, walk_s=walk_s, default_ms=default_ms, seed=seed)
+    levels = candidates(loaded, phases_of, reuse_of or ())
     with _progress() as progress:
-        measured = sweep(loaded, Dataset.open(data), candidates(loaded, phases_of), output, effort, progress)
+        measured = sweep(loaded, Dataset.open(data), levels, output, effort, progress)
     (output / "frontier.json").write_text(json.dumps(measured.to_json(), indent=2) + "\n")
     draw_frontier(measured, output / "frontier.png")
     if record:
-        with_levels(loaded, offered_levels(measured), bundle)
+        record_frontier(loaded, measured, bundle)
     if as_json:
         typer.echo(json.dumps(measured.to_json(), indent=2))
     else:

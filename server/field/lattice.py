@@ -45,10 +45,18 @@ class Snapped(NamedTuple):
 class Lattice:
     """The nodes of one scene for one `Reuse`; safe to share between threads.
 
-    Cells fill the bounds evenly, nodes are in their middles. `offset` (3,) moves them, by less than half a cell.
+    Cells fill the bounds evenly, nodes are in their middles. `offset` (3,) moves them, by less than half a cell, and
+    `turned` turns their headings.
     """
 
-    def __init__(self, bundle: Bundle, reuse: Reuse, paths: SoundPathFinder, offset: Vector3 = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        bundle: Bundle,
+        reuse: Reuse,
+        paths: SoundPathFinder,
+        offset: Vector3 = (0.0, 0.0, 0.0),
+        turned: float = 0.0,
+    ) -> None:
         manifest = bundle.manifest
         self._paths = paths
         self._spacing_m = reuse.spacing_m
@@ -56,6 +64,7 @@ class Lattice:
         self._corners = np.ascontiguousarray(bundle.floor_plan.walls[:, 0])
         self._low, self._high = np.array(manifest.bounds.minimum), np.array(manifest.bounds.maximum)
         self._offset = np.array(offset)
+        self._turned = turned
         self._step_m = max(_LEAST_STEP_M, reuse.spacing_m / 4)
         self._samples_per_step = self._step_m / manifest.speed_of_sound * manifest.codec.sample_rate
         self._bent_m = lru_cache(_ARRIVALS)(self._length_m)
@@ -75,7 +84,7 @@ class Lattice:
 
     def _heading(self, yaw: float) -> float:
         turn = math.tau / self._turns
-        return (round(yaw / turn) % self._turns) * turn
+        return (round((yaw - self._turned) / turn) % self._turns) * turn + self._turned
 
     def _length_m(self, listener: Vector3, emitter: Vector3) -> float:
         return float(self._paths.find(np.array(listener), np.array([emitter])).length_m[0])

@@ -133,12 +133,14 @@ class Phase(Strict):
 
 class Accuracy(Strict):
     """Mean errors over `pairs` held-out pairs, each heard at `yaws` head orientations, by metric, and the
-    repeatability floor."""
+    repeatability floor. `steps` are the largest changes seen between poses a centimetre apart, by metric, in
+    just-noticeable differences."""
 
     pairs: int
     yaws: int
     errors: dict[str, Finite]
     floor: dict[str, Finite]
+    steps: Annotated[dict[str, Finite], Field(default_factory=dict)]
 
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -200,6 +202,15 @@ class QualityLevel(Strict):
     cost: Cost | None = None
 
 
+class FrontierPoint(Strict):
+    """A level that was measured and is not offered; what it would take of `architecture` and `rank` need not be in the
+    bundle."""
+
+    level: QualityLevel
+    architecture: str
+    rank: Annotated[int, Field(ge=1)] | None = None
+
+
 class Manifest(Strict):
     """All of `scene.json`; `files` maps every other file of the bundle to its SHA-256."""
 
@@ -216,11 +227,16 @@ class Manifest(Strict):
     start: Start
     direct_sound: Literal["geometry", "field"] = "geometry"
     """Where it comes from."""
+    reference_level_db: Finite = 0.0
+    """Of the direct sound one metre from an emitter, in the unit of the fields' responses, whatever it was measured in:
+    sound is heard, and maps are drawn, as if it were 0."""
     channels: tuple[Literal["left"], Literal["right"]] | tuple[Literal["mono"]] = ("left", "right")
     codec: CodecParameters
     fields: dict[str, FieldFile]
     """None where nothing reverberates: in the open, or in a room that is heard by its first reflections alone."""
     levels: Annotated[tuple[QualityLevel, ...], Field(min_length=1)]
+    frontier: tuple[FrontierPoint, ...] = ()
+    """Worth their time as the levels are, and so near one of them that they are not offered."""
     effects: Mapping[EffectName, bool] = Field(default_factory=dict)
     """On or off whatever the planner would decide; those that are not named are its to decide."""
     files: dict[FileName, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]

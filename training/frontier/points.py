@@ -11,6 +11,7 @@ from server.scene.manifest import Accuracy, Cost, QualityLevel
 
 _Floats = npt.NDArray[np.float64]
 _MISSING_ALLOWANCE = 0.01
+OFFERED_APART = 3.0
 
 
 @dataclass(frozen=True)
@@ -46,14 +47,15 @@ class Point:
 
 
 def pareto(points: Sequence[Point], *, missing: float = 0.0) -> list[Point]:
-    """Those that no quicker one equals, quickest first, of all that miss hardly more than `missing`.
+    """Those that no cheaper one equals, cheapest first, of all that miss hardly more than `missing`. Their cost is the
+    mean.
 
     Each is more accurate than the one before it by more than one standard error of their difference over the held-out
     pairs, so that what is called better is not the luck of the draw.
     """
     best: list[Point] = []
     eligible = [point for point in points if not point.bound and point.missing <= missing + _MISSING_ALLOWANCE]
-    for point in sorted(eligible, key=lambda point: point.cost.ms_p50):
+    for point in sorted(eligible, key=lambda point: point.cost.ms_mean):
         if not best or _is_better(point.by_pair, best[-1].by_pair):
             best.append(point)
     return best
@@ -68,5 +70,21 @@ def _is_better(ours: _Floats, theirs: _Floats) -> bool:
 
 
 def default_point(best: Sequence[Point], *, ms: float) -> Point:
-    """The most accurate of Pareto-optimal points whose median is at most `ms`, or else the quickest."""
-    return next((point for point in reversed(best) if point.cost.ms_p50 <= ms), best[0])
+    """The most accurate of Pareto-optimal points whose response takes at most `ms` where nothing was kept, or else the
+    cheapest."""
+    return next((point for point in reversed(best) if point.cost.ms_miss <= ms), best[0])
+
+
+def offered_points(best: Sequence[Point], default: Point) -> list[Point]:
+    """A few of the Pareto-optimal points, the default first: from it on down and up, each the most accurate of those
+    that cost a third or less of the one before it, or three times as much or more."""
+    offered = [default]
+    for point in reversed(best):
+        if point.cost.ms_mean * OFFERED_APART <= offered[-1].cost.ms_mean:
+            offered.append(point)
+    dearest = default
+    for point in best:
+        if point.cost.ms_mean >= OFFERED_APART * dearest.cost.ms_mean:
+            dearest = point
+            offered.append(point)
+    return offered

@@ -7,6 +7,7 @@ Cost is measured at the end, of all levels in one run.
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,19 +17,25 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
+from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
+from server.field.lattice import Lattice
 from server.field.levels import Levels
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, QualityLevel
+from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, QualityLevel
 from server.whole_field import WholeField
 from training.dataset import Dataset
 from training.evaluation.held_out import require_same_scene
 from training.frontier.accuracy import Entry, Errors, HeldOutSample
 from training.frontier.bound import TruePhase
-from training.frontier.cost import cost_of, measure_ms, memory_mb, one_core
-from training.frontier.points import Point, default_point, pareto
+from training.frontier.cost import STRETCH_S, cost_of, measure, memory_mb, one_core
+from training.frontier.points import Point, default_point, offered_points, pareto
+from training.frontier.steps import largest_steps
 
 _STEP_M = 0.05
+_OFFSETS = 4
+_MOST_OFFSET_M = 0.25
+_STEPS = 60
 
 
 @dataclass(frozen=True)
@@ -44,9 +51,15 @@ class Frontier:
     floor: Errors
     block_ms: float
 
+    @property
+    def offered(self) -> tuple[Point, ...]:
+        """What a bundle should offer of them, the default first."""
+        return tuple(offered_points(self.best, self.default))
+
     def to_json(self) -> dict[str, Any]:
         """Plain values for `json.dumps`."""
         best = {point.level.name for point in self.best}
+        offered = {point.level.name for point in self.offered}
         return {
             "scene": self.scene,
             "pairs": self.pairs,
@@ -61,25 +74,27 @@ class Frontier:
                     "errors": point.accuracy.errors,
                     "errors_jnd": dict(point.audible),
                     "audible_error_jnd": point.audible_error,
+                    "steps_jnd": point.accuracy.steps,
                     "missing": point.missing,
                     "is_pareto_optimal": point.level.name in best,
+                    "is_offered": point.level.name in offered,
                     "is_bound": point.bound,
                 }
-                for point in sorted(self.points, key=lambda point: point.cost.ms_p50)
+                for point in sorted(self.points, key=lambda point: point.cost.ms_mean)
             ],
         }
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: held-out `pairs` at `yaws` each; `rounds` of timing, at most `budget_s` per level; the
-    default level is the most accurate below `default_ms`."""
+    """How much is measured: held-out `pairs` at `yaws` each; a walk of `walk_s`, of which a level that computes every
+    response anew gets `budget_s`; the default level is the most accurate whose response takes at most `default_ms`."""
 
     pairs: int = 40
     yaws: int = 3
-    rounds: int = 40
+    walk_s: float = 300.0
     budget_s: float = 10.0
-    default_ms: float = 2.0
+    default_ms: float = 2.5
     seed: int = 0
 
 
@@ -96,10 +111,14 @@ def sweep(
     sample = HeldOutSample(dataset, trial.manifest.codec.codec, pairs=effort.pairs, yaws=effort.yaws, seed=effort.seed)
     floor = sample.floor()
     errors = _accuracies(trial, sample, levels, folder / "accuracy.json", effort, progress)
-    task = progress.add_task("timing", total=effort.rounds)
+    task = progress.add_task("timing", total=math.ceil(effort.walk_s / STRETCH_S))
     with one_core():
-        times = measure_ms(
-            Levels.load(trial), rounds=effort.rounds, budget_s=effort.budget_s, advance=lambda: progress.advance(task)
+        times = measure(
+            Levels.load(trial),
+            walk_s=effort.walk_s,
+            budget_s=effort.budget_s,
+            seed=effort.seed,
+            advance=lambda: progress.advance(task),
         )
     first_of_field = {level.field: level.name for level in reversed(levels)}
     memory = memory_mb(trial.folder, list(first_of_field.values()))
@@ -137,15 +156,23 @@ def with_levels(bundle: Bundle, levels: Sequence[QualityLevel], folder: Path) ->
     return written
 
 
-def offered_levels(frontier: Frontier) -> list[QualityLevel]:
-    """What a bundle should offer: the Pareto-optimal levels with what was measured, the default first."""
-    others = [point.level for point in frontier.best if point is not frontier.default]
-    return [frontier.default.level, *others]
+def record(bundle: Bundle, frontier: Frontier, folder: Path) -> Bundle:
+    """The bundle written to `folder`, its own or another, with the levels that it should offer and, beside them, all
+    Pareto-optimal points that were measured."""
+    fields = bundle.manifest.fields
+    offered = [point.level for point in frontier.offered]
+    points = []
+    for point in frontier.best:
+        if point.level not in offered:
+            file = fields[point.level.field]
+            points.append(FrontierPoint(level=point.level, architecture=file.architecture, rank=file.rank))
+    measured = bundle.manifest.model_copy(update={"frontier": tuple(points)})
+    return with_levels(dataclasses.replace(bundle, manifest=measured), offered, folder)
 
 
 def _point(level: QualityLevel, cost: Cost, errors: Errors, floor: Errors, sample: HeldOutSample) -> Point:
     pairs, yaws = sample.size
-    accuracy = Accuracy(pairs=pairs, yaws=yaws, errors=errors.errors, floor=floor.errors)
+    accuracy = Accuracy(pairs=pairs, yaws=yaws, errors=errors.errors, floor=floor.errors, steps=errors.steps)
     measured = level.model_copy(update={"accuracy": accuracy, "cost": cost})
     return Point(measured, errors.audible, errors.by_pair, errors.missing)
 
@@ -168,13 +195,30 @@ def _accuracies(
         progress.update(task, description=f"accuracy  {level.name}")
         key = _key(trial, level, effort)
         if key not in kept:
-            field = AcousticField.load(trial, level=level.name)
-            kept[key] = asdict(sample.errors_of(_Estimate(field)))
+            kept[key] = asdict(_errors(AcousticField.load(trial, level=level.name), sample, effort.seed))
             kept[key]["by_pair"] = kept[key]["by_pair"].tolist()
             path.write_text(json.dumps(kept))
         errors[level.name] = Errors(**{**kept[key], "by_pair": np.array(kept[key]["by_pair"])})
         progress.advance(task)
     return errors
+
+
+def _errors(field: AcousticField, sample: HeldOutSample, seed: int) -> Errors:
+    """Held-out poses are where a simulation has them and look where it did, and might be nodes: of a level with a
+    lattice, the mean over several places and headings of it."""
+    steps = largest_steps(field, count=_STEPS, seed=seed)
+    reuse, nodes = field.level.reuse, field.nodes
+    if reuse is None or nodes is None:
+        return dataclasses.replace(sample.errors_of(_Estimate(field)), steps=steps)
+    paths = SoundPathFinder(field.bundle.floor_plan, field.bundle.manifest.speed_of_sound)
+    most = min(_MOST_OFFSET_M, reuse.spacing_m / 2)
+    measured = []
+    rng = np.random.default_rng([seed, 12])
+    for _ in range(_OFFSETS):
+        x, y, z, turned = (*rng.uniform(-most, most, 3).tolist(), rng.uniform(-math.pi, math.pi))
+        nodes.lattice = Lattice(field.bundle, reuse, paths, (x, y, z), turned)
+        measured.append(sample.errors_of(_Estimate(field)))
+    return dataclasses.replace(Errors.mean(measured), steps=steps)
 
 
 def _key(trial: Bundle, level: QualityLevel, effort: Effort) -> str:

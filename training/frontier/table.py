@@ -13,24 +13,31 @@ def report(frontier: Frontier) -> Table:
     """The quality levels, quickest first, each error in its unit and, in brackets, in JND."""
     table = Table(
         title=f"{frontier.scene}: {len(frontier.best)} of {len(frontier.points)} levels measured are worth their time",
-        caption=f"mean errors on {frontier.pairs} held-out pairs at {frontier.yaws} orientations, (JND); * default",
+        caption=(
+            f"mean errors on {frontier.pairs} held-out pairs at {frontier.yaws} orientations, (JND); "
+            "milliseconds per pose of a walk; largest step between poses 1 cm apart; + offered, * default"
+        ),
     )
     table.add_column("level")
-    for heading in ("p50 ms", "p99 ms", "memory MB", "storage MB"):
+    for heading in ("mean ms", "p50 ms", "p99 ms", "miss ms", "memory MB"):
         table.add_column(heading, justify="right")
     for metric in _SHOWN:
         table.add_column(f"{metric.label} {metric.unit}".strip(), justify="right")
     table.add_column("mean JND", justify="right")
+    table.add_column("step JND", justify="right")
     for point in frontier.best:
         cost = point.cost
-        costs = [f"{value:.3g}" for value in (cost.ms_p50, cost.ms_p99, cost.memory_mb, cost.storage_mb)]
+        times = (cost.ms_mean, cost.ms_p50, cost.ms_p99, cost.ms_miss)
+        costs = [f"{value:.3g}" for value in (*times, cost.memory_mb)]
         errors = [_cell(point.accuracy.errors, point.audible, metric.name) for metric in _SHOWN]
-        name = point.level.name + ("*" if point is frontier.default else "")
-        table.add_row(name, *costs, *errors, f"{point.audible_error:.3g}")
+        mark = "*" if point is frontier.default else "+" if point in frontier.offered else ""
+        steps = point.accuracy.steps
+        largest = f"{max(steps.values()):.2g} {max(steps, key=steps.__getitem__)}" if steps else "none"
+        table.add_row(point.level.name + mark, *costs, *errors, f"{point.audible_error:.3g}", largest)
     floor = frontier.floor
     mean = sum(floor.audible.values()) / len(floor.audible)
     errors = [_cell(floor.errors, floor.audible, metric.name) for metric in _SHOWN]
-    table.add_row("[dim]floor[/dim]", "", "", "", "", *errors, f"{mean:.3g}")
+    table.add_row("[dim]floor[/dim]", "", "", "", "", "", *errors, f"{mean:.3g}", "")
     return table
 
 

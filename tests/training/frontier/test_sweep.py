@@ -1,25 +1,34 @@
+import itertools
 import json
+import math
 
 import numpy as np
 import pytest
 from rich.progress import Progress
 
+from server.errors import BundleError
+from server.field.field import AcousticField
 from server.field.levels import Levels
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import Phase
+from server.scene.manifest import Phase, QualityLevel, Reuse
 from training.frontier import sweep as sweep_module
 from training.frontier.accuracy import HeldOutSample
 from training.frontier.candidates import candidates
+from training.frontier.cost import Listener
 from training.frontier.figure import draw_frontier
-from training.frontier.sweep import Effort, offered_levels, sweep, with_levels
+from training.frontier.sweep import Effort, record, sweep, with_levels
+from training.frontier.walk import POSES_PER_S, SPEED_M_PER_S, walk
 
-EFFORT = Effort(pairs=3, yaws=2, rounds=4)
+EFFORT = Effort(pairs=3, yaws=2, walk_s=12.0)
 
 
 @pytest.fixture(scope="module")
 def chosen(tiny_bundle):
     wanted = {Phase(), Phase(kind="griffin_lim", iterations=1)}
-    return [level for level in candidates(tiny_bundle) if level.phase in wanted]
+    (field,) = tiny_bundle.manifest.fields
+    levels = [level for level in candidates(tiny_bundle, reuse_of=[field]) if level.phase in wanted]
+    lattices = {Reuse(spacing_m=0.1, turn_deg=15), Reuse(spacing_m=5, turn_deg=360, first_reflections="node")}
+    return [level for level in levels if level.reuse is None or level.reuse in lattices]
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +42,12 @@ def sample(tiny_bundle, dataset) -> HeldOutSample:
 
 
 def test_candidates_differ_in_what_they_are_and_not_only_in_name(tiny_bundle) -> None:
-    levels = candidates(tiny_bundle)
+    levels = candidates(tiny_bundle, reuse_of=tiny_bundle.manifest.fields)
     assert len({level.name for level in levels}) == len(levels)
     assert len({level.model_copy(update={"name": "x"}).model_dump_json() for level in levels}) == len(levels)
-    assert all(level.phase == Phase() for level in candidates(tiny_bundle, []))
+    assert all(level.phase == Phase() and level.reuse is None for level in candidates(tiny_bundle, []))
+    with pytest.raises(BundleError, match="there is no 'other', only"):
+        candidates(tiny_bundle, reuse_of=["other"])
 
 
 def test_a_reference_has_no_error_and_its_twin_has_the_floors(sample) -> None:
@@ -64,7 +75,7 @@ def test_the_true_phase_bounds_what_phase_can_do(frontier) -> None:
 def test_costs_are_measured_in_one_run(frontier) -> None:
     for point in frontier.points:
         assert 0 < point.cost.ms_p50 <= point.cost.ms_p99
-        assert point.cost.storage_mb > 0
+        assert min(point.cost.ms_mean, point.cost.ms_miss, point.cost.storage_mb) > 0
     assert frontier.default in frontier.best
 
 
@@ -78,10 +89,11 @@ def test_what_was_measured_is_not_measured_again(tiny_bundle, dataset, chosen, t
 
 
 def test_a_bundle_offers_the_optimal_levels_and_keeps_what_was_measured(frontier, tiny_bundle, tmp_path) -> None:
-    levels = offered_levels(frontier)
-    with_levels(tiny_bundle, levels, tmp_path)
+    record(tiny_bundle, frontier, tmp_path)
     loaded = Levels.load(Bundle.load(tmp_path))
-    assert list(loaded) == [level.name for level in levels]
+    assert list(loaded) == [point.level.name for point in frontier.offered]
+    measured = {point.level.name for point in loaded.bundle.manifest.frontier}
+    assert measured == {point.level.name for point in frontier.best} - set(loaded)
     assert loaded.default.level == frontier.default.level
     assert loaded.default.level.cost is not None
     assert loaded.default.level.accuracy is not None
@@ -93,6 +105,45 @@ def test_the_document_names_every_point_and_the_picture_is_drawn(frontier, tmp_p
     assert sum(entry["is_pareto_optimal"] for entry in document["points"]) == len(frontier.best)
     draw_frontier(frontier, tmp_path / "frontier.png")
     assert (tmp_path / "frontier.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_one_response_for_all_poses_costs_next_to_nothing_and_is_worse_and_jumps(frontier) -> None:
+    points = {point.level.reuse: point for point in frontier.points if point.level.phase == Phase() and not point.bound}
+    exact = points[None]
+    fine, coarse = sorted((point for reuse, point in points.items() if reuse), key=lambda p: p.level.reuse.spacing_m)
+    assert coarse.cost.ms_mean < 0.2 * exact.cost.ms_mean
+    assert coarse.cost.ms_p50 < 0.05 * exact.cost.ms_p50
+    assert coarse.cost.ms_miss > 0.5 * exact.cost.ms_miss
+    assert coarse.accuracy.errors["drr"] > 1.2 * exact.accuracy.errors["drr"]
+    assert max(exact.accuracy.steps.values()) < max(coarse.accuracy.steps.values())
+    assert fine.cost.memory_mb > exact.cost.memory_mb  # what it keeps is memory too
+
+
+def test_a_walk_is_at_the_speed_of_walking_through_the_room_and_looks_about(tiny_bundle) -> None:
+    poses = walk(tiny_bundle, duration_s=30, seed=3)
+    places = np.array([pose.position for pose in poses])
+    assert len(poses) == 30 * POSES_PER_S
+    assert tiny_bundle.floor_plan.contains(places).all()
+    steps_m = np.linalg.norm(np.diff(places, axis=0), axis=-1)
+    assert np.median(steps_m) == pytest.approx(SPEED_M_PER_S / POSES_PER_S)
+    assert steps_m.max() < 1.01 * SPEED_M_PER_S / POSES_PER_S
+    turns = np.array([math.remainder(b.yaw - a.yaw, math.tau) for a, b in itertools.pairwise(poses)])
+    assert 0.01 < np.abs(turns).max() * POSES_PER_S < 1.5 * math.pi
+    assert walk(tiny_bundle, duration_s=30, seed=3) == poses != walk(tiny_bundle, duration_s=30, seed=4)
+
+
+def test_a_listener_that_forgot_pays_again_and_one_that_stands_still_pays_once(tiny_bundle) -> None:
+    (field,) = tiny_bundle.manifest.fields
+    level = QualityLevel(name="kept", field=field, reuse=Reuse(spacing_m=2, turn_deg=90, first_reflections="node"))
+    graph = AcousticField.load(tiny_bundle).graph
+    listener = Listener(AcousticField(tiny_bundle, level, graph))
+    pose = walk(tiny_bundle, duration_s=1, seed=0)[0]
+    first = listener.time_ms(pose)
+    again = min(listener.time_ms(pose) for _ in range(20))
+    assert listener.kept_bytes > 0
+    listener.forget()
+    assert listener.kept_bytes == 0
+    assert again < 0.1 * min(first, listener.time_ms(pose))
 
 
 def test_fields_that_no_level_needs_leave_the_folder(tiny_bundle, tmp_path) -> None:

@@ -1,0 +1,52 @@
+"""How much what is heard changes from one pose to another a centimetre away.
+
+Of responses computed anew for every pose, little; where poses share responses, by a jump at the border of a cell.
+"""
+
+import itertools
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.audibility import in_jnd
+from server.acoustics.geometry import Pose
+from server.acoustics.metrics import parameter_errors
+from server.acoustics.room_parameters import measure
+from server.field.field import AcousticField
+from server.whole_field import WholeField
+from training.frontier.walk import SPEED_M_PER_S, walk
+
+STEP_M = 0.01
+_WALK_S = 60.0
+
+
+def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, float]:
+    """In JND by metric: the largest change of `count` steps of a walk, or of all that lead to another node.
+
+    Steps are spread evenly over the walk, and where the level reuses responses, over those from one node to another.
+    DRR counts where both poses have the emitter in sight, as everywhere.
+    """
+    emitter = field.bundle.manifest.start.emitter
+    poses = walk(field.bundle, duration_s=_WALK_S, poses_per_s=SPEED_M_PER_S / STEP_M, seed=seed)
+    steps = list(itertools.pairwise(poses))
+    if field.nodes is not None:
+        nodes = [field.snap(pose.position, emitter, pose.yaw) for pose in poses]
+        steps = [step for step, (one, other) in zip(steps, itertools.pairwise(nodes), strict=True) if one != other]
+    chosen = np.unique(np.linspace(0, len(steps) - 1, min(count, len(steps))).astype(int)) if steps else []
+    whole = WholeField.through_kemar(field)
+    largest: dict[str, float] = {}
+    for number in chosen:
+        before, after = (measure(_response(whole, pose), field.sample_rate) for pose in steps[number])
+        errors = parameter_errors(before, after)
+        places = np.array([pose.position for pose in steps[number]])
+        if not np.all(field.bundle.floor_plan.is_visible(places, np.array(emitter))):
+            del errors["drr"]
+        for metric, change in in_jnd(errors, before).items():
+            if np.isfinite(change):
+                largest[metric] = max(largest.get(metric, 0.0), float(change))
+    return largest
+
+
+def _response(whole: WholeField, pose: Pose) -> npt.NDArray[np.float32]:
+    emitter = whole.bundle.manifest.start.emitter
+    return whole.impulse_responses([pose.position], [emitter], [pose.yaw])[0]

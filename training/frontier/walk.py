@@ -1,0 +1,62 @@
+"""The walk over which quality levels are measured: somebody strolls through a scene, looking about.
+
+Metres, radians, seconds.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.geometry import Pose, Vector3
+from server.scene.bundle import Bundle
+
+SPEED_M_PER_S = 1.4
+POSES_PER_S = 20
+_GLANCE_RAD = math.radians(60)
+_GLANCE_S = 5.0
+_MOST_TURN_RAD_PER_S = math.pi
+_Floats = npt.NDArray[np.float64]
+
+
+def walk(bundle: Bundle, *, duration_s: float, poses_per_s: float = POSES_PER_S, seed: int) -> list[Pose]:
+    """A listener's poses: straight from one place in sight to the next, at ear height throughout, looking ahead and to
+    either side in turn. The same places for the same seed, however many poses there are on the way."""
+    rng = np.random.default_rng([seed, 11])
+    step_m = SPEED_M_PER_S / poses_per_s
+    poses: list[Pose] = []
+    places = _places(bundle, rng)
+    at, heading = next(places), 0.0
+    towards = next(places)
+    while len(poses) < duration_s * poses_per_s:
+        left_m = float(np.linalg.norm(towards - at))
+        while left_m < step_m:
+            at, towards = towards, next(places)
+            left_m = float(np.linalg.norm(towards - at))
+        at = at + (towards - at) * (step_m / left_m)
+        ahead = math.atan2(towards[1] - at[1], towards[0] - at[0])
+        most = _MOST_TURN_RAD_PER_S / poses_per_s
+        heading += min(most, max(-most, math.remainder(ahead - heading, math.tau)))
+        glance = _GLANCE_RAD * math.sin(math.tau * len(poses) / poses_per_s / _GLANCE_S)
+        poses.append(Pose.from_yaw(_point(at), heading + glance))
+    return poses
+
+
+def _places(bundle: Bundle, rng: np.random.Generator) -> Iterator[_Floats]:
+    """For ever: places at the height of the scene's start, each in sight of the one before it."""
+    low, high = np.array(bundle.manifest.bounds.minimum), np.array(bundle.manifest.bounds.maximum)
+    at = np.array(bundle.manifest.start.listener)
+    low[2] = high[2] = at[2]
+    while True:
+        yield at
+        while True:
+            place = rng.uniform(low, high)
+            if bundle.floor_plan.contains(place) and bundle.floor_plan.is_visible(at, place):
+                break
+        at = place
+
+
+def _point(place: _Floats) -> Vector3:
+    x, y, z = place.tolist()
+    return (x, y, z)
