@@ -71,6 +71,7 @@ SLOT = np.dtype(
         # Where things are, at the end of the last block. A spring is where its anchor is, where it is, and its speed.
         ("started", np.bool_),
         ("sounds", np.bool_),  # not muted
+        ("is_elsewhere", np.bool_),  # asked for since it was muted
         ("filtered", np.bool_),
         ("was_unattenuated", np.bool_),
         ("silent", np.int64),  # samples
@@ -214,14 +215,19 @@ def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, 
 @compiled
 def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> None:
     """Add a slot to the mixes."""
-    starts, was_muted = not slot.started, not slot.sounds
+    starts = not slot.started
+    appears = not (starts or slot.sounds)
     slot.started = True
     slot.sounds = not slot.muted
-    if slot.muted and (starts or was_muted):
+    if slot.muted and (starts or appears):
+        slot.is_elsewhere = starts or slot.is_elsewhere or slot.asked
         slot.jump = slot.asked = False
         return
-    at_once = starts or was_muted
-    was_filtered, was_plain = slot.filtered and not at_once, not (slot.filtered or at_once)
+    # What has not moved while it was muted goes on from where it was.
+    at_once = starts or (appears and slot.is_elsewhere)
+    slot.is_elsewhere = False
+    was_filtered = slot.filtered and not (starts or appears)
+    was_plain = not (slot.filtered or starts or appears)
     jumps = not at_once and _jumps(slot, size, state.sample_rate, state.speed_of_sound)
     if slot.asked:
         slot.since_asked = 0
@@ -238,7 +244,7 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
     is_plain = not (slot.filtered or slot.muted)
     if jumps or slot.filtered != was_filtered:
         change = _LEAP
-    if slot.filtered and (change != _NONE or at_once):
+    if slot.filtered and (change != _NONE or starts):
         _find_filters(state, slot)
 
     window = 2 * state.bins.shape[1]
@@ -252,7 +258,7 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
             samples[:] = 0
         elif slot.filtered:
             # A filter has to know what came before.
-            past = slot.delay[ear] if was_plain else _delay(state, slot, ear)
+            past = _delay(state, slot, ear) if at_once else slot.delay[ear]
             _read_still(state, state.line[index], past, window - size, samples[:window])
             samples[:window] *= np.float32(gain_before)
         _read(state, slot, state.line[index], ear, size, at_once, jumps, gain_before, newest)
