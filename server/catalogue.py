@@ -63,7 +63,6 @@ def describe_scene(levels: Levels) -> SceneDescription:
         speed_of_sound=manifest.speed_of_sound,
         bounds=manifest.bounds,
         walls_known=manifest.geometry is not None,
-        direct_sound=manifest.direct_sound,
         corners=plan.corners,
         height_m=plan.height_m - plan.floor_m,
         openings=() if manifest.geometry is None else manifest.geometry.openings,

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.decibels import amplitude_to_db
+from server.acoustics.decibels import amplitude_to_db, db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.sound_path import SoundPathFinder
@@ -61,7 +61,8 @@ class DirectSound:
 
     `early_reflections` are what the impulse responses of the scene's fields leave out, None where they hold it. Fields
     that hold the direct sound too leave nothing to a renderer: then there are no `filters` for it, and where those
-    fields have no ears either, `binauralization` gives them the listener's.
+    fields have no ears either, `binauralization` gives them the listener's. `field_gain`, linear, takes the fields'
+    responses to unit pressure one metre from an emitter.
     """
 
     def __init__(
@@ -74,10 +75,12 @@ class DirectSound:
         early_reflections: EarlyReflections | None = None,
         early_without_head: EarlyReflections | None = None,
         binauralization: Binauralization | None = None,
+        field_gain: float = 1.0,
     ) -> None:
         self.early_reflections = early_reflections
         self.early_without_head = early_without_head
         self.binauralization = binauralization
+        self.field_gain = field_gain
         self._finder = SoundPathFinder(plan, speed_of_sound)
         self._straight = SoundPathFinder(_IN_THE_OPEN, speed_of_sound)
         self._speed_of_sound = speed_of_sound
@@ -95,6 +98,7 @@ class DirectSound:
             early_reflections=EarlyReflections.of(bundle, filters),
             early_without_head=EarlyReflections.of(bundle, NoHead(filters.sample_rate)),
             binauralization=Binauralization.of(bundle, filters),
+            field_gain=float(db_to_amplitude(-manifest.reference_level_db)),
         )
 
     def renderer(

@@ -128,6 +128,8 @@ def composed_irs(
     if late:
         heads = np.tile(np.asarray(listener.position), (len(late), 1))
         held[late] = (ask or field.impulse_responses)(heads, np.asarray(places)[late], np.full(len(late), listener.yaw))
+        if direct.field_gain != 1.0:
+            held *= np.float32(direct.field_gain)
     if direct.binauralization is not None:
         return direct.binauralization.hear(held, listener, places) if channels == 2 else held
     irs = without_head(held, field.sample_rate) if channels == 1 else held

@@ -1,7 +1,7 @@
 """How loud an emitter is everywhere in a scene: a map of listener positions, for people to look at.
 
 Level is that of both ears together, averaged over head orientations, in dB relative to the emitter's free field at one
-metre; of measured scenes relative to the square of the unit that they were measured in.
+metre.
 """
 
 import io
@@ -85,7 +85,8 @@ def loudness_map(
     inside = bundle.floor_plan.contains(cells)
     levels = np.full((rows, columns), np.nan)
     reflected = _reflected_power(field.field, cells[inside], emitter)
-    levels[inside] = power_to_db(field.path_power(cells[inside], emitter) + reflected)
+    whole = power_to_db(field.path_power(cells[inside], emitter) + reflected)
+    levels[inside] = whole - bundle.manifest.reference_level_db
     return LoudnessMap(levels, (float(x[0]), float(y[0])), spacing_m, listener_height_m)
 
 

@@ -302,7 +302,6 @@ class SceneDescription(_Message):
     speed_of_sound: float
     bounds: Bounds
     walls_known: bool
-    direct_sound: Literal["geometry", "field"]
     corners: tuple[tuple[float, float], ...]
     height_m: float
     openings: tuple[Opening, ...]

@@ -1,5 +1,7 @@
 """A scene of which one microphone's responses are known and no walls: served whole, and heard with two ears."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -16,11 +18,15 @@ from server.impulse_response import ImpulseResponse, IrQuery
 from server.ir_request import compute_irs
 from server.load import Rung
 from server.loudness import loudness_map
+from server.places import place_of_field
 from server.protocol import PROTOCOL, AddEmitter, DirectivityPattern, Hello, ListenerPose
 from server.render import PathPoint, RenderedEmitter, render
 from server.rendering.hrtf import HeadFilters
 from server.rendering.sphere import fill_gaps, triangulate
+from server.scene.effects import EffectName
 from server.scene.manifest import Manifest
+from server.scene.planner import make_plan
+from server.scene.situation import Emitter, Listener, Situation
 from server.session import Session
 from server.whole_field import WholeField
 from tests.conftest import CODEC, MANIFEST, MEASURED, measured_response
@@ -138,7 +144,7 @@ def session(field, filters):
 def test_a_stream_plays_the_clip_through_what_the_ears_hear(session, field, filters):
     session.receive(ListenerPose(pose_id=1, position=HERE, orientation=Pose.from_yaw(HERE, 1.0).orientation))
     session.receive(AddEmitter(id="talker", clip="noise", position=THERE, loop=False))
-    session.accept(compute_irs(Levels([field]), session.take_request(), session.prepare))
+    session.accept(compute_irs(Levels([field]), session.take_request(), session.renderer))
     streamed = np.concatenate([session.render_block().samples for _ in range(20)], axis=1)
     measured = field.impulse_responses([HERE], [THERE], [0.0])
     response = Binauralization(filters, speed_of_sound=343.0).hear(measured, Pose.from_yaw(HERE, 1.0), [THERE])[0]
@@ -148,7 +154,7 @@ def test_a_stream_plays_the_clip_through_what_the_ears_hear(session, field, filt
 
 def test_an_offline_render_is_the_stream(session, field, filters):
     session.receive(AddEmitter(id="talker", clip="noise", position=THERE, loop=False))
-    session.accept(compute_irs(Levels([field]), session.take_request(), session.prepare))
+    session.accept(compute_irs(Levels([field]), session.take_request(), session.renderer))
     streamed = np.concatenate([session.render_block().samples for _ in range(12)], axis=1)
     start = MEASURED.start
     path = [PathPoint.at(0, Pose.from_yaw(start.listener, np.radians(start.listener_yaw_deg)))]
@@ -156,6 +162,32 @@ def test_an_offline_render_is_the_stream(session, field, filters):
         field, DirectSound.of(field.bundle, filters), [RenderedEmitter(CLIP, Pose(THERE))], path, length=12 * 256
     )
     np.testing.assert_array_equal(rendered, streamed)
+
+
+def test_what_is_heard_does_not_depend_on_the_unit_of_the_measurement(field, filters):
+    """Responses twice as large, and a reference that says so."""
+    quiet = np.square(_heard(field, filters)).sum()
+    manifest = field.bundle.manifest.model_copy(update={"reference_level_db": 20 * np.log10(2.0)})
+    field.bundle = dataclasses.replace(field.bundle, manifest=manifest)
+    drawn = loudness_map(WholeField.through_kemar(field), THERE, listener_height_m=0.0, spacing_m=0.2)
+    halved = np.square(_heard(field, filters)).sum()
+    assert_allclose(halved, quiet / 4, rtol=1e-4)
+    energy = float(np.square(measured_response(), dtype=np.float64).sum())
+    distance = np.hypot(drawn.origin[0] - THERE[0], drawn.origin[1] - THERE[1])
+    assert_allclose(drawn.levels_db[0, 0], 10 * np.log10(energy / 4 / distance**2), atol=0.01)
+
+
+def _heard(field, filters):
+    path = [PathPoint.at(0, Pose(HERE))]
+    return render(field, DirectSound.of(field.bundle, filters), [RenderedEmitter(CLIP, Pose(THERE))], path)
+
+
+def test_a_plan_keeps_the_head_that_gives_the_place_its_ears(field):
+    listener = Listener(Pose(HERE), turns=True)
+    plan = make_plan(Situation(place_of_field(field), listener, {"talker": Emitter(Pose(THERE))}))
+    called_for = {decision.name for decision in plan.decisions if decision.called_for}
+    assert {EffectName.HRTF, EffectName.HEAD_ROTATION, EffectName.LATE_REVERBERATION} <= called_for
+    assert not called_for & {EffectName.DIRECT_PATH, EffectName.EARLY_REFLECTIONS, EffectName.PROPAGATION_DELAY}
 
 
 def test_loudspeakers_keep_the_directivity_they_were_measured_with(session):

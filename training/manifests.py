@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from server.acoustics.decibels import power_to_db
 from server.scene.geometry import Point
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
 from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.responses import ImportedDataset, SimulatedResponses
 
 _MARGIN_M = 0.1
+_LEVELLED_ROWS = 500
+_DIRECT_S = (-0.001, 0.0025)  # about when geometry has it arrive
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,7 @@ def measured_manifest(responses: ImportedDataset, fields: Fields) -> Manifest:
         ),
         speed_of_sound=SPEED_OF_SOUND,
         direct_sound="field",
+        reference_level_db=round(_reference_level_db(responses), 2),
         channels=("mono",) if responses.channels == 1 else ("left", "right"),
         start=Start(
             listener=_point(responses.listener[usual]),
@@ -77,6 +81,18 @@ def measured_manifest(responses: ImportedDataset, fields: Fields) -> Manifest:
         levels=fields.levels,
         files=fields.files,
     )
+
+
+def _reference_level_db(responses: ImportedDataset) -> float:
+    """Median of what the direct sound has one metre from the emitter, were it to spread in the open."""
+    rows = np.sort(np.random.default_rng(0).permutation(len(responses.yaw))[:_LEVELLED_ROWS])
+    energies = []
+    for row in rows:
+        first, last = (round((responses.onset_s[row] + offset) * responses.sample_rate) for offset in _DIRECT_S)
+        direct = responses.read([row])[0, :, max(first, 0) : last].astype(np.float64)
+        distance_m = np.linalg.norm(responses.emitter[row] - responses.listener[row])
+        energies.append(np.square(direct).sum(axis=-1).mean() * distance_m**2)
+    return float(power_to_db(np.median(energies)))
 
 
 def _point(position: np.ndarray) -> Point:

@@ -52,7 +52,8 @@ def without_head(prediction: Prediction) -> Change:
     energies, shares = prediction.whole, prediction.shares
     after = (energies.mirrored[0] + energies.held[0]) @ shares
     direct = energies.direct[0, : len(after)] @ shares
-    is_first_heard = direct > after / 10
+    # What a field holds begins with the direct sound.
+    is_first_heard = (direct > after / 10) | prediction.place.holds_direct_sound
     changes = [
         _in_jnd("iacc", (1 - rest.late_iacc) * float(part))
         for rest, part in zip(prediction.reverberation, after / (direct + after), strict=True)
@@ -75,6 +76,9 @@ def without_turning(prediction: Prediction) -> Change:
     listener = prediction.listener
     if not listener.turns or listener.output == "mono":
         return UNCHANGED
+    if prediction.place.holds_direct_sound:
+        delay_s = _interaural_delay_s(1.0, prediction.place.speed_of_sound)
+        return _most(_in_jnd("itd", 1e6 * delay_s), _in_jnd("ild", _LATERAL_ILD_DB))
     energies, shares = prediction.whole, prediction.shares
     mirrored = prediction.mirrored_energies([ALL_ON])[0] @ shares
     change_db = 0.0

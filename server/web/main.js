@@ -289,8 +289,7 @@ class Page {
       this.paper.show(this.field, this.scale);
       this.legend.show(this.scale);
       const whose = emitters.length > 1 ? "of all sources together" : `of source ${emitters[0].id}`;
-      const zero = this.scene.direct_sound === "field" ? "a response of unit energy" : "1 m in the open";
-      this.legend.note = `${whose}; 0 dB is ${zero}`;
+      this.legend.note = `${whose}; 0 dB is 1 m in the open`;
       this.#pointNeedle();
     } catch (error) {
       if (error.name === "AbortError") return;

@@ -4,6 +4,7 @@
 import { Floor, distance, wrapAngle } from "./geometry.js";
 
 export const MOST_EMITTERS = 2;
+const INSIDE_M = 1e-4;
 
 export class World extends EventTarget {
   constructor(scene) {
@@ -11,7 +12,9 @@ export class World extends EventTarget {
     this.scene = scene;
     const { minimum, maximum } = scene.bounds;
     const clearance = scene.walls_known ? undefined : null;
-    this.floor = new Floor({ corners: scene.corners, minimum: minimum.slice(0, 2), maximum: maximum.slice(0, 2), clearance });
+    // Poses travel in single precision, which rounds what lies on the bounds to either side of them.
+    const [west, south, east, north] = [minimum[0] + INSIDE_M, minimum[1] + INSIDE_M, maximum[0] - INSIDE_M, maximum[1] - INSIDE_M];
+    this.floor = new Floor({ corners: scene.corners, minimum: [west, south], maximum: [east, north], clearance });
     this.listener = { position: [...scene.listener.position], yaw: scene.listener.yaw ?? 0 };
     this.emitters = new Map();
   }
