@@ -77,7 +77,7 @@ def played(clip, samples, *, loop=True):
 
 
 def decibels(ratio):
-    return 20 * np.log10(ratio + 1e-300)
+    return 20 * np.log10(ratio + 1e-15)
 
 
 def error_db(actual, expected):

@@ -60,7 +60,7 @@ def test_an_emitter_without_response_and_path_waits_in_silence(measured, filters
 class _Never:
     """A source that must not be asked."""
 
-    def process(self, out):
+    def process(self, _out):
         raise AssertionError("asked for sound before it can be heard")
 
     def reset(self):
