@@ -200,6 +200,7 @@ class Renderer:
         It is silent, its source waiting, until it has an IR, if it `awaits_ir`, and, where direct paths are heard, a
         path. Raises DuplicateEmitterError, RendererFullError, and ValueError for a gain that would overflow.
         """
+        require_gain(gain)
         if emitter_id in self._emitters:
             raise DuplicateEmitterError(f"emitter {emitter_id!r} is present already")
         if len(self._emitters) >= self.max_emitters:
@@ -208,7 +209,7 @@ class Renderer:
         if slot is None:
             raise RendererFullError("too many emitters removed just now still ring out")
         self._emitters[emitter_id] = _Emitter(self._mixer, slot, source, awaits_ir)
-        self._mixer.gain[:, slot] = require_gain(gain)
+        self._mixer.gain[:, slot] = gain
         self._mixer.send[:, slot] = 1.0
 
     def remove_emitter(self, emitter_id: str) -> None:
