@@ -45,7 +45,7 @@ class EnergyError(nn.Module):
             self.register_buffer(name, torch.tensor(np.asarray(sums, dtype=np.float32)), persistent=False)
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Of flat (B, heads.size) levels in physical units."""
+        """Of flat levels in physical units, (B, size of `heads.levels`)."""
         ours, theirs = self._energies(predicted, self._deficit), self._energies(target, 0.0)
         return torch.stack([nn.functional.mse_loss(a, b) for a, b in zip(ours, theirs, strict=True)]).sum()
 

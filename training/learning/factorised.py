@@ -130,16 +130,19 @@ class FactorisedLearner:
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
         field, flat, measured = self.field, targets[0].float(), targets[1]
-        error = prediction - (flat - field.mean) / field.spread
-        squared = error * error  # whose gradient is quicker than that of a power
+        off = prediction - (flat - field.mean) / field.spread
+        squared = off * off  # whose gradient is quicker than that of a power
         losses = {}
-        for name, part in field.heads.slices.items():
-            of_rows = squared[:, part].mean(dim=1)
+        # Split, not sliced: the gradient of every slice would be as wide as the whole.
+        for name, part in zip(field.heads.shapes, squared.split(field.heads.sizes, dim=1), strict=True):
+            of_rows = part.mean(dim=1)
             # Lessons are of levels alone.
             counted = of_rows if name in _LEVEL_HEADS else of_rows * measured
             losses[name] = _HEAD_WEIGHTS[name] * counted.mean()
         if self.recipe.energy_weight:
-            error = self._energy_error.to(flat.device)(field.in_physical_units(prediction), flat)
+            levels = field.heads.levels
+            predicted = prediction[:, levels] * field.spread[levels] + field.mean[levels]
+            error = self._energy_error.to(flat.device)(predicted, flat[:, levels])
             losses["energy"] = self.recipe.energy_weight * error
         return losses
 

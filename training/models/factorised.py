@@ -142,11 +142,12 @@ class Heads(nn.Module):
         }
         if channels == 2:
             self.shapes["interaural"] = (2, cells.bands.cells, cells.all_frames.cells)
-        sizes = [int(np.prod(shape)) for shape in self.shapes.values()]
-        bounds = np.concatenate([[0], np.cumsum(sizes)])
+        self.sizes = [int(np.prod(shape)) for shape in self.shapes.values()]
+        bounds = np.concatenate([[0], np.cumsum(self.sizes)])
         self.slices = {
             name: slice(int(a), int(b)) for name, a, b in zip(self.shapes, bounds[:-1], bounds[1:], strict=True)
         }
+        self.levels = slice(self.slices["fine"].start, self.slices["late"].stop)
         self.size = int(bounds[-1])
 
 
