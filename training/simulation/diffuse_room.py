@@ -17,6 +17,8 @@ from training.simulation.rays import surface_shares
 _Floats = npt.NDArray[np.float64]
 
 _SIXTY_DB = 6 * np.log(10)
+# Nearer to none or all of it, absorption counts as this: times and powers stay finite.
+_LEAST_SHARE = 1e-9
 _NEPERS_PER_DB = np.log(10) / 10
 _BANDWIDTHS_HZ = np.asarray(OCTAVE_BANDS_HZ) / np.sqrt(2)
 
@@ -51,7 +53,8 @@ class DiffuseRoom:
     @cached_property
     def absorption(self) -> _Floats:
         """(band,) mean over the surfaces."""
-        return np.asarray(self.areas_m2 @ (1 - surface_shares(self.geometry)[0]) / self.surface_m2)
+        absorbed = self.areas_m2 @ (1 - surface_shares(self.geometry)[0]) / self.surface_m2
+        return np.asarray(np.clip(absorbed, _LEAST_SHARE, 1 - _LEAST_SHARE))
 
     @cached_property
     def scattering(self) -> _Floats:
@@ -64,19 +67,15 @@ class DiffuseRoom:
     @cached_property
     def reverberation_time_s(self) -> _Floats:
         """(band,) by Eyring (J. Acoust. Soc. Am. 1, 1930), with the air's share (Kuttruff, Room Acoustics, 5.1)."""
-        with np.errstate(divide="ignore"):
-            by_walls = -self.surface_m2 * np.log(1 - self.absorption)
+        by_walls = -self.surface_m2 * np.log1p(-self.absorption)
         per_m = np.zeros(len(self.absorption)) if self.air is None else self.air.absorption_db_per_m * _NEPERS_PER_DB
-        lossless = np.finfo(np.float64).tiny
-        area = np.maximum(by_walls + 4 * per_m * self.volume_m3, lossless)
+        area = by_walls + 4 * per_m * self.volume_m3
         return np.asarray(4 * _SIXTY_DB * self.volume_m3 / (self.speed_of_sound * area))
 
     def reflected_power(self, order: int) -> _Floats:
         """(band,) of everything that was reflected so many times or more: the geometric series whose sum, from one
         reflection on, is the reverberant power 16 pi (1 - a) / (S a) (Kuttruff, 5.5)."""
-        kept = 1 - self.absorption
-        lossless = np.finfo(np.float64).tiny
-        return np.asarray(16 * np.pi / self.surface_m2 * kept**order / np.maximum(self.absorption, lossless))
+        return np.asarray(16 * np.pi / self.surface_m2 * (1 - self.absorption) ** order / self.absorption)
 
     @property
     def mixing_time_s(self) -> float:

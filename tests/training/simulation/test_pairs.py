@@ -1,0 +1,116 @@
+"""Simulation by a plan: what is off is not computed, and what a plan leaves out is not missed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from training.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.simulation import pairs
+from training.simulation.pairs import PairSimulation
+from training.simulation.plan import SimulatedEffect, SimulationPlan
+from training.simulation.planner import planner_of
+from training.simulation.rays import RayTracer
+from training.simulation.shared_tail import SharedTail
+from training.simulation.synthesis import BinauralSynthesis
+
+YAWS = 2 * np.pi * np.arange(4) / 4
+EVERYTHING = SimulationPlan.everything(2, 500)
+
+
+@pytest.fixture(scope="module")
+def box(tiny_scene):
+    return SceneFile.read(tiny_scene)
+
+
+def simulation_of(scene, plan, seed=0):
+    return PairSimulation.prepare(scene, scene.probe_positions(0), YAWS, seed=seed, plan=plan)
+
+
+def taken(simulation, emitter=0, take=0):
+    listeners = np.delete(np.arange(len(simulation.probes)), emitter)
+    _, energies, responses = zip(*simulation.take(emitter, listeners, take), strict=True)
+    return np.stack(energies).astype(float), np.stack(responses).astype(float)
+
+
+def test_the_same_seed_gives_the_same_numbers_in_any_order(box):
+    plan = planner_of(box, 0).plan({})
+    one, other = simulation_of(box, plan), simulation_of(box, plan)
+    taken(other, emitter=3)
+    for first, second in zip(taken(one, emitter=1), taken(other, emitter=1), strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_a_plan_of_everything_draws_whole_responses_of_each_pair(box):
+    """As `BinauralSynthesis.render` has them."""
+    simulation = simulation_of(box, EVERYTHING)
+    _, responses = taken(simulation)
+    rng = np.random.default_rng([0, 2, 0, 0])
+    probes = simulation.probes
+    tracer = simulation._tracer(probes[1:])
+    arrivals = tracer.trace(probes[0], rays=EVERYTHING.rays, rng=rng)
+    for listener, arrival, response in zip(probes[1:], arrivals, responses, strict=True):
+        onset_s = np.linalg.norm(listener - probes[0]) / 343
+        expected = simulation._synthesis.render(arrival, listener, onset_s, rng)
+        np.testing.assert_allclose(response, expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_without_rays_nothing_is_traced_and_no_noise_drawn(box, monkeypatch):
+    monkeypatch.setattr(RayTracer, "trace", None)
+    monkeypatch.setattr(BinauralSynthesis, "late", None)
+    monkeypatch.setattr(SharedTail, "__init__", None)
+    plan = planner_of(box, 0).plan({SimulatedEffect.LATE_REVERBERATION: False, SimulatedEffect.EARLY_REFLECTIONS: True})
+    energies, responses = taken(simulation_of(box, plan))
+    assert not energies.any()
+    assert responses.any()
+
+
+def test_a_shared_tail_is_traced_once_and_rays_of_pairs_end_with_it(box, monkeypatch):
+    traced_s = []
+    trace = RayTracer.trace
+
+    def counted(self, *arguments, **named):
+        traced_s.append(self.shape[-1] * HISTOGRAM_BIN_S)
+        return trace(self, *arguments, **named)
+
+    monkeypatch.setattr(RayTracer, "trace", counted)
+    simulation = simulation_of(box, planner_of(box, 0).plan({}))
+    once = len(traced_s)
+    assert once == pairs.TAKES * len(simulation.probes)  # from all over the room, which has few probes
+    taken(simulation)
+    taken(simulation, emitter=1)
+    assert len(traced_s) == once + 2
+    assert max(traced_s[once:]) < 0.08
+    assert min(traced_s[:once]) > 0.24
+
+
+def test_one_tail_for_all_has_the_level_and_decay_of_own_ones(box):
+    """Means over pairs and draws, of the part that is shared."""
+    planner = planner_of(box, 0)
+    start = round((planner.plan({}).tail_start_s + 0.01) * box.simulation.sample_rate)
+    curves = []
+    for plan in (planner.plan({}), planner.everything):
+        late = [
+            taken(simulation_of(box, replace(plan, tail_rays=min(plan.tail_rays, 500)), seed), emitter)[1][..., start:]
+            for seed in range(4)
+            for emitter in range(3)
+        ]
+        power = (np.stack(late) ** 2).mean(axis=(0, 1, 2, 3))
+        curves.append(10 * np.log10(power[::-1].cumsum()[::-1]))
+    shared, own = (curve[: len(curve) * 3 // 4 : 200] for curve in curves)
+    # 500 rays leave the end of a decay, 25 dB down, uncertain by more than its beginning.
+    np.testing.assert_allclose(shared[: len(shared) // 2], own[: len(own) // 2], atol=0.6)
+    np.testing.assert_allclose(shared, own, atol=1.5)
+
+
+def test_energies_of_a_shared_tail_are_as_loud_in_responses_as_own_ones(box):
+    """Through the same head, which adds its own gain to both."""
+    gains_db = []
+    for own_tail in (False, True):
+        overrides = {SimulatedEffect.EARLY_REFLECTIONS: False, SimulatedEffect.PER_SOURCE_TAIL: own_tail}
+        simulation = simulation_of(box, planner_of(box, 0).plan(overrides))
+        energies, responses = zip(*(taken(simulation, emitter) for emitter in range(6)), strict=True)
+        drawn_from = np.stack(energies).sum(axis=(2, 4)).mean()
+        heard = (np.stack(responses) ** 2).sum(axis=-1).mean()
+        gains_db.append(10 * np.log10(heard / drawn_from))
+    assert gains_db[0] == pytest.approx(gains_db[1], abs=0.3)

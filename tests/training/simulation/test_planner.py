@@ -1,0 +1,178 @@
+"""Plans follow from the scene alone; each effect is called for where theory says that it is heard."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from server.scene.geometry import Opening
+from training.scene_file import SceneFile, SceneFileError
+from training.simulation.plan import SimulatedEffect, SimulationPlan, overrides_among
+from training.simulation.planner import THRESHOLD_JND, planner_of
+from training.simulation.predictions import Predictions
+
+TWO_ROOMS = ((0, 0), (3, 0), (3, 4), (3.2, 4), (3.2, 0), (7, 0), (7, 5), (0, 5))
+
+
+@pytest.fixture(scope="module")
+def box(tiny_scene):
+    return SceneFile.read(tiny_scene).model_copy(update={"effects": {}})
+
+
+def with_materials(scene, walls=None, **shares):
+    """Shares alike on all surfaces, and what only walls have."""
+    of_all = {name: (value,) * 7 for name, value in shares.items()}
+    materials = scene.geometry.materials
+    changed = {name: getattr(materials, name).model_copy(update=of_all) for name in ("walls", "floor", "ceiling")}
+    changed["walls"] = changed["walls"].model_copy(update=walls or {})
+    return with_geometry(scene, materials=materials.model_copy(update=changed))
+
+
+def with_geometry(scene, **changes):
+    return scene.model_copy(update={"geometry": scene.geometry.model_copy(update=changes)})
+
+
+def two_rooms(scene, **walls):
+    passage = Opening(name="passage", start=(3.1, 4), end=(3.1, 5))
+    return with_materials(with_geometry(scene, corners=TWO_ROOMS, openings=(passage,)), walls=walls)
+
+
+def decided(scene, name, overrides=None):
+    plan = planner_of(scene, 0).plan(overrides or {})
+    (decision,) = (each for each in plan.decisions if each.name == name)
+    return plan, decision
+
+
+def test_the_same_scene_has_the_same_plan(box):
+    assert planner_of(box, 3).plan({}) == planner_of(box, 3).plan({})
+
+
+def test_an_effect_is_on_where_its_change_reaches_the_threshold(apartment, box):
+    for scene in (apartment, box):
+        for each in planner_of(scene, 0).plan({}).decisions:
+            assert np.isfinite(each.change_jnd)
+            assert each.called_for == (each.change_jnd >= THRESHOLD_JND)
+            assert each.reason
+
+
+def test_an_anechoic_room_has_no_rays_and_no_images(box):
+    plan, late = decided(with_materials(box, absorption=1.0), SimulatedEffect.LATE_REVERBERATION)
+    assert (plan.rays, plan.tail_rays, plan.image_order, plan.tail_start_s) == (0, 0, 1, None)
+    assert late.change_jnd < 0.01
+
+
+def test_one_room_shares_its_tail_and_two_do_not(box):
+    alone, _ = decided(box, SimulatedEffect.PER_SOURCE_TAIL)
+    parted, decision = decided(two_rooms(box), SimulatedEffect.PER_SOURCE_TAIL)
+    assert alone.tail_start_s is not None
+    assert parted.tail_start_s is None
+    assert decision.change_jnd > 1
+
+
+def test_the_tail_is_shared_only_after_everything_has_mixed_everywhere(box):
+    plan, _ = decided(box, SimulatedEffect.PER_SOURCE_TAIL)
+    probes = box.probe_positions(0)
+    farthest_m = np.linalg.norm(probes[:, None] - probes[None], axis=-1).max()
+    assert plan.tail_start_s == pytest.approx(farthest_m / 343 + 50.1e-3 + 0.0117e-3 * 30)
+
+
+def test_a_tail_that_would_start_after_the_response_is_not_shared(box):
+    short = box.simulation.model_copy(update={"duration_s": 0.25})
+    hall = with_geometry(box, corners=((0, 0), (90, 0), (90, 3), (0, 3)))
+    wide = box.probes.model_copy(update={"spacing_m": 12.0})
+    plan, decision = decided(
+        hall.model_copy(update={"simulation": short, "probes": wide}), SimulatedEffect.PER_SOURCE_TAIL
+    )
+    assert not decision.called_for
+    assert plan.tail_start_s is None
+    assert plan.rays == short.rays
+
+
+def test_smooth_walls_need_no_scattering(box):
+    _, smooth = decided(with_materials(box, scattering=0.02), SimulatedEffect.SCATTERING)
+    _, rough = decided(with_materials(box, scattering=0.2), SimulatedEffect.SCATTERING)
+    assert not smooth.called_for
+    assert rough.called_for
+
+
+def test_a_rougher_room_needs_images_of_fewer_orders(box):
+    room = box.model_copy(update={"simulation": box.simulation.model_copy(update={"image_order": 4})})
+    orders = [
+        planner_of(with_materials(room, absorption=0.5, scattering=share), 0).plan({}).image_order
+        for share in (0.02, 0.3, 0.9)
+    ]
+    assert orders == sorted(orders, reverse=True)
+    assert orders[0] > orders[-1]
+
+
+def test_air_matters_less_where_walls_take_most(box):
+    live, dead = (Predictions(with_materials(box, absorption=share), box.probe_positions(0)) for share in (0.05, 0.99))
+    assert live.air_absorption().change_jnd > THRESHOLD_JND > dead.air_absorption().change_jnd
+
+
+def test_sound_bends_where_there_are_corners(box):
+    alone, none = decided(box, SimulatedEffect.DIFFRACTION)
+    parted, round_corners = decided(two_rooms(box), SimulatedEffect.DIFFRACTION)
+    assert (alone.diffraction, none.change_jnd) == (False, 0.0)
+    assert parted.diffraction
+    assert round_corners.change_jnd > THRESHOLD_JND
+
+
+def test_only_thin_walls_let_anything_heard_through(box):
+    changes = [
+        decided(two_rooms(box, surface_mass_kg_m2=mass), SimulatedEffect.TRANSMISSION)[1].change_jnd
+        for mass in (0.5, 5.0, 50.0, 500.0)
+    ]
+    assert changes == sorted(changes, reverse=True)
+    assert changes[0] > THRESHOLD_JND > changes[-1]
+    assert decided(two_rooms(box), SimulatedEffect.TRANSMISSION)[1].change_jnd == 0.0
+    assert (
+        decided(with_materials(box, walls={"surface_mass_kg_m2": 0.5}), SimulatedEffect.TRANSMISSION)[1].change_jnd == 0
+    )
+
+
+def test_fewer_rays_do_in_a_smaller_room(box):
+    many = box.model_copy(update={"simulation": box.simulation.model_copy(update={"rays": 10**9})})
+    larger = with_geometry(many, corners=((0, 0), (8, 0), (8, 6), (0, 6)))
+    rays = [Predictions(scene, box.probe_positions(0)).rays() for scene in (many, larger)]
+    assert rays[0] < rays[1] < 10**9
+    assert Predictions(box, box.probe_positions(0)).rays() == box.simulation.rays  # never more than the file allows
+
+
+@pytest.mark.parametrize("is_on", [True, False])
+def test_overrides_are_followed_and_told(box, is_on):
+    names = set(SimulatedEffect) - {SimulatedEffect.DIRECTIVITY, SimulatedEffect.TRANSMISSION}
+    plan = planner_of(box, 0).plan(dict.fromkeys(names, is_on))
+    told = {each.name: each for each in plan.decisions}
+    assert all(told[name].called_for == is_on and told[name].overridden for name in names)
+    assert plan.image_order == (box.simulation.image_order if is_on else 1)
+    assert plan.rays == (box.simulation.rays if is_on else 0)
+    assert (plan.scattering, plan.air_absorption, plan.diffraction) == (is_on,) * 3
+
+
+def test_everything_has_all_that_the_scene_file_allows(apartment):
+    plan = planner_of(apartment, 0).everything
+    assert plan.settings == SimulationPlan.everything(3, 20_000).settings
+
+
+@pytest.mark.parametrize("name", ["directivity", "transmission"])
+def test_what_cannot_be_simulated_is_refused_by_name(box, name):
+    with pytest.raises(SceneFileError, match=f"effects.{name}"):
+        planner_of(box, 0).plan({SimulatedEffect(name): True})
+
+
+def test_overrides_of_rendering_alone_are_not_simulations():
+    assert overrides_among({"hrtf": False, "air_absorption": True}) == {SimulatedEffect.AIR_ABSORPTION: True}
+
+
+def test_a_scene_file_names_effects_that_exist(tiny_scene, tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(tiny_scene.read_text() + "echo = true\n")
+    with pytest.raises(SceneFileError, match=r"effects: .*no effect 'echo', only direct_path"):
+        SceneFile.read(path)
+
+
+def test_a_plan_survives_json(apartment):
+    plan = replace(planner_of(apartment, 0).plan({}), cost_s=12.5)
+    assert SimulationPlan.from_json(json.loads(json.dumps(plan.to_json()))) == plan
