@@ -32,14 +32,12 @@ _SHORTEST_T60_S = 0.01
 @lru_cache(maxsize=16)
 def place_of_field(field: AcousticField, block_size: int = 256) -> Place:
     """That of a field's scene; asks the field once, for tens of milliseconds."""
-    has_field = bool(field.bundle.manifest.fields)
-    return place_of(
-        field.bundle, reverberation=typical_reverberation(field) if has_field else None, block_size=block_size
-    )
+    known = reverberations(field) if field.bundle.manifest.fields else ()
+    return place_of(field.bundle, known, block_size=block_size)
 
 
-def place_of(bundle: Bundle, *, reverberation: Reverberation | None, block_size: int = 256) -> Place:
-    """`reverberation` is typical of the place, None where it has no field."""
+def place_of(bundle: Bundle, known: tuple[Reverberation, ...], *, block_size: int = 256) -> Place:
+    """`known` is what the scene's field holds of emitters all over the place; nothing where it has no field."""
     manifest = bundle.manifest
     stages = Partitioning(block_size, manifest.codec.samples).stages
     return Place(
@@ -51,14 +49,15 @@ def place_of(bundle: Bundle, *, reverberation: Reverberation | None, block_size:
         nearest_m=NEAR_LIMIT_M,
         plan=None if manifest.geometry is None else manifest.geometry.floor_plan,
         materials=manifest.geometry.materials if manifest.geometry is not None and manifest.image_order else None,
-        reverberation=reverberation,
+        reverberation=_typical(known) if known else None,
+        reverberations=known,
         holds_direct_sound=manifest.direct_sound == "field",
         tail_start_s=stages[-1].start / manifest.codec.sample_rate if len(stages) > 1 else None,
     )
 
 
-def typical_reverberation(field: AcousticField) -> Reverberation:
-    """Of a few pairs of places all over the scene, the first of which are where a visitor starts; energies are means.
+def reverberations(field: AcousticField) -> tuple[Reverberation, ...]:
+    """Of pairs of places all over the scene, the first of which are where a visitor starts.
 
     A field that takes long is asked for one pair alone.
     """
@@ -68,12 +67,17 @@ def typical_reverberation(field: AcousticField) -> Reverberation:
         found.extend(reverberation_of(field, Pose.from_yaw(listener, 0.0), [emitter]))
         if time.perf_counter() - began_s > _LONGEST_S:
             break
+    return tuple(found)
+
+
+def _typical(known: tuple[Reverberation, ...]) -> Reverberation:
+    """Means, and of what turning changes the most."""
     return Reverberation(
-        energy=np.mean([each.energy for each in found], axis=0),
-        early=float(np.mean([each.early for each in found])),
-        t60_s=np.mean([each.t60_s for each in found], axis=0),
-        late_iacc=float(np.mean([each.late_iacc for each in found])),
-        turn_db=max(each.turn_db for each in found),
+        energy=np.mean([each.energy for each in known], axis=0),
+        early=float(np.mean([each.early for each in known])),
+        t60_s=np.mean([each.t60_s for each in known], axis=0),
+        late_iacc=float(np.mean([each.late_iacc for each in known])),
+        turn_db=max(each.turn_db for each in known),
     )
 
 

@@ -16,6 +16,8 @@ from server.scene.reach import facing
 _HEAD_RADIUS_M = 0.0875
 _LATERAL_ILD_DB = 6.0
 """Between the ears for sound from straight aside, over all frequencies; a head's shadow is deeper at high ones."""
+_EAR_GAIN = 3.0
+"""Of the energy from one side, by how much that of some third of an octave changes at an ear that turns to it: 6 dB."""
 _LEAST_COLOURING_DB = 3.0
 """No direction is heard without some third of an octave being off by more, whatever head hears it."""
 
@@ -84,8 +86,8 @@ def without_turning(prediction: Prediction) -> Change:
     change_db = 0.0
     for number, rest in enumerate(prediction.reverberation):
         mine = prediction.mirrored.owner == number
-        # What comes from one side more than from the other: an ear that turns away from it hears about nothing of it.
-        sided = np.linalg.norm(mirrored[mine] @ prediction.mirrored.arrival[mine, :2])
+        # What comes from one side more than from the other, of which a head takes or adds some bands when it turns.
+        sided = _EAR_GAIN * np.linalg.norm(mirrored[mine] @ prediction.mirrored.arrival[mine, :2])
         held = float(energies.held[0, number] @ shares)
         turned = sided + (0.0 if rest is None else held * (10 ** (rest.turn_db / 10) - 1))
         whole = float(energies.direct[0, number] @ shares) + float(mirrored[mine].sum()) + held
@@ -97,11 +99,14 @@ def without_turning(prediction: Prediction) -> Change:
 def without_own_tails(prediction: Prediction) -> Change:
     """All share the tail of one."""
     start_s, shares = prediction.place.tail_start_s, prediction.shares
-    known = [rest for rest in prediction.reverberation if rest is not None]
-    if start_s is None or len(known) < 2:
+    emitters = prediction.emitters
+    if start_s is None or len(emitters) < 2:
         return UNCHANGED
-    if any(emitter.reverberation is None for emitter in prediction.emitters):
-        return Change(MOST_JND, "t60")
+    known = [each.reverberation for each in emitters if each.reverberation is not None]
+    if len(known) < len(emitters):
+        known = [*known, *prediction.place.reverberations]
+        if len(known) < 2 and prediction.place.reverberation is not None:
+            return Change(MOST_JND, "t60")
     changes = [UNCHANGED]
     for own, shared in itertools.permutations(known, 2):
         own_s, shared_s = (float(rest.t60_s @ shares) for rest in (own, shared))

@@ -117,9 +117,9 @@ class _Planner:
         """Switch on what is inaudible alone while all that is off is audible together."""
         assert self._prediction is not None
         while True:
-            off = [name for name in _OF_ENERGY if not decisions[name].called_for]
-            candidates = [name for name in off if decisions[name].change_jnd > 0 and name not in self._overrides]
-            if len(candidates) < 2:
+            off = [name for name in _OF_ENERGY if not decisions[name].called_for and decisions[name].change_jnd > 0]
+            candidates = [name for name in off if name not in self._overrides]
+            if len(off) < 2 or not candidates:
                 return
             together = worst(self._prediction.changes([frozenset(off)]), 0, number)
             if together.jnd < ENTER_JND:

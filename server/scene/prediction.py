@@ -8,6 +8,7 @@ energies are relative to the direct sound at one metre.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +27,20 @@ ALL_ON: Off = frozenset()
 MOST_JND = 100.0
 """Where something is missing altogether; numbers stay finite."""
 
+_COHERENT = frozenset(
+    {
+        EffectName.DIRECT_PATH,
+        EffectName.DISTANCE_ATTENUATION,
+        EffectName.DIRECTIVITY,
+        EffectName.EARLY_REFLECTIONS,
+        EffectName.DIFFRACTION,
+    }
+)
+"""What changes how direct sound and first reflections add up."""
+
 _SILENCE = 1e-12
+_FACING_GAIN = 4.0
+"""6 dB; heads differ, and outer ears do more at 4 kHz (Shaw, J. Acoust. Soc. Am. 56, 1974)."""
 _DIRECT_S = 0.0015
 _DECAY_POINTS = 48
 _THIRDS_HZ = 1000 * 2 ** (np.arange(-9, 11) / 3)
@@ -87,6 +101,7 @@ class Prediction:
                 self._diffuse[number] = np.mean(db_to_power(emitter.directivity.diffuse_gain_db))
             if rest is not None:
                 self._held[number], self._early[number] = rest.energy, rest.early
+        self._facing_gain = _FACING_GAIN if self.listener.output == "headphones" else 1.0
         self._decays = _Decays.of(self)
         self.whole = self.energies([ALL_ON])
         self._heard = self._parameters(self.whole)
@@ -125,24 +140,19 @@ class Prediction:
         return Energies(direct, mirrored, held, held * self._early)
 
     def mirrored_energies(self, variants: Sequence[Off]) -> Floats:
-        """(v, m, band) where there are any."""
+        """(v, m, band) where there are any; air is in them whether or not the direct sound is without."""
         paths = self.mirrored
         surface = db_to_power(paths.surface_db) / np.maximum(paths.length_m, self.place.nearest_m)[:, None] ** 2
         departure = db_to_power(paths.departure_db)
         air = db_to_power(-paths.length_m[:, None] * self.place.air_db_per_m)
-        return np.array(
-            [
-                surface
-                * (1.0 if EffectName.DIRECTIVITY in off else departure)
-                * (1.0 if EffectName.AIR_ABSORPTION in off else air)
-                for off in variants
-            ]
-        )
+        return np.array([surface * air * (1.0 if EffectName.DIRECTIVITY in off else departure) for off in variants])
 
     def changes(self, variants: Sequence[Off]) -> dict[str, Floats]:
         """(v, e) change of each parameter in each variant, in JND, the worst within reach."""
-        without = self._parameters(self.energies(variants))
-        changes = {}
+        left = self.energies(variants)
+        without = self._parameters(left)
+        spectrum_db = np.maximum(self._spectral_change_db(left, 1.0), self._spectral_change_db(left, self._facing_gain))
+        changes = {"spectrum": self.reach.most(spectrum_db) / HEARD["spectrum"].amount}
         for name, heard in self._heard.items():
             if name == "edt":
                 # A decay that cannot be told, with or without, changes nothing: energies tell the rest.
@@ -151,54 +161,91 @@ class Prediction:
                 changes[name] = np.abs(ratio - 1) * 100 / HEARD[name].amount
             else:
                 difference = np.abs(without[name] - heard) / (1 if name in {"drr", "c50"} else HEARD[name].amount)
-                changes[name] = self.reach.most(difference.max(axis=-1) if difference.ndim > 2 else difference)
+                changes[name] = self.reach.most(difference)
         for number, off in enumerate(variants):
             quiet = all(change[number].min() < 1 for change in changes.values())
-            if EffectName.EARLY_REFLECTIONS in off and quiet:
-                beats = self._interference(off) / HEARD["spectrum"].amount
-                changes["spectrum"][number] = np.maximum(changes["spectrum"][number], beats)
+            if quiet and off & _COHERENT:
+                beats_db = np.max(np.abs(self._thirds_db(off) - self._heard_thirds_db), axis=-1)
+                changes["spectrum"][number] = np.maximum(
+                    changes["spectrum"][number], beats_db / HEARD["spectrum"].amount
+                )
         return {name: np.minimum(change, MOST_JND) for name, change in changes.items()}
 
     def _parameters(self, energies: Energies) -> dict[str, Floats]:
-        """Level (v, n) in dB, spectrum (v, n, band) in dB, DRR and C50 (v, n) in JND, EDT (v, e) in seconds."""
+        """Level (v, n) in dB, DRR and C50 (v, n) in JND, EDT (v, e) in seconds."""
         owner = self.reach.owner
         after = energies.mirrored + energies.held
         late = (energies.held - energies.early) @ self.shares
         direct, early = energies.direct @ self.shares, (after @ self.shares) - late
-        spectrum = power_to_db(energies.direct + after[:, owner] + _SILENCE)
 
         def ratio_db(above: Floats, below: Floats) -> Floats:
             return power_to_db((above + _SILENCE) / (below + _SILENCE))
 
         return {
             "level": power_to_db(direct + (early + late)[:, owner] + _SILENCE),
-            "spectrum": spectrum,
             "drr": ratio_in_jnd("drr", ratio_db(direct, (early + late)[:, owner])),
             "c50": ratio_in_jnd("c50", ratio_db(direct + early[:, owner], late[:, owner])),
             "edt": self._decays.early_decay_s(energies),
         }
 
-    def _interference(self, off: Off) -> Floats:
-        """(e,) the greatest change in dB, in a third of an octave, that the first reflections make by their phase."""
-        without_them = self.energies([off])
-        paths, change = self.mirrored, np.zeros(len(self.emitters))
-        if not len(paths.owner):
-            return change
+    def _spectral_change_db(self, left: Energies, gain: float) -> Floats:
+        """(v, n) in the band where it is greatest, at an ear that hears the direct sound by `gain` louder than what
+        comes from everywhere.
+
+        What a field holds is noise: in a third of an octave it is more or less in phase with the rest by chance, and
+        the more so the fewer modes there are, of which a decay has as many as its bandwidth times its duration.
+        """
+        owner, whole = self.reach.owner, self.whole
+
+        def parts(energies: Energies) -> tuple[Floats, Floats, Floats]:
+            return energies.direct * gain, energies.mirrored[:, owner], energies.held[:, owner]
+
+        direct, mirrored, held = parts(whole)
+        other_direct, other_mirrored, other_held = parts(left)
+        amplitude = np.abs(np.sqrt(direct) - np.sqrt(other_direct)) + np.abs(
+            np.sqrt(mirrored) - np.sqrt(other_mirrored)
+        )
+        by_chance = amplitude * np.sqrt(held) + np.abs(np.sqrt(held) - np.sqrt(other_held)) * np.sqrt(direct + mirrored)
+        before, after = direct + mirrored + held + _SILENCE, other_direct + other_mirrored + other_held + _SILENCE
+        most = np.abs(before - after) + 2 * by_chance * self._chance[owner]
+        return np.asarray(power_to_db(1 + most / np.minimum(before, after)).max(axis=-1))
+
+    @cached_property
+    def _chance(self) -> Floats:
+        """(e, band) how much of noise is in phase with something, at most: two standard deviations."""
+        third_hz = np.asarray(OCTAVE_BANDS_HZ) * (2 ** (1 / 6) - 2 ** (-1 / 6))
+        decays_s = np.array([np.zeros(len(third_hz)) if rest is None else rest.t60_s for rest in self.reverberation])
+        return np.asarray(2 / np.sqrt(np.maximum(third_hz * decays_s / 6.9, 4)))
+
+    @cached_property
+    def _heard_thirds_db(self) -> Floats:
+        return self._thirds_db(ALL_ON)
+
+    @cached_property
+    def _phases(self) -> tuple[npt.NDArray[np.int64], list[npt.NDArray[np.complex128]]]:
+        """(frequency,) the bands of frequencies in thirds of octaves; of each emitter (m, frequency) by how much its
+        mirrored paths are later than its direct sound."""
         frequency = (_THIRDS_HZ[0.45 * self.place.sample_rate > _THIRDS_HZ, None] * _PER_THIRD).ravel()
-        to_bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
-        amplitude = np.sqrt(self.mirrored_energies([off])[0])[:, to_bands]
-        for number in range(len(self.emitters)):
-            mine = paths.owner == number
-            later_s = (paths.length_m[mine] - self.reach.paths.length_m[number]) / self.place.speed_of_sound
-            direct = np.sqrt(without_them.direct[0, number])[to_bands]
-            waves = np.sum(amplitude[mine] * np.exp(-2j * np.pi * later_s[:, None] * frequency), axis=0)
-            rest = without_them.held[0, number][to_bands] + _SILENCE
-            with_them, without = (
-                (np.abs(wave) ** 2 + rest).reshape(-1, len(_PER_THIRD)).mean(axis=-1)
-                for wave in (direct + waves, direct)
-            )
-            change[number] = np.max(np.abs(power_to_db(with_them / without)))
-        return change
+        bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
+        paths, direct_m = self.mirrored, self.reach.paths.length_m
+        later_s = (paths.length_m - direct_m[paths.owner]) / self.place.speed_of_sound
+        turns = np.exp(-2j * np.pi * later_s[:, None] * frequency)
+        return bands, [turns[paths.owner == number] for number in range(len(self.emitters))]
+
+    def _thirds_db(self, off: Off) -> Floats:
+        """(e, third) spectrum, as everybody is now: the direct sound and the first reflections with their phases, and
+        what the field holds."""
+        energies, (bands, phases) = self.energies([off]), self._phases
+        amplitude = np.sqrt(self.mirrored_energies([off])[0])
+        if EffectName.EARLY_REFLECTIONS in off:
+            amplitude[:] = 0
+        thirds = []
+        for number, turns in enumerate(phases):
+            wave = np.sqrt(energies.direct[0, number])[bands]
+            wave = wave + np.sum(amplitude[self.mirrored.owner == number][:, bands] * turns, axis=0)
+            power = np.abs(wave) ** 2 + energies.held[0, number][bands] + _SILENCE
+            thirds.append(power.reshape(-1, len(_PER_THIRD)).mean(axis=-1))
+        return power_to_db(np.array(thirds))
 
     def _mirror(self) -> Mirrored:
         bands = len(OCTAVE_BANDS_HZ)

@@ -78,7 +78,7 @@ class Place:
     the open, and where nobody measured the walls; `materials` are there where first reflections come from geometry;
     `reverberation`, typical of the place, where it has a field; with `holds_direct_sound` that is all there is to hear.
     The late tails that emitters could share begin `tail_start_s` after emission; None where responses are too short to
-    share any.
+    share any. `reverberations` are of places all over it: as unlike as emitters of which nothing else is known.
     """
 
     minimum: Vector3
@@ -92,6 +92,7 @@ class Place:
     reverberation: Reverberation | None = None
     holds_direct_sound: bool = False
     tail_start_s: float | None = None
+    reverberations: tuple[Reverberation, ...] = ()
 
     @cached_property
     def paths(self) -> SoundPathFinder | None:

@@ -122,7 +122,8 @@ def test_a_wall_between_is_called_for_and_so_is_one_within_reach():
 
 
 def test_deep_in_the_shadow_there_is_no_direct_sound_to_compute():
-    assert EffectName.DIRECT_PATH not in on(make_plan(situation(CORNER, at(1.5, 7), stands=(7, 1.5, 1.5))))
+    lively = replace(CORNER, reverberation=replace(LIVELY, energy=np.full(BANDS, 2.0)))
+    assert EffectName.DIRECT_PATH not in on(make_plan(situation(lively, at(1.5, 7.5), stands=(7.5, 1.5, 1.5))))
 
 
 def test_what_beams_is_called_for_where_it_is_not_heard_from_ahead():
@@ -143,8 +144,11 @@ def test_tails_are_shared_where_their_decays_are_alike():
     # A tail from 35 dB down on is no part of the reverberation time.
     late = replace(place, tail_start_s=0.6 * 1.5 * 35 / 60)
     assert not make_plan(situation(late, alike[0], other)).is_on(EffectName.PER_SOURCE_TAIL)
-    unknown = make_plan(situation(place, at(2), at(4)))
-    assert unknown.is_on(EffectName.PER_SOURCE_TAIL)
+    assert make_plan(situation(place, at(2), at(4))).is_on(EffectName.PER_SOURCE_TAIL)
+    known = replace(place, reverberations=(LIVELY, alike[1].reverberation))
+    assert not make_plan(situation(known, at(2), at(4))).is_on(EffectName.PER_SOURCE_TAIL)
+    known = replace(place, reverberations=(LIVELY, other.reverberation))
+    assert make_plan(situation(known, at(2), at(4))).is_on(EffectName.PER_SOURCE_TAIL)
 
 
 def test_responses_turn_with_the_head_only_where_it_turns():
@@ -154,7 +158,7 @@ def test_responses_turn_with_the_head_only_where_it_turns():
 
 
 def test_a_direct_sound_buried_in_reverberation_is_not_called_for_nor_anything_about_it():
-    drowned = replace(ROOM, reverberation=replace(LIVELY, energy=np.full(BANDS, 10.0)))
+    drowned = replace(ROOM, reverberation=replace(LIVELY, energy=np.full(BANDS, 1000.0)))
     plan = make_plan(situation(drowned, at(5, 4, speed_m_s=1.0)))
     effects = on(plan)
     assert EffectName.DIRECT_PATH not in effects
