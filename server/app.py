@@ -15,6 +15,7 @@ from starlette.staticfiles import StaticFiles
 
 from server.answers import Answers
 from server.audio_engine import AudioEngine
+from server.calibration import calibrate
 from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
@@ -106,11 +107,11 @@ def _warm_up(host: StreamHost) -> None:
     see how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
     for scene, levels in host.scenes.items():
+        filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
         offer = host.offers[scene] = Offer(
-            tuple(levels[name].level for name in levels.names), levels.calibrate(_CALIBRATION_POSES)
+            tuple(levels[name].level for name in levels.names), calibrate(levels, filters, _CALIBRATION_POSES)
         )
         clips = playable_clips(host.clips[scene])
-        filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
         hello = Hello(protocol=PROTOCOL, scene=scene)
         (rung, *_) = offer.rungs(AUTO, block_s=hello.block_size / levels.default.sample_rate)
         session = Session(hello, levels, filters, host.clips[scene].load, rung=rung, window=100)

@@ -359,7 +359,8 @@ class Session:
         field = self._levels[self._rung.level]
         if emitter.effects.folds:
             return None
-        return response_identity(field, self._direct_sound.early_reflections, self._listener, emitter)
+        shared = response_identity(field, self._direct_sound.early_reflections, self._listener, emitter)
+        return None if shared is None else (shared, emitter.effects, self._effects.channels)
 
     def _change(self) -> list[ServerMessage]:
         """Stand on the rung that was asked for last, with the block that follows."""

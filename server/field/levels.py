@@ -1,10 +1,6 @@
 """All quality levels of a scene: one field each, and one session per graph between them."""
 
-import statistics
-import time
 from collections.abc import Iterator, Mapping, Sequence
-
-import numpy as np
 
 from server.acoustics.phase import FrozenNoise
 from server.bounded_cache import BoundedCache
@@ -15,10 +11,6 @@ from server.field.reuse import KEPT_BYTES, Kept
 from server.field.runtime import InferenceSession
 from server.scene.bundle import Bundle
 from server.scene.manifest import CodecParameters
-
-_CALIBRATION_POSES = 5
-_CALIBRATION_MS = 50.0
-"""Of a level that has taken so long no more is asked."""
 
 
 class Levels(Mapping[str, AcousticField]):
@@ -80,32 +72,6 @@ class Levels(Mapping[str, AcousticField]):
     def choose(self, name: str | None) -> AcousticField:
         """The level a client named, or the default. Raises RequestError `unknown_level` with the names there are."""
         return self.default if name is None else self[require_level(self.bundle, name)]
-
-    def calibrate(self, poses: int = _CALIBRATION_POSES) -> dict[str, float]:
-        """What an impulse response takes here and now, by level: the median of `poses`, or of fewer for a level that is
-        slow, milliseconds.
-
-        Time of this thread, so that what else runs meanwhile counts little; levels take turns, so that it slows all of
-        them.
-        """
-        places = self._places(poses)
-        times_ms: dict[str, list[float]] = {name: [] for name in self}
-        for number in range(-1, poses):
-            listener, emitter = places[number], places[number - 1]
-            for name, field in self.items():
-                # The first time warms up, compiling what has to be, and says nothing of the others.
-                if sum(times_ms[name][1:]) > _CALIBRATION_MS:
-                    continue
-                self.kept.clear()  # what a deadline has to bear is a response that nobody asked for before
-                started_s = time.thread_time()
-                field.impulse_responses([listener], [emitter], [float(number)])
-                times_ms[name].append((time.thread_time() - started_s) * 1000)
-        return {name: statistics.median(times[1:]) for name, times in times_ms.items()}
-
-    def _places(self, count: int) -> list[tuple[float, ...]]:
-        """Between the two places a visitor starts from, along a line."""
-        start = self.bundle.manifest.start
-        return [tuple(place) for place in np.linspace(start.listener, start.emitter, count)]
 
 
 def require_level(bundle: Bundle, name: str) -> str:

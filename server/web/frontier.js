@@ -1,5 +1,5 @@
-// What accuracy costs in time: one mark per quality level, on a logarithmic scale of milliseconds, and what the server says of
-// the one that is heard.
+// What accuracy costs in time: one mark per quality level, on a logarithmic scale of milliseconds, small ones for those that were
+// measured and are not offered, and what the server says of the one that is heard.
 //
 // Errors are in just-noticeable differences (JND), the mean over the metrics that have one; smaller is better.
 
@@ -13,8 +13,10 @@ const REASONS = {
   recovered: "the server has time again",
 };
 
-const milliseconds = (value) => `${value < 1 ? value.toFixed(2) : value.toPrecision(2)} ms`;
-const costOf = (level) => level.ms_p50 ?? level.ms_here;
+const milliseconds = (value) => `${value < 0.1 ? value.toPrecision(1) : value < 1 ? value.toFixed(2) : value.toPrecision(2)} ms`;
+const costOf = (level) => level.ms_mean ?? level.ms_here;
+// What was measured here is a response that nobody asked for before; most poses of a walk need none where levels reuse them.
+const hereOf = (level) => (level.ms_mean === null || level.ms_here === null ? level.ms_here : (level.ms_here * level.ms_mean) / level.ms_miss);
 const isPlaced = (level) => level.audible !== null && costOf(level) !== null;
 
 function draw(name, attributes, parent, text) {
@@ -55,8 +57,8 @@ export class Frontier extends EventTarget {
   show({ levels }) {
     const chosen = this.chosen || "auto";
     this.#levels = levels;
-    const options = [...levels].reverse().map((level) => {
-      const cost = level.ms_here ?? level.ms_p50;
+    const options = levels.filter(({ is_offered: isOffered }) => isOffered).reverse().map((level) => {
+      const cost = hereOf(level) ?? level.ms_mean;
       return new Option(cost === null ? level.name : `${level.name}, ${milliseconds(cost)}`, level.name);
     });
     this.#choice.replaceChildren(new Option("Automatic", "auto"), ...options);
@@ -96,7 +98,7 @@ export class Frontier extends EventTarget {
   #draw() {
     const heard = this.#levels.find(({ name }) => name === this.#heard);
     this.#name.textContent = heard ? heard.name : "–";
-    const cost = heard?.ms_here ?? null;
+    const cost = heard ? hereOf(heard) : null;
     this.#note.textContent = heard ? (cost === null ? "" : `${milliseconds(cost)} here`) : "once playing";
     this.#chart.replaceChildren();
     const placed = this.#levels.filter(isPlaced);
@@ -111,7 +113,7 @@ export class Frontier extends EventTarget {
   }
 
   #axes(placed) {
-    const costs = placed.flatMap((level) => [level.ms_p50, level.ms_here]).filter((cost) => cost !== null);
+    const costs = placed.flatMap((level) => [level.ms_mean, hereOf(level)]).filter((cost) => cost !== null);
     // Half a decade on either side, so that there is a power of ten to read.
     const low = Math.log10(Math.min(...costs)) - 0.5;
     const high = Math.log10(Math.max(...costs)) + 0.5;
@@ -142,18 +144,23 @@ export class Frontier extends EventTarget {
 
   #mark(level, x, y) {
     const isHeard = level.name === this.#heard;
-    const mark = draw("g", { class: isHeard ? "level heard" : "level", "data-level": level.name }, this.#chart);
+    const kind = level.is_offered ? (isHeard ? "level heard" : "level") : "measured";
+    const mark = draw("g", { class: kind, "data-level": level.name }, this.#chart);
     const [at, height] = [x(costOf(level)), y(level.audible)];
-    if (level.ms_here !== null && level.ms_p50 !== null) {
-      draw("path", { class: "here", d: `M${at.toFixed(1)} ${height.toFixed(1)}H${x(level.ms_here).toFixed(1)}m0 -3.5v7` }, mark);
+    if (level.ms_here !== null && level.ms_mean !== null) {
+      draw("path", { class: "here", d: `M${at.toFixed(1)} ${height.toFixed(1)}H${x(hereOf(level)).toFixed(1)}m0 -3.5v7` }, mark);
     }
     if (isHeard) draw("circle", { class: "halo", cx: at, cy: height, r: 8 }, mark);
-    draw("circle", { class: "dot", cx: at, cy: height, r: 4 }, mark);
-    draw("circle", { class: "touch", cx: at, cy: height, r: 11 }, mark);
+    draw("circle", { class: "dot", cx: at, cy: height, r: level.is_offered ? 4 : 2.5 }, mark);
+    draw("circle", { class: "touch", cx: at, cy: height, r: level.is_offered ? 11 : 4 }, mark);
     const floor = level.audible_floor === null ? "" : `, floor ${level.audible_floor.toFixed(2)}`;
-    const here = level.ms_here === null ? "" : `, ${milliseconds(level.ms_here)} on this server`;
-    const bundled = level.ms_p50 === null ? "" : `, ${milliseconds(level.ms_p50)} where it was made`;
-    draw("title", {}, mark, `${level.name}: error ${level.audible.toFixed(2)} JND${floor}${bundled}${here}`);
+    const here = level.ms_here === null ? "" : `, ${milliseconds(hereOf(level))} on this server`;
+    const bundled = level.ms_mean === null ? "" : `, ${milliseconds(level.ms_mean)} a pose where it was made`;
+    const steps = Object.values(level.steps ?? {});
+    const step = steps.length === 0 ? "" : `, steps of up to ${Math.max(...steps).toFixed(1)} JND`;
+    const unoffered = level.is_offered ? "" : ", measured but not offered";
+    draw("title", {}, mark, `${level.name}: error ${level.audible.toFixed(2)} JND${floor}${step}${bundled}${here}${unoffered}`);
+    if (!level.is_offered) return;
     mark.addEventListener("click", () => this.#choose(level.name));
     if (!isHeard) return;
     const isLeft = at > WIDTH * 0.6;

@@ -3,6 +3,7 @@
 import pytest
 
 from server.bench.field import measure_levels
+from server.calibration import calibrate
 from server.field.levels import Levels
 from server.scene.bundle import write_bundle
 from server.scene.manifest import Phase, QualityLevel
@@ -27,6 +28,6 @@ def test_the_dear_level_costs_more_and_it_is_decoding_that_costs(levels):
     assert measured["summary"][0]["value"] == standard["ms_p50"]
 
 
-def test_calibration_tells_them_apart_too(levels):
-    costs_ms = levels.calibrate()
+def test_calibration_tells_them_apart_too(levels, filters):
+    costs_ms = calibrate(levels, filters)
     assert costs_ms["dear"] > 2 * costs_ms["standard"]

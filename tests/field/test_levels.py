@@ -1,8 +1,5 @@
 """Quality levels side by side."""
 
-import time
-
-import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
@@ -61,42 +58,3 @@ def test_unknown_level_is_refused_with_the_names_there_are(bundle):
     with pytest.raises(RequestError, match="standard") as refusal:
         levels.choose("luxurious")
     assert (refusal.value.code, refusal.value.field) == ("unknown_level", "level")
-
-
-def test_calibration_times_every_level(bundle, tmp_path):
-    levels = Levels.load(_with(bundle, tmp_path / "two", levels=_levels(None, None)))
-    costs_ms = levels.calibrate()
-    assert list(costs_ms) == list(levels)
-    assert np.all(np.array(list(costs_ms.values())) > 0)
-
-
-def test_a_slow_level_is_asked_no_more_than_it_takes_to_know(bundle, tmp_path, monkeypatch):
-    levels = Levels.load(_with(bundle, tmp_path / "two", levels=_levels(None, None)))
-    asked, respond = [], levels["level1"].impulse_responses
-
-    def slowly(*pose):
-        asked.append(pose)
-        began_s = time.thread_time()  # computing is what counts, not waiting
-        while time.thread_time() - began_s < 0.06:
-            pass
-        return respond(*pose)
-
-    monkeypatch.setattr(levels["level1"], "impulse_responses", slowly)
-    assert levels.calibrate()["level1"] >= 60
-    assert len(asked) == 2  # the first to warm up
-
-
-def test_what_is_compiled_the_first_time_is_no_cost_of_the_level(bundle, tmp_path, monkeypatch):
-    levels = Levels.load(_with(bundle, tmp_path / "two", levels=_levels(None, None)))
-    asked, respond = [], levels["level0"].impulse_responses
-
-    def slowly_at_first(*pose):
-        asked.append(pose)
-        began_s = time.thread_time()
-        while len(asked) == 1 and time.thread_time() - began_s < 0.2:
-            pass
-        return respond(*pose)
-
-    monkeypatch.setattr(levels["level0"], "impulse_responses", slowly_at_first)
-    assert levels.calibrate()["level0"] < 100
-    assert len(asked) > 2

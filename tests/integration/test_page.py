@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from server.scene.bundle import BUNDLED, Bundle, bundled_scenes, write_bundle
-from server.scene.manifest import Cost
+from server.scene.manifest import Cost, FrontierPoint
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -379,7 +379,8 @@ def several_levels(tmp_path_factory) -> Iterator[str]:
         return standard.model_copy(update={"name": name, "accuracy": accuracy, "cost": cost, **changes})
 
     levels = (level("standard", 1.0, 1.0), level("fine", 40.0, 0.9), level("quick", 0.1, 1.5, ir_rate_hz=20.0))
-    manifest = apartment.manifest.model_copy(update={"levels": levels})
+    measured = FrontierPoint(level=level("near", 0.9, 1.05), architecture="factorised")
+    manifest = apartment.manifest.model_copy(update={"levels": levels, "frontier": (measured,)})
     files = {name: (apartment.folder / name).read_bytes() for name in manifest.files}
     folder = tmp_path_factory.mktemp("scenes") / "apartment"
     write_bundle(folder, manifest, files)
@@ -397,6 +398,9 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     assert boxes[0]["x"] < boxes[1]["x"] < boxes[2]["x"], "costlier is further right"
     assert boxes[0]["y"] < boxes[1]["y"] < boxes[2]["y"], "more accurate is lower"
     assert page.locator("#frontier .heard").count() == 0
+    (measured,) = page.locator("#frontier .measured").all()
+    assert measured.get_attribute("data-level") == "near"
+    assert boxes[0]["x"] < measured.locator(".dot").bounding_box()["x"] < boxes[1]["x"]
     options = page.locator("#level-choice option").all_inner_texts()
     assert [option.split(",")[0] for option in options] == ["Automatic", "fine", "standard", "quick"]
 

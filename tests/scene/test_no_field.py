@@ -5,11 +5,13 @@ import json
 import numpy as np
 import pytest
 
+from server.calibration import calibrate
 from server.errors import BundleError
 from server.field.field import AcousticField
 from server.field.levels import Levels
 from server.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import Bundle, find_bundle
+from server.whole_field import kemar
 
 C = 343.0
 
@@ -30,7 +32,7 @@ def test_its_only_level_is_silence(open_field):
     assert responses.shape == (3, 2, levels.default.ir_samples)
     assert not responses.any()
     assert not levels.default.energy([(0, 0, 1.5)], [(4, 0, 1.5)], [0]).any()
-    assert levels.calibrate(2)
+    assert calibrate(levels, kemar(levels.default.sample_rate), 2)
 
 
 def test_an_impulse_arrives_when_and_as_loud_as_distance_has_it(open_field):

@@ -4,8 +4,7 @@ import math
 import multiprocessing
 import os
 import platform
-import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,21 +13,17 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 
-from server.acoustics.directivity import OMNIDIRECTIONAL
-from server.acoustics.geometry import Pose
 from server.bounded_cache import BoundedCache
-from server.direct_sound import DirectSound
+from server.calibration import Listener
 from server.field.field import AcousticField
 from server.field.levels import Levels
 from server.field.reuse import KEPT_BYTES, Kept
-from server.ir_request import EmitterSnapshot, IrRequest, compute_irs
-from server.kept_irs import response_identity
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from server.scene.manifest import Cost, QualityLevel
 from server.whole_field import kemar
 from training.frontier.walk import POSES_PER_S, walk
 
-BLOCK_SIZE = 256
 STRETCH_S = 5
 _FEW = 12
 _WARM_UP = 3
@@ -46,42 +41,6 @@ def one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, cores)
-
-
-class Listener:
-    """Somebody who hears one emitter at one level, as a stream serves them: what happens between a pose and a response
-    that is ready to be convolved. Nothing is kept from before."""
-
-    def __init__(self, field: AcousticField) -> None:
-        bundle = field.bundle
-        self._kept: Kept = BoundedCache(KEPT_BYTES)
-        self._field = AcousticField(bundle, field.level, field.graph, kept=self._kept)
-        self._levels = Levels([self._field], self._kept)
-        self._direct_sound = DirectSound.of(bundle, kemar(field.sample_rate))
-        self._renderer = self._direct_sound.renderer(
-            block_size=BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
-        )
-        self._emitter = EmitterSnapshot(0, Pose(bundle.manifest.start.emitter), OMNIDIRECTIONAL)
-        self._heard: Hashable | None = None
-
-    @property
-    def kept_bytes(self) -> int:
-        return self._kept.bytes
-
-    def time_ms(self, listener: Pose) -> float:
-        """Milliseconds that a pose takes."""
-        started_s = time.perf_counter()
-        early = self._direct_sound.early_reflections
-        identity = response_identity(self._field, early, listener, self._emitter)
-        if identity is None or identity != self._heard:
-            request = IrRequest(0, self._field.level.name, listener, (self._emitter,), self._direct_sound)
-            compute_irs(self._levels, request, self._renderer)
-            self._heard = identity
-        return 1000 * (time.perf_counter() - started_s)
-
-    def forget(self) -> None:
-        self._kept.clear()
-        self._heard = None
 
 
 @dataclass(frozen=True)
@@ -110,7 +69,8 @@ def measure(
     stretches.
     """
     poses = walk(levels.bundle, duration_s=walk_s, seed=seed)
-    listeners = {name: Listener(field) for name, field in levels.items()}
+    filters = kemar(levels.default.sample_rate)
+    listeners = {name: _alone(field, filters) for name, field in levels.items()}
     times: dict[str, list[float]] = {name: [] for name in levels}
     misses: dict[str, list[float]] = {name: [] for name in levels}
     for listener in listeners.values():
@@ -135,6 +95,12 @@ def measure(
                 listeners[name].forget()
                 misses[name].append(listeners[name].time_ms(poses[start]))
     return {name: Times(np.array(times[name]), np.array(misses[name] or times[name]), kept_mb[name]) for name in levels}
+
+
+def _alone(field: AcousticField, filters: HeadFilters) -> Listener:
+    """Who shares with no other level what is kept."""
+    kept: Kept = BoundedCache(KEPT_BYTES)
+    return Listener(AcousticField(field.bundle, field.level, field.graph, kept=kept), filters, kept=kept)
 
 
 def cost_of(bundle: Bundle, level: QualityLevel, times: Times, memory_mb: float) -> Cost:

@@ -31,10 +31,10 @@ def walk(bundle: Bundle, *, duration_s: float, poses_per_s: float = POSES_PER_S,
     towards = next(places)
     while len(poses) < duration_s * poses_per_s:
         left_m = float(np.linalg.norm(towards - at))
-        while left_m < step_m:
+        if left_m <= step_m:
             at, towards = towards, next(places)
-            left_m = float(np.linalg.norm(towards - at))
-        at = at + (towards - at) * (step_m / left_m)
+        else:
+            at = at + (towards - at) * (step_m / left_m)
         ahead = math.atan2(towards[1] - at[1], towards[0] - at[0])
         most = _MOST_TURN_RAD_PER_S / poses_per_s
         heading += min(most, max(-most, math.remainder(ahead - heading, math.tau)))

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
+from server.bounded_cache import BoundedCache
+from server.calibration import Listener
 from server.errors import BundleError
 from server.field.field import AcousticField
 from server.field.levels import Levels
+from server.field.reuse import KEPT_BYTES
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Phase, QualityLevel, Reuse
+from server.whole_field import kemar
 from training.frontier import sweep as sweep_module
 from training.frontier.accuracy import HeldOutSample
 from training.frontier.candidates import candidates
-from training.frontier.cost import Listener
 from training.frontier.figure import draw_frontier
 from training.frontier.sweep import Effort, record, sweep, with_levels
 from training.frontier.walk import POSES_PER_S, SPEED_M_PER_S, walk
@@ -136,7 +139,9 @@ def test_a_listener_that_forgot_pays_again_and_one_that_stands_still_pays_once(t
     (field,) = tiny_bundle.manifest.fields
     level = QualityLevel(name="kept", field=field, reuse=Reuse(spacing_m=2, turn_deg=90, first_reflections="node"))
     graph = AcousticField.load(tiny_bundle).graph
-    listener = Listener(AcousticField(tiny_bundle, level, graph))
+    kept = BoundedCache(KEPT_BYTES)
+    field_at_nodes = AcousticField(tiny_bundle, level, graph, kept=kept)
+    listener = Listener(field_at_nodes, kemar(field_at_nodes.sample_rate), kept=kept)
     pose = walk(tiny_bundle, duration_s=1, seed=0)[0]
     first = listener.time_ms(pose)
     again = min(listener.time_ms(pose) for _ in range(20))
