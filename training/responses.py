@@ -130,7 +130,7 @@ class SimulatedResponses:
         rows = np.asarray(rows, dtype=np.int64)
         pairs, which = np.unique(self.pair[rows], return_inverse=True)
         of_pairs = self.dataset.read(self._pairs[pairs])
-        return of_pairs[which, rows % len(self.dataset.yaws)].astype(np.float32)
+        return _finite(of_pairs[which, rows % len(self.dataset.yaws)].astype(np.float32), self.file)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class ImportedDataset:
         rows = np.asarray(rows, dtype=np.int64)
         ascending, which = np.unique(rows, return_inverse=True)  # as HDF5 wants them
         with h5py.File(self.folder / FILE, "r") as file:
-            return np.asarray(file["responses"][ascending], dtype=np.float32)[which]
+            return _finite(np.asarray(file["responses"][ascending], dtype=np.float32), self.file)[which]
 
     @classmethod
     def open(cls, folder: Path) -> "ImportedDataset":
@@ -238,8 +238,8 @@ class ImportedDataset:
         """Takes measurements one by one, of any lengths (shorter ones end in zeros), and counts them in the report,
         which the iteration may still extend. The folder appears whole or not at all; an earlier import is replaced.
 
-        Raises ResponsesError for measurements that differ in rate or channels, or none at all, and DatasetError if
-        the folder holds a simulated dataset.
+        Raises ResponsesError for measurements that differ in rate or channels, for one that is empty or not finite, or
+        none at all, and DatasetError if the folder holds a simulated dataset.
         """
         if (folder / "pairs.h5").exists():
             raise DatasetError(f"{folder}: holds a simulated dataset; choose another folder")
@@ -248,6 +248,7 @@ class ImportedDataset:
         if first is None:
             reasons = "; ".join(f"{skipped.count} {reason}" for reason, skipped in report.skipped.items())
             raise ResponsesError(Path(source), "responses", f"none could be read ({reasons or 'none found'})")
+        _require_usable(first, 0, source)
         folder.mkdir(parents=True, exist_ok=True)
         path, partial = folder / FILE, folder / "responses.partial"
         listener, emitter, yaw = [], [], []
@@ -261,6 +262,7 @@ class ImportedDataset:
                 chunks=(1, channels, samples),
             )
             for row, measurement in enumerate(chain([first], remaining)):
+                _require_usable(measurement, row, source)
                 channels, samples = measurement.response.shape
                 if measurement.sample_rate != first.sample_rate:
                     problem = (
@@ -309,6 +311,21 @@ def choose_held_out(emitter: _Floats, listener: _Floats, share: float, seed: int
     wanted = 0 if share == 0 else min(max(1, round(share * len(couples))), len(couples) - 1)
     chosen = np.random.default_rng([seed, 1]).choice(len(couples), wanted, replace=False)
     return np.isin(couple.reshape(-1), chosen)
+
+
+def _require_usable(measurement: Measurement, row: int, source: str) -> None:
+    pose = (*measurement.listener, *measurement.emitter, measurement.yaw)
+    if measurement.response.shape[-1] == 0:
+        raise ResponsesError(Path(source), "responses", f"row {row} has no samples; leave it out")
+    if not np.isfinite(measurement.response).all() or not np.isfinite(pose).all():
+        raise ResponsesError(Path(source), "responses", f"row {row} is not finite, response or pose; leave it out")
+
+
+def _finite(responses: _Responses, path: Path) -> _Responses:
+    """Raises ResponsesError for what would spoil everything that is trained on it."""
+    if not np.isfinite(responses).all():
+        raise ResponsesError(path, "responses", "hold samples that are not finite; simulate or import them anew")
+    return responses
 
 
 def _array(path: Path, file: h5py.File, name: str) -> h5py.Dataset:

@@ -18,6 +18,7 @@ from training.models.naf import NafShape
 from training.responses import ResponseSet, SimulatedResponses
 
 CHECKPOINT = "checkpoint.pt"
+LOG = "log.csv"
 
 
 class RunError(NafirError):
@@ -108,7 +109,7 @@ class Configuration:
             raise RunError(f"{run / 'run.json'}: not a configuration: {exc}") from exc
 
     def write(self, run: Path) -> None:
-        (run / "run.json").write_text(json.dumps({"kind": self.kind, **asdict(self)}, indent=2) + "\n")
+        _write_whole(run / "run.json", {"kind": self.kind, **asdict(self)})
 
 
 _NAF_SHAPES = {
@@ -157,7 +158,7 @@ def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> No
             raise RunError(f"{run}: holds a run of another configuration; choose an empty folder")
         require_same_data(responses, run)
     identity = {"folder": str(responses.file.parent.resolve()), **_identity(responses)}
-    (run / "dataset.json").write_text(json.dumps(identity, indent=2) + "\n")
+    _write_whole(run / "dataset.json", identity)
     configuration.write(run)
 
 
@@ -215,14 +216,32 @@ def minutes_of(run: Path) -> float:
     return float(round((state["seconds"] + state["prepared_s"]) / 60, 3))
 
 
+def keep_log(run: Path, rounds: int) -> None:
+    """The first rounds of the log, as many as the checkpoint knows: what was written after it will be again."""
+    path = run / LOG
+    if not rounds:
+        path.unlink(missing_ok=True)
+    elif path.exists():
+        partial = path.with_suffix(".partial")
+        partial.write_text("".join(path.read_text().splitlines(keepends=True)[: 1 + rounds]))
+        partial.replace(path)
+
+
 def append_log(run: Path, row: dict[str, float]) -> None:
-    path = run / "log.csv"
+    path = run / LOG
     fresh = not path.exists()
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, list(row))
         if fresh:
             writer.writeheader()
         writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
+
+
+def _write_whole(path: Path, document: dict[str, Any]) -> None:
+    """An interrupt in the middle of writing leaves what was there before."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(document, indent=2) + "\n")
+    partial.replace(path)
 
 
 def _identity(responses: ResponseSet) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from training.runs import (
     Configuration,
     append_log,
     claim,
+    keep_log,
     load_checkpoint,
     require_same_data,
     restore,
@@ -43,10 +44,12 @@ _ROUNDS = 20
 _BATCHES_AHEAD = 2
 _PROBE_ROWS = 2
 _LARGEST_GRADIENT = 1.0
+_EXPLODED = 1000.0
+"""Times the first loss, or one where that is less: normalised targets have errors of about one to begin with."""
 
 
 class DivergedError(NafirError):
-    """A loss or gradient that is not finite."""
+    """A loss or gradient that is not finite, or far above what it was at first."""
 
 
 def train(responses: ResponseSet, run: Path, configuration: Configuration, progress: Progress) -> None:
@@ -101,6 +104,7 @@ class _State:
     stale: int = 0
     bfloat16: bool = False
     finished: bool = False
+    first_loss: float | None = None
 
 
 class _Loop:
@@ -126,7 +130,11 @@ class _Loop:
             learner.field.load_state_dict(state.pop("field"))
             self._optimiser.load_state_dict(state.pop("optimiser"))
             self._state = _State(**state)
+            if processes.first and not self._state.finished:
+                keep_log(run, self._state.rounds)
         else:
+            if processes.first:
+                keep_log(run, 0)
             learner.initialise(self._rows, configuration.seed)
             self._state = _State(bfloat16=self._choose_precision())
 
@@ -144,16 +152,16 @@ class _Loop:
         try:
             while self._fraction() < 1 and not self._stopped():
                 start = time.perf_counter()
-                self._step(parallel, *next(batches))
+                due = state.seconds - saved_s > _CHECKPOINT_S
+                self._step(parallel, *next(batches), save=due)
+                saved_s = state.seconds if due else saved_s
                 (state.seconds,) = self._processes.agreed(state.seconds + time.perf_counter() - start)
                 ended = self._round_ended()
                 if ended:
                     summary = self._end_round(writer)
                     state.rounds += 1
-                if ended or state.seconds - saved_s > _CHECKPOINT_S:
                     self._save()
                     saved_s = state.seconds
-                if ended:
                     progress.update(task, advance=1, description=f"training  held back: {summary}")
         finally:
             batches.close()
@@ -177,7 +185,10 @@ class _Loop:
             return self._state.step % self._steps_per_epoch == 0
         return self._fraction() >= min(1.0, (self._state.rounds + 1) / _ROUNDS)
 
-    def _step(self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...]) -> None:
+    def _step(
+        self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, save: bool
+    ) -> None:
+        """With `save`, parameters are kept as they are before the step, when their loss has shown them to be good."""
         state, configuration = self._state, self._configuration
         beta, share = self._learner.momentum_and_rate(self._fraction())
         for group in self._optimiser.param_groups:
@@ -187,16 +198,26 @@ class _Loop:
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self._learner.field.parameters(), _LARGEST_GRADIENT)
         mean_loss, mean_norm = (float(value) for value in self._processes.mean(torch.stack([loss.detach(), norm])))
-        if not np.isfinite(mean_loss) or not np.isfinite(mean_norm):
-            raise DivergedError(
-                f"{self._run}: the loss is {mean_loss:g} and its gradient {mean_norm:g} in step {state.step + 1}; the "
-                f"last checkpoint is kept. Train with a lower learning rate than {configuration.learning_rate:g}"
-            )
+        state.first_loss = mean_loss if state.first_loss is None else state.first_loss
+        if not np.isfinite(mean_norm) or not self._is_plausible(mean_loss):
+            raise self._diverged(f"the loss is {mean_loss:g} and its gradient {mean_norm:g} in step {state.step + 1}")
+        if save:
+            self._save()
         self._optimiser.step()
         state.step += 1
         state.epochs = state.step / self._steps_per_epoch
         state.round_loss += mean_loss
         state.round_steps += 1
+
+    def _is_plausible(self, loss: float) -> bool:
+        """Neither is one that has left all numbers behind, nor one so far above the first that nothing is learned."""
+        first = self._state.first_loss
+        return bool(np.isfinite(loss)) and (first is None or loss <= _EXPLODED * max(first, 1.0))
+
+    def _diverged(self, problem: str) -> DivergedError:
+        rate = self._configuration.learning_rate
+        kept = "the last checkpoint is kept" if (self._run / CHECKPOINT).exists() else "there is no checkpoint yet"
+        return DivergedError(f"{self._run}: {problem}; {kept}. Train with a lower learning rate than {rate:g}")
 
     def _loss(
         self, model: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, bfloat16: bool
@@ -211,6 +232,8 @@ class _Loop:
         state = self._state
         parts = self._validate() if self._processes.first else {}
         (held_back,) = self._processes.agreed(sum(parts.values()))
+        if not self._is_plausible(held_back):  # before it is kept, and saved
+            raise self._diverged(f"the error on what is held back is {held_back:g} after step {state.step}")
         if held_back < state.best_loss:
             state.best_loss, state.stale = held_back, 0
         else:

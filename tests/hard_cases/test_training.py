@@ -39,6 +39,14 @@ KINDS = pytest.mark.parametrize(
 GRID = [((float(x), float(y), 1.5), (1.4, 1.6, 1.2)) for x in range(4) for y in range(3)]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def single_precision():
+    """The clock decides between precisions, and on a busy machine not always alike."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("training.train.bfloat16_gains", lambda *_: False)
+        yield
+
+
 def response(seed, samples=SAMPLES):
     noise = np.random.default_rng(seed).standard_normal((2, samples))
     return (noise * 10 ** (-3 * np.arange(samples) / RATE / 0.1)).astype(np.float32)
@@ -341,7 +349,8 @@ def test_a_process_killed_by_the_system_leaves_a_run_that_goes_on(responses, who
         "def slowly(run, state):\n"
         "    save(run, state); print('saved', flush=True); time.sleep(60)\n"
         "t.save_checkpoint = slowly\n"
-        "t.train(ImportedDataset.open(Path(sys.argv[1])), Path(sys.argv[2]), Configuration.read(Path(sys.argv[3])), Progress(disable=True))\n"
+        "data, run, like = map(Path, sys.argv[1:])\n"
+        "t.train(ImportedDataset.open(data), run, Configuration.read(like), Progress(disable=True))\n"
     )
     command = [sys.executable, "-c", program, str(responses.folder), str(tmp_path), str(whole[0])]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=_ROOT) as process:

@@ -145,4 +145,4 @@ class NafLearner:
         left = self.responses.samples - delay_samples(self.responses, row)
         if self.field.shape.domain == "time":
             return max(1, int(left))
-        return int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left))
+        return max(1, int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left)))

@@ -3,6 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
+from training.dataset import DatasetError
 from training.responses import SAME_POINT_M, ResponseSet
 
 _HELD_BACK_SHARE = 0.05
@@ -13,7 +14,8 @@ def split(responses: ResponseSet, *, share: float, seed: int) -> tuple[npt.NDArr
     directions; both count the rows that are not held out. The pairs of a smaller share are among those of a larger one,
     and what is held back is the same for all.
 
-    (What is held out belongs to the evaluation, and no run ever sees it.)
+    (What is held out belongs to the evaluation, and no run ever sees it.) Raises DatasetError where nothing is left to
+    train on.
     """
     trainable = np.flatnonzero(~responses.held_out)
     ends = np.stack([responses.emitter[trainable], responses.listener[trainable]], axis=1)
@@ -25,4 +27,9 @@ def split(responses: ResponseSet, *, share: float, seed: int) -> tuple[npt.NDArr
     pairs = responses.pair[trainable]
     candidates = rng.permutation(np.unique(pairs[~held_back]))
     used = np.isin(pairs, candidates[: max(1, round(share * len(candidates)))])
+    if not (used & ~held_back).any():
+        raise DatasetError(
+            f"{responses.file}: nothing is left to train on: {len(trainable)} responses are not held out, between "
+            f"{len(couples)} couples of points, and one couple is held back; measure or simulate more"
+        )
     return np.flatnonzero(used & ~held_back), np.flatnonzero(held_back)

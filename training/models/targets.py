@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.codec import Codec
+from training.dataset import DatasetError
 from training.models.cells import Cells
 from training.responses import ResponseSet
 
@@ -19,6 +20,9 @@ LOG_FLOOR = 1e-5
 
 
 def codec_of(responses: ResponseSet, n_fft: int = N_FFT) -> Codec:
+    """Raises DatasetError for responses that are shorter than what is transformed at a time."""
+    if responses.samples < n_fft:
+        raise DatasetError(f"{responses.file}: responses of {responses.samples} samples are too short, {n_fft} needed")
     return Codec(responses.sample_rate, n_fft, n_fft // 4, responses.samples, LOG_FLOOR)
 
 
@@ -57,5 +61,8 @@ def _complex_parts(values: npt.NDArray[np.complexfloating], axis: int) -> npt.ND
 
 
 def delay_samples(responses: ResponseSet, row: int) -> float:
-    """How much earlier than emitted an aligned response starts."""
-    return float(responses.onset_s[row]) * responses.sample_rate - LEAD_SAMPLES
+    """How much earlier than emitted an aligned response starts. Raises DatasetError where no sound can arrive."""
+    onset_s = float(responses.onset_s[row])
+    if not np.isfinite(onset_s):
+        raise DatasetError(f"{responses.file}: row {row}: no way leads from emitter to listener; is one inside a wall?")
+    return onset_s * responses.sample_rate - LEAD_SAMPLES
