@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from server.acoustics.decibels import power_to_db
+from server.scene.effects import EffectName
 from server.scene.geometry import Point
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
 from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
@@ -43,6 +44,7 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields) -> Manifes
         air=scene.air,
         image_order=GEOMETRIC_ORDER,
         start=scene.start,
+        effects={name: scene.effects[name] for name in EffectName if name in scene.effects},
         codec=fields.codec,
         fields=fields.fields,
         levels=fields.levels,

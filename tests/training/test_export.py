@@ -135,6 +135,10 @@ def test_a_field_of_numbers_too_large_for_float16_is_not_written(dataset, run, t
     assert not (tmp_path / "bundle").exists()
 
 
+def test_overrides_of_the_scene_file_are_overrides_of_rendering(tiny_bundle, dataset):
+    assert tiny_bundle.manifest.effects == dataset.scene.effects == {"early_reflections": True}
+
+
 def test_the_manifest_describes_the_scene(tiny_bundle, dataset):
     manifest, scene = tiny_bundle.manifest, dataset.scene
     assert manifest.geometry == scene.geometry
