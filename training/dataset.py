@@ -92,6 +92,8 @@ class Dataset:
     @classmethod
     def open(cls, folder: Path, *, finished: bool = True) -> "Dataset":
         """Raises DatasetError if the folder is no dataset or, with `finished`, if its simulation was cut short."""
+        if (folder / "responses.h5").is_file():
+            raise DatasetError(f"{folder}: holds measured responses; this takes a simulated scene")
         try:
             scene = SceneFile.read(folder / "scene.toml")
             with h5py.File(folder / "pairs.h5", "r") as file:

@@ -9,6 +9,7 @@ from rich.progress import Progress
 from server.field.levels import Levels
 from server.whole_field import WholeField
 from tests.training.measured_room import RATE, SAMPLES, Room
+from training.dataset import Dataset, DatasetError
 from training.evaluation.held_out import open_held_out
 from training.evaluation.run import evaluate_bundles
 from training.evaluation.shaped import ShapedNearest
@@ -85,3 +86,8 @@ def test_responses_of_another_folder_are_refused(dataset, tmp_path):
     other = Room(tail=0.0).write(tmp_path / "other")
     with pytest.raises(ExportError, match="other responses"):
         export(dataset, [other.folder], tmp_path / "bundle")
+
+
+def test_what_takes_a_simulated_scene_says_so(dataset):
+    with pytest.raises(DatasetError, match="holds measured responses"):
+        Dataset.open(dataset.folder)
