@@ -337,7 +337,7 @@ def frontier(
     pairs: Annotated[int, typer.Option(min=2, help="Held-out pairs to measure.")] = 40,
     yaws: Annotated[int, typer.Option(min=1, help="Head orientations of each.")] = 3,
     walk_s: Annotated[float, typer.Option(min=10, help="Seconds of the walk that costs are measured on.")] = 300.0,
-    phases_of: Annotated[list[str] | None, typer.Option(help="Fields to sweep over phases; all if not given.")] = None,
+    phases_of: Annotated[list[str] | None, typer.Option(help="Fields to sweep over phases; all, or none.")] = None,
     reuse_of: Annotated[list[str] | None, typer.Option(help="Fields to sweep over reuse of responses.")] = None,
     default_ms: Annotated[float, typer.Option(help="A response of the default level takes no longer.")] = 2.5,
     record: Annotated[bool, typer.Option(help="Write a few of the Pareto-optimal levels into the bundle.")] = False,

@@ -10,6 +10,8 @@ from server.errors import BundleError
 from server.scene.bundle import Bundle
 from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel, Reuse
 
+NONE = "none"
+"""Instead of a field's name: no field."""
 GRIFFIN_LIM_ITERATIONS = (1, 4, 16, 64)
 _LATTICES = (
     (0.1, 15),
@@ -43,12 +45,12 @@ def candidates(
 
     Swept over phases are the fields that `phases_of` names, by default all: what Griffin and Lim's iteration adds in
     time does not depend on the field beneath. Swept over lattices on which responses are reused are those that
-    `reuse_of` names. Raises BundleError for a name that is no field.
+    `reuse_of` names; either may name `NONE`. Raises BundleError for a name that is no field.
     """
     fields = bundle.manifest.fields
     reused = set(reuse_of)
     swept = set(fields) if phases_of is None else set(phases_of)
-    if unknown := sorted((swept | reused) - set(fields)):
+    if unknown := sorted((swept | reused) - {*fields, NONE}):
         raise BundleError(bundle.folder, "fields", f"there is no {unknown[0]!r}, only {', '.join(fields)}")
     levels = [level for name, file in fields.items() for level in _levels(bundle.manifest, name, file, name in swept)]
     return [*levels, *(_reusing(name, reuse) for name in fields if name in reused for reuse in REUSES)]
