@@ -7,7 +7,8 @@ ceiling passes to the last bit.
 It adds no latency, so it looks ahead no further than the end of its block. The gain falls in time for a peak within
 the block, at most by 1 over `_ATTACK` samples; where a block begins with a peak it falls as fast as it must, and until
 it is low enough samples are held at the ceiling. What lies between the last samples of a block and the first of the
-next is known only with the latter; a gain that recovers slowly keeps that in check while sound goes on.
+next is known only with the latter; a gain that recovers slowly keeps that in check while sound goes on. It stays down
+for as long as a period of the lowest tones before it does, so that they are not bent.
 
 A sample that is not finite becomes silence here. Nothing before lets one arise; were it otherwise, a loudspeaker would
 be the wrong place to find out.
@@ -21,6 +22,8 @@ import numpy.typing as npt
 from server.compiled import HAS_NUMBA, compiled
 
 FloatArray = npt.NDArray[np.float32]
+DoubleArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 CEILING = 10 ** (-1 / 20)
 """-1 dB of full scale, true peak: the maximum permitted by EBU R 128, with room for what codecs and resamplers add."""
@@ -31,6 +34,9 @@ _PHASES = 3  # between two samples
 _STEP = 16
 """Samples between the points that the gain is a straight line between."""
 _ATTACK = 64
+_HOLD_S = 0.02
+_AGAIN = 1.01
+"""A peak that asks for so little more than the gain there is keeps it down."""
 _RELEASE_S = 0.2
 _AT_REST = 1e-5
 """Of a gain that is so near to 1, the rest is let go: a ten-thousandth of a decibel."""
@@ -54,16 +60,20 @@ class Limiter:
         self._table = _interpolators()
         # Up to here no signal reaches the ceiling between samples, whatever its phases.
         self._safe = np.float32(ceiling / np.abs(self._table).sum(axis=-1).max())
-        self._keep = np.float32(math.exp(-_STEP / (_RELEASE_S * sample_rate)))
+        self._keep = math.exp(-_STEP / (_RELEASE_S * sample_rate))
+        self._hold = round(_HOLD_S * sample_rate / _STEP)
         self._signal = np.zeros((channels, _TAPS - 1 + block_size), np.float32)
         self._peak = np.zeros(block_size, np.float32)
-        self._gain = np.ones(block_size // _STEP + 1, np.float32)
+        # In double precision: in single, the last of a slow release is lost to rounding, and it never ends.
+        self._gain = np.ones(block_size // _STEP + 1)
+        self._held = np.zeros(1, np.int64)
         self.reset()
 
     def reset(self) -> None:
         """Forget what was heard before."""
         self._signal.fill(0)
         self._gain.fill(1)
+        self._held.fill(0)
         self.acted = False
         """Whether the block last processed was changed."""
         self.samples_silenced = 0
@@ -72,7 +82,16 @@ class Limiter:
     def process(self, block: FloatArray) -> None:
         """Limit a block in place."""
         is_limited, silenced = _limit(
-            block, self._signal, self._table, self._ceiling, self._safe, self._keep, self._peak, self._gain
+            block,
+            self._signal,
+            self._table,
+            self._ceiling,
+            self._safe,
+            self._keep,
+            self._hold,
+            self._peak,
+            self._gain,
+            self._held,
         )
         self.acted = bool(is_limited or silenced)
         self.samples_silenced += silenced
@@ -85,9 +104,11 @@ def _limit(
     table: FloatArray,
     ceiling: np.float32,
     safe: np.float32,
-    keep: np.float32,
+    keep: float,
+    hold: int,
     peak: FloatArray,
-    gain: FloatArray,  # at the ends of steps
+    gain: DoubleArray,  # at the ends of steps
+    held: IntArray,  # (1,) steps since a peak asked for a gain
 ) -> tuple[bool, int]:
     channels, size = block.shape
     before = signal.shape[1] - size
@@ -107,11 +128,11 @@ def _limit(
         return False, silenced
     if not is_loud:
         peak[:] = 0
-    _follow(peak, ceiling, keep, gain)
-    rise = np.arange(1, _STEP + 1).astype(np.float32) / np.float32(_STEP)
+    _follow(peak, ceiling, keep, hold, gain, held)
+    rise = np.arange(1, _STEP + 1) / _STEP
     for step in range(gain.size - 1):
         at = step * _STEP
-        line = gain[step] + (gain[step + 1] - gain[step]) * rise
+        line = (gain[step] + (gain[step + 1] - gain[step]) * rise).astype(np.float32)
         if step == 0:
             line = np.minimum(line, ceiling / np.maximum(peak[:_STEP], ceiling))
         for channel in range(channels):
@@ -167,18 +188,22 @@ def _find_peaks(signal: FloatArray, table: FloatArray, peak: FloatArray) -> None
 
 
 @compiled
-def _follow(peak: FloatArray, ceiling: np.float32, keep: np.float32, gain: FloatArray) -> None:
+def _follow(peak: FloatArray, ceiling: np.float32, keep: float, hold: int, gain: DoubleArray, held: IntArray) -> None:
     """The gain at the ends of steps, from what it is at the beginning."""
     steps = gain.size - 1
     for step in range(steps):
-        allowed = ceiling / max(ceiling, np.max(peak[step * _STEP : (step + 1) * _STEP]))
+        allowed = float(ceiling) / max(float(ceiling), float(np.max(peak[step * _STEP : (step + 1) * _STEP])))
         gain[step + 1] = allowed
         if step > 0:
             gain[step] = min(gain[step], allowed)
-    fall = np.float32(_STEP / _ATTACK)
+    fall = _STEP / _ATTACK
     for step in range(steps - 1, 0, -1):
         gain[step] = min(gain[step], gain[step + 1] + fall)
     for step in range(steps):
-        gain[step + 1] = min(gain[step + 1], 1 - (1 - gain[step]) * keep)
+        if gain[step + 1] < min(1.0, _AGAIN * gain[step]):
+            held[0] = 0
+        else:
+            held[0] += 1
+        gain[step + 1] = min(gain[step + 1], gain[step] if held[0] < hold else 1 - (1 - gain[step]) * keep)
     if gain[steps] > 1 - _AT_REST:
         gain[steps] = 1
