@@ -26,8 +26,8 @@ _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
 _Halves = npt.NDArray[np.float16]
 
-# So many emitters tell how late sound decays, and where it comes from.
-_TAIL_EMITTERS = 8
+# So many tell how late sound decays, and where it comes from.
+_TAIL_PROBES = 8
 TAKES = 2
 """The second is for the repeatability of the first."""
 
@@ -124,13 +124,13 @@ class PairSimulation:
 
 
 def _tail_energy(scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator) -> _Floats:
-    """(direction, band, bin) mean over emitters all over the room and all other probes."""
-    emitters = np.unique(np.linspace(0, len(probes) - 1, _TAIL_EMITTERS).astype(int))
-    rays = -(-plan.tail_rays // len(emitters))
+    """(direction, band, bin) mean over pairs of probes all over the room."""
+    some = probes[np.unique(np.linspace(0, len(probes) - 1, _TAIL_PROBES).astype(int))]
+    rays = -(-plan.tail_rays // len(some))
     means = [
-        RoomTracer.of(scene, plan, np.delete(probes, emitter, axis=0))
-        .energy(probes[emitter], rays=rays, rng=rng)
+        RoomTracer.of(scene, plan, np.delete(some, emitter, axis=0))
+        .energy(place, rays=rays, rng=rng)
         .mean(axis=0, dtype=np.float64)
-        for emitter in emitters
+        for emitter, place in enumerate(some)
     ]
     return np.asarray(np.mean(means, axis=0))

@@ -144,10 +144,14 @@ class BinauralSynthesis:
             sections *= self._window
             spectra = np.ascontiguousarray(rfft(sections).transpose(2, 1, 0))
             for band in range(neighbours, len(OCTAVE_BANDS_HZ), 2):
+                inside = np.flatnonzero(self._band_weights[band])
+                within = slice(inside[0], inside[-1] + 1)
                 amplitudes = np.sqrt(directional[:, band]).astype(np.float32)
-                shape = np.sqrt(self._band_weights[band])[:, None, None]
-                shaped = np.matmul(spectra * amplitudes, self._arrival_spectra) * shape
-                sections = irfft(np.ascontiguousarray(shaped.transpose(2, 1, 0)), self._n_fft)
+                shape = np.sqrt(self._band_weights[band, within])[:, None, None]
+                shaped = np.zeros((2 * len(self.yaws), frames, len(spectra)), dtype=np.complex64)
+                arriving = np.matmul(spectra[within] * (amplitudes * shape), self._arrival_spectra[within])
+                shaped[..., within] = arriving.transpose(2, 1, 0)
+                sections = irfft(shaped, self._n_fft)
                 sections *= self._window
                 later = np.roll(sections[..., step:], 1, axis=1)
                 heard[band] = (sections[..., :step] + later).reshape(len(sections), -1)
