@@ -4,6 +4,7 @@ import math
 import multiprocessing
 import os
 import platform
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from training.frontier.walk import POSES_PER_S, walk
 
 STRETCH_S = 5
 _FEW = 12
+_STRETCHES_OF_MISSES = 12
 _WARM_UP = 3
 
 
@@ -63,8 +65,9 @@ def measure(
 ) -> dict[str, Times]:
     """What a pose takes at each level, on a `walk` of `walk_s` through the scene.
 
-    All levels walk a few seconds each in turn, so that whatever else the machine does meets all of them, and each finds
-    its numbers in the processor's caches, as a stream does. To a level that computes every response anew one pose is
+    Time is that of this thread, which is all that computes, so that what else the machine does counts little. All
+    levels walk a few seconds each in turn, so that it meets all of them, and each finds its numbers in the processor's
+    caches, as a stream does. To a level that computes every response anew one pose is
     like another: it takes the first few of each stretch, and none once it has had its `budget_s`, but for three
     stretches.
     """
@@ -89,18 +92,20 @@ def measure(
                 times[name] += [listener.time_ms(pose) for pose in poses[start : start + _FEW]]
         advance()
     kept_mb = {name: listener.kept_bytes / 1e6 for name, listener in listeners.items()}
-    for start in starts:
+    for start in starts[:: len(starts) // _STRETCHES_OF_MISSES or 1]:
         for name, level in levels.items():
             if level.level.reuse is not None:
-                listeners[name].forget()
-                misses[name].append(listeners[name].time_ms(poses[start]))
+                for pose in poses[start : start + _FEW]:
+                    listeners[name].forget()
+                    misses[name].append(listeners[name].time_ms(pose))
     return {name: Times(np.array(times[name]), np.array(misses[name] or times[name]), kept_mb[name]) for name in levels}
 
 
 def _alone(field: AcousticField, filters: HeadFilters) -> Listener:
     """Who shares with no other level what is kept."""
     kept: Kept = BoundedCache(KEPT_BYTES)
-    return Listener(AcousticField(field.bundle, field.level, field.graph, kept=kept), filters, kept=kept)
+    alone = AcousticField(field.bundle, field.level, field.graph, kept=kept)
+    return Listener(alone, filters, kept=kept, time_s=time.thread_time)
 
 
 def cost_of(bundle: Bundle, level: QualityLevel, times: Times, memory_mb: float) -> Cost:

@@ -71,8 +71,9 @@ def _is_better(ours: _Floats, theirs: _Floats) -> bool:
 
 def default_point(best: Sequence[Point], *, ms: float) -> Point:
     """The most accurate of Pareto-optimal points whose response takes at most `ms` where nothing was kept, or else the
-    cheapest."""
-    return next((point for point in reversed(best) if point.cost.ms_miss <= ms), best[0])
+    one whose takes least."""
+    quick = (point for point in reversed(best) if point.cost.ms_miss <= ms)
+    return next(quick, min(best, key=lambda point: point.cost.ms_miss))
 
 
 def offered_points(best: Sequence[Point], default: Point) -> list[Point]:

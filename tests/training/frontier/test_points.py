@@ -75,6 +75,11 @@ def test_what_is_rarely_computed_is_no_quicker_for_it_when_it_is() -> None:
     assert default_point(best[:2], ms=8).level.name == "a"
 
 
+def test_where_nothing_is_in_time_the_default_is_what_a_deadline_bears_best() -> None:
+    best = pareto([point("reusing", 0.1, 0.5, miss_ms=9), point("c", 3, 0.3), point("d", 5, 0.2)])
+    assert default_point(best, ms=1).level.name == "c"
+
+
 @pytest.mark.parametrize("default", range(0, 30, 5))
 def test_a_few_are_offered_from_the_default_on_down_and_up_each_much_cheaper_or_dearer(default) -> None:
     times = np.geomspace(0.003, 30, 30)
