@@ -210,7 +210,7 @@ def _suffix(precision: Precision) -> str:
     return "" if precision == "float32" else f"-{precision}"
 
 
-def _outputs(learner: Learner) -> tuple[str, ...]:
+def _outputs(learner: FactorisedLearner | NafLearner) -> tuple[str, ...]:
     """Of one channel there is no coherence between ears."""
     return OUTPUTS[: 2 + learner.responses.channels]
 
