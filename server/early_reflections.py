@@ -15,10 +15,12 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db, db_to_power
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
+from server.acoustics.transmission import PathFinder, TransmittedPaths, transmission_loss_db
 from server.radiation import Placed, departure_gain_db, reverberation_gain
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.fractional_delay import TAPS
@@ -41,11 +43,16 @@ class EarlyReflections:
         speed_of_sound: float,
         air_db_per_m: _Floats,
         filters: HeadFilters | NoHead,
+        transmission: bool = False,
     ) -> None:
+        """With `transmission` what goes straight through walls, as their mass lets it, is heard with them."""
         surfaces = materials.walls, materials.floor, materials.ceiling
         gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
         self.filters = filters
-        self._finder = ReflectionFinder(plan, gains_db)
+        self._finder: PathFinder = ReflectionFinder(plan, gains_db)
+        mass = materials.walls.surface_mass_kg_m2
+        if transmission and mass is not None:
+            self._finder = TransmittedPaths(self._finder, plan, transmission_loss_db(mass, OCTAVE_BANDS_HZ))
         # Each of the two legs of a path is no longer than the room.
         (west, south), (east, north) = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
         longest_s = 2 * math.hypot(east - west, north - south, plan.height_m) / speed_of_sound
@@ -67,6 +74,7 @@ class EarlyReflections:
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
             filters=filters,
+            transmission=manifest.transmission,
         )
 
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Placed]) -> None:

@@ -43,6 +43,7 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields) -> Manifes
         speed_of_sound=SPEED_OF_SOUND,
         air=scene.air,
         image_order=GEOMETRIC_ORDER,
+        transmission=responses.dataset.effects.transmission,
         start=scene.start,
         effects={name: scene.effects[name] for name in EffectName if name in scene.effects},
         codec=fields.codec,

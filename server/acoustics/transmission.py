@@ -6,11 +6,14 @@ NBS 42, 1949; Bies & Hansen, Engineering Noise Control, 4th ed., 2009, sec. 8.2.
 to 78 degrees, as it does in rooms, loses 5.5 dB less in octave or third-octave bands.
 """
 
+from typing import Protocol
+
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import FloorPlan, Points
+from server.acoustics.reflections import Reflections
 
 _Floats = npt.NDArray[np.float64]
 
@@ -49,3 +52,38 @@ def walls_between(plan: FloorPlan, a: Points, b: Points) -> npt.NDArray[np.int64
     on_wall = (offset[..., 0] * step[..., 1] - offset[..., 1] * step[..., 0]) / safe
     crossed = ~parallel & (on_line > 0) & (on_line < 1) & (on_wall >= 0) & (on_wall < 1)
     return np.asarray(crossed.sum(axis=-1) // 2)
+
+
+class PathFinder(Protocol):
+    """As `ReflectionFinder`."""
+
+    def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections: ...
+
+
+class TransmittedPaths:
+    """The paths of a finder, and with them the straight ones through walls, each of which takes `wall_loss_db` (band,).
+    Safe to share between threads if the finder is."""
+
+    def __init__(self, finder: PathFinder, plan: FloorPlan, wall_loss_db: _Floats) -> None:
+        self._finder = finder
+        self._plan = plan
+        self._wall_loss_db = wall_loss_db
+
+    def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections:
+        """Paths to `listener` (3,) from `emitters` (n, 3), emitter after emitter."""
+        found = self._finder.find(listener, emitters)
+        here, places = np.asarray(listener, dtype=np.float64), np.asarray(emitters, dtype=np.float64)
+        walls = walls_between(self._plan, here, places)
+        hidden = np.flatnonzero(walls)
+        offset = places[hidden] - here
+        length_m = np.linalg.norm(offset, axis=-1)  # a wall stands between: never zero
+        arrival = offset / length_m[:, None]
+        emitter = np.concatenate([found.emitter, hidden])
+        order = np.argsort(emitter, kind="stable")
+        return Reflections(
+            emitter[order],
+            np.concatenate([found.length_m, length_m])[order],
+            np.concatenate([found.arrival, arrival])[order],
+            np.concatenate([found.departure, -arrival])[order],
+            np.concatenate([found.gain_db, -walls[hidden, None] * self._wall_loss_db])[order],
+        )

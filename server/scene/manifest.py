@@ -224,6 +224,8 @@ class Manifest(Strict):
     air: Air = Air()
     image_order: Literal[0, 1] = 0
     """Mirrored reflections of up to so many surfaces are not in the fields: the server computes them from geometry."""
+    transmission: bool = False
+    """So does it what goes straight through walls, as far as their mass lets it; where not, walls are solid."""
     start: Start
     direct_sound: Literal["geometry", "field"] = "geometry"
     """Where it comes from."""

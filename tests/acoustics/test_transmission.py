@@ -6,8 +6,10 @@ from scipy.integrate import quad
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
+from server.acoustics.reflections import ReflectionFinder
 from server.acoustics.transmission import (
     AIR_IMPEDANCE,
+    TransmittedPaths,
     normal_incidence_loss_db,
     transmission_loss_db,
     walls_between,
@@ -67,3 +69,26 @@ def test_points_in_sight_have_no_wall_between_them():
     a, b = (rng.uniform((0, 0, 0.1), (7, 5, 2.4), (4000, 3)) for _ in range(2))
     inside = PLAN.contains(a) & PLAN.contains(b)
     np.testing.assert_array_equal((walls_between(PLAN, a, b) == 0)[inside], PLAN.is_visible(a, b)[inside])
+
+
+def test_paths_through_walls_join_those_of_a_finder_emitter_by_emitter():
+    listener, loss_db = np.array([1.0, 1.0, 1.2]), transmission_loss_db(20.0, OCTAVE_BANDS_HZ)
+    emitters = np.array([[2.0, 3.0, 1.5], [6.0, 2.0, 1.8], [1.5, 4.5, 1.0], [6.5, 1.0, 1.2]])
+    finder = ReflectionFinder(PLAN, np.full((3, len(OCTAVE_BANDS_HZ)), -3.0))
+    mirrored = finder.find(listener, emitters)
+    found = TransmittedPaths(finder, PLAN, loss_db).find(listener, emitters)
+    np.testing.assert_array_equal(found.emitter, np.sort(found.emitter))
+    for number, emitter in enumerate(emitters):
+        before, after = np.flatnonzero(mirrored.emitter == number), np.flatnonzero(found.emitter == number)
+        is_hidden = not PLAN.is_visible(listener, emitter)
+        assert len(after) == len(before) + is_hidden
+        if is_hidden:
+            through = after[-1]
+            distance = np.linalg.norm(emitter - listener)
+            assert found.length_m[through] == pytest.approx(distance)
+            np.testing.assert_allclose(found.arrival[through] * distance, emitter - listener, atol=1e-12)
+            np.testing.assert_array_equal(found.departure[through], -found.arrival[through])
+            np.testing.assert_allclose(found.gain_db[through], -loss_db)
+            after = after[:-1]
+        for name in ("length_m", "arrival", "departure", "gain_db"):
+            np.testing.assert_array_equal(getattr(found, name)[after], getattr(mirrored, name)[before])

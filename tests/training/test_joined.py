@@ -2,7 +2,7 @@
 response, and no part of it comes twice.
 
 The oracle is the simulation with its own direct sound. Beside a wall's edge, and round it, the direct path bends and
-the simulated one does not: pairs for this stand clear of both.
+the straight one simulated here does not: pairs for this stand clear of both.
 """
 
 import dataclasses
@@ -20,6 +20,8 @@ from server.rendering.still_paths import StillPaths
 from server.scene.bundle import BUNDLED, Bundle
 from server.whole_field import WholeField, kemar
 from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.simulation.direct_paths import DirectPaths
+from training.simulation.plan import SimulationPlan
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
@@ -186,3 +188,33 @@ def test_the_bundled_field_and_the_direct_path_are_the_whole_response(pairs, fie
     assert np.abs(ratios).mean() < np.abs(floor).mean() + 0.8
     assert np.abs(np.mean(ratios)) < 0.7
     assert np.abs(np.mean(levels)) < 0.3
+
+
+def test_what_goes_through_a_wall_is_the_simulations(apartment):
+    """Beside the first reflections, of a pair that the wall of the flat parts."""
+    walls = apartment.geometry.materials.walls.model_copy(update={"surface_mass_kg_m2": 10.0})
+    materials = apartment.geometry.materials.model_copy(update={"walls": walls})
+    scene = apartment.model_copy(update={"geometry": apartment.geometry.model_copy(update={"materials": materials})})
+    emitter, listener = np.array([6.0, 1.0, 1.5]), np.array([2.0, 1.2, 1.6])
+    plan = SimulationPlan.everything(1, 100, diffraction=False, transmission=True)
+    synthesis = BinauralSynthesis(kemar(RATE), sphere_directions(6), YAWS, 12_000)
+    simulated = synthesis.specular(*DirectPaths.of(scene, plan).images(emitter, listener), listener)
+    heard = []
+    for transmission in (False, True):
+        early = EarlyReflections(
+            scene.geometry.floor_plan,
+            materials,
+            speed_of_sound=SPEED_OF_SOUND,
+            air_db_per_m=scene.air.absorption_db_per_m,
+            filters=kemar(RATE),
+            transmission=transmission,
+        )
+        responses = np.zeros((len(YAWS), 2, 12_000), np.float32)
+        placed = RenderedEmitter(np.zeros(1, np.float32), Pose(tuple(emitter)))
+        for response, yaw in zip(responses, YAWS, strict=True):
+            early.add(response[None], Pose.from_yaw(tuple(listener), yaw), [placed])
+        heard.append(responses)
+    through = heard[1] - heard[0]
+    assert np.abs(simulated).max() > 1e-3
+    np.testing.assert_allclose(energy_db(through), energy_db(simulated), atol=0.3)
+    np.testing.assert_allclose(np.argmax(np.abs(through), axis=-1), np.argmax(np.abs(simulated), axis=-1), atol=2)
