@@ -20,6 +20,7 @@ from server.acoustics.sound_path import SoundPathFinder
 from server.early_reflections import EarlyReflections
 from server.field.field import AcousticField
 from server.radiation import departure_gain_db
+from server.rendering.convolver import FloatArray
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.scene.effects import EffectName
@@ -53,6 +54,7 @@ class _Lane:
         direct: bool = True,
         shared_tail: bool = False,
         moves: bool = False,
+        exchanges: bool = False,
         distance: bool = True,
         air: bool = True,
     ) -> None:
@@ -74,12 +76,15 @@ class _Lane:
         decay = 10 ** (-3 * np.arange(field.ir_samples) / field.ir_samples)
         self._names = [str(number) for number in range(_EMITTERS)]
         self._moves, self._block = moves, 0
+        self._exchanged: list[FloatArray] = []
         for name in self._names:
             clip = rng.standard_normal(rate).astype(np.float32)
             self._renderer.add_emitter(name, ClipPlayer(clip, loop=True), awaits_ir=response)
             if response:
-                noise = rng.standard_normal((channels, field.ir_samples)) * decay
-                self._renderer.set_ir(name, noise.astype(np.float32))
+                noise = (rng.standard_normal((channels, field.ir_samples)) * decay).astype(np.float32)
+                self._renderer.set_ir(name, noise)
+                if exchanges:
+                    self._exchanged.append(noise)
             self._renderer.hear_direct(name, is_heard=direct, distance=distance, air=air)
         self._walk()
 
@@ -87,6 +92,8 @@ class _Lane:
         for _ in range(_BLOCKS):
             if self._moves:
                 self._walk()
+            for name, response in zip(self._names, self._exchanged, strict=False):
+                self._renderer.set_ir(name, self._renderer.prepare(response))
             self._renderer.process()
 
     def _walk(self) -> None:
@@ -110,7 +117,11 @@ def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
         "without distance": {"moves": True, "distance": False},
     }
     if field.bundle.manifest.fields:
-        made |= {"without response": {"response": False}, "shared": {"shared_tail": True}}
+        made |= {
+            "without response": {"response": False},
+            "shared": {"shared_tail": True},
+            "exchanging": {"exchanges": True},
+        }
     else:
         made = {name: {**options, "response": False} for name, options in made.items()}
     lanes = {name: _Lane(field, block_size, **options) for name, options in made.items()}
@@ -118,7 +129,9 @@ def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
     memory = {name: _bytes(lane) for name, lane in lanes.items()}
     block_s = block_size / field.sample_rate
     responses_per_block = RESPONSES_PER_S * block_s
-    response_us = _response_us(field) * responses_per_block
+    response_us = 0.0
+    if "exchanging" in us:
+        response_us = (_response_us(field) + us["exchanging"] - us["still"]) * responses_per_block
 
     def between(more: str, less: str) -> float:
         return max(0.0, us[more] - us[less])
@@ -190,9 +203,7 @@ def _finders(field: AcousticField) -> dict[str, float]:
 
 
 def _response_us(field: AcousticField) -> float:
-    """What the field takes for one response."""
-    if not field.bundle.manifest.fields:
-        return 0.0
+    """What the field takes for one response, before it is made ready and faded in."""
     start, times_s = field.bundle.manifest.start, []
     for turn in range(_ROUNDS + 1):
         started_s = time.thread_time()

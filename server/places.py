@@ -10,6 +10,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.fft import next_fast_len
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import Pose, Vector3
@@ -113,7 +114,7 @@ def _of_responses(
     samples = turned.shape[-1]
     arrival, until = (min(samples, round(time_s * sample_rate)) for time_s in (arrival_s, arrival_s + _EARLY_S))
     per_ear = np.sum(turned**2, axis=-1)
-    by_band = _octaves(turned[0], sample_rate)
+    energy, by_band = _octaves(turned[0], sample_rate)
     decay = np.cumsum(np.sum(by_band**2, axis=1)[:, ::-1], axis=-1)[:, ::-1]
     whole = float(per_ear[0].sum())
     silent = whole <= 0
@@ -123,7 +124,7 @@ def _of_responses(
     except UnmeasurableError:
         late_iacc = 1.0
     return Reverberation(
-        energy=np.divide(decay[:, 0] / len(turned[0]), unit, out=np.zeros_like(unit), where=unit > 0),
+        energy=np.divide(energy, unit, out=np.zeros_like(unit), where=unit > 0),
         early=0.0 if silent else float(np.sum(turned[0][:, :until] ** 2)) / whole,
         t60_s=np.array([_decay_time_s(curve[arrival:], sample_rate) for curve in decay]),
         late_iacc=late_iacc,
@@ -131,13 +132,22 @@ def _of_responses(
     )
 
 
-def _octaves(response: npt.NDArray[np.float64], sample_rate: int) -> npt.NDArray[np.float64]:
-    """(band, channel, sample): parts that add up to the response."""
-    spectrum = np.fft.rfft(response)
-    frequency = np.maximum(np.fft.rfftfreq(response.shape[-1], 1 / sample_rate), 1.0)
-    nearest = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
-    bands = np.arange(len(OCTAVE_BANDS_HZ))
-    return np.asarray(np.fft.irfft(np.where(nearest == bands[:, None, None], spectrum, 0), response.shape[-1]))
+def _octaves(
+    response: npt.NDArray[np.float64], sample_rate: int
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """(band,) energy per channel, of all bands together that of the response; and (band, channel, sample) what filters
+    let through whose slopes are an octave wide, so that they ring for less time than rooms do."""
+    samples = response.shape[-1]
+    size = next_fast_len(2 * samples, real=True)
+    spectrum = np.fft.rfft(response, size)
+    frequency = np.maximum(np.fft.rfftfreq(size, 1 / sample_rate), 1.0)
+    away = np.log2(frequency) - np.log2(np.asarray(OCTAVE_BANDS_HZ))[:, None]
+    power = np.mean(np.abs(spectrum) ** 2, axis=0) / size
+    # Bins between DC and Nyquist stand for two.
+    power[1 : -1 if size % 2 == 0 else None] *= 2
+    energy = np.bincount(np.argmin(np.abs(away), axis=0), power, len(OCTAVE_BANDS_HZ))
+    gain = np.cos(np.pi / 2 * np.clip(away, -1, 1)) ** 2
+    return np.asarray(energy, np.float64), np.asarray(np.fft.irfft(gain[:, None] * spectrum, size)[..., :samples])
 
 
 def _decay_time_s(curve: npt.NDArray[np.float64], sample_rate: int) -> float:

@@ -89,6 +89,25 @@ def stream(
 
 
 @app.command()
+def effects(
+    as_json: AsJson = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print a table for a README.")] = False,
+) -> None:
+    """What a plan of effects saves, and what it gets wrong, in six situations."""
+    from server.bench.effects import SCENARIOS, measure_effects
+    from server.bench.effects_table import markdown_table, terminal_rows
+
+    with _progress(len(SCENARIOS)) as advance:
+        measured = measure_effects(SCENARIOS, advance)
+    if as_json:
+        print_json({"situations": measured})
+    elif markdown:
+        typer.echo(markdown_table(measured))
+    else:
+        print_rows("Effects by plan, beside all of them and none", terminal_rows(measured))
+
+
+@app.command()
 def listen(
     url: Annotated[str, typer.Option(help="The server's stream.")] = "ws://127.0.0.1:8000/v1/stream",
     scene: Annotated[str, typer.Option(help="Id of a scene it serves.")] = "apartment",
