@@ -17,10 +17,12 @@ from server.answers import Answers
 from server.audio_engine import AudioEngine
 from server.calibration import calibrate
 from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
+from server.effect_costs import measured_costs
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.ir_request import compute_irs
 from server.load import AUTO, Offer
+from server.places import place_of_field
 from server.priority import become_background
 from server.problems import install_problems
 from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
@@ -31,6 +33,7 @@ from server.settings import Settings
 from server.streaming import StreamHost
 
 _CALIBRATION_POSES = 3
+_COSTS_AFTER_S = 5.0
 WEB = Path(__file__).parent / "web"
 
 _logger = logging.getLogger(__name__)
@@ -100,6 +103,16 @@ async def _become_ready(host: StreamHost) -> None:
     gc.freeze()
     host.is_ready = True
     _logger.info("ready: %s", ", ".join(host.scenes))
+    # Nothing waits for these: whoever came first is served first.
+    await asyncio.sleep(_COSTS_AFTER_S)
+    with ThreadPoolExecutor(1, "nafir-costs", initializer=become_background) as measuring:
+        await asyncio.get_running_loop().run_in_executor(measuring, _measure_effects, host)
+
+
+def _measure_effects(host: StreamHost) -> None:
+    """See what effects cost here. Plans of streams opened before do not say."""
+    for scene, levels in host.scenes.items():
+        host.effect_costs[scene] = measured_costs(levels.default)
 
 
 def _warm_up(host: StreamHost) -> None:
@@ -107,6 +120,7 @@ def _warm_up(host: StreamHost) -> None:
     see how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
     for scene, levels in host.scenes.items():
+        host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
         offer = host.offers[scene] = Offer(
             tuple(levels[name].level for name in levels.names), calibrate(levels, filters, _CALIBRATION_POSES)

@@ -159,13 +159,20 @@ def render(
             help="CSV: sample or time_s; x, y, z; qx, qy, qz, qw or yaw_deg; reverberation_sample where it is later."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32, stereo.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32.")],
     block_size: Annotated[int, typer.Option(help="Poses take effect at multiples of it, samples.", min=16)] = 256,
     level: Level = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
     hrtf: Annotated[
         Path | None, typer.Option(help="SOFA file with the head to hear through, instead of KEMAR.")
     ] = None,
+    effects: Annotated[
+        str,
+        typer.Option(
+            help="all, plan (those the walk calls for), or names between commas.", metavar="all|plan|NAME,..."
+        ),
+    ] = "plan",
+    mono: Annotated[bool, typer.Option("--mono", help="For one loudspeaker: one channel, no head.")] = False,
     duration_s: Annotated[
         float | None, typer.Option(help="Length to render; by default until all has rung out.")
     ] = None,
@@ -178,7 +185,7 @@ def render(
     from server.field.field import AcousticField
     from server.field.levels import require_level
     from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
-    from server.render import MAX_RENDER_S, read_path
+    from server.render import MAX_RENDER_S, planned_effects, read_path
     from server.render import render as render_path
     from server.scene.bundle import Bundle, find_bundle
 
@@ -199,6 +206,7 @@ def render(
     length = None if duration_s is None else round(duration_s * field.sample_rate)
     heads = HrtfLibrary([] if hrtf is None else [hrtf], [field.sample_rate])
     filters = heads.filters(DEFAULT_HRTF if hrtf is None else hrtf.stem, field.sample_rate)
+    planned = planned_effects(effects, field, points[0].pose, output="mono" if mono else "headphones")
     started_s = time.perf_counter()
     with Progress(transient=True, disable=as_json, console=Console(stderr=True)) as progress:
         task = progress.add_task("rendering", total=1.0)
@@ -210,6 +218,7 @@ def render(
             block_size=block_size,
             length=length,
             progress=lambda done: progress.update(task, completed=done),
+            planned=planned,
         )
     elapsed_s = time.perf_counter() - started_s
     rendered_s = samples.shape[1] / field.sample_rate

@@ -21,13 +21,16 @@ from server.direct_sound import DirectSound
 from server.effects_in_force import EffectsInForce, as_asked
 from server.emitters import Emitter
 from server.errors import NafirError
-from server.field.field import Silence
+from server.field.field import AcousticField, Silence
 from server.ir_request import EmitterSnapshot, Field, composed_irs
+from server.places import place_of_field
 from server.planned_effects import PlannedEffects
 from server.radiation import reverberation_gain
 from server.rendering.ingest import DryAudio, require_gain
 from server.rendering.renderer import render_all
 from server.rendering.sources import ClipPlayer
+from server.scene.effects import EffectName, require_effect
+from server.scene.situation import Output
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -220,6 +223,22 @@ def render(
         if progress:
             progress((block + 1) / blocks)
     return output.reshape(len(output), -1)[:, :length]
+
+
+def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output: Output) -> PlannedEffects | None:
+    """What to render: `all` effects (None), those that a `plan` calls for, or those named between commas and no other.
+
+    Raises RequestError unknown_effect.
+    """
+    if choice == "all" and output == "headphones":
+        return None
+    own: dict[EffectName, bool] = {}
+    if choice == "all":
+        own = dict.fromkeys(EffectName, True) | {EffectName.HRTF: False}
+    elif choice != "plan":
+        named = {require_effect(name.strip()) for name in choice.split(",") if name.strip()}
+        own = {name: name in named for name in EffectName}
+    return PlannedEffects(place_of_field(field), listener, output=output, scene=field.bundle.manifest.effects, own=own)
 
 
 class _Walk:

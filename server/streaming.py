@@ -25,7 +25,7 @@ from server.errors import RequestError
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.load import Offer, Rung
-from server.places import place_of_field
+from server.places import place_of
 from server.protocol import (
     AddEmitter,
     ClientMessage,
@@ -38,6 +38,8 @@ from server.protocol import (
     parse_client_message,
 )
 from server.rendering.ingest import DryAudio
+from server.scene.planner import Costs
+from server.scene.situation import Place
 from server.session import Session
 from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
@@ -79,6 +81,10 @@ class StreamHost:
     settings: Settings
     answers: Answers
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
+    places: dict[str, Place] = dataclasses.field(default_factory=dict)
+    """What plans of effects are made for, by scene."""
+    effect_costs: dict[str, Costs] = dataclasses.field(default_factory=dict)
+    """By scene, once they were measured."""
     past: StreamTotals = dataclasses.field(default_factory=StreamTotals)
     """Of streams that have ended."""
     is_ready: bool = False
@@ -188,7 +194,10 @@ class Connection:
             max_emitters=host.settings.max_emitters,
             shared_tail=host.settings.shared_tail,
             window=window,
-            place=place_of_field(field, hello.block_size),
+            place=place_of(
+                levels.bundle, host.places[hello.scene].reverberations, block_size=hello.block_size
+            ),
+            costs=host.effect_costs.get(hello.scene),
         )
 
     async def _pump(self, stream: Stream, hello: Hello) -> None:

@@ -5,7 +5,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 
-import numpy as np
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
@@ -15,6 +14,7 @@ from server.blocks import AudioBlock
 from server.catalogue import open_clips
 from server.field.levels import Levels
 from server.load import Offer
+from server.places import place_of_field
 from server.protocol import (
     PROTOCOL,
     Acknowledge,
@@ -26,6 +26,7 @@ from server.protocol import (
     Status,
     parse_server_message,
 )
+from server.session import Session
 from server.settings import Settings
 from server.streaming import Connection, StreamHost
 
@@ -76,6 +77,7 @@ async def hosting(field, hrtfs, **settings):
             settings=Settings(**settings),
             answers=Answers(workers=1, waiting=1),
             offers={"flat": Offer((field.level,), {field.level.name: 1.0})},
+            places={"flat": place_of_field(field)},
             is_ready=True,
         )
         audio.start()
@@ -190,13 +192,13 @@ def test_a_client_may_leave_at_any_moment(field, hrtfs):
         assert asyncio.run(scenario(first, sends)) == 0
 
 
-def test_a_stream_that_fails_is_closed_with_an_internal_error(field, hrtfs):
+def test_a_stream_that_fails_is_closed_with_an_internal_error(field, hrtfs, monkeypatch):
     async def scenario():
         socket = Socket()
         async with hosting(field, hrtfs) as host:
             running = asyncio.create_task(Connection(socket, host).run())
-            # Fewer responses than poses, however many are asked for at once: stands for a defect of our own.
-            field.impulse_responses = lambda *_, **__: np.zeros((0, 2, 100), np.float32)
+            # Stands for a defect of our own.
+            monkeypatch.setattr(Session, "accept", lambda *_: 1 / 0)
             socket.say(HELLO)
             socket.say(AddEmitter(id="a", clip="trumpet", position=(1.0, 2.0, 1.0)))
             await asyncio.wait_for(running, 5)
