@@ -155,7 +155,7 @@ def export(
         bool, typer.Option("--exact-tables", help="Add every naf once more, with less arithmetic for the same numbers.")
     ] = False,
 ) -> None:
-    """Write finished runs as the fields of a scene bundle, after checking every graph against torch."""
+    """Write finished runs as the fields of a scene bundle, after checking every graph against torch, and its health."""
     from training.export import PRECISIONS
     from training.export import export as export_bundle
     from training.responses import FILE, open_responses

@@ -2,6 +2,7 @@
 before anything is written."""
 
 import io
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +18,9 @@ from server.acoustics.codec import Codec
 from server.errors import NafirError
 from server.field.graph import INPUTS, OUTPUTS, RESPONSE
 from server.field.runtime import open_session
+from server.health.check import Effort, check
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import ARRAYS_FILE, CodecParameters, FieldFile, QualityLevel
+from server.scene.manifest import ARRAYS_FILE, CodecParameters, FieldFile, Manifest, QualityLevel
 from training.evaluation.held_out import measured_pairs
 from training.evaluation.shaped import ShapedNearest
 from training.graphs import halve_weights, pose_by_pose, to_int8, to_onnx
@@ -40,6 +42,8 @@ PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 MODEL_FILE = "factorised.onnx"
 DEFAULT_LEVEL = "standard"
 SHAPED_NEAREST = "shaped-nearest"
+EFFORT = Effort()
+"""Of the health check that a bundle has to pass."""
 
 _CHECK_POSES = {"factorised": 64, "naf": 2, SHAPED_NEAREST: 8}
 _INT8_LEAST_WEIGHTS = 100_000
@@ -84,8 +88,8 @@ def export(
 
     Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it.
 
-    Raises RunError for an unfinished run, and ExportError for a graph that disagrees and for a dataset folder that is
-    not of `responses` or not measured.
+    Raises RunError for an unfinished run, ExportError for a graph that disagrees and for a dataset folder that is not
+    of `responses` or not measured, and HealthError for fields that break a law of `nafir check`: nothing is written.
     """
     exported: list[_Exported] = []
     # All are opened before the first graph is made, which takes a while.
@@ -120,9 +124,16 @@ def export(
     files[ARRAYS_FILE] = arrays.getvalue()
     described = Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
     if isinstance(responses, SimulatedResponses):
-        return write_bundle(folder, simulated_manifest(responses, described), files)
+        return _write_healthy(folder, simulated_manifest(responses, described), files)
     assert isinstance(responses, ImportedDataset)
-    return write_bundle(folder, measured_manifest(responses, described), files)
+    return _write_healthy(folder, measured_manifest(responses, described), files)
+
+
+def _write_healthy(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> Bundle:
+    """Raises HealthError, and writes nothing, where a law is broken."""
+    with tempfile.TemporaryDirectory() as trial:
+        check(write_bundle(Path(trial), manifest, files), EFFORT).require()
+    return write_bundle(folder, manifest, files)
 
 
 def _opened(responses: ResponseSet, place: Path) -> Learner | ImportedDataset:

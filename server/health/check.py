@@ -70,12 +70,9 @@ class Effort:
     field_s: float = 12.0
 
     def of_share(self, share: float) -> "Effort":
-        """That share of the poses, one of each kind at least."""
-        counts = {
-            name: max(1, round(getattr(self, name) * share))
-            for name in ("scattered", "halved", "climbing", "responses")
-        }
-        return replace(self, **counts)
+        """That share of the poses, one at least, but none to climb from where there is no time for that."""
+        counts = {name: max(1, round(getattr(self, name) * share)) for name in ("scattered", "halved", "responses")}
+        return replace(self, **counts, climbing=int(self.climbing * share))
 
 
 @dataclass(frozen=True)
@@ -186,7 +183,9 @@ def _check_field(
         what: search.steepest(bundle, predictions.energies, _change, spread, moved, kept=effort.halved)
         for what, moved in search.moves(spread, rng).items()
     }
-    for what, (level, spectrum) in _CONTINUITY.items():
+    # Measured responses step from one place to the next, as they were measured; what is learned of them does not.
+    is_recording = graph.gives_responses and manifest.direct_sound == "field"
+    for what, (level, spectrum) in () if is_recording else _CONTINUITY.items():
         for law, change_db in ((level, laws.level_change_db), (spectrum, laws.spectral_change_db)):
             values = change_db(steps[what].before, steps[what].after)
             if len(values):
@@ -226,9 +225,10 @@ def _check_level(field: AcousticField, poses: Poses) -> list[Finding]:
     whole = _responses(WholeField(field, head), poses)
     exact = _responses(DoubleWholeField(field, head), poses)
     from_zero_phase = field.level.phase.kind == "griffin_lim" and not field.level.phase.warm
+    if field.bundle.manifest.direct_sound == "geometry":  # else, in whatever unit it was measured
+        findings.append(_worst(PEAK, name, poses, np.abs(together).max(axis=(1, 2)).astype(np.float64)))
     return [
         *findings,
-        _worst(PEAK, name, poses, np.abs(together).max(axis=(1, 2)).astype(np.float64)),
         _worst(REPEATABLE, name, poses, np.abs(together - again).max(axis=(1, 2)).astype(np.float64)),
         _worst(BATCH, name, poses, _difference_db(together, alone)),
         _worst(ITERATED if from_zero_phase else DOUBLE, name, poses, _difference_db(whole, exact)),

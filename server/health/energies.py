@@ -35,8 +35,11 @@ class Predictions:
 
     def energies(self, poses: Poses) -> Energies:
         """NaN where the graph's outputs are not finite."""
-        parts = [self._energies(poses[start : start + _CHUNK]) for start in range(0, len(poses), _CHUNK)]
-        return np.concatenate(parts)
+        windows = -(-self.graph.parameters.codec.frames // self._frames)
+        energies = np.empty((len(poses), self.graph.channels, len(OCTAVE_BANDS_HZ), windows))
+        for start in range(0, len(poses), _CHUNK):
+            energies[start : start + _CHUNK] = self._energies(poses[start : start + _CHUNK])
+        return energies
 
     def spectrograms(self, poses: Poses) -> Spectrograms:
         return self.graph.spectrograms(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])

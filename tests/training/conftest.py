@@ -9,6 +9,7 @@ import torch
 from rich.progress import Progress
 
 from server import whole_field
+from server.health.check import Effort
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from training.dataset import Dataset
@@ -46,6 +47,14 @@ def kemar() -> HeadFilters:
 @pytest.fixture(scope="session")
 def configuration() -> Configuration:
     return CONFIGURATION
+
+
+@pytest.fixture(scope="session", autouse=True)
+def brief_health_checks() -> Iterator[None]:
+    """Enough to find what is wrong all over; exports are many here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("training.export.EFFORT", Effort(scattered=16, halved=4, climbing=2, responses=2, field_s=2.0))
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
