@@ -52,6 +52,7 @@ def place_of(bundle: Bundle, known: tuple[Reverberation, ...], *, block_size: in
         materials=manifest.geometry.materials if manifest.geometry is not None and manifest.image_order else None,
         reverberation=_typical(known) if known else None,
         reverberations=known,
+        transmits=manifest.transmission,
         holds_direct_sound=manifest.direct_sound == "field",
         tail_start_s=stages[-1].start / manifest.codec.sample_rate if len(stages) > 1 else None,
     )

@@ -17,6 +17,7 @@ from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import FloorPlan, Pose, Vector3
 from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
 from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.transmission import PathFinder, TransmittedPaths, transmission_loss_db
 from server.scene.geometry import Materials
 
 Output = Literal["headphones", "mono"]
@@ -77,6 +78,7 @@ class Place:
     `minimum` and `maximum` bound where anybody can be. Nearer than `nearest_m`, sound gets no louder. `plan` is None in
     the open, and where nobody measured the walls; `materials` are there where first reflections come from geometry;
     `reverberation`, typical of the place, where it has a field; with `holds_direct_sound` that is all there is to hear.
+    Where it `transmits`, sound goes through walls whose mass is known, and is heard with the first reflections.
     The late tails that emitters could share begin `tail_start_s` after emission; None where responses are too short to
     share any. `reverberations` are of places all over it: as unlike as emitters of which nothing else is known.
     """
@@ -91,6 +93,7 @@ class Place:
     materials: Materials | None = None
     reverberation: Reverberation | None = None
     holds_direct_sound: bool = False
+    transmits: bool = False
     tail_start_s: float | None = None
     reverberations: tuple[Reverberation, ...] = ()
 
@@ -102,12 +105,16 @@ class Place:
         return SoundPathFinder(self.plan, self.speed_of_sound)
 
     @cached_property
-    def reflections(self) -> ReflectionFinder | None:
+    def reflections(self) -> PathFinder | None:
+        """With them what goes straight through walls, where it does."""
         if self.plan is None or self.materials is None:
             return None
         surfaces = self.materials.walls, self.materials.floor, self.materials.ceiling
         gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
-        return ReflectionFinder(self.plan, gains_db)
+        finder, mass = ReflectionFinder(self.plan, gains_db), self.materials.walls.surface_mass_kg_m2
+        if not self.transmits or mass is None:
+            return finder
+        return TransmittedPaths(finder, self.plan, transmission_loss_db(mass, OCTAVE_BANDS_HZ))
 
     @cached_property
     def band_shares(self) -> Bands:

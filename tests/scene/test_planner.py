@@ -121,6 +121,23 @@ def test_a_wall_between_is_called_for_and_so_is_one_within_reach():
     assert make_plan(situation(CORNER, at(1.5, 4), stands=(2, 2, 1.5), speed_m_s=1.4)).is_on(EffectName.OCCLUSION)
 
 
+def test_through_a_light_wall_sound_is_heard_with_the_first_reflections():
+    """Out of sight, where no wall mirrors from one to the other."""
+    dead = Material(absorption=(0.999,) * BANDS, scattering=(0.9,) * BANDS)
+    hidden = {"emitter": at(1.0, 7.0), "stands": (7.0, 1.0, 1.5)}
+
+    def change(mass: float, *, transmits: bool) -> float:
+        walls = dead.model_copy(update={"surface_mass_kg_m2": mass})
+        materials = Materials(walls=walls, floor=dead, ceiling=dead)
+        place = replace(CORNER, materials=materials, transmits=transmits, reverberation=DRY)
+        plan = make_plan(situation(place, hidden["emitter"], stands=hidden["stands"]))
+        return plan.about(EffectName.EARLY_REFLECTIONS, "0")[0].change_jnd
+
+    assert change(0.5, transmits=True) > 1
+    assert change(0.5, transmits=False) < 0.1
+    assert change(500.0, transmits=True) < change(0.5, transmits=True) / 3
+
+
 def test_deep_in_the_shadow_there_is_no_direct_sound_to_compute():
     lively = replace(CORNER, reverberation=replace(LIVELY, energy=np.full(BANDS, 2.0)))
     assert EffectName.DIRECT_PATH not in on(make_plan(situation(lively, at(1.5, 7.5), stands=(7.5, 1.5, 1.5))))
