@@ -23,7 +23,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle scenes table tables office container-test clean
+.PHONY: help serve test lint format bundle scenes table tables office container-test clean hard-cases fuzz mutants
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -64,6 +64,16 @@ office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere
 	$(BIN)/nafir-train evaluate $(OFFICE)/bundle $(OFFICE)/data --record --markdown \
 		--methods nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear > $(OFFICE)/table.md
 	@cat $(OFFICE)/table.md
+
+hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
+	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md
+
+fuzz: $(VENV)/installed-dev ## drive message parsing and bundle loading with atheris, FUZZ_SECONDS=60 each
+	$(BIN)/python tests/hard_cases/fuzz.py messages --seconds $(FUZZ_SECONDS)
+	$(BIN)/python tests/hard_cases/fuzz.py bundles --seconds $(FUZZ_SECONDS)
+
+mutants: $(VENV)/installed-dev ## remove each guard in a copy of the tree and show which tests notice
+	$(BIN)/python tests/hard_cases/mutants.py
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh

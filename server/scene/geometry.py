@@ -6,13 +6,14 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.geometry import FloorPlan
+from server.acoustics.geometry import FARTHEST_M, FloorPlan
 
 Share = Annotated[float, Field(ge=0, le=1)]
 PerBand = Annotated[tuple[Share, ...], Field(min_length=len(OCTAVE_BANDS_HZ), max_length=len(OCTAVE_BANDS_HZ))]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-PlanPoint = tuple[Finite, Finite]
-Point = tuple[Finite, Finite, Finite]
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
+PlanPoint = tuple[Coordinate, Coordinate]
+Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
 # Shorter ones are a corner written twice; geometry divides by the length of a wall.
@@ -55,7 +56,7 @@ class Opening(Strict):
 class Geometry(Strict):
     """A floor polygon, counter-clockwise and not crossing itself, extruded to `height_m`."""
 
-    height_m: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    height_m: Annotated[float, Field(gt=0, le=FARTHEST_M, allow_inf_nan=False)]
     corners: Annotated[tuple[PlanPoint, ...], Field(min_length=3)]
     openings: tuple[Opening, ...] = ()
     materials: Materials

@@ -75,7 +75,7 @@ def test_a_pose_id_may_be_the_last_there_is_and_none_comes_after_it(field, filte
             parse_client_message(f'{{"type": "listener", "pose_id": {number}, "position": [2, 2, 1.5]}}')
 
 
-def test_sequences_of_live_blocks_end_where_their_numbers_do(field, filters):
+def test_sequences_of_live_blocks_end_where_their_numbers_do():
     last = DryBlock.parse(DryBlock("a", 2**32 - 1, np.zeros(4, np.float32)).serialize("f32"))
     assert last.sequence == 2**32 - 1
     with pytest.raises(struct.error):

@@ -1,0 +1,87 @@
+"""The doors by which bytes of a stranger's enter, and what may come of them: an answer, or a refusal that says why."""
+
+import hashlib
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from server.blocks import DryBlock
+from server.errors import BundleError, RequestError
+from server.protocol import parse_client_message
+from server.scene.bundle import BUNDLED, MANIFEST_FILE, Bundle
+from server.scene.manifest import ARRAYS_FILE
+
+MESSAGES = [
+    '{"type": "hello", "protocol": 2, "scene": "flat", "block_size": 256, "encoding": "s16", "buffer_blocks": 8}',
+    '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [1, 2, 1.5], "yaw": 0.5}}',
+    '{"type": "add_emitter", "id": "a", "clip": "noise", "position": [6, 3, 1.5], "gain_db": -6.0, "loop": true}',
+    '{"type": "add_emitter", "id": "a", "live": true, "position": [6, 3, 1.5], "orientation": [0, 0, 0, 1],'
+    ' "directivity": {"pattern": "cardioid", "order": 2.5}}',
+    '{"type": "add_emitter", "id": "a", "live": true, "position": [6, 3, 1.5], "directivity": {"pattern": "measured",'
+    ' "angles_deg": [0, 90, 180], "gains_db": [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0],'
+    " [0, -10, -20]]}}",
+    '{"type": "move_emitter", "id": "a", "position": [1, 1, 1], "pose_id": 7}',
+    '{"type": "set_gain", "id": "a", "gain_db": 3.5}',
+    '{"type": "set_level", "level": "auto"}',
+    '{"type": "remove_emitter", "id": "a"}',
+    '{"type": "listener", "position": [2, 2, 1.5], "yaw": 1.0, "pose_id": 9}',
+    '{"type": "acknowledge", "sequence": 12}',
+    '{"type": "ping", "id": 5}',
+]
+"""One of each kind that a client sends as text."""
+BLOCKS = [
+    b"\x02\0\0\0\7\0\0\0" + np.array([2, 2, 1.5, 0, 0, 0, 1], "<f4").tobytes(),
+    DryBlock("a", 3, np.ones(5, np.float32)).serialize("f32"),
+    DryBlock("violin", 4, np.ones(6, np.float32)).serialize("s16"),
+]
+"""And as bytes."""
+
+
+def receive(data: str | bytes) -> object | None:
+    """What a message says; None for one that is refused. Anything else that is raised is a fault."""
+    try:
+        return parse_client_message(data)
+    except RequestError as exc:
+        refusal = exc
+    assert refusal.code
+    assert str(refusal)
+    return None
+
+
+def load(folder: Path) -> Bundle | None:
+    """A bundle; None for one that is refused, which names its file and field."""
+    try:
+        return Bundle.load(folder)
+    except BundleError as exc:
+        refusal = exc
+    assert refusal.field
+    assert str(refusal.path).startswith(str(folder))
+    return None
+
+
+def write_bundle_without_fields(folder: Path) -> Path:
+    """A bundle to damage: the manifest of one that is shipped, and hardly anything in the files that it lists."""
+    folder.mkdir()
+    document = json.loads((BUNDLED / "apartment" / MANIFEST_FILE).read_bytes())
+    noise = io.BytesIO()
+    np.savez(noise, frozen_noise=np.ones((2, document["codec"]["samples"]), np.float32))
+    for name in document["files"]:
+        data = noise.getvalue() if name == ARRAYS_FILE else name.encode()
+        (folder / name).write_bytes(data)
+        document["files"][name] = hashlib.sha256(data).hexdigest()
+    (folder / MANIFEST_FILE).write_text(json.dumps(document))
+    return folder
+
+
+def write_manifest(folder: Path, text: bytes) -> None:
+    (folder / MANIFEST_FILE).write_bytes(text)
+
+
+def write_arrays(folder: Path, data: bytes) -> None:
+    """With their hash in the manifest, so that they are looked at."""
+    (folder / ARRAYS_FILE).write_bytes(data)
+    document = json.loads((folder / MANIFEST_FILE).read_bytes())
+    document["files"][ARRAYS_FILE] = hashlib.sha256(data).hexdigest()
+    (folder / MANIFEST_FILE).write_text(json.dumps(document))

@@ -1,0 +1,89 @@
+"""Coverage-guided fuzzing of the doors by atheris: `python tests/hard_cases/fuzz.py messages|bundles --seconds 60`.
+
+It starts from one message of each kind, or from a whole bundle, and keeps what reaches code that was not reached
+before. What is raised and is no refusal ends it, with the input written beside.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import atheris
+
+with atheris.instrument_imports(include=["server"]):
+    from server import blocks, protocol  # noqa: F401  what is instrumented is what is imported here
+    from server.scene import bundle, geometry, manifest  # noqa: F401
+
+from doors import (  # beside this script
+    BLOCKS,
+    MESSAGES,
+    load,
+    receive,
+    write_arrays,
+    write_bundle_without_fields,
+    write_manifest,
+)
+
+from server.scene.bundle import MANIFEST_FILE
+from server.scene.manifest import ARRAYS_FILE
+
+
+def messages(_folder: Path) -> tuple[Callable[[bytes], None], list[bytes]]:
+    def one(data: bytes) -> None:
+        receive(data)
+        receive(data.decode(errors="replace"))
+
+    return one, [*(text.encode() for text in MESSAGES), *BLOCKS]
+
+
+def bundles(folder: Path) -> tuple[Callable[[bytes], None], list[bytes]]:
+    """The first byte says which file the others are."""
+    written = write_bundle_without_fields(folder / "scene")
+    whole = (written / MANIFEST_FILE).read_bytes()
+
+    def one(data: bytes) -> None:
+        write_manifest(written, whole)
+        if data[:1] == b"a":
+            write_arrays(written, data[1:])
+        else:
+            write_manifest(written, data[1:])
+        load(written)
+
+    return one, [b"m" + whole, b"a" + (written / ARRAYS_FILE).read_bytes()[:4_000]]
+
+
+DOORS = {"messages": messages, "bundles": bundles}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("door", choices=DOORS)
+    parser.add_argument("--seconds", type=int, default=60)
+    parser.add_argument("--runs", type=int, default=-1, help="at most; -1 for as many as there is time for")
+    parser.add_argument("--findings", type=Path, default=Path(), help="folder for inputs that break something")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        one, seeds = DOORS[options.door](Path(folder))
+        corpus = Path(folder) / "corpus"
+        corpus.mkdir()
+        for number, seed in enumerate(seeds):
+            (corpus / str(number)).write_bytes(seed)
+        arguments = [
+            sys.argv[0],
+            f"-max_total_time={options.seconds}",
+            f"-runs={options.runs}",
+            "-max_len=8192",
+            "-seed=1",
+            "-rss_limit_mb=4096",
+            f"-artifact_prefix={options.findings}/",
+            "-print_final_stats=1",
+            str(corpus),
+        ]
+        atheris.Setup(arguments, one)
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()
