@@ -9,7 +9,7 @@ import numpy.typing as npt
 from server.field.field import AcousticField
 from server.field.levels import Levels
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import Accuracy
+from server.scene.manifest import Accuracy, QualityLevel
 from server.whole_field import WholeField
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
 from training.evaluation.held_out import EvaluationError, HeldOut, Responses, require_same_scene
@@ -65,21 +65,26 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
 
 
 def record_accuracy(bundle: Bundle, evaluation: Evaluation) -> Bundle:
-    """Writes the measured errors of every quality level into the bundle's manifest; `evaluation` is of it alone."""
+    """Writes the measured errors of every quality level into the bundle's manifest; `evaluation` is of it alone.
+
+    Levels that reuse responses keep what the frontier found: held-out poses look where the nodes of a lattice may, and
+    there is no moving them here.
+    """
     floor = {} if evaluation.floor is None else _means(evaluation, evaluation.floor.name)
-    levels = tuple(
-        level.model_copy(
-            update={
-                "accuracy": Accuracy(
-                    pairs=evaluation.pairs,
-                    yaws=evaluation.yaws,
-                    errors=_means(evaluation, level.name),
-                    floor=floor,
-                )
-            }
+
+    def measured(level: QualityLevel) -> QualityLevel:
+        if level.reuse is not None and level.accuracy is not None:
+            return level
+        accuracy = Accuracy(
+            pairs=evaluation.pairs,
+            yaws=evaluation.yaws,
+            errors=_means(evaluation, level.name),
+            floor=floor,
+            steps={} if level.accuracy is None else level.accuracy.steps,
         )
-        for level in bundle.manifest.levels
-    )
+        return level.model_copy(update={"accuracy": accuracy})
+
+    levels = tuple(measured(level) for level in bundle.manifest.levels)
     files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
     return write_bundle(bundle.folder, bundle.manifest.model_copy(update={"levels": levels}), files)
 

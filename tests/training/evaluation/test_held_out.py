@@ -10,7 +10,7 @@ from PIL import Image
 from server.acoustics.metrics import spectral_loss
 from server.field.field import AcousticField
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import QualityLevel
+from server.scene.manifest import Accuracy, QualityLevel, Reuse
 from server.whole_field import WholeField
 from training.dataset import DatasetError
 from training.evaluation.evaluate import spectral_codec
@@ -141,6 +141,20 @@ def test_errors_of_every_level_are_recorded_and_the_bundle_still_loads(evaluatio
         for name, summary in evaluation.of(level.name).summaries.items():
             assert level.accuracy.errors.get(name) == summary.mean
             assert level.accuracy.floor.get(name) == evaluation.floor.summaries[name].mean
+
+
+def test_what_the_frontier_found_of_lattices_and_steps_stays(evaluation, two_levels, tmp_path):
+    standard, short = two_levels.manifest.levels
+    found = Accuracy(pairs=7, yaws=2, errors={"t60": 9.0}, floor={"t60": 1.0}, steps={"level": 0.5})
+    levels = (
+        standard.model_copy(update={"accuracy": found}),
+        short.model_copy(update={"accuracy": found, "reuse": Reuse(spacing_m=1, turn_deg=30)}),
+    )
+    files = {name: (two_levels.folder / name).read_bytes() for name in two_levels.manifest.files}
+    bundle = write_bundle(tmp_path, two_levels.manifest.model_copy(update={"levels": levels}), files)
+    exact, reusing = record_accuracy(bundle, evaluation).manifest.levels
+    assert (exact.accuracy.pairs, exact.accuracy.steps) == (evaluation.pairs, {"level": 0.5})
+    assert reusing.accuracy == found
 
 
 class TestMeasured:
