@@ -5,10 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from rich.progress import Progress
+from typer.testing import CliRunner
 
 from server.field.levels import Levels
+from server.scene.bundle import Bundle
 from server.whole_field import WholeField
 from tests.training.measured_room import RATE, SAMPLES, Room
+from training.cli import app
 from training.dataset import Dataset, DatasetError
 from training.evaluation.held_out import open_held_out
 from training.evaluation.run import evaluate_bundles
@@ -32,13 +35,17 @@ def dataset(tmp_path_factory) -> ImportedDataset:
 @pytest.fixture(scope="module")
 def trained(dataset, configuration, tmp_path_factory):
     run = tmp_path_factory.mktemp("measured") / "run"
-    train(dataset, run, dataclasses.replace(configuration, epochs=3), Progress(disable=True))
+    train(dataset, run, dataclasses.replace(configuration, epochs=40, batch=8), Progress(disable=True))
     return run
 
 
 @pytest.fixture(scope="module")
 def bundle(dataset, trained, tmp_path_factory):
-    return export(dataset, [dataset.folder, trained], tmp_path_factory.mktemp("measured") / "bundle")
+    """As the command line makes it of the folder itself and a run on it."""
+    folder = tmp_path_factory.mktemp("measured") / "bundle"
+    done = CliRunner().invoke(app, ["export", str(dataset.folder), str(trained), "-o", str(folder)])
+    assert done.exit_code == 0, done.output
+    return Bundle.load(folder)
 
 
 def test_the_manifest_says_what_can_be_known(bundle, dataset):

@@ -71,3 +71,18 @@ def test_any_place_is_answered(graph):
     rng = np.random.default_rng(2)
     for listener, emitter in [*rng.uniform(-9, 9, (10, 2, 3)), np.zeros((2, 3))]:
         assert np.isfinite(answer(graph, listener, emitter, 0.0)).all()
+
+
+@pytest.mark.parametrize("samples", [SAMPLES, 200])
+def test_one_response_answers_everywhere_by_its_distance(room, samples):
+    """Nothing can be learned of it; of 12 ms nothing is left after the direct sound."""
+    only = np.arange(60) == 3
+    pairs = TrainingPairs(
+        room.responses[..., :samples], room.listener, room.emitter, room.listeners, room.emitters, only
+    )
+    alone = ShapedNearest(pairs, room.delays_s, RATE)
+    graph = ShapedNearestGraph(alone, np.zeros(1), lead=LEAD).eval()
+    emitter, listener = room.emitters[room.emitter[3]], room.listeners[room.listener[3]]
+    near, far = (answer(graph, emitter + share * (listener - emitter), emitter, 0.0) for share in (1.0, 2.0))
+    direct = slice(LEAD - 4, LEAD + 5)
+    np.testing.assert_allclose(far[..., direct], near[..., direct] / 2, atol=0.02 * np.abs(near).max())
