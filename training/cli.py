@@ -49,7 +49,7 @@ def simulate(
     from training.simulation.run import simulate as simulate_scene
 
     planned = simulation.plan_of(scene, seed, effects)
-    Console(stderr=True).print(simulation.plan_table(planned))
+    simulation.wide_console(stderr=True).print(simulation.plan_table(planned))
     processes = workers or os.cpu_count() or 1
     with _progress() as progress:
         dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, plan=planned)

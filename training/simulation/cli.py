@@ -25,6 +25,11 @@ Effects = Annotated[
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
 
 
+def wide_console(*, stderr: bool = False) -> Console:
+    """As wide as the table where nobody's terminal is narrower."""
+    return Console(stderr=stderr, width=None if Console(stderr=stderr).is_terminal else 150)
+
+
 def plan_of(scene: Path, seed: int, effects: str) -> "SimulationPlan":
     """With its costs on this host."""
     import numpy as np
@@ -77,7 +82,7 @@ def plan(
         content = planned.to_json() if checked is None else {"plan": planned.to_json(), "check": checked.to_json()}
         typer.echo(json.dumps(content, indent=2))
         return
-    console = Console(width=None if Console().is_terminal else 150)
+    console = wide_console()
     console.print(plan_table(planned))
     if checked is not None:
         console.print(_check_table(checked))

@@ -67,7 +67,7 @@ class ExpectedSpectrograms:
         return self._synthesis.specular(positions, amplitudes, self._dataset.probes[listener])
 
     def diffuse_products(self, emitter: int, listener: int, pool: _Singles, advance_samples: float = 0.0) -> _Singles:
-        """(product, yaw, frequency, cell) expected products of the ears' spectra, of the diffuse part of the stored
+        """(frequency, product, yaw, cell) expected products of the ears' spectra, of the diffuse part of the stored
         response: the squared magnitudes of left and right, and left times conjugate right, real and imaginary. Frames
         are summed to cells with (frame, cell) `pool`; `advance_samples` is how much earlier than emission a response
         begins that was aligned.

@@ -92,7 +92,7 @@ class BinauralSynthesis:
     def late_covariance(
         self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles, heard: _Singles
     ) -> _Singles:
-        """(product, yaw, bin, cell) expected products per sample of what the ears hear of the diffuse part of `render`,
+        """(bin, product, yaw, cell) expected products per sample of what the ears hear of the diffuse part of `render`,
         summed over (time,) `times_s` with (time, cell) `weights`; none outside the response. `heard` is that of
         `arrival_products`."""
         step_s = self._n_fft // 2 / self._sample_rate
@@ -113,9 +113,10 @@ class BinauralSynthesis:
         )
         shared = coo_array((2 * rise * share * (1 - share), (at, before)), shape=(len(times_s), frames - 1))
         own_weights, shared_weights = ((part.T @ weights).astype(np.float32) for part in (own, shared))
-        over_cells = power @ own_weights + np.sqrt(power[..., :-1] * power[..., 1:]) @ shared_weights
-        found = np.ascontiguousarray(heard.reshape(len(heard), -1, len(energy))) @ over_cells
-        return np.asarray(found.reshape(*heard.shape[:-1], -1).transpose(1, 2, 0, 3))
+        neighbours = np.sqrt(power[..., :-1] * power[..., 1:])
+        over_cells = np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
+        # Not matmul: for a stack of small matrices, threads of linear algebra mostly wait for each other.
+        return np.einsum("bpyd,bdc->bpyc", heard, over_cells)
 
     def arrival_products(self, bins: int) -> _Singles:
         """(bin, product, yaw, direction) of the spectra of a wave from each direction at the ears, at frequencies from
