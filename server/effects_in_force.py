@@ -11,9 +11,10 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.emitters import Emitter
 from server.planned_effects import PlannedEffects
 from server.radiation import reverberation_gain
-from server.rendered_effects import EmitterEffects, SharedEffects
+from server.rendered_effects import PARTS, EmitterEffects, SharedEffects
 from server.rendering.convolver import PartitionedIr
 from server.rendering.renderer import Renderer
+from server.scene.effects import EffectName
 
 
 class EffectsInForce:
@@ -63,6 +64,15 @@ class EffectsInForce:
             if ears != self.shared.channels:
                 self._outdate(emitter)
         return begin
+
+    def whole(self) -> tuple[EmitterEffects, bool]:
+        """What would be on if all were but what was switched off by hand, and whether that has a head."""
+        assert self.planned is not None
+        off = {name for name, is_on in self.planned.overrides.items() if not is_on}
+        parts = {part: name not in off for name, part in PARTS.items()}
+        parts["early"] &= self._has_early
+        parts["late"] &= self._has_late
+        return EmitterEffects(**parts), self.planned.output == "headphones" and EffectName.HRTF not in off
 
     def share_tail(self, is_shared: bool, emitters: Mapping[str, Emitter]) -> None:
         """Have emitters share a late tail where a quality level does, or none would be told from its own."""

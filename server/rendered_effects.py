@@ -1,10 +1,23 @@
 """What a plan of effects means to whoever renders: which parts of a listener's sound there are."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
 from server.scene.effects import EffectName
 from server.scene.plan import Plan
+
+PARTS: Mapping[EffectName, str] = {
+    EffectName.DIRECT_PATH: "direct_path",
+    EffectName.DISTANCE_ATTENUATION: "distance_attenuation",
+    EffectName.AIR_ABSORPTION: "air_absorption",
+    EffectName.OCCLUSION: "occlusion",
+    EffectName.DIFFRACTION: "diffraction",
+    EffectName.DIRECTIVITY: "directivity",
+    EffectName.EARLY_REFLECTIONS: "early",
+    EffectName.LATE_REVERBERATION: "late",
+}
+"""Which part of `EmitterEffects` an effect is, of those that a single moment tells."""
 
 
 @dataclass(frozen=True)

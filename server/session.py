@@ -11,6 +11,7 @@ Blocks are rendered in three steps, so that many sessions' can be rendered in on
 A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Hashable
 
@@ -48,6 +49,7 @@ from server.protocol import (
     SetGain,
 )
 from server.radiation import reverberation_gain
+from server.regret import Regret, RegretCheck
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
@@ -143,6 +145,7 @@ class Session:
         self._applied_pose_id = 0  # by the impulse responses
         self._in_flight: IrRequest | None = None
         self._waits_for_change = False
+        self._checked = 0
         self._ir_interval_s = 0.0
         self._next_request_clock = 0
 
@@ -277,6 +280,33 @@ class Session:
         self._effects.share_tail(self._heard.shared_tail, self._emitters)
         self._waits_for_change = False
         return [*events, PlanChanged.of(plan, self.sample_clock)] if is_other else events
+
+    def take_check(self) -> RegretCheck | None:
+        """A check of the plan in effect, of one emitter after the other; None where everything is on."""
+        planned = self._effects.planned
+        if planned is None or planned.plan is None:
+            return None
+        named = [name for name, emitter in self._emitters.items() if emitter.is_decided]
+        if not named:
+            return None
+        self._checked += 1
+        emitter = self._emitters[named[self._checked % len(named)]]
+        whole, head = self._effects.whole()
+        check = RegretCheck(
+            self._heard.level,
+            self._listener,
+            dataclasses.replace(emitter),
+            whole,
+            self.renderer.channels,
+            2 if head else self.renderer.channels,
+            self._direct_sound,
+        )
+        return check if check.finds_anything else None
+
+    def learn(self, regret: Regret) -> None:
+        """Correct the plan by what a check found."""
+        if regret.corrections and self._effects.planned is not None:
+            self._effects.planned.correct(regret.corrections)
 
     def keep_effects(self) -> list[ServerMessage]:
         """No plan came of the one asked for last: what is on stays on; of who has just come, everything."""

@@ -30,6 +30,7 @@ from server.protocol import (
     SetLevel,
     Status,
 )
+from server.regret import FIRST_S, PERIOD_S, SHARE, Regret, RegretRecord
 from server.scene.plan import Plan
 from server.session import Session
 
@@ -116,6 +117,10 @@ class Stream:
         self._messages: deque[tuple[float, ClientMessage]] = deque()
         self._answers: deque[tuple[IrRequest, Future[_Computed]]] = deque()
         self._plans: deque[Future[Plan]] = deque()
+        self.regrets = RegretRecord()
+        self._checks: deque[Future[Regret]] = deque()
+        self._next_check_s: float | None = FIRST_S
+        """None while one is under way."""
         self._next_status_s = 1.0
 
     @property
@@ -159,7 +164,7 @@ class Stream:
 
     @property
     def has_news(self) -> bool:
-        return bool(self._messages or self._answers or self._plans)
+        return bool(self._messages or self._answers or self._plans or self._checks)
 
     def take_in(self, workers: Executor) -> list[Outgoing]:
         """Heed what waits and ask for impulse responses."""
@@ -175,6 +180,9 @@ class Stream:
                 self.pose_times.arrive(message.pose_id, arrived_s)
                 self.reverberation_times.arrive(message.pose_id, arrived_s)
             outgoing += refused
+        while self._checks:
+            self._take_regret(self._checks.popleft())
+        self._check_plan(workers)
         if (wanted := self.session.take_plan_request()) is not None:
             workers.submit(PlanRequest.plan, wanted).add_done_callback(self._keep_plan)
         if (request := self.session.take_request()) is not None:
@@ -243,6 +251,29 @@ class Stream:
     def _keep_answer(self, request: IrRequest, answer: "Future[_Computed]") -> None:
         self._answers.append((request, answer))  # on the worker's thread
         self._wake()
+
+    def _check_plan(self, workers: Executor) -> None:
+        clock_s = self.next_block * self.block_s
+        if self._next_check_s is None or clock_s < self._next_check_s:
+            return
+        self._next_check_s = clock_s + PERIOD_S
+        if (check := self.session.take_check()) is not None:
+            self._next_check_s = None
+            workers.submit(check.run, self._levels[check.level]).add_done_callback(self._keep_regret)
+
+    def _keep_regret(self, regret: "Future[Regret]") -> None:
+        self._checks.append(regret)  # on the worker's thread; looked at with the next block
+
+    def _take_regret(self, answer: "Future[Regret]") -> None:
+        clock_s = self.next_block * self.block_s
+        self._next_check_s = clock_s + PERIOD_S
+        if (failure := answer.exception()) is not None:
+            _logger.error("a plan of effects could not be checked", exc_info=failure)
+            return
+        regret = answer.result()
+        self._next_check_s = clock_s + max(PERIOD_S, regret.cost_s / SHARE)
+        self.regrets.add(regret)
+        self.session.learn(regret)
 
     def _keep_plan(self, plan: "Future[Plan]") -> None:
         self._plans.append(plan)  # on the worker's thread

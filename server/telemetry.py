@@ -18,6 +18,7 @@ from server.audio_engine import AudioEngine
 from server.clips import ClipLibrary
 from server.durations import DurationHistogram
 from server.load import Offer
+from server.regret import RegretRecord
 from server.stream import Stream
 
 _SHORTEST_S, _LONGEST_S = 3e-5, 10.0
@@ -29,6 +30,7 @@ class StreamTotals:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
+        self.regrets = RegretRecord()
         self.durations: defaultdict[str, DurationHistogram] = defaultdict(DurationHistogram)
 
     def add(self, stream: Stream) -> None:
@@ -39,6 +41,7 @@ class StreamTotals:
         self.counts["exchanges"] += session.ir_exchanges
         self.counts["limited"] += session.blocks_limited
         self.counts["silenced"] += session.renderer.samples_silenced
+        self.regrets.merge(stream.regrets)
         self.durations["render"].merge(stream.render_times)
         self.durations["lateness"].merge(stream.latenesses)
         self.durations["ir"].merge(stream.ir_times)
@@ -46,6 +49,7 @@ class StreamTotals:
 
     def merge(self, other: "StreamTotals") -> None:
         self.counts += other.counts
+        self.regrets.merge(other.regrets)
         for name, durations in other.durations.items():
             self.durations[name].merge(durations)
 
@@ -87,6 +91,7 @@ class ServerCollector(Collector):
         yield GaugeMetricFamily("nafir_ready", "1 where streams may be opened.", value=self._host.is_ready)
         yield from self._streams(streams)
         yield from self._blocks(totals)
+        yield from _regrets(totals.regrets)
         yield CounterMetricFamily(
             "nafir_ir_exchanges", "Blocks that faded to other impulse responses.", value=totals.counts["exchanges"]
         )
@@ -161,6 +166,25 @@ class ServerCollector(Collector):
             for name, ms in offer.ms_here.items():
                 costs.add_metric([scene, name], ms / 1000)
         return costs
+
+
+def _regrets(record: RegretRecord) -> Iterator[Metric]:
+    yield CounterMetricFamily(
+        "nafir_effect_checks", "Moments heard as planned and with every effect on.", value=record.checks
+    )
+    yield CounterMetricFamily(
+        "nafir_effect_check_failures",
+        "Of these, where an effect that was off was heard to be; it is on from then on.",
+        value=record.failures,
+    )
+    worst = GaugeMetricFamily(
+        "nafir_effect_regret_jnd",
+        "The most that any check found, in just-noticeable differences.",
+        labels=["parameter"],
+    )
+    for parameter, jnd in sorted(record.worst_jnd.items()):
+        worst.add_metric([parameter], jnd)
+    yield worst
 
 
 def exposition(collector: Collector) -> bytes:

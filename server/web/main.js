@@ -1,6 +1,7 @@
 // Joins the parts: scene and loudness over HTTP, poses and audio through the stream worker, the plan, the panel and the keyboard.
 
 import { FloorPlan } from "./floorplan.js";
+import { Effects } from "./effects.js";
 import { Frontier } from "./frontier.js";
 import { PoseLedger } from "./latency.js";
 import { Legend } from "./legend.js";
@@ -31,6 +32,8 @@ class Page {
     this.panel = new Panel(document);
     this.legend = new Legend(find("legend"));
     this.frontier = new Frontier(find("quality"));
+    this.effects = new Effects(find("rendered"));
+    this.rendered = null; // the server's plan of effects; null while there is no stream
     this.level = null; // what is heard; null while there is no stream
     this.player = new Player();
     this.ledger = new PoseLedger();
@@ -164,6 +167,10 @@ class Page {
         this.level = detail.level;
         this.frontier.changed(detail);
       },
+      effects: (detail) => {
+        this.rendered = detail;
+        this.effects.show(detail);
+      },
       refused: ({ code, message }) => this.notices.show(code, message),
     };
     this.worker.onmessage = ({ data: { type, detail } }) => handlers[type](detail);
@@ -173,6 +180,7 @@ class Page {
   #listenToControls() {
     find("play").addEventListener("click", () => (this.playing ? this.pause() : this.play()));
     this.frontier.addEventListener("chosen", ({ detail }) => this.#tell("level", { name: detail }));
+    this.effects.addEventListener("wished", ({ detail }) => this.#tell("effects", detail));
     find("volume").addEventListener("input", ({ target }) => this.#setVolume(target.valueAsNumber));
     this.#setVolume(find("volume").valueAsNumber);
     onThemeChange(() => {
@@ -215,7 +223,7 @@ class Page {
     }
     if (!this.playing) return;
     this.notices.clear("audio");
-    const hello = { scene: this.scene.id, sampleRate: this.scene.sample_rate, level: this.frontier.chosen };
+    const hello = { scene: this.scene.id, sampleRate: this.scene.sample_rate, level: this.frontier.chosen, ...this.effects.wishes };
     const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
     this.#tell("open", { url: streamUrl(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
   }
@@ -228,6 +236,8 @@ class Page {
     this.#tell("close");
     this.panel.rest();
     this.frontier.heard = this.level = null;
+    this.rendered = null;
+    this.effects.rest();
     this.plan.glow(0, 0);
     this.#setConnection("idle", "Paused");
   }

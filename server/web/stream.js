@@ -32,8 +32,8 @@ export class Stream {
   #heartbeat = 0;
 
   /**
-   * `hello` is {scene, sampleRate, level}; `listeners` are callbacks: block(block), state({state, ...}), posed({poseId, at}),
-   * status(message), level(message), refused({code, message, field}).
+   * `hello` is {scene, sampleRate, level, effects, output}; `listeners` are callbacks: block(block), state({state, ...}),
+   * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field}).
    */
   constructor({ url, hello, listener, emitters, listeners }) {
     this.#url = url;
@@ -75,6 +75,14 @@ export class Stream {
   setLevel(level) {
     this.#hello = { ...this.#hello, level };
     if (this.#welcomed) this.#send(message.setLevel(level));
+  }
+
+  /** `effects` are on, off, or null for as planned; `output` null where it stays. */
+  setEffects({ effects, output }) {
+    const wished = { ...this.#hello.effects, ...effects };
+    for (const [name, isOn] of Object.entries(wished)) if (isOn === null) delete wished[name];
+    this.#hello = { ...this.#hello, effects: wished, output: output ?? this.#hello.output };
+    if (this.#welcomed) this.#send(message.setEffects({ effects, output }));
   }
 
   close() {
@@ -132,6 +140,7 @@ export class Stream {
     if (received.type === "welcome") this.#welcome(received);
     else if (received.type === "status") this.#listeners.status(received);
     else if (received.type === "level_changed") this.#listeners.level(received);
+    else if (received.type === "plan_changed") this.#listeners.effects(received);
     else if (received.type === "error") {
       this.#lastError = received.message;
       this.#listeners.refused(received);

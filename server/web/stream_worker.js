@@ -24,6 +24,7 @@ function open({ url, hello, listener, emitters, port }) {
       posed: tell("posed"),
       status: tell("status"),
       level: tell("level"),
+      effects: tell("effects"),
       refused: tell("refused"),
     },
   });
@@ -35,6 +36,7 @@ const commands = {
   emitter: (detail) => stream?.setEmitter(detail),
   remove: ({ id }) => stream?.removeEmitter(id),
   level: ({ name }) => stream?.setLevel(name),
+  effects: (wishes) => stream?.setEffects(wishes),
   close() {
     stream?.close();
     stream = null;

@@ -23,7 +23,7 @@ export function serializePose({ poseId, position, yaw }) {
 
 /**
  * Audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, left, right}; the ears are
- * Float32Array(frames), the newest poses those of the direct sound and of what follows it.
+ * Float32Array(frames), alike where there is one channel, the newest poses those of the direct sound and of what follows it.
  */
 export function parseBlock(buffer) {
   const view = new DataView(buffer);
@@ -32,14 +32,14 @@ export function parseBlock(buffer) {
   }
   const channels = view.getUint16(2, true);
   const frames = view.getUint32(24, true);
-  if (channels !== 2 || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * channels * 4) {
+  if ((channels !== 1 && channels !== 2) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * channels * 4) {
     throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${channels} channels`);
   }
   const left = new Float32Array(frames);
   const right = new Float32Array(frames);
-  for (let frame = 0, offset = BLOCK_HEADER_BYTES; frame < frames; frame++, offset += 8) {
+  for (let frame = 0, offset = BLOCK_HEADER_BYTES; frame < frames; frame++, offset += 4 * channels) {
     left[frame] = view.getFloat32(offset, true);
-    right[frame] = view.getFloat32(offset + 4, true);
+    right[frame] = view.getFloat32(offset + 4 * (channels - 1), true);
   }
   return {
     flags: view.getUint8(1),
@@ -54,8 +54,9 @@ export function parseBlock(buffer) {
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, level, listener }) =>
-    JSON.stringify({ type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, listener }),
+  hello: ({ scene, sampleRate, level, effects, output, listener }) =>
+    JSON.stringify({ type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, listener }),
+  setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),
   addEmitter: ({ id, clip, position, gainDb }) => JSON.stringify({ type: "add_emitter", id, clip, position, gain_db: gainDb }),
   setGain: ({ id, gainDb }) => JSON.stringify({ type: "set_gain", id, gain_db: gainDb }),

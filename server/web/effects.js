@@ -1,0 +1,134 @@
+// Which effects are rendered now, why, and what each costs or saves; each can be switched, to hear the difference.
+//
+// The server decides effect by effect, for each source or for all that is heard; a row sums up what it said of one effect.
+
+const SHOWN_JND = 10; // the bar's full length; whatever changes more changes everything
+const TITLES = {
+  hrtf: "head",
+  per_source_tail: "own late tails",
+};
+const titleOf = (name) => TITLES[name] ?? name.replaceAll("_", " ");
+const microseconds = (value) => `${value < 10 ? value.toPrecision(2) : Math.round(value)} µs`;
+
+function element(tag, className, text) {
+  const node = document.createElement(tag);
+  node.className = className;
+  if (text !== undefined) node.textContent = text;
+  return node;
+}
+
+/** One entry per effect of a plan's decisions: on where it is on for any source, with what is most audible of them. */
+export function summarise(decisions) {
+  const effects = new Map();
+  for (const decision of decisions) {
+    const known = effects.get(decision.name);
+    if (!known) {
+      effects.set(decision.name, { ...decision, count: 1, on: +decision.called_for });
+      continue;
+    }
+    known.count += 1;
+    known.on += +decision.called_for;
+    known.overridden ||= decision.overridden;
+    if (decision.cost_us !== null) known.cost_us = (known.cost_us ?? 0) + decision.cost_us;
+    const tells = decision.called_for === known.called_for ? decision.change_jnd > known.change_jnd : decision.called_for;
+    if (tells) Object.assign(known, { called_for: decision.called_for, change_jnd: decision.change_jnd, reason: decision.reason });
+  }
+  return [...effects.values()];
+}
+
+export class Effects extends EventTarget {
+  #list;
+  #total;
+  #note;
+  #output;
+  #rows = new Map();
+  #wishes = {};
+
+  /** `root` is the section; emits "wished" with {effects, output} of what was changed: on, off, or null for as planned. */
+  constructor(root) {
+    super();
+    const find = (id) => root.querySelector(`#${id}`);
+    this.#list = find("effects");
+    this.#total = find("effects-cost");
+    this.#note = find("effects-note");
+    this.#output = find("output");
+    this.#output.addEventListener("change", () => this.#wish({}, this.#output.value));
+    this.rest();
+  }
+
+  /** What to say in a hello: only what was switched by hand. */
+  get wishes() {
+    return { effects: { ...this.#wishes }, output: this.#output.value };
+  }
+
+  /** A plan as the server sends it. */
+  show({ decisions, cost_us: cost, saved_us: saved }) {
+    const effects = summarise(decisions);
+    const on = effects.filter((effect) => effect.called_for).length;
+    this.#total.textContent = `${on} of ${effects.length}`;
+    this.#note.textContent = cost + saved > 0 ? `${microseconds(cost)} a block, ${microseconds(saved)} saved` : "on";
+    for (const effect of effects) this.#row(effect.name).show(effect);
+  }
+
+  /** Nothing is rendered. */
+  rest() {
+    this.#total.textContent = "–";
+    this.#note.textContent = "once playing";
+    for (const row of this.#rows.values()) row.rest();
+  }
+
+  #row(name) {
+    if (!this.#rows.has(name)) {
+      const row = new Row(name, (isOn) => this.#wish({ [name]: isOn }));
+      this.#rows.set(name, row);
+      this.#list.append(row.root);
+    }
+    return this.#rows.get(name);
+  }
+
+  #wish(effects, output = null) {
+    for (const [name, isOn] of Object.entries(effects)) {
+      if (isOn === null) delete this.#wishes[name];
+      else this.#wishes[name] = isOn;
+    }
+    this.dispatchEvent(new CustomEvent("wished", { detail: { effects, output } }));
+  }
+}
+
+class Row {
+  #switch = element("input", "");
+  #bar = element("i", "");
+  #cost = element("span", "cost");
+  #reason = element("p", "reason");
+  #undo = element("button", "undo", "as planned");
+
+  constructor(name, wish) {
+    this.root = element("li", "effect");
+    this.root.dataset.effect = name;
+    this.#switch.type = "checkbox";
+    this.#switch.setAttribute("role", "switch");
+    this.#undo.type = "button";
+    const label = element("label", "");
+    label.append(this.#switch, element("span", "name", titleOf(name)));
+    const track = element("span", "jnd");
+    track.append(this.#bar);
+    this.root.append(label, track, this.#cost, this.#reason, this.#undo);
+    this.#switch.addEventListener("change", () => wish(this.#switch.checked));
+    this.#undo.addEventListener("click", () => wish(null));
+  }
+
+  show({ called_for: isOn, change_jnd: change, cost_us: cost, reason, overridden, count, on }) {
+    this.#switch.disabled = false;
+    this.#switch.checked = isOn;
+    this.root.classList.toggle("on", isOn);
+    this.root.classList.toggle("overridden", overridden);
+    this.#bar.style.transform = `scaleX(${Math.min(1, change / SHOWN_JND).toFixed(3)})`;
+    this.#cost.textContent = cost === null || cost < 0.05 ? "" : microseconds(cost);
+    this.#reason.textContent = on > 0 && on < count ? `${reason} (${on} of ${count} sources)` : reason;
+    this.#undo.hidden = !overridden;
+  }
+
+  rest() {
+    this.#switch.disabled = true;
+  }
+}
