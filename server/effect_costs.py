@@ -14,12 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.directivity import CARDIOID, OMNIDIRECTIONAL, Directivity
+from server.acoustics.directivity import CARDIOID, Directivity
 from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
-from server.early_reflections import EarlyReflections
+from server.direct_sound import DirectSound
+from server.emitters import Emitter
 from server.field.field import AcousticField
+from server.ir_request import composed_irs
 from server.radiation import departure_gain_db
+from server.rendered_effects import EmitterEffects
 from server.rendering.convolver import FloatArray
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
@@ -129,9 +132,10 @@ def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
     memory = {name: _bytes(lane) for name, lane in lanes.items()}
     block_s = block_size / field.sample_rate
     responses_per_block = RESPONSES_PER_S * block_s
+    late_us, early_us = _response_us(field)
     response_us = 0.0
     if "exchanging" in us:
-        response_us = (_response_us(field) + us["exchanging"] - us["still"]) * responses_per_block
+        response_us = (late_us + us["exchanging"] - us["still"]) * responses_per_block
 
     def between(more: str, less: str) -> float:
         return max(0.0, us[more] - us[less])
@@ -148,7 +152,7 @@ def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
         EffectName.OCCLUSION: Cost(0.0, 0, finding["occlusion"]),
         EffectName.DIRECTIVITY: Cost(0.0, 0, finding["directivity"]),
         EffectName.HRTF: Cost(between("still", "one ear"), bytes_between("still", "one ear")),
-        EffectName.EARLY_REFLECTIONS: Cost(0.0, 0, finding["early reflections"] * responses_per_block),
+        EffectName.EARLY_REFLECTIONS: Cost(0.0, 0, early_us * responses_per_block),
         # Responses of where one walks are of where one looks.
         EffectName.HEAD_ROTATION: Cost(0.0, 0, 0.0, response_us),
         # The path that is searched tells what its edges take, too.
@@ -186,7 +190,7 @@ def _bytes(thing: object, seen: set[int] | None = None) -> int:
 def _finders(field: AcousticField) -> dict[str, float]:
     """Microseconds per emitter of what is computed of geometry for each pose."""
     bundle = field.bundle
-    manifest, filters = bundle.manifest, kemar(field.sample_rate)
+    manifest = bundle.manifest
     listener, emitters = np.array(manifest.start.listener), np.tile(manifest.start.emitter, (_EMITTERS, 1))
     finder = SoundPathFinder(bundle.floor_plan, manifest.speed_of_sound)
     beam, departure = _Placed(Pose((0.0, 0.0, 0.0)), CARDIOID), np.array([0.6, 0.8, 0.0])
@@ -194,24 +198,26 @@ def _finders(field: AcousticField) -> dict[str, float]:
         "occlusion": lambda: finder.find(listener, emitters),
         "directivity": lambda: [departure_gain_db(beam, departure) for _ in range(_EMITTERS)],
     }
-    early = EarlyReflections.of(bundle, filters)
-    if early is not None:
-        responses = np.zeros((_EMITTERS, 2, field.ir_samples), np.float32)
-        omni = [_Placed(Pose(manifest.start.emitter), OMNIDIRECTIONAL)] * _EMITTERS
-        computed["early reflections"] = lambda: early.add(responses, Pose(manifest.start.listener), omni)
-    return {"early reflections": 0.0, **_time_in_turns(computed, per=_EMITTERS)}
+    return _time_in_turns(computed, per=_EMITTERS)
 
 
-def _response_us(field: AcousticField) -> float:
-    """What the field takes for one response, before it is made ready and faded in."""
-    start, times_s = field.bundle.manifest.start, []
+def _response_us(field: AcousticField) -> tuple[float, float]:
+    """What one response takes before it is made ready and faded in: of what the field holds, and of the first
+    reflections."""
+    start = field.bundle.manifest.start
+    direct = DirectSound.of(field.bundle, kemar(field.sample_rate))
+    times_us: dict[bool, list[float]] = {False: [], True: []}
     for turn in range(_ROUNDS + 1):
-        started_s = time.thread_time()
-        field.impulse_responses([start.listener], [start.emitter], [0.1 * turn])
-        times_s.append(time.thread_time() - started_s)
-        if turn and sum(times_s) > _LONGEST_S:
+        listener = Pose.from_yaw(start.listener, 0.1 * turn)
+        for has_early, of_it in times_us.items():
+            effects = EmitterEffects(early=has_early, late=bool(field.bundle.manifest.fields))
+            started_s = time.thread_time()
+            composed_irs(field, direct, listener, [Emitter(0, Pose(start.emitter), effects=effects)])
+            of_it.append(1e6 * (time.thread_time() - started_s))
+        if turn and sum(map(sum, times_us.values())) > 1e6 * _LONGEST_S:
             break
-    return 1e6 * statistics.median(times_s[1:])
+    late_us, whole_us = (statistics.median(of_it[1:]) for of_it in times_us.values())
+    return late_us, max(0.0, whole_us - late_us)
 
 
 def _time_in_turns(lanes: dict[str, Callable[[], object]], *, per: int) -> dict[str, float]:
