@@ -86,6 +86,9 @@ def train(
     ] = None,
 ) -> None:
     """Train a field on a dataset. Run again after an interruption to go on; with torchrun, in several processes."""
+    # Targets are made of many small products, for which threads of linear algebra wait for each other; those of torch
+    # are its own.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from training.responses import open_responses
     from training.runs import configure, minutes_of
     from training.train import train as train_field
