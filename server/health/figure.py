@@ -53,6 +53,9 @@ def _draw_energy(axes: "Axes", health: Health) -> None:
             continue
         distance = np.linalg.norm(evidence.poses[:, LISTENER] - evidence.poses[:, EMITTER], axis=-1)
         axes.plot(distance, evidence.excess_db, ".", markersize=3.5, color=colour, label=name)
+    if all(evidence.excess_db is None for evidence in health.evidence.values()):
+        axes.text(0.5, 0.5, "no walls are known, or no field is there", ha="center", transform=axes.transAxes)
+        return
     axes.axhline(0.0, color=_BOUND, linestyle="--", label="bound")
     axes.legend(frameon=False, fontsize=8, loc="lower left")
 
