@@ -8,7 +8,7 @@ from pathlib import Path
 from server.clips import Clip, ClipLibrary, DecodeError
 from server.field.levels import Levels
 from server.hrtfs import HrtfLibrary
-from server.protocol import Place, SceneDescription
+from server.replies import Place, SceneDescription
 from server.scene.bundle import Bundle, bundled_scenes
 
 _logger = logging.getLogger(__name__)

@@ -7,10 +7,11 @@ from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose, Vector3
 from server.blocks import DryBlock
 from server.errors import RequestError
-from server.protocol import AddEmitter, LiveStatus, MoveEmitter
+from server.protocol import AddEmitter, MoveEmitter
 from server.rendered_effects import ALL_ON, EmitterEffects
 from server.rendering.convolver import PartitionedIr
 from server.rendering.sources import LiveSource
+from server.replies import LiveStatus
 
 _LIVE_LEAD_BLOCKS = 2
 _LIVE_QUEUE_S = 0.5

@@ -6,7 +6,7 @@ at most while poses change. Clocks are seconds of sound.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -60,7 +60,7 @@ class PlanRequest:
 
 class PlannedEffects:
     """Of one session in `place`. `scene` are the wishes of who made the scene, which `own` ones, of who listens,
-    override."""
+    override. `costs` tells what effects cost here, or nothing as long as nobody knows."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class PlannedEffects:
         output: Output = "headphones",
         scene: Overrides | None = None,
         own: Overrides | None = None,
-        costs: Costs | None = None,
+        costs: Callable[[], Costs] = dict,
     ) -> None:
         self.place = place
         self.output = output
@@ -78,7 +78,7 @@ class PlannedEffects:
         self.corrections: dict[EffectName, str] = {}
         self._scene = dict(scene or {})
         self._own = dict(own or {})
-        self._costs = costs or {}
+        self._costs = costs
         self._listener = Motion(listener, 0.0)
         self._emitters: dict[str, Motion] = {}
         self._is_stale = False
@@ -143,17 +143,20 @@ class PlannedEffects:
             Listener(listener, motion.speed_m_s(clock_s), motion.turns(clock_s), self.output),
             {name: self._emitter(name, emitter, clock_s) for name, emitter in emitters.items()},
         )
-        seen = _coarse(situation)
+        costs = self._costs()
+        seen = _coarse(situation), bool(costs)
         if not self._is_stale and seen == self._seen:
             return None
         self._is_stale, self._seen, self._in_flight = False, seen, True
-        return PlanRequest(situation, self.plan, self.overrides, dict(self.corrections), self._costs)
+        return PlanRequest(situation, self.plan, self.overrides, dict(self.corrections), costs)
 
     def accept(self, plan: Plan) -> bool:
-        """Put the plan asked for last into effect. Whether it switches anything."""
+        """Put the plan asked for last into effect. Whether it switches anything, or is the first to say what costs."""
         self._in_flight = False
         before, self.plan = self.plan, plan
-        return before is None or _switched_on(before) != _switched_on(plan)
+        if before is None or _switched_on(before) != _switched_on(plan):
+            return True
+        return before.cost_us + before.saved_us == 0 < plan.cost_us + plan.saved_us
 
     def give_up(self) -> None:
         """No plan came of the request: what is on stays on."""

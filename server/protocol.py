@@ -12,19 +12,16 @@ import struct
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from server.acoustics import directivity
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose, Quaternion
 from server.blocks import DryBlock, Encoding
-from server.durations import DurationHistogram
 from server.errors import RequestError
-from server.load import AUTO, Reason
-from server.scene.geometry import Opening
-from server.scene.manifest import Bounds, QualityLevel
-from server.scene.plan import Plan
+from server.load import AUTO
+from server.message import Message, Position
 from server.scene.situation import Output
 
 PROTOCOL: Final = 2
@@ -32,7 +29,6 @@ PROTOCOL: Final = 2
 BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
 PoseId = Annotated[int, Field(ge=0, lt=2**32)]
-Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Orientation = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 LevelName = Annotated[str, Field(max_length=256)]
 GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
@@ -40,15 +36,7 @@ GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
 _POSE_FIELDS = frozenset({"position", "orientation", "yaw", "listener"})
 
 
-class _Message(BaseModel):
-    # Unknown fields are refused: a misspelt "orientaton" would otherwise be heard as a head that never turns.
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
-
-    def serialize(self) -> str:
-        return self.model_dump_json()
-
-
-class _Directed(_Message):
+class _Directed(Message):
     """A position and where front is: a quaternion, or a yaw where up is up; with neither, front is along +x."""
 
     position: Position
@@ -81,7 +69,7 @@ class ListenerStart(_Directed):
     """Where the listener stands when the stream begins: pose 0."""
 
 
-class Hello(_Message):
+class Hello(Message):
     """First message. `sample_rate` may be left out; given, it has to be the scene's. `buffer_blocks` is how many blocks
     ahead of real time the server runs: more survives a worse network, less is heard sooner. `hrtf` names the head to
     hear through, one of GET /v1/hrtfs. `level` names a quality level of the scene, or leaves it to the server (auto):
@@ -98,11 +86,11 @@ class Hello(_Message):
     hrtf: Annotated[str, Field(max_length=256)] | None = None
     level: LevelName = AUTO
     output: Output = "headphones"
-    effects: Annotated[dict[str, bool], Field(max_length=32)] = {}
+    effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
     buffer_blocks: Annotated[int, Field(ge=1, le=32)] = 8
 
 
-class DirectivityPattern(_Message):
+class DirectivityPattern(Message):
     """How loud an emitter is in each direction, as seen by itself: one of the cardioid family, narrowed by `order`, or
     measured: `gains_db`, seven octave bands from 125 Hz of one gain for each of `angles_deg`, which rise from 0 (its
     front) to 180."""
@@ -164,7 +152,7 @@ class MoveEmitter(_Directed):
     pose_id: PoseId
 
 
-class SetGain(_Message):
+class SetGain(Message):
     """How loud an emitter is from now on, direct sound and reverberation alike."""
 
     type: Literal["set_gain"] = "set_gain"
@@ -172,23 +160,23 @@ class SetGain(_Message):
     gain_db: GainDb
 
 
-class SetLevel(_Message):
+class SetLevel(Message):
     """The quality level to hear from now on, or auto; a level changed says when."""
 
     type: Literal["set_level"] = "set_level"
     level: LevelName
 
 
-class SetEffects(_Message):
+class SetEffects(Message):
     """Effects to switch on or off whatever the plan of effects would decide, or, with null, to leave to it; and what
     the sound is heard from, from now on. A plan changed says what came of it."""
 
     type: Literal["set_effects"] = "set_effects"
-    effects: Annotated[dict[str, bool | None], Field(max_length=32)] = {}
+    effects: dict[str, bool | None] = Field(default_factory=dict, max_length=32)
     output: Output | None = None
 
 
-class RemoveEmitter(_Message):
+class RemoveEmitter(Message):
     type: Literal["remove_emitter"] = "remove_emitter"
     id: EmitterId
 
@@ -223,14 +211,14 @@ class ListenerPose(_Directed):
         return self._LAYOUT.pack(self.KIND, 0, 0, self.pose_id, *pose.position, *pose.orientation)
 
 
-class Acknowledge(_Message):
+class Acknowledge(Message):
     """Every block up to and including `sequence` has arrived."""
 
     type: Literal["acknowledge"] = "acknowledge"
     sequence: Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class Ping(_Message):
+class Ping(Message):
     type: Literal["ping"] = "ping"
     id: Annotated[int, Field(ge=0, lt=2**53)]  # what JavaScript counts exactly
 
@@ -279,203 +267,3 @@ def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
     else:
         code = "malformed_message"
     return RequestError(code, f"{field}: {first['msg']}" if field else str(first["msg"]), field=field)
-
-
-class Place(_Message):
-    position: Position
-    yaw: float = 0.0
-
-
-class SceneDescription(_Message):
-    """What a client needs to know of a scene; `corners` is the floor plan, counter-clockwise, or where no walls are
-    known the outline of the bounds. Of `channels` a scene has two ears or one microphone; a stream always has two.
-
-    `listener` and `emitter` are where to put a visitor and what he hears first.
-    """
-
-    id: str
-    name: str
-    description: str
-    sample_rate: int
-    ir_samples: int
-    channels: tuple[str, ...]
-    speed_of_sound: float
-    bounds: Bounds
-    walls_known: bool
-    corners: tuple[tuple[float, float], ...]
-    height_m: float
-    openings: tuple[Opening, ...]
-    listener: Place
-    emitter: Place
-    level: str
-    levels: tuple[QualityLevel, ...]
-
-
-class Welcome(_Message):
-    """Answer to a good hello. `window` is how many blocks may be unacknowledged before the server skips ahead. `level`
-    is the quality level heard at first."""
-
-    type: Literal["welcome"] = "welcome"
-    protocol: Literal[2] = PROTOCOL
-    session: str
-    scene: SceneDescription
-    sample_rate: int
-    block_size: int
-    channels: int
-    encoding: Encoding
-    buffer_blocks: int
-    window: int
-    ir_samples: int
-    hrtf: str
-    level: str
-
-
-class EmitterAdded(_Message):
-    """The emitter's first IR is in effect: its clip begins at `sample_clock`, in the block that follows, and so does
-    what was sent live, once enough of it waits."""
-
-    type: Literal["emitter_added"] = "emitter_added"
-    id: str
-    sample_clock: int
-
-
-class EmitterRemoved(_Message):
-    type: Literal["emitter_removed"] = "emitter_removed"
-    id: str
-
-
-class LevelChanged(_Message):
-    """From `sample_clock` on another quality is heard: impulse responses of `level`, at most `ir_rate_hz` a second for
-    each emitter or, where that is None, one with every pose; with `shared_tail` all emitters share one late tail.
-
-    `reason` is chosen (by the client), load (there is too much to do for what was heard before) or recovered (there no
-    longer is).
-    """
-
-    type: Literal["level_changed"] = "level_changed"
-    level: str
-    reason: Reason
-    ir_rate_hz: float | None
-    shared_tail: bool
-    sample_clock: int
-
-
-class EffectDecision(_Message):
-    """One effect on or off, of an emitter or, with null, of all that is heard. `change_jnd` is by how many
-    just-noticeable differences the `parameter` that changes most would change without it; `cost_us` per block and
-    `memory_bytes` are what it costs, or saves, null where that was not measured."""
-
-    name: str
-    emitter: str | None
-    called_for: bool
-    change_jnd: float
-    parameter: str
-    cost_us: float | None
-    memory_bytes: int | None
-    reason: str
-    overridden: bool
-
-
-class PlanChanged(_Message):
-    """From `sample_clock` on these effects are heard, or their change is under way. Microseconds per block."""
-
-    type: Literal["plan_changed"] = "plan_changed"
-    decisions: tuple[EffectDecision, ...]
-    cost_us: float
-    saved_us: float
-    sample_clock: int
-
-    @classmethod
-    def of(cls, plan: Plan, sample_clock: int) -> "PlanChanged":
-        # Not validated: a plan of many emitters is long, and this is made on the audio thread.
-        decisions = tuple(
-            EffectDecision.model_construct(**{**vars(each), "change_jnd": round(each.change_jnd, 3)})
-            for each in plan.decisions
-        )
-        return cls.model_construct(
-            decisions=decisions, cost_us=plan.cost_us, saved_us=plan.saved_us, sample_clock=sample_clock
-        )
-
-
-class Durations(_Message):
-    """Milliseconds that a half, 99 % and 99.9 % did not exceed; None before the first."""
-
-    p50: float | None
-    p99: float | None
-    p99_9: float | None
-
-    @classmethod
-    def of(cls, durations: DurationHistogram) -> Self:
-        def milliseconds(share: float) -> float | None:
-            quantile_s = durations.quantile_s(share)
-            return None if quantile_s is None else round(1000 * quantile_s, 3)
-
-        return cls(p50=milliseconds(0.5), p99=milliseconds(0.99), p99_9=milliseconds(0.999))
-
-
-class LiveStatus(_Message):
-    """What became of a live emitter's samples: waiting, dropped because too many waited, silenced because they were no
-    audio; and how often there were too few."""
-
-    id: str
-    samples_queued: int
-    samples_dropped: int
-    samples_gated: int
-    underruns: int
-
-
-class Status(_Message):
-    """Once a second. Counts and durations run from the start of the stream.
-
-    `buffer_ms` is how far ahead of real time it is. `render_ms` is what a block costs; of blocks rendered together with
-    other streams', its share. `lateness_ms` is how long after it was due a block was ready to be sent: what it cost,
-    what was rendered with it, and how late the audio thread woke. `pose_ms` and `reverberation_ms` run from the arrival
-    of a pose to the first block, ready to be sent, whose direct sound and whose reverberation has it. `level` is the
-    quality level heard, and `ir_rate_hz` how many impulse responses an emitter gets per second at most.
-    `blocks_limited` would have been too loud, and were turned down.
-    """
-
-    type: Literal["status"] = "status"
-    sample_clock: int
-    blocks_sent: int
-    blocks_late: int
-    blocks_dropped: int
-    unacknowledged: int
-    buffer_ms: float
-    render_ms: Durations
-    lateness_ms: Durations
-    ir_ms: Durations
-    pose_ms: Durations
-    reverberation_ms: Durations
-    ir_exchanges: int
-    blocks_limited: int
-    level: str
-    ir_rate_hz: float | None
-    live: tuple[LiveStatus, ...] = ()
-
-
-class Pong(_Message):
-    type: Literal["pong"] = "pong"
-    id: int
-
-
-class Error(_Message):
-    """What was wrong with a message; the stream goes on unless it was the hello."""
-
-    type: Literal["error"] = "error"
-    code: str
-    message: str
-    field: str | None = None
-
-    @classmethod
-    def from_refusal(cls, refusal: RequestError) -> Self:
-        return cls(code=refusal.code, message=str(refusal), field=refusal.field)
-
-
-ServerMessage = Welcome | EmitterAdded | EmitterRemoved | LevelChanged | PlanChanged | Status | Pong | Error
-_SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
-
-
-def parse_server_message(data: str) -> ServerMessage:
-    """A text message as a client receives it; raises pydantic.ValidationError."""
-    return _SERVER.validate_json(data)

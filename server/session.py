@@ -34,17 +34,10 @@ from server.protocol import (
     Acknowledge,
     AddEmitter,
     ClientMessage,
-    EmitterAdded,
-    EmitterRemoved,
-    Error,
     Hello,
-    LevelChanged,
     ListenerPose,
-    LiveStatus,
     MoveEmitter,
-    PlanChanged,
     RemoveEmitter,
-    ServerMessage,
     SetEffects,
     SetGain,
 )
@@ -54,6 +47,7 @@ from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
 from server.rendering.sources import ClipPlayer, Source
+from server.replies import EmitterAdded, EmitterRemoved, Error, LevelChanged, LiveStatus, PlanChanged, ServerMessage
 from server.scene.bundle import Bundle
 from server.scene.effects import read_overrides, require_effect
 from server.scene.plan import Plan
@@ -87,7 +81,7 @@ class Session:
         shared_tail: bool = False,
         window: int = 40,
         place: Place | None = None,
-        costs: Costs | None = None,
+        costs: Callable[[], Costs] = dict,
     ) -> None:
         field = levels.default
         if hello.protocol != PROTOCOL:

@@ -19,18 +19,9 @@ from server.ir_request import IrRequest, IrResponse, compute_irs
 from server.load import Ladder, Offer, Reason, Strain, ir_interval_s
 from server.pacing import StreamClock
 from server.planned_effects import PlanRequest
-from server.protocol import (
-    AddEmitter,
-    ClientMessage,
-    Durations,
-    Error,
-    ListenerPose,
-    MoveEmitter,
-    ServerMessage,
-    SetLevel,
-    Status,
-)
+from server.protocol import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
 from server.regret import FIRST_S, PERIOD_S, SHARE, Regret, RegretRecord
+from server.replies import Durations, Error, ServerMessage, Status
 from server.scene.plan import Plan
 from server.session import Session
 

@@ -26,18 +26,9 @@ from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.load import Offer, Rung
 from server.places import place_of
-from server.protocol import (
-    AddEmitter,
-    ClientMessage,
-    Error,
-    Hello,
-    Ping,
-    Pong,
-    ServerMessage,
-    Welcome,
-    parse_client_message,
-)
+from server.protocol import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
 from server.rendering.ingest import DryAudio
+from server.replies import Error, Pong, ServerMessage, Welcome
 from server.scene.planner import Costs
 from server.scene.situation import Place
 from server.session import Session
@@ -194,10 +185,8 @@ class Connection:
             max_emitters=host.settings.max_emitters,
             shared_tail=host.settings.shared_tail,
             window=window,
-            place=place_of(
-                levels.bundle, host.places[hello.scene].reverberations, block_size=hello.block_size
-            ),
-            costs=host.effect_costs.get(hello.scene),
+            place=place_of(levels.bundle, host.places[hello.scene].reverberations, block_size=hello.block_size),
+            costs=lambda: host.effect_costs.get(hello.scene, {}),
         )
 
     async def _pump(self, stream: Stream, hello: Hello) -> None:

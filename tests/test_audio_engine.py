@@ -13,7 +13,8 @@ from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
 from server.field.levels import Levels
 from server.load import Offer
-from server.protocol import PROTOCOL, AddEmitter, EmitterAdded, Error, Hello, ListenerPose, Status
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
+from server.replies import EmitterAdded, Error, Status
 from server.session import Session
 from server.stream import MAX_WAITING_MESSAGES, Stream, StreamFailed, TimedBlock
 

@@ -15,17 +15,8 @@ from server.catalogue import open_clips
 from server.field.levels import Levels
 from server.load import Offer
 from server.places import place_of_field
-from server.protocol import (
-    PROTOCOL,
-    Acknowledge,
-    AddEmitter,
-    Error,
-    Hello,
-    Ping,
-    RemoveEmitter,
-    Status,
-    parse_server_message,
-)
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, Ping, RemoveEmitter
+from server.replies import Error, Status, parse_server_message
 from server.session import Session
 from server.settings import Settings
 from server.streaming import Connection, StreamHost

@@ -15,20 +15,10 @@ from server.load import Rung
 from server.motion import REST_S
 from server.places import place_of_field
 from server.planned_effects import PERIOD_S, PlannedEffects
-from server.protocol import (
-    PROTOCOL,
-    AddEmitter,
-    EmitterAdded,
-    Error,
-    Hello,
-    ListenerPose,
-    ListenerStart,
-    MoveEmitter,
-    PlanChanged,
-    SetEffects,
-)
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, ListenerStart, MoveEmitter, SetEffects
 from server.render import PathPoint, RenderedEmitter, render
 from server.rendering.convolver import Convolver
+from server.replies import EmitterAdded, Error, PlanChanged
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import EffectName
 from server.session import Session

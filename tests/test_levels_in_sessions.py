@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from server.field.levels import Levels
 from server.ir_request import compute_irs
 from server.load import Rung
-from server.protocol import PROTOCOL, AddEmitter, EmitterAdded, Hello, LevelChanged, ListenerPose, RemoveEmitter
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, RemoveEmitter
+from server.replies import EmitterAdded, LevelChanged
 from server.scene.manifest import QualityLevel
 from server.session import Session
 

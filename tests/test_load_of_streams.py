@@ -8,7 +8,8 @@ import pytest
 from server.audio_engine import AudioEngine
 from server.field.levels import Levels
 from server.load import Offer
-from server.protocol import PROTOCOL, AddEmitter, Error, Hello, LevelChanged, ListenerPose, SetLevel, Status
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, SetLevel
+from server.replies import Error, LevelChanged, Status
 from server.scene.manifest import QualityLevel
 from server.session import Session
 from server.stream import Stream

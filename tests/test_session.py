@@ -18,9 +18,6 @@ from server.protocol import (
     Acknowledge,
     AddEmitter,
     DirectivityPattern,
-    EmitterAdded,
-    EmitterRemoved,
-    Error,
     Hello,
     ListenerPose,
     ListenerStart,
@@ -29,6 +26,7 @@ from server.protocol import (
     RemoveEmitter,
     SetGain,
 )
+from server.replies import EmitterAdded, EmitterRemoved, Error
 from server.session import Session
 from server.whole_field import WholeField
 

@@ -12,22 +12,8 @@ from starlette.websockets import WebSocketDisconnect
 from server.app import create_app
 from server.blocks import AudioBlock, DryBlock
 from server.field.levels import Levels
-from server.protocol import (
-    PROTOCOL,
-    Acknowledge,
-    AddEmitter,
-    EmitterAdded,
-    EmitterRemoved,
-    Error,
-    Hello,
-    ListenerPose,
-    Ping,
-    Pong,
-    RemoveEmitter,
-    Status,
-    Welcome,
-    parse_server_message,
-)
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter
+from server.replies import EmitterAdded, EmitterRemoved, Error, Pong, Status, Welcome, parse_server_message
 from server.settings import Settings
 
 HELLO = Hello(protocol=PROTOCOL, scene="flat")

@@ -17,7 +17,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.blocks import AudioBlock
 from server.durations import DurationHistogram
-from server.protocol import Durations, ListenerPose
+from server.protocol import ListenerPose
+from server.replies import Durations
 from server.stream import Stream
 from server.streaming import StreamHost
 

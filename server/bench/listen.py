@@ -12,16 +12,8 @@ from server.acoustics.geometry import Vector3
 from server.blocks import AudioBlock
 from server.clips import ClipLibrary
 from server.errors import NafirError
-from server.protocol import (
-    PROTOCOL,
-    Acknowledge,
-    AddEmitter,
-    Error,
-    Hello,
-    ListenerPose,
-    Welcome,
-    parse_server_message,
-)
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.replies import Error, Welcome, parse_server_message
 
 _TURN_S = 12.0
 _ACKNOWLEDGE_EVERY = 4

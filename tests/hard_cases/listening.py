@@ -9,11 +9,12 @@ from scipy.signal import fftconvolve
 from server.field.levels import Levels
 from server.ir_request import compute_irs
 from server.load import Rung
-from server.protocol import PROTOCOL, AddEmitter, Error, Hello
+from server.protocol import PROTOCOL, AddEmitter, Hello
 from server.rendering.direct_path import PathTarget
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
+from server.replies import Error
 from server.session import Session
 
 RATE, SIZE, IR_SAMPLES = 24_000, 256, 6_000

@@ -14,7 +14,8 @@ from server.blocks import AudioBlock
 from server.catalogue import describe_scene
 from server.errors import NafirError
 from server.field.levels import Levels
-from server.protocol import AddEmitter, Welcome, parse_client_message
+from server.protocol import AddEmitter, parse_client_message
+from server.replies import Welcome
 
 
 def test_field_bench_reports_the_scene_it_was_given(bundle):

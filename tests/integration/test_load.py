@@ -12,17 +12,8 @@ from websockets.sync.client import connect
 
 from server.blocks import AudioBlock
 from server.field.levels import Levels
-from server.protocol import (
-    PROTOCOL,
-    Acknowledge,
-    AddEmitter,
-    Hello,
-    LevelChanged,
-    ListenerPose,
-    SetLevel,
-    Status,
-    parse_server_message,
-)
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, SetLevel
+from server.replies import LevelChanged, Status, parse_server_message
 from server.scene.manifest import QualityLevel
 
 # Long blocks, so that what a response costs fits into one on a slow host too.

@@ -16,8 +16,8 @@ from server.clips import ClipLibrary
 from server.direct_sound import DirectSound
 from server.field.field import AcousticField
 from server.field.levels import Levels
-from server.protocol import EmitterAdded, Welcome
 from server.render import RenderedEmitter, read_path, render
+from server.replies import EmitterAdded, Welcome
 
 WALK = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "walk.py"
 
