@@ -30,6 +30,11 @@ def expected_phasor(mean: _Complex, variance: npt.NDArray[np.floating]) -> npt.N
     return np.asarray(mean / np.maximum(magnitude, least) * certainty)
 
 
+def _by_yaw(products: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """(frequency, product, yaw, cell) to (yaw, product, frequency, cell)."""
+    return products.transpose(2, 1, 0, 3)
+
+
 class ExpectedTargets:
     """Of a dataset whose responses were simulated."""
 
@@ -45,23 +50,21 @@ class ExpectedTargets:
         advance = self._dataset.onset_s[emitter, listener] * self._dataset.sample_rate - LEAD_SAMPLES
         diffuse = self._spectrograms.diffuse_products(emitter, listener, self._pool, advance)
         mean = self._mean(emitter, listener, advance)
-        left, right = mean[:, 0], mean[:, 1]
+        left, right = (np.moveaxis(mean[:, ear], 1, 0) for ear in (0, 1))
         cross = left * np.conj(right)
-        specular = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag])
-        products = diffuse + specular @ self._pool[: mean.shape[-1]]
-        pooled = self._bands @ products
-        levels = products[:2, ..., :fine], pooled[:2, ..., fine:]
-        of_bins, of_cells = (np.moveaxis(np.sqrt(power), 0, 1) for power in levels)
-        loudness = np.sqrt(pooled[0] * pooled[1])
+        specular = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag], axis=1)
+        products = diffuse + np.tensordot(specular.astype(np.float32), self._pool[: mean.shape[-1]], 1)
+        pooled = np.tensordot(self._bands, products, 1)
+        loudness = np.sqrt(pooled[:, 0] * pooled[:, 1])
         known = np.s_[..., : cells.known_frames]
         # What lies beneath the codec's floor has no phase worth learning.
-        variance = np.moveaxis(diffuse[:2], 0, 1)[known] + cells.codec.log_floor**2
+        variance = _by_yaw(diffuse[:, :2])[known] + cells.codec.log_floor**2
         phasor = expected_phasor(mean[known], variance)
         parts = (
-            cells.codec.log_magnitude(of_bins),
-            cells.codec.log_magnitude(of_cells),
+            cells.codec.log_magnitude(_by_yaw(np.sqrt(products[:, :2, :, :fine]))),
+            cells.codec.log_magnitude(_by_yaw(np.sqrt(pooled[:, :2, :, fine:]))),
             np.stack([phasor.real, phasor.imag], axis=1),
-            np.moveaxis(pooled[2:] / np.maximum(loudness, 1e-20), 0, 1),
+            _by_yaw(pooled[:, 2:] / np.maximum(loudness, 1e-20)[:, None]),
         )
         return np.concatenate([part.reshape(len(mean), -1) for part in parts], axis=-1).astype(np.float16)
 

@@ -51,7 +51,7 @@ def test_expected_products_are_the_mean_of_all_draws(codec, expected, drawn):
     """Power in decibels, and the complex coherence of the ears, in octaves or so of the middle of the spectrum."""
     some = np.s_[..., 4:-4, 6:-6]
     specular = products(codec.transform(expected.specular(0, 3)))
-    found = (specular + expected.diffuse_products(0, 3, every_frame(codec)))[some]
+    found = (specular + expected.diffuse_products(0, 3, every_frame(codec)).transpose(1, 2, 0, 3))[some]
     true = products(drawn).mean(axis=1)[some]
     power = np.stack([found[:2], true[:2]]).mean(axis=(2, 3))  # (which, ear, frame)
     loud = power[1] > 1e-6
