@@ -123,6 +123,13 @@ def test_any_bits_at_all_leave_the_door_as_sound(measured, data):
         assert audio.silenced == np.count_nonzero(~(np.abs(given_bits) <= LOUDEST))
 
 
+@pytest.mark.parametrize("value", [1e-45, -1e-45, 1e-39, -1.17e-38])
+def test_a_denormal_sample_is_silence_and_nothing_to_complain_of(measured, value):
+    audio = DryAudio(np.array([0.5, value, 0.5], np.float32))
+    measured("what is left of it", float(np.abs(audio.samples[1])), 0.0)
+    assert audio.silenced == 0
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.int16, np.int64, np.float16, np.bool_])
 def test_samples_of_other_types_come_in_as_floats(measured, dtype):
     values = np.array([0, 1, 1, 0, 1], dtype)
