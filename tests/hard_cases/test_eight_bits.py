@@ -4,8 +4,10 @@ random weights, whose numbers fill the scales as those of a trained one do."""
 from itertools import product
 
 import numpy as np
+import onnx
 import pytest
 import torch
+from onnx import numpy_helper
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
@@ -30,15 +32,18 @@ def graphs():
         field.mean[field.heads.slices["fine"]] = -3.0
         field.mean[field.heads.slices["late"]] = -6.0
     poses = tuple(torch.from_numpy(part[:2]) for part in scattered(2))
-    sessions = []
-    for outlier in (False, True):
-        with torch.no_grad():
-            if outlier:
-                field.basis[3, field.heads.slices["fine"].start + 70] *= 1_000.0
-        exact = to_onnx(ExportedField(field, cells).eval(), poses, OUTPUTS)
-        small = to_int8(exact, least_weights=field.basis.numel())
-        sessions += [open_session(model.SerializeToString()) for model in (exact, small)]
-    return sessions
+    plain = to_onnx(ExportedField(field, cells).eval(), poses, OUTPUTS)
+    uneven = onnx.ModelProto()
+    uneven.CopyFrom(plain)
+    (basis,) = [tensor for tensor in uneven.graph.initializer if tuple(tensor.dims) == tuple(field.basis.shape)]
+    weights = numpy_helper.to_array(basis).copy()
+    weights[3, field.heads.slices["fine"].start + 70] *= 1_000.0
+    basis.CopyFrom(numpy_helper.from_array(weights, basis.name))
+    return [
+        open_session(model.SerializeToString())
+        for exact in (plain, uneven)
+        for model in (exact, to_int8(exact, least_weights=weights.size))
+    ]
 
 
 def scattered(count):
