@@ -7,9 +7,10 @@ in time of the thread that measures, so that what else runs meanwhile counts lit
 import statistics
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -37,6 +38,7 @@ _EMITTERS = 4
 _BLOCKS = 48
 _ROUNDS = 5
 _LONGEST_S = 0.25
+_Key = TypeVar("_Key", bound=Hashable)
 
 
 class _Placed(NamedTuple):
@@ -52,6 +54,7 @@ class _Lane:
         field: AcousticField,
         block_size: int,
         *,
+        emitters: int = _EMITTERS,
         head: bool = True,
         response: bool = True,
         direct: bool = True,
@@ -70,16 +73,17 @@ class _Lane:
             filters=kemar(rate),
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
-            max_emitters=_EMITTERS,
+            max_emitters=emitters,
             shared_tail=shared_tail,
             outputs=channels,
             has_head=head,
         )
         rng = np.random.default_rng(0)
         decay = 10 ** (-3 * np.arange(field.ir_samples) / field.ir_samples)
-        self._names = [str(number) for number in range(_EMITTERS)]
+        self._names = [str(number) for number in range(emitters)]
         self._moves, self._block = moves, 0
         self._exchanged: list[FloatArray] = []
+        self._blocks_per_response = max(1, round(rate / block_size / RESPONSES_PER_S))
         for name in self._names:
             clip = rng.standard_normal(rate).astype(np.float32)
             self._renderer.add_emitter(name, ClipPlayer(clip, loop=True), awaits_ir=response)
@@ -92,20 +96,22 @@ class _Lane:
         self._walk()
 
     def play(self) -> None:
-        for _ in range(_BLOCKS):
+        for block in range(_BLOCKS):
             if self._moves:
                 self._walk()
-            for name, response in zip(self._names, self._exchanged, strict=False):
-                self._renderer.set_ir(name, self._renderer.prepare(response))
+            if block % self._blocks_per_response == 0:
+                for name, response in zip(self._names, self._exchanged, strict=False):
+                    self._renderer.set_ir(name, self._renderer.prepare(response))
             self._renderer.process()
 
     def _walk(self) -> None:
         """A centimetre on, and a little turned, block by block."""
         self._block += 1
-        angle = 0.02 * self._block + np.arange(_EMITTERS)
-        arrivals = np.stack([np.cos(angle), np.sin(angle), np.zeros(_EMITTERS)], axis=-1)
-        lengths_m = 3 + np.sin(0.01 * self._block) + np.arange(_EMITTERS)
-        self._renderer.set_paths(self._names, lengths_m, arrivals, np.zeros((_EMITTERS, len(OCTAVE_BANDS_HZ))))
+        count = len(self._names)
+        angle = 0.02 * self._block + np.arange(count)
+        arrivals = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=-1)
+        lengths_m = 3 + np.sin(0.01 * self._block) + np.arange(count)
+        self._renderer.set_paths(self._names, lengths_m, arrivals, np.zeros((count, len(OCTAVE_BANDS_HZ))))
 
 
 @lru_cache(maxsize=16)
@@ -127,44 +133,63 @@ def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
         }
     else:
         made = {name: {**options, "response": False} for name, options in made.items()}
-    lanes = {name: _Lane(field, block_size, **options) for name, options in made.items()}
-    us = _time_in_turns({name: lane.play for name, lane in lanes.items()}, per=_BLOCKS * _EMITTERS)
-    memory = {name: _bytes(lane) for name, lane in lanes.items()}
-    block_s = block_size / field.sample_rate
-    responses_per_block = RESPONSES_PER_S * block_s
+    lanes = {
+        (name, count): _Lane(field, block_size, emitters=count, **options)
+        for name, options in made.items()
+        for count in (1, _EMITTERS)
+    }
+    us = _time_in_turns({key: lane.play for key, lane in lanes.items()}, per=_BLOCKS)
+    responses_per_block = RESPONSES_PER_S * block_size / field.sample_rate
     late_us, early_us = _response_us(field)
-    response_us = 0.0
-    if "exchanging" in us:
-        response_us = (late_us + us["exchanging"] - us["still"]) * responses_per_block
 
-    def between(more: str, less: str) -> float:
-        return max(0.0, us[more] - us[less])
+    def between(more: str, less: str) -> tuple[float, float]:
+        """Of each emitter, and of there being any."""
+        one, all_ = (us[more, count] - us[less, count] for count in (1, _EMITTERS))
+        each = max(0.0, (all_ - one) / (_EMITTERS - 1))
+        return each, max(0.0, one - each)
 
     def bytes_between(more: str, less: str) -> int:
-        return max(0, memory[more] - memory[less]) // _EMITTERS
+        most, least = (_bytes(lanes[name, _EMITTERS]) for name in (more, less))
+        return max(0, most - least) // _EMITTERS
+
+    def while_moving(more: str, less: str) -> Cost:
+        each, first = between(more, less)
+        return Cost(0.0, 0, moving_us=each, moving_first_us=first)
 
     finding = _finders(field)
-    costs = {
-        EffectName.DIRECT_PATH: Cost(between("still", "without direct"), 0),
-        EffectName.DISTANCE_ATTENUATION: Cost(0.0, 0, between("moving", "without distance")),
-        EffectName.PROPAGATION_DELAY: Cost(0.0, 0, between("moving", "still"), between("moving", "still")),
-        EffectName.AIR_ABSORPTION: Cost(0.0, 0, between("moving", "without air")),
-        EffectName.OCCLUSION: Cost(0.0, 0, finding["occlusion"]),
-        EffectName.DIRECTIVITY: Cost(0.0, 0, finding["directivity"]),
-        EffectName.HRTF: Cost(between("still", "one ear"), bytes_between("still", "one ear")),
-        EffectName.EARLY_REFLECTIONS: Cost(0.0, 0, early_us * responses_per_block),
-        # Responses of where one walks are of where one looks.
-        EffectName.HEAD_ROTATION: Cost(0.0, 0, 0.0, response_us),
-        # The path that is searched tells what its edges take, too.
-        EffectName.DIFFRACTION: Cost(0.0, 0),
-        EffectName.PER_SOURCE_TAIL: Cost(0.0, 0),
-        EffectName.LATE_REVERBERATION: Cost(0.0, 0),
+    nothing = Cost(0.0, 0)
+    direct_us, first_direct_us = between("still", "without direct")
+    head_us, first_head_us = between("still", "one ear")
+    following = while_moving("moving", "still")
+    costs = dict.fromkeys(EffectName, nothing) | {
+        EffectName.DIRECT_PATH: Cost(direct_us, 0, first_us=first_direct_us),
+        EffectName.DISTANCE_ATTENUATION: while_moving("moving", "without distance"),
+        EffectName.PROPAGATION_DELAY: replace(
+            following, turning_us=following.moving_us, turning_first_us=following.moving_first_us
+        ),
+        EffectName.AIR_ABSORPTION: while_moving("moving", "without air"),
+        # The path that is searched tells what its edges take, too: diffraction costs nothing beside it.
+        EffectName.OCCLUSION: Cost(0.0, 0, moving_us=finding["occlusion"]),
+        EffectName.DIRECTIVITY: Cost(0.0, 0, moving_us=finding["directivity"]),
+        EffectName.HRTF: Cost(head_us, bytes_between("still", "one ear"), first_us=first_head_us),
+        EffectName.EARLY_REFLECTIONS: Cost(0.0, 0, moving_us=early_us * responses_per_block),
     }
-    if "shared" in us:
-        costs[EffectName.PER_SOURCE_TAIL] = Cost(between("still", "shared"), bytes_between("still", "shared"))
-        costs[EffectName.LATE_REVERBERATION] = Cost(
-            between("still", "without response"), bytes_between("still", "without response"), response_us
-        )
+    if field.bundle.manifest.fields:
+        late, tail = between("still", "without response"), between("still", "shared")
+        exchange_us, first_exchange_us = between("exchanging", "still")
+        response_us = late_us * responses_per_block + exchange_us
+        costs |= {
+            EffectName.LATE_REVERBERATION: Cost(
+                late[0],
+                bytes_between("still", "without response"),
+                moving_us=response_us,
+                first_us=late[1],
+                moving_first_us=first_exchange_us,
+            ),
+            EffectName.PER_SOURCE_TAIL: Cost(tail[0], bytes_between("still", "shared"), first_us=tail[1]),
+            # Responses of where one walks are of where one looks.
+            EffectName.HEAD_ROTATION: Cost(0.0, 0, turning_us=response_us, turning_first_us=first_exchange_us),
+        }
     return costs
 
 
@@ -220,9 +245,9 @@ def _response_us(field: AcousticField) -> tuple[float, float]:
     return late_us, max(0.0, whole_us - late_us)
 
 
-def _time_in_turns(lanes: dict[str, Callable[[], object]], *, per: int) -> dict[str, float]:
+def _time_in_turns(lanes: dict[_Key, Callable[[], object]], *, per: int) -> dict[_Key, float]:
     """Microseconds of each, divided by `per`; a first round warms up."""
-    times_s: dict[str, list[float]] = {name: [] for name in lanes}
+    times_s: dict[_Key, list[float]] = {name: [] for name in lanes}
     for _ in range(_ROUNDS + 1):
         for name, lane in lanes.items():
             started_s = time.thread_time()

@@ -34,12 +34,16 @@ _OF_EACH = tuple(name for name, effect in CATALOGUE.items() if not effect.is_sha
 @dataclass(frozen=True)
 class Cost:
     """Of one emitter, where an effect is on: microseconds per block and bytes; `moving_us` more while it or the
-    listener moves, or `turning_us` while only the head turns."""
+    listener moves, or `turning_us` while only the head turns. What it costs that there is any such emitter, all share:
+    `first_us` and so on."""
 
     us: float
     memory_bytes: int
     moving_us: float = 0.0
     turning_us: float = 0.0
+    first_us: float = 0.0
+    moving_first_us: float = 0.0
+    turning_first_us: float = 0.0
 
 
 Costs = Mapping[EffectName, Cost]
@@ -158,10 +162,11 @@ class _Planner:
         )
 
     def _cost_us(self, cost: Cost, emitter: Emitter) -> float:
-        listener = self._situation.listener
+        listener, share = self._situation.listener, 1 / len(self._situation.emitters)
+        us = cost.us + share * cost.first_us
         if emitter.speed_m_s or listener.speed_m_s:
-            return cost.us + cost.moving_us
-        return cost.us + cost.turning_us if listener.turns else cost.us
+            return us + cost.moving_us + share * cost.moving_first_us
+        return us + cost.turning_us + share * cost.turning_first_us if listener.turns else us
 
     def _was_on(self, name: EffectName, emitter: str | None) -> bool:
         if self._previous is None:

@@ -243,6 +243,19 @@ def test_costs_are_counted_where_they_fall():
     assert plan.about(EffectName.HRTF)[0].memory_bytes == 20
 
 
+def test_what_it_costs_that_there_is_any_is_shared_by_all():
+    costs = {EffectName.HRTF: Cost(2.0, 0, first_us=10.0, moving_us=5.0, moving_first_us=1.0, turning_us=3.0)}
+
+    def cost_us(count: int, **listener) -> float | None:
+        (decision,) = make_plan(situation(OPEN, *[at(3)] * count, **listener), costs=costs).about(EffectName.HRTF)
+        return decision.cost_us
+
+    assert cost_us(1) == 12
+    assert cost_us(4) == pytest.approx(4 * 2 + 10)
+    assert cost_us(4, turns=True) == pytest.approx(4 * (2 + 3) + 10)
+    assert cost_us(4, speed_m_s=1.0, turns=True) == pytest.approx(4 * (2 + 5) + 11)
+
+
 def test_the_same_situation_has_the_same_plan_and_json_holds_it():
     asked = situation(CORNER, at(1.5, 7, directivity=CARDIOID), stands=(7, 1.5, 1.5), speed_m_s=1.4, turns=True)
     assert make_plan(asked) == make_plan(asked)
