@@ -6,6 +6,7 @@
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT] = [296, 132];
 const MARGIN = { left: 26, right: 14, top: 12, bottom: 22 };
+const LETTER = 6.5; // width of one in a name
 const KEPT = 3; // changes told
 const REASONS = {
   chosen: "as you chose",
@@ -98,6 +99,7 @@ export class Frontier extends EventTarget {
   #draw() {
     const heard = this.#levels.find(({ name }) => name === this.#heard);
     this.#name.textContent = heard ? heard.name : "–";
+    this.#name.classList.toggle("long", this.#name.textContent.length > 16);
     const cost = heard ? hereOf(heard) : null;
     this.#note.textContent = heard ? (cost === null ? "" : `${milliseconds(cost)} here`) : "once playing";
     this.#chart.replaceChildren();
@@ -164,6 +166,8 @@ export class Frontier extends EventTarget {
     mark.addEventListener("click", () => this.#choose(level.name));
     if (!isHeard) return;
     const isLeft = at > WIDTH * 0.6;
+    const room = isLeft ? at - MARGIN.left : WIDTH - at;
+    if (level.name.length * LETTER + 12 > room) return; // it is above the chart in any case
     draw("text", { x: at + (isLeft ? -12 : 12), y: height - 7, class: isLeft ? "name end" : "name" }, this.#chart, level.name);
   }
 }
