@@ -140,3 +140,29 @@ def test_a_part_of_the_pairs_is_trained_for_a_part_of_a_minute(nafir_train, data
     written = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (written["share"], written["minutes"], written["shape"]["rank"]) == (0.5, 0.01, 16)
     assert written["learning_rate"] == 0.001
+
+
+def test_results_of_scenes_come_into_one_table(nafir_train, dataset, tiny_bundle, tmp_path):
+    """With what every step took, where that was written down beside them."""
+    results = tmp_path / "table.json"
+    code, table, _ = nafir_train(
+        "evaluate", tiny_bundle.folder, dataset.folder, "--methods", "nearest", "--output", results, "--markdown"
+    )
+    assert code == 0
+    (tmp_path / "times.jsonl").write_text('{"step": "train", "wall_s": 90, "cpu_s": 60, "rc": 0}\n')
+    code, out, _ = nafir_train("tabulate", results)
+    assert code == 0
+    (ours,) = (line for line in out.splitlines() if line.startswith(f"| {dataset.scene.id} | standard |"))
+    (alone,) = (line for line in table.splitlines() if line.startswith("| standard |"))
+    spectral_loss = [line.replace("*", "").split("|") for line in (ours, alone)]
+    assert spectral_loss[0][3].strip() == spectral_loss[1][2].strip()
+    assert "| all | 1.5 (1.0) | 1.5 (1.0) |" in out
+    (record,) = json.loads(nafir_train("tabulate", results, "--json")[1])
+    assert record["times"] == [{"step": "train", "wall_s": 90.0, "cpu_s": 60.0}]
+
+
+def test_the_length_of_a_run_is_said_once(nafir_train, dataset, run, tmp_path):
+    code, _, err = nafir_train("train", dataset.folder, "-o", tmp_path / "r", "--minutes", "1", "--as-long-as", run)
+    assert code == 2
+    assert "leave one out" in err
+    assert not (tmp_path / "r").exists()

@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from training import train as train_module
 from training.learning.factorised import FactorisedLearner, RecipeError
+from training.learning.kinds import learner_of
 from training.learning.naf import NafLearner
 from training.learning.pairs import split
 from training.learning.precision import bfloat16_gains
@@ -21,7 +22,15 @@ from training.models.naf import NafShape
 from training.models.stored_targets import load_targets
 from training.models.targets import codec_of
 from training.responses import SimulatedResponses
-from training.runs import Configuration, FactorisedRecipe, NafRecipe, RunError, configure, dataset_folder
+from training.runs import (
+    Configuration,
+    FactorisedRecipe,
+    NafRecipe,
+    RunError,
+    configure,
+    dataset_folder,
+    minutes_of,
+)
 from training.train import DivergedError, load_learner, train
 
 
@@ -113,6 +122,17 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configura
     assert torch.log(corrected / true).abs() < 0.1
     for name in ("phasor", "interaural"):
         assert not field.level_correction[field.heads.slices[name]].any()
+
+
+def test_a_run_says_how_long_it_took_with_its_targets(dataset, run, tmp_path):
+    training_s = losses(run, "seconds")[-1]
+    learner = learner_of(SimulatedResponses(dataset), Configuration.read(run))
+    learner.prepare(Progress(disable=True))
+    assert learner.prepared_s > 0
+    # What the targets of this dataset once took, whoever computes them now.
+    assert 60 * minutes_of(run) == pytest.approx(training_s + learner.prepared_s, abs=0.5)
+    with pytest.raises(RunError, match="holds no checkpoint"):
+        minutes_of(tmp_path)
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"epochs": 21}, {"learning_rate": 1e-3}])
