@@ -145,7 +145,9 @@ def test_what_stands_still_is_part_of_the_response_and_follows_at_once_when_it_m
     noise = 0.005 * np.random.default_rng(5).standard_normal(7_000).astype(np.float32)
     heard = {}
     for plans in (True, False):
-        stage = open_stage("mirrored", clip=noise, plans=plans)
+        # But for delays, the plan has no say: what else it leaves out is not what is compared here.
+        wishes = {name.value: True for name in EffectName if name is not EffectName.PROPAGATION_DELAY}
+        stage = open_stage("mirrored", clip=noise, plans=plans, effects=wishes)
         stage.add()
         parts = [stage.hear(1.0)]
         if plans:
@@ -272,6 +274,17 @@ def test_output_can_change_while_it_plays(open_stage):
     stereo = stage.hear(2.0)
     assert not np.array_equal(*stereo[:, -5_000:])
     assert [mixer.channels for mixer in stage.session.renderer._mixers] == [2]
+
+
+def test_output_can_change_while_nobody_sounds(open_stage):
+    stage = open_stage("mirrored", output="mono")
+    stage.hear(0.1)
+    stage.tell(SetEffects(output="headphones"))
+    stage.hear(0.5)
+    stage.add()
+    stereo = stage.hear(0.5)
+    assert not np.array_equal(*stereo[:, -5_000:])
+    assert not [event for event in stage.events if isinstance(event, Error)]
 
 
 def test_somebody_who_shifts_about_does_not_make_it_flutter(open_stage):
