@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from training.simulation.check import PlanCheck
     from training.simulation.plan import SimulationPlan
 
+# A caption is wrapped to its table.
+_CHECK_WIDTH = 100
+
 Scene = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
 Effects = Annotated[
     str,
@@ -112,7 +115,7 @@ def _check_table(checked: "PlanCheck") -> Table:
         f"{checked.plan_s:.1f} s for these emitters and {checked.once_s:.1f} s once, with everything on "
         f"{checked.everything_s:.1f} s: the whole scene {checked.speedup:.1f} times as fast"
     )
-    table = Table(title=title, title_justify="left", caption=seconds, caption_justify="left")
+    table = Table(title=title, title_justify="left", caption=seconds, caption_justify="left", min_width=_CHECK_WIDTH)
     table.add_column("mean error")
     for column in ("plan", "floor"):
         table.add_column(column, justify="right")
