@@ -358,7 +358,7 @@ QUATERNION = "sample,x,y,z,qx,qy,qz,qw\n"
         ),
         (
             QUATERNION + "0,1,2,1.5,0,0,0,0\n",
-            "path.csv: line 2, columns 'qx' to 'qw': orientation must be a quaternion of non-zero length",
+            "path.csv: line 2, columns 'qx' to 'qw': orientation must be a quaternion of non-zero length, not of 0",
         ),
     ],
 )
