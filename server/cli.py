@@ -19,6 +19,7 @@ from rich.progress import Progress
 from server.bench import cli as bench
 from server.errors import NafirError, RequestError
 from server.health.cli import check
+from server.soak.cli import soak
 
 if TYPE_CHECKING:
     from server.field.field import AcousticField
@@ -34,6 +35,7 @@ app = typer.Typer(
 )
 app.add_typer(bench.app, name="bench")
 app.command()(check)
+app.command()(soak)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]

@@ -135,7 +135,7 @@ def composed_irs(
     irs = without_head(held, field.sample_rate) if channels == 1 else held
     early = direct.early(channels)
     mirrored = [row for row, emitter in enumerate(emitters) if emitter.effects.early]
-    if early is not None and len(mirrored) == count:
+    if early is not None and 0 < len(mirrored) == count:
         add_first_reflections(field, early, irs, listener, emitters)
     elif early is not None and mirrored:
         reflected = irs[mirrored]

@@ -1,0 +1,49 @@
+"""What a block costs while there is sound, and in the silence after it.
+
+Filters that ring out end in numbers so small that some processors take a hundred times as long over them.
+"""
+
+import statistics
+import time
+
+import numpy as np
+
+from server.acoustics.geometry import Pose
+from server.direct_sound import DirectSound
+from server.emitters import Emitter
+from server.field.field import AcousticField
+from server.rendering.ingest import DryAudio
+from server.rendering.sources import ClipPlayer
+from server.whole_field import kemar
+
+_BLOCK_SIZE = 256
+_SOUND_S = 2.0
+_SILENCE_S = 4.0
+_ROUNDS = 5
+
+
+def silence_to_sound(field: AcousticField) -> float:
+    """The median time of a block in silence over that in sound; the median of several rounds of both."""
+    manifest = field.bundle.manifest
+    rate = field.sample_rate
+    direct = DirectSound.of(field.bundle, kemar(rate))
+    start = manifest.start
+    listener = Pose(start.listener)
+    emitter = Emitter(serial=0, pose=Pose(start.emitter))
+    ir = field.impulse_responses([start.listener], [start.emitter], [0.0])[0]
+    loud = np.random.default_rng(0).uniform(-1, 1, round(_SOUND_S * rate)).astype(np.float32)
+    ratios = []
+    for _ in range(_ROUNDS):
+        renderer = direct.renderer(
+            block_size=_BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=rate, max_emitters=1
+        )
+        renderer.add_emitter("noise", ClipPlayer(DryAudio(loud), loop=False))
+        renderer.set_ir("noise", ir)
+        direct.aim(renderer, listener, {"noise": emitter})
+        times_s: dict[bool, list[float]] = {True: [], False: []}
+        for block in range(round((_SOUND_S + _SILENCE_S) * rate / _BLOCK_SIZE)):
+            started_s = time.perf_counter()
+            renderer.process()
+            times_s[block * _BLOCK_SIZE < loud.size].append(time.perf_counter() - started_s)
+        ratios.append(statistics.median(times_s[False]) / statistics.median(times_s[True]))
+    return statistics.median(ratios)

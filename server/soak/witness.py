@@ -1,0 +1,99 @@
+"""A listener at rest, who knows to the last sample what he should hear.
+
+One emitter loops a clip. Once the response is full, every block is a stretch of the clip's circular convolution with
+the whole impulse response, which is known in double precision (`server.health.double_precision`); whatever the server
+goes through meanwhile, and however long, that does not change.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.decibels import db_to_amplitude, power_to_db
+from server.blocks import AudioBlock
+from server.clips import ClipLibrary
+from server.field.levels import Levels
+from server.health.double_precision import DoubleWholeField
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerStart
+from server.scene.effects import EffectName
+from server.whole_field import kemar
+
+_CLIP = "man-reading"
+_GAIN_DB = -12.0
+"""Below where the limiter would have something to do."""
+_STRETCH_S = 1.0
+
+
+@dataclass
+class Errors:
+    """Of stretches of a second, in dB of the whole expected sound's mean power."""
+
+    db: list[float] = field(default_factory=list)
+
+    def drift_db(self) -> float:
+        """By how much the worst of the last tenth is worse than the worst of the first."""
+        tenth = max(1, len(self.db) // 10)
+        return max(self.db[-tenth:]) - max(self.db[:tenth]) if self.db else math.nan
+
+    @property
+    def worst_db(self) -> float:
+        return max(self.db, default=math.nan)
+
+
+class Witness:
+    """Of one level of a scene, with every effect on."""
+
+    def __init__(self, levels: Levels) -> None:
+        manifest = levels.bundle.manifest
+        rate = manifest.codec.sample_rate
+        start = manifest.start
+        self.hello = Hello(
+            protocol=PROTOCOL,
+            scene=levels.bundle.id,
+            level=levels.default.level.name,
+            effects={name.value: True for name in EffectName},
+            listener=ListenerStart(position=start.listener, yaw=math.radians(start.listener_yaw_deg)),
+        )
+        self.emitter = AddEmitter(id="witness", clip=_CLIP, position=start.emitter, gain_db=_GAIN_DB)
+        self.errors = Errors()
+        self._ir_samples = levels.default.ir_samples
+        self._stretch_samples = round(_STRETCH_S * rate)
+        self._begins: int | None = None
+        yaw = math.radians(start.listener_yaw_deg)
+        response = DoubleWholeField(levels.default, kemar(rate)).impulse_responses(
+            [start.listener], [start.emitter], [yaw]
+        )[0]
+        clip = ClipLibrary(rate).load(_CLIP).samples.astype(np.float64) * db_to_amplitude(_GAIN_DB)
+        self._expected = _circular(clip, response.astype(np.float64))
+        self._power = float(np.mean(self._expected**2))
+        self._error_power = 0.0
+        self._heard = 0
+
+    def begin(self, sample_clock: int) -> None:
+        """The clip's first sample is this one."""
+        self._begins = sample_clock
+
+    def hear(self, block: AudioBlock) -> None:
+        if self._begins is None or block.sample_clock - self._begins < self._ir_samples:
+            return
+        frames = block.samples.shape[1]
+        at = (block.sample_clock - self._begins + np.arange(frames)) % self._expected.shape[1]
+        difference: npt.NDArray[np.float64] = block.samples - self._expected[:, at]
+        self._error_power += float(np.sum(difference**2))
+        self._heard += difference.size
+        if self._heard >= 2 * self._stretch_samples:
+            self.errors.db.append(float(power_to_db(self._error_power / self._heard / self._power)))
+            self._error_power, self._heard = 0.0, 0
+
+
+def _circular(clip: npt.NDArray[np.float64], response: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(ear, sample of the clip): what is heard of a clip (n,) that has been looping for longer than `response`
+    (ear, m) lasts."""
+    folded = np.zeros((len(response), clip.size))
+    for start in range(0, response.shape[1], clip.size):
+        part = response[:, start : start + clip.size]
+        folded[:, : part.shape[1]] += part
+    spectrum = np.fft.rfft(clip) * np.fft.rfft(folded, axis=-1)
+    return np.fft.irfft(spectrum, clip.size, axis=-1)
