@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "field": {"acoustics", "scene"},
     "rendering": {"acoustics"},
 }
-SHARED_MODULES = {"compiled", "errors"}
+SHARED_MODULES = {"bounded_cache", "compiled", "errors"}
 
 IMPORT_ALL_WITHOUT_TRAINING = """
 import importlib, sys
