@@ -21,6 +21,8 @@ _DECAY_DB = 60.0
 _QUIET_BAND = 1e-3
 """Bands further below the whole count as no louder than this share of it: what they do is masked."""
 _CUT_RAD = 0.1
+_SILENT_ENERGY = 1e-6
+"""Where walls let nothing remain: 60 dB below the direct sound at one metre, as near as a field comes to silence."""
 _NOTHING = float(np.finfo(np.float64).tiny)
 
 
@@ -46,7 +48,8 @@ def energy_excess_db(manifest: Manifest, geometry: Geometry, poses: Poses, energ
     most = np.full(len(poses), diffuse_energy(geometry) * _CORNER)
     spread = np.maximum(np.linalg.norm(poses[:, LISTENER] - poses[:, EMITTER], axis=-1), NEAR_LIMIT_M) ** 2
     paths = (manifest.direct_sound == "field") + 3 * (manifest.image_order == 0)
-    return power_to_db(np.max(np.sum(energies, axis=(-1, -2)), axis=-1) / (_NEARER_EAR * (most + paths / spread)))
+    bound = np.maximum(_NEARER_EAR * (most + paths / spread), _SILENT_ENERGY)
+    return power_to_db(np.max(np.sum(energies, axis=(-1, -2)), axis=-1) / bound)
 
 
 def window_levels_db(energies: Energies) -> Floats:
