@@ -1,9 +1,8 @@
 """One listener's stream as a state machine without input, output or waiting.
 
 Messages go in, messages and audio blocks come out. The direct paths of each block follow the newest poses. What follows
-the direct sound comes later: `take_request` hands out one request for impulse responses (IRs) at a time, always for the
-newest poses, and whoever computes them brings the answer back through `accept` between two blocks. Sound never waits
-for it.
+the direct sound comes later: `take_request` hands out what impulse responses (IRs) to compute, and whoever computes
+them brings the answer back through `accept` between two blocks. Sound never waits for it.
 
 Blocks are rendered in three steps, so that many sessions' can be rendered in one call: `begin_block`, rendering
 `renderer`, `finish_block`.
@@ -13,19 +12,18 @@ A `Session` belongs to the thread that renders it. Positions are metres, clocks 
 
 import dataclasses
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 
 from server.acoustics.decibels import db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.blocks import AudioBlock, DryBlock, FloatArray
 from server.direct_sound import DirectSound
-from server.effects_in_force import EffectsInForce, as_asked
+from server.effects_in_force import EffectsInForce
 from server.emitters import Emitter, LiveInput
 from server.errors import RequestError
 from server.field.levels import Levels
-from server.ir_request import EmitterSnapshot, IrRequest, IrResponse
-from server.kept_irs import response_identity
+from server.ir_request import IrRequest, IrResponse
 from server.load import Reason, Rung
 from server.pacing import SendWindow
 from server.planned_effects import PlannedEffects, PlanRequest
@@ -47,7 +45,8 @@ from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
 from server.rendering.sources import ClipPlayer, Source
-from server.replies import EmitterAdded, EmitterRemoved, Error, LevelChanged, LiveStatus, PlanChanged, ServerMessage
+from server.replies import EmitterRemoved, Error, LiveStatus, PlanChanged, ServerMessage
+from server.responses_in_force import ResponsesInForce
 from server.scene.bundle import Bundle
 from server.scene.effects import read_overrides, require_effect
 from server.scene.plan import Plan
@@ -101,9 +100,6 @@ class Session:
         self.blocks_dropped = 0
         self.blocks_limited = 0
         self._bundle = levels.bundle
-        self._levels = levels
-        self._rung = self._heard = rung
-        self._reason: Reason = "chosen"
         self._sample_rate = field.sample_rate
         self._load_clip = load_clip
         self._direct_sound = DirectSound.of(self._bundle, filters)
@@ -123,7 +119,6 @@ class Session:
             outputs=1 if hello.output == "mono" else 2,
             has_head=planned is None or planned.shared.head,
         )
-        self.renderer.share_tail(rung.shared_tail)
         self._effects = EffectsInForce(
             self.renderer,
             planned,
@@ -132,16 +127,12 @@ class Session:
             has_late=bool(self._bundle.manifest.fields),
         )
         self._emitters: dict[str, Emitter] = {}
+        self._responses = ResponsesInForce(
+            self.renderer, self._effects, self._emitters, levels=levels, direct_sound=self._direct_sound, rung=rung
+        )
         self._next_serial = 0
-        self._newest_pose_id = 0
         self._followed_pose_id = 0  # by the direct paths
-        self._accepted_pose_id = 0
-        self._applied_pose_id = 0  # by the impulse responses
-        self._in_flight: IrRequest | None = None
-        self._waits_for_change = False
         self._checked = 0
-        self._ir_interval_s = 0.0
-        self._next_request_clock = 0
 
     @property
     def sample_clock(self) -> int:
@@ -151,27 +142,21 @@ class Session:
     @property
     def rung(self) -> Rung:
         """The quality that is heard."""
-        return self._heard
+        return self._responses.heard
 
     @property
     def awaits_irs(self) -> bool:
         """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
-        return self._in_flight is not None or self.sample_clock < self._next_request_clock
+        return self._responses.are_awaited
 
     def hear(self, rung: Rung, reason: Reason) -> list[ServerMessage]:
         """Have what follows the direct sound come from another rung: from now on, or, where it takes another level's
         IRs, from when they are there."""
-        if rung.level != self._rung.level:
-            for emitter in self._emitters.values():
-                emitter.is_outdated = True
-            self._waits_for_change = False
-            self._next_request_clock = 0
-        self._rung, self._reason = rung, reason
-        return self._change() if rung.level == self._heard.level or not self._emitters else []
+        return self._responses.hear(rung, reason)
 
     def space_irs(self, interval_s: float) -> None:
         """Have so much time pass from one request for IRs to the next, unless an emitter waits for its first."""
-        self._ir_interval_s = interval_s
+        self._responses.space(interval_s)
 
     def receive(self, message: ClientMessage) -> list[ServerMessage]:
         """Take in one message; what is wrong with it comes back as an `Error`, and nothing has changed then."""
@@ -202,59 +187,15 @@ class Session:
 
     def take_request(self) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, or when every IR is up to date."""
-        if self._in_flight is not None or self._waits_for_change:
-            return None
-        outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter)]
-        if not outdated and not self._effects.awaits_ears:
-            self._accepted_pose_id = self._newest_pose_id
-            return None
-        if self.sample_clock < self._next_request_clock and all(emitter.token is not None for emitter in outdated):
-            return None
-        self._next_request_clock = self.sample_clock + round(self._ir_interval_s * self._sample_rate)
-        asked = {emitter.serial: as_asked(emitter) for emitter in outdated}
-        for emitter in outdated:
-            emitter.is_outdated = False
-        self._in_flight = IrRequest(
-            self._newest_pose_id,
-            self._rung.level,
-            self._listener,
-            tuple(
-                EmitterSnapshot(
-                    emitter.serial,
-                    emitter.pose,
-                    emitter.directivity,
-                    self._identity(emitter),
-                    asked[emitter.serial],
-                )
-                for emitter in outdated
-            ),
-            self._direct_sound,
-            self._effects.channels,
-        )
-        return self._in_flight
+        return self._responses.take_request(self._listener)
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""
-        self._in_flight = None
-        if response.request.level not in {self._rung.level, self._heard.level}:
-            return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
-        pose_id = response.request.pose_id
-        asked = response.request.emitters
-        arrived = {each.serial: (ir, each) for each, ir in zip(asked, response.irs, strict=True)}
-        events: list[ServerMessage] = []
-        if response.request.channels != self.renderer.channels:
-            self.renderer.hear_with(response.request.channels)
-        for identifier, emitter in self._emitters.items():
-            if emitter.serial not in arrived:
-                continue
-            ir, snapshot = arrived[emitter.serial]
-            if self._effects.hear(identifier, emitter, ir, snapshot.effects, pose_id):
-                emitter.identity = snapshot.identity
-                events += self._announce(identifier)
-        self._accepted_pose_id = pose_id
-        if response.request.level == self._rung.level:
-            events += self._change()
-        return events
+        return self._responses.accept(response)
+
+    def give_up(self, request: IrRequest) -> list[ServerMessage]:
+        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
+        return self._responses.give_up(request)
 
     def take_plan_request(self) -> PlanRequest | None:
         """The plan of effects to make now. None while an earlier one is unanswered, or where nothing has changed."""
@@ -268,11 +209,7 @@ class Session:
         planned = self._effects.planned
         assert planned is not None
         is_other = planned.accept(plan)
-        events: list[ServerMessage] = []
-        for identifier in self._effects.enforce(self._emitters):
-            events += self._announce(identifier)
-        self._effects.share_tail(self._heard.shared_tail, self._emitters)
-        self._waits_for_change = False
+        events = self._responses.enforce_plan()
         return [*events, PlanChanged.of(plan, self.sample_clock)] if is_other else events
 
     def take_check(self) -> RegretCheck | None:
@@ -287,7 +224,7 @@ class Session:
         emitter = self._emitters[named[self._checked % len(named)]]
         whole, head = self._effects.whole()
         check = RegretCheck(
-            self._heard.level,
+            self.rung.level,
             self._listener,
             dataclasses.replace(emitter),
             whole,
@@ -311,17 +248,6 @@ class Session:
             emitter.is_decided = True
         return [Error(code="plan_failure", message="no plan of effects could be made")]
 
-    def give_up(self, request: IrRequest) -> list[ServerMessage]:
-        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
-        self._in_flight = None
-        self._waits_for_change = True
-        failed = {emitter.serial for emitter in request.emitters}
-        for emitter in self._emitters.values():
-            emitter.is_outdated |= emitter.serial in failed
-        return [
-            Error(code="field_failure", message=f"no impulse response could be computed for pose {request.pose_id}")
-        ]
-
     def begin_block(self) -> None:
         """Have the direct paths of the next block follow the newest poses."""
         displaced = {name: emitter for name, emitter in self._emitters.items() if emitter.is_displaced}
@@ -329,7 +255,7 @@ class Session:
         for emitter in displaced.values():
             emitter.is_displaced = False
         self.renderer.set_orientation(self._listener.orientation)
-        self._followed_pose_id = self._newest_pose_id
+        self._followed_pose_id = self._responses.newest_pose_id
 
     def finish_block(self, sample_clock: int, samples: FloatArray) -> AudioBlock | None:
         """The block just rendered, which began at `sample_clock`; None when the window is full, so that it is not to be
@@ -340,8 +266,7 @@ class Session:
         is_exchange = self.renderer.exchanged
         self.ir_exchanges += is_exchange
         self.blocks_limited += self.renderer.is_limited
-        if self._applied_pose_id != self._accepted_pose_id and self._has_applied_all():
-            self._applied_pose_id = self._accepted_pose_id
+        self._responses.follow_renderer()
         if not self.window.is_open:
             self.blocks_dropped += 1
             return None
@@ -349,7 +274,7 @@ class Session:
             sequence=self.window.take_sequence(),
             sample_clock=sample_clock,
             pose_id=self._followed_pose_id,
-            reverberation_pose_id=self._applied_pose_id,
+            reverberation_pose_id=self._responses.applied_pose_id,
             samples=samples,
             is_exchange=is_exchange,
             is_limited=self.renderer.is_limited,
@@ -370,46 +295,6 @@ class Session:
         refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
 
-    def _needs_ir(self, emitter: Emitter) -> bool:
-        """Whether its IR is of another pose, which where poses share responses need not make it another; or is to hold
-        the direct sound, too."""
-        if not (emitter.is_decided and emitter.effects.has_response):
-            return False
-        if emitter.is_outdated and emitter.identity is not None:
-            emitter.is_outdated = self._identity(emitter) != emitter.identity
-        return emitter.is_outdated or emitter.wants_folding
-
-    def _identity(self, emitter: Emitter) -> Hashable | None:
-        field = self._levels[self._rung.level]
-        if emitter.effects.folds:
-            return None
-        shared = response_identity(field, self._direct_sound.early_reflections, self._listener, emitter)
-        return None if shared is None else (shared, emitter.effects, self._effects.channels)
-
-    def _change(self) -> list[ServerMessage]:
-        """Stand on the rung that was asked for last, with the block that follows."""
-        if self._rung == self._heard:
-            return []
-        self._heard = self._rung
-        self._effects.share_tail(self._heard.shared_tail, self._emitters)
-        return [
-            LevelChanged(
-                level=self._heard.level,
-                reason=self._reason,
-                ir_rate_hz=self._heard.ir_rate_hz,
-                shared_tail=self._heard.shared_tail,
-                sample_clock=self.sample_clock,
-            )
-        ]
-
-    def _announce(self, identifier: str) -> list[ServerMessage]:
-        """That an emitter sounds from the next block on, if it has not been said."""
-        emitter = self._emitters[identifier]
-        if emitter.is_announced:
-            return []
-        emitter.is_announced = True
-        return [EmitterAdded(id=identifier, sample_clock=self.sample_clock)]
-
     def _follow(self, identifier: str, emitter: Emitter) -> None:
         if self._effects.planned is not None:
             self._effects.planned.follow_emitter(identifier, emitter.pose, self._effects.clock_s)
@@ -419,17 +304,10 @@ class Session:
             wishes = {require_effect(name): is_on for name, is_on in message.effects.items()}
             self._effects.planned.wish(wishes, message.output)
 
-    def _has_applied_all(self) -> bool:
-        return all(
-            self.renderer.applied(name) == emitter.token
-            for name, emitter in self._emitters.items()
-            if emitter.token is not None
-        )
-
     def _move_listener(self, message: ListenerPose) -> None:
         pose = message.pose
         self._bundle.require_inside(pose.position, "position")
-        self._advance_pose_id(message.pose_id)
+        self._responses.advance(message.pose_id)
         moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
         shared = self._effects.shared
         for identifier, emitter in self._emitters.items():
@@ -444,7 +322,7 @@ class Session:
     def _move_emitter(self, message: MoveEmitter) -> None:
         emitter = self._require_emitter(message.id)
         self._bundle.require_inside(message.position, "position")
-        self._advance_pose_id(message.pose_id)
+        self._responses.advance(message.pose_id)
         before = emitter.pose.orientation
         emitter.move(message)
         # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
@@ -452,14 +330,6 @@ class Session:
         emitter.is_outdated |= is_mirrored and emitter.pose.orientation != before
         self._effects.unfold(message.id, emitter)
         self._follow(message.id, emitter)
-
-    def _advance_pose_id(self, pose_id: int) -> None:
-        if pose_id <= self._newest_pose_id:
-            raise RequestError(
-                "stale_pose", f"pose {pose_id} is not newer than {self._newest_pose_id}", field="pose_id"
-            )
-        self._newest_pose_id = pose_id
-        self._waits_for_change = False
 
     def _add_emitter(self, message: AddEmitter) -> None:
         self._bundle.require_inside(message.position, "position")
@@ -480,7 +350,7 @@ class Session:
         self._emitters[message.id] = emitter
         self._follow(message.id, emitter)
         self._next_serial += 1
-        self._waits_for_change = False
+        self._responses.retry()
 
     def _open_source(self, message: AddEmitter) -> tuple[LiveInput | None, Source]:
         if message.clip is not None:
@@ -500,7 +370,7 @@ class Session:
         if self._effects.planned is not None:
             self._effects.planned.forget_emitter(message.id)
         self.renderer.remove_emitter(message.id)
-        return [EmitterRemoved(id=message.id), *([] if self._emitters else self._change())]
+        return [EmitterRemoved(id=message.id), *([] if self._emitters else self._responses.change_rung())]
 
     def _require_emitter(self, identifier: str) -> Emitter:
         if identifier not in self._emitters:

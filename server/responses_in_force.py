@@ -1,0 +1,215 @@
+"""Has a renderer make what follows a session's direct sound: the impulse responses (IRs) of its newest poses, at the
+quality that was asked for last.
+
+IRs are computed off the audio thread: `take_request` says which, one request at a time and always for the newest poses,
+and whoever computes them brings them back through `accept`, or through `give_up` where none could be. A rung that takes
+another level's IRs is heard from when they are there. Clocks are samples.
+"""
+
+from collections.abc import Hashable, Iterable, Mapping
+
+from server.acoustics.geometry import Pose
+from server.direct_sound import DirectSound
+from server.effects_in_force import EffectsInForce, as_asked
+from server.emitters import Emitter
+from server.errors import RequestError
+from server.field.levels import Levels
+from server.ir_request import EmitterSnapshot, IrRequest, IrResponse
+from server.kept_irs import response_identity
+from server.load import Reason, Rung
+from server.rendering.renderer import Renderer
+from server.replies import EmitterAdded, Error, LevelChanged, ServerMessage
+
+
+class ResponsesInForce:
+    """Of one session, whose `emitters` are who sounds at each moment. `rung` is what is heard of `levels` first."""
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        effects: EffectsInForce,
+        emitters: Mapping[str, Emitter],
+        *,
+        levels: Levels,
+        direct_sound: DirectSound,
+        rung: Rung,
+    ) -> None:
+        self.heard = rung
+        """The quality that is heard."""
+        self.newest_pose_id = 0
+        self.applied_pose_id = 0
+        """Of the poses whose IRs are heard."""
+        self._renderer = renderer
+        self._effects = effects
+        self._emitters = emitters
+        self._levels = levels
+        self._sample_rate = levels.default.sample_rate
+        self._direct_sound = direct_sound
+        self._wanted = rung
+        self._reason: Reason = "chosen"
+        self._accepted_pose_id = 0
+        self._in_flight: IrRequest | None = None
+        self._waits_for_change = False
+        self._interval_s = 0.0
+        self._next_request_clock = 0
+        renderer.share_tail(rung.shared_tail)
+
+    @property
+    def are_awaited(self) -> bool:
+        """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
+        return self._in_flight is not None or self._renderer.sample_clock < self._next_request_clock
+
+    def hear(self, rung: Rung, reason: Reason) -> list[ServerMessage]:
+        """Have IRs come from another rung: from now on, or, where it takes another level's, from when they are
+        there."""
+        if rung.level != self._wanted.level:
+            for emitter in self._emitters.values():
+                emitter.is_outdated = True
+            self._waits_for_change = False
+            self._next_request_clock = 0
+        self._wanted, self._reason = rung, reason
+        return self.change_rung() if rung.level == self.heard.level or not self._emitters else []
+
+    def change_rung(self) -> list[ServerMessage]:
+        """Stand on the rung that was asked for last, with the block that follows."""
+        if self._wanted == self.heard:
+            return []
+        self.heard = self._wanted
+        self._effects.share_tail(self.heard.shared_tail, self._emitters)
+        return [
+            LevelChanged(
+                level=self.heard.level,
+                reason=self._reason,
+                ir_rate_hz=self.heard.ir_rate_hz,
+                shared_tail=self.heard.shared_tail,
+                sample_clock=self._renderer.sample_clock,
+            )
+        ]
+
+    def space(self, interval_s: float) -> None:
+        """Have so much time pass from one request to the next, unless an emitter waits for its first."""
+        self._interval_s = interval_s
+
+    def advance(self, pose_id: int) -> None:
+        """Something takes a pose. Raises RequestError where a newer one was taken before."""
+        if pose_id <= self.newest_pose_id:
+            raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")
+        self.newest_pose_id = pose_id
+        self._waits_for_change = False
+
+    def retry(self) -> None:
+        """Ask again after a failure: somebody has come."""
+        self._waits_for_change = False
+
+    def enforce_plan(self) -> list[ServerMessage]:
+        """Put the plan of effects into effect, with the block that follows."""
+        events = self._announce(self._effects.enforce(self._emitters))
+        self._effects.share_tail(self.heard.shared_tail, self._emitters)
+        self._waits_for_change = False
+        return events
+
+    def take_request(self, listener: Pose) -> IrRequest | None:
+        """The IRs to compute now. None while an earlier request is unanswered, or when every IR is up to date."""
+        if self._in_flight is not None or self._waits_for_change:
+            return None
+        outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter, listener)]
+        if not outdated and not self._effects.awaits_ears:
+            self._accepted_pose_id = self.newest_pose_id
+            return None
+        clock = self._renderer.sample_clock
+        if clock < self._next_request_clock and all(emitter.token is not None for emitter in outdated):
+            return None
+        self._next_request_clock = clock + round(self._interval_s * self._sample_rate)
+        asked = {emitter.serial: as_asked(emitter) for emitter in outdated}
+        for emitter in outdated:
+            emitter.is_outdated = False
+        self._in_flight = IrRequest(
+            self.newest_pose_id,
+            self._wanted.level,
+            listener,
+            tuple(
+                EmitterSnapshot(
+                    emitter.serial,
+                    emitter.pose,
+                    emitter.directivity,
+                    self._identity(emitter, listener),
+                    asked[emitter.serial],
+                )
+                for emitter in outdated
+            ),
+            self._direct_sound,
+            self._effects.channels,
+        )
+        return self._in_flight
+
+    def accept(self, response: IrResponse) -> list[ServerMessage]:
+        """Put the answer of the last request into effect, with the block that follows."""
+        self._in_flight = None
+        if response.request.level not in {self._wanted.level, self.heard.level}:
+            return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
+        pose_id = response.request.pose_id
+        asked = response.request.emitters
+        arrived = {each.serial: (ir, each) for each, ir in zip(asked, response.irs, strict=True)}
+        events: list[ServerMessage] = []
+        if response.request.channels != self._renderer.channels:
+            self._renderer.hear_with(response.request.channels)
+        for identifier, emitter in self._emitters.items():
+            if emitter.serial not in arrived:
+                continue
+            ir, snapshot = arrived[emitter.serial]
+            if self._effects.hear(identifier, emitter, ir, snapshot.effects, pose_id):
+                emitter.identity = snapshot.identity
+                events += self._announce([identifier])
+        self._accepted_pose_id = pose_id
+        if response.request.level == self._wanted.level:
+            events += self.change_rung()
+        return events
+
+    def give_up(self, request: IrRequest) -> list[ServerMessage]:
+        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
+        self._in_flight = None
+        self._waits_for_change = True
+        failed = {emitter.serial for emitter in request.emitters}
+        for emitter in self._emitters.values():
+            emitter.is_outdated |= emitter.serial in failed
+        return [
+            Error(code="field_failure", message=f"no impulse response could be computed for pose {request.pose_id}")
+        ]
+
+    def follow_renderer(self) -> None:
+        """See, after each block, whether the IRs accepted last are heard."""
+        if self.applied_pose_id != self._accepted_pose_id and self._has_applied_all():
+            self.applied_pose_id = self._accepted_pose_id
+
+    def _needs_ir(self, emitter: Emitter, listener: Pose) -> bool:
+        """Whether its IR is of another pose, which where poses share responses need not make it another; or is to hold
+        the direct sound, too."""
+        if not (emitter.is_decided and emitter.effects.has_response):
+            return False
+        if emitter.is_outdated and emitter.identity is not None:
+            emitter.is_outdated = self._identity(emitter, listener) != emitter.identity
+        return emitter.is_outdated or emitter.wants_folding
+
+    def _identity(self, emitter: Emitter, listener: Pose) -> Hashable | None:
+        field = self._levels[self._wanted.level]
+        if emitter.effects.folds:
+            return None
+        shared = response_identity(field, self._direct_sound.early_reflections, listener, emitter)
+        return None if shared is None else (shared, emitter.effects, self._effects.channels)
+
+    def _announce(self, identifiers: Iterable[str]) -> list[ServerMessage]:
+        """That emitters sound from the next block on, of those of whom it has not been said."""
+        events: list[ServerMessage] = []
+        for identifier in identifiers:
+            emitter = self._emitters[identifier]
+            if not emitter.is_announced:
+                emitter.is_announced = True
+                events.append(EmitterAdded(id=identifier, sample_clock=self._renderer.sample_clock))
+        return events
+
+    def _has_applied_all(self) -> bool:
+        return all(
+            self._renderer.applied(name) == emitter.token
+            for name, emitter in self._emitters.items()
+            if emitter.token is not None
+        )
