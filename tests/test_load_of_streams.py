@@ -80,7 +80,7 @@ class Stage:
         end_s = self.clock.now_s + duration_s
         while self.clock.now_s < end_s:
             self._pose_id += 1
-            self.stream.offer(ListenerPose(pose_id=self._pose_id, position=(2.0, 2.0, 1.5), yaw=0.1))
+            self.stream.offer(ListenerPose(pose_id=self._pose_id, position=(2.0, 2.0, 1.5), yaw=0.1 * self._pose_id))
             self.workers.run()
             while (wait_s := self.thread.tick()) is not None and wait_s <= 0:
                 pass
