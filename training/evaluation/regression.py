@@ -5,8 +5,8 @@ Axes: pairs (row, 3) emitters and (row, 3) listeners, metres; values (row, targe
 The covariance of two pairs adds up what they have in common: being near each other at both ends; the same listener,
 whoever speaks (a microphone's gain, what stands beside it); the same emitter heard at places near each other (its
 directivity); the same listener and emitters near each other. Lengths and shares are those most likely a posteriori
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 5.2 and 5.4.1), common to all targets up to their
-scale; what is known of them before, to a factor of e, decides where there are only a dozen pairs.
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 5.2 and 5.4.1), common to all targets up to
+their scale; what is known of them before, to a factor of e, decides where there are only a dozen pairs.
 """
 
 from dataclasses import dataclass
