@@ -73,8 +73,10 @@ def serve(
 
     from server.app import create_app
     from server.catalogue import load_hrtfs, load_scenes
+    from server.memory import give_back_large_arrays
     from server.settings import Settings
 
+    give_back_large_arrays()
     given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf}
     try:
         settings = Settings(**{name: value for name, value in given.items() if value is not None})

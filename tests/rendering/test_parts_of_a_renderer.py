@@ -143,7 +143,7 @@ def test_muted_direct_sound_fades_out_and_is_there_at_once_when_it_comes_back(en
     assert error_db(muted, weight * always) < -110
 
 
-def test_muted_direct_sound_takes_no_time_but_that_of_its_line(engine, monkeypatch):
+def test_muted_direct_sound_takes_no_time_but_that_of_its_line(engine):
     """What is not heard is neither read from the line nor filtered: nothing is left of it in the windows."""
     renderer = engine()
     add(renderer, noise(6, 3_000))

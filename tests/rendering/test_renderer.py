@@ -307,7 +307,11 @@ def test_a_bad_room_is_refused_and_the_old_one_stays_in_effect():
     add(engine, "a", noise(35, 100))
     engine.set_ir("a", room(36), token=1)
     engine.process()
-    for bad in (np.full((2, 10), np.nan, np.float32), np.zeros((3, 10), np.float32), np.zeros((2, IR_SAMPLES + 1), np.float32)):
+    for bad in (
+        np.full((2, 10), np.nan, np.float32),
+        np.zeros((3, 10), np.float32),
+        np.zeros((2, IR_SAMPLES + 1), np.float32),
+    ):
         with pytest.raises(ValueError):
             engine.set_ir("a", bad, token=2)
     assert np.isfinite(engine.process()).all()
