@@ -42,6 +42,7 @@ _ACTIONS_PER_S = 60.0
 _LIFE_S = 2.0, 20.0
 _STALL_S = 3.0
 _PATIENCE_S = 15.0
+_REFUSAL_S = 3.0
 _MOST_EMITTERS = 8
 _BINARY_POSE = struct.Struct("<BBHI7f")
 _CLIPS = "man-reading", "trumpet", "woman-reading"
@@ -159,9 +160,12 @@ class _Life:
             await asyncio.sleep(self._rng.exponential(1 / _ACTIONS_PER_S))
 
     async def settle(self) -> None:
-        """Until everything sent so far has been answered; then nothing may be missing."""
+        """Until everything sent so far has been answered; then nothing may be missing. What the audio thread refuses may
+        be told of after the answer to a ping, which it never sees."""
         await self._socket.send(Ping(id=1).serialize())
         await asyncio.wait_for(self._pong.wait(), _PATIENCE_S)
+        if self._errors < self._faults:
+            await asyncio.sleep(_REFUSAL_S)
         self._told.faults_unanswered += max(0, self._faults - self._errors)
 
     # What a client may do, each the messages to send.
