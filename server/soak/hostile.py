@@ -160,8 +160,8 @@ class _Life:
             await asyncio.sleep(self._rng.exponential(1 / _ACTIONS_PER_S))
 
     async def settle(self) -> None:
-        """Until everything sent so far has been answered; then nothing may be missing. What the audio thread refuses may
-        be told of after the answer to a ping, which it never sees."""
+        """Until everything sent so far has been answered; then nothing may be missing. What the audio thread refuses
+        may be told of after the answer to a ping, which it never sees."""
         await self._socket.send(Ping(id=1).serialize())
         await asyncio.wait_for(self._pong.wait(), _PATIENCE_S)
         if self._errors < self._faults:
