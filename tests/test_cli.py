@@ -118,8 +118,8 @@ def test_an_unknown_scene_is_named(nafir, tmp_path):
 def test_render_writes_what_a_still_listener_hears(nafir, bundle, field, filters, tmp_path):
     path, output = tmp_path / "path.csv", tmp_path / "out.wav"
     path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
-    code, _, _ = nafir("render", bundle.folder, "--emitter", "trumpet@6,3,1.5", "--path", path, "-o", output)
-    assert code == 0
+    arguments = ("--emitter", "trumpet@6,3,1.5", "--path", path, "--effects", "all", "-o", output)
+    assert nafir("render", bundle.folder, *arguments)[0] == 0
     heard, rate = soundfile.read(output, dtype="float32")
     assert rate == 24_000
     emitter = RenderedEmitter(ClipLibrary(24_000).load("trumpet"), Pose((6.0, 3.0, 1.5)))
@@ -131,7 +131,7 @@ def test_render_writes_what_a_still_listener_hears(nafir, bundle, field, filters
 def test_render_of_a_level_is_that_levels(nafir, levels, filters, tmp_path):
     path, output = tmp_path / "path.csv", tmp_path / "out.wav"
     path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
-    arguments = ("--emitter", "trumpet@6,3,1.5", "--path", path, "--duration-s", 0.5, "-o", output)
+    arguments = ("--emitter", "trumpet@6,3,1.5", "--path", path, "--effects", "all", "--duration-s", 0.5, "-o", output)
     assert nafir("render", levels.bundle.folder, *arguments, "--level", "rough")[0] == 0
     emitter = RenderedEmitter(ClipLibrary(24_000).load("trumpet"), Pose((6.0, 3.0, 1.5)))
     still = [PathPoint.at(0, Pose((2.0, 2.0, 1.5)))]

@@ -138,6 +138,8 @@ class _Tail:
 def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
     """Lundeby's iteration over windows `(window,)`; None where the late response does not decay."""
     count = _after_last(block_power > 0.0)
+    if count == 0:  # all there is comes before the first whole window, or after the last
+        return None
     block_power, levels_db = block_power[:count], levels_db[:count]
     tail_start = count - max(1, round(_TAIL_SHARE * count))
     noise_start = tail_start

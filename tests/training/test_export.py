@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -210,7 +211,9 @@ def test_all_of_them_are_heard(family):
     np.testing.assert_allclose(responses["naf-tables"], responses["naf"], atol=1e-3 * scale)
 
 
-def test_a_field_in_the_time_domain_gives_responses(dataset, time_domain_run, tmp_path):
+def test_a_field_in_the_time_domain_gives_responses(dataset, time_domain_run, tmp_path, monkeypatch):
+    # A few steps of training make no field that is smooth enough for the health check.
+    monkeypatch.setattr(export_module, "check", lambda *_: SimpleNamespace(require=lambda: None))
     bundle = export(SimulatedResponses(dataset), [time_domain_run], tmp_path / "bundle")
     assert list(bundle.manifest.fields) == ["naf-time-domain"]
     field = Levels.load(bundle).default
