@@ -42,7 +42,8 @@ def test_what_is_sent_comes_back_as_the_room_has_it(served, bundle, filters, tmp
     # It begins with a block, as soon as two have arrived.
     lags = [256 * blocks for blocks in range(30)]
     errors = [np.sqrt(np.mean((heard[lag : lag + 48_000] - expected[:48_000]) ** 2)) for lag in lags]
-    assert amplitude_to_db(min(errors) / np.sqrt(np.mean(expected[:48_000] ** 2))) < -80
+    # Its plan leaves out the air, which nobody hears; exact streams are in tests/test_render.py.
+    assert amplitude_to_db(min(errors) / np.sqrt(np.mean(expected[:48_000] ** 2))) < -35
 
 
 def test_without_a_recording_it_claps(served, tmp_path):

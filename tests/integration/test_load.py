@@ -1,5 +1,6 @@
 """A stream on a host that others keep busy: it steps down instead of running late, says so, and recovers."""
 
+import math
 import os
 import subprocess
 import sys
@@ -30,6 +31,7 @@ class Laborious:
 
     def __init__(self, field, name, cost_s):
         self.bundle, self.level, self._cost_s = field.bundle, QualityLevel(name=name, field="arithmetic"), cost_s
+        self.onset_s = field.onset_s
         self._ir = (0.01 * np.random.default_rng(1).standard_normal((2, self.ir_samples))).astype(np.float32)
 
     def impulse_responses(self, listeners, *_, **__):
@@ -59,7 +61,7 @@ def burning(processes):
 
 
 class Listener:
-    """Turns its head with every block, and keeps what it is told of levels."""
+    """Walks to and fro, a step with every block, and keeps what it is told of levels."""
 
     def __init__(self, socket):
         self.socket, self.changes, self.status = socket, [], None
@@ -79,7 +81,8 @@ class Listener:
             self.late += block.is_late
             self.pose_id += 1
             self.socket.send(Acknowledge(sequence=block.sequence).serialize())
-            pose = ListenerPose(pose_id=self.pose_id, position=(2.0, 2.5, 1.5), yaw=0.01 * self.pose_id % 3)
+            place = (2.0 + 0.5 * math.sin(0.05 * self.pose_id), 2.5, 1.5)
+            pose = ListenerPose(pose_id=self.pose_id, position=place, yaw=0.01 * self.pose_id % 3)
             self.socket.send(pose.serialize())
             return
         event = parse_server_message(message)
