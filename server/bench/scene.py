@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.sound_path import SoundPathFinder
 from server.bench.rooms import FloatArray, room
 from server.field.field import AcousticField
 from server.scene.bundle import Bundle
@@ -56,6 +57,7 @@ class BankField(AcousticField):
             frozen_noise=np.zeros((2, _SAMPLES), np.float32),
         )
         self.level = _MANIFEST.levels[0]
+        self._paths = SoundPathFinder(self.bundle.floor_plan, _MANIFEST.speed_of_sound)
         self._bank = np.stack([_LEVEL * room(seed, _SAMPLES) for seed in range(_BANK)])
 
     def impulse_responses(
