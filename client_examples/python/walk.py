@@ -30,6 +30,21 @@ BLOCK = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample 
 PROTOCOL = 2
 POSES_PER_SECOND = 30
 BLOCK_SIZE = 256
+EFFECTS = [
+    "direct_path",
+    "distance_attenuation",
+    "propagation_delay",
+    "air_absorption",
+    "occlusion",
+    "directivity",
+    "hrtf",
+    "early_reflections",
+    "late_reverberation",
+    "diffraction",
+    "per_source_tail",
+    "head_rotation",
+]
+"""All of them, so that an offline render is the same sample for sample; a game leaves them to the server's plan."""
 
 
 def as_float32(numbers: tuple[float, ...]) -> tuple[float, ...]:
@@ -161,6 +176,7 @@ async def listen(arguments: argparse.Namespace) -> None:
             "block_size": BLOCK_SIZE,
             "encoding": "f32",
             "level": arguments.level,
+            "effects": dict.fromkeys(EFFECTS, True),
         }
         await socket.send(json.dumps(hello))
         welcome = json.loads(await socket.recv())
@@ -210,7 +226,7 @@ async def listen(arguments: argparse.Namespace) -> None:
             )
     print(f"{recording.late} blocks late")
     print(
-        f"Render it again:\n  nafir render {arguments.scene} --level {welcome['level']} "
+        f"Render it again:\n  nafir render {arguments.scene} --level {welcome['level']} --effects all "
         f"--emitter {arguments.clip}@{x:g},{y:g},{z:g} --loop "
         f"--path {arguments.path} --duration-s {len(recording.samples()) / recording.sample_rate:.6f} -o again.wav"
     )
