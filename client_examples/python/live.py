@@ -34,6 +34,13 @@ def dry_block(sequence: int, samples: np.ndarray) -> bytes:
     return header + identifier + padding + samples.astype("<f4").tobytes()
 
 
+def effect(text: str) -> tuple[str, bool]:
+    name, _, state = text.partition("=")
+    if state not in ("on", "off"):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither NAME=on nor NAME=off")
+    return name, state == "on"
+
+
 def read(path: Path | None, sample_rate: int) -> np.ndarray:
     """(n,) at `sample_rate`: a recording, or two seconds of claps."""
     if path is None:
@@ -58,7 +65,8 @@ async def perform(arguments: argparse.Namespace) -> None:
     # Compression off: audio does not shrink, and trying takes time.
     async with connect(arguments.url, compression=None, max_size=None) as socket:
         hello = {"protocol": PROTOCOL, "scene": arguments.scene, "block_size": BLOCK_SIZE, "encoding": "f32"}
-        await socket.send(json.dumps({"type": "hello", **hello, "level": arguments.level}))
+        wishes = {"level": arguments.level, "effects": dict(arguments.effect)}
+        await socket.send(json.dumps({"type": "hello", **hello, **wishes}))
         welcome = json.loads(await socket.recv())
         if welcome["type"] == "error":
             raise SystemExit(f"{welcome['code']}: {welcome['message']}")
@@ -114,6 +122,14 @@ def main() -> None:
     parser.add_argument("--url", default="ws://127.0.0.1:8000/v1/stream")
     parser.add_argument("--scene", default="apartment")
     parser.add_argument("--level", default="auto", help="a quality level of GET /v1/scenes/SCENE/frontier")
+    parser.add_argument(
+        "--effect",
+        type=effect,
+        action="append",
+        default=[],
+        metavar="NAME=on|off",
+        help="an effect to have or to leave out, whatever the server's plan says; repeatable",
+    )
     parser.add_argument("--input", type=Path, help="audio file to send (default: claps)")
     parser.add_argument(
         "--ahead", type=int, default=4, help="blocks sent ahead: more survives a worse network, fewer are heard sooner"
