@@ -116,7 +116,12 @@ class _Lane:
 
 @lru_cache(maxsize=16)
 def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
-    """Of a field's scene, measured once: half a second, and longer where nothing is compiled yet."""
+    """Of a field's scene, measured once."""
+    return measure_costs(field, block_size)
+
+
+def measure_costs(field: AcousticField, block_size: int = 256) -> Costs:
+    """Of a field's scene, now: half a second, and longer where nothing is compiled yet."""
     made: dict[str, dict[str, Any]] = {
         "still": {},
         "without direct": {"direct": False},

@@ -6,7 +6,8 @@ just-noticeable differences.
 
 - `plan_us`, `all_us`, `none_us`: time of the rendering thread per block of 256 samples, median of rounds in which the
   three take turns, impulse responses and plans included where any are made.
-- `sum_us`: what nothing costs, and what each effect that is on costs on this host; `ratio` is the plan's to that.
+- `sum_us`: what nothing costs, and what each effect that is on costs on this host, measured anew in each of the same
+  rounds; `ratio` is the median of the plan's time to that, round by round.
 - `error_jnd`: of the parameter in which plan and everything differ most. `least_jnd`: of all effects that are on, the
   one whose leaving out changes least, in the parameter that it changes most.
 """
@@ -26,7 +27,7 @@ from server.acoustics.geometry import Pose, Vector3
 from server.bench.rooms import FloatArray, noise
 from server.bench.statistical_field import Room, StatisticalField, box
 from server.direct_sound import DirectSound
-from server.effect_costs import measured_costs
+from server.effect_costs import measure_costs
 from server.emitters import Emitter as SessionEmitter
 from server.field.field import AcousticField
 from server.field.levels import Levels
@@ -48,7 +49,7 @@ from server.whole_field import kemar
 
 BLOCK_SIZE: BlockSize = 256
 _POSES_PER_S = 30.0
-_ROUNDS = 5
+_ROUNDS = 9
 _BLOCKS = 96
 _SETTLE_S = 3.0
 
@@ -121,8 +122,7 @@ def measure_effects(scenarios: Sequence[Scenario], advance: Callable[[str], None
     """One row per scenario."""
     rows = []
     for scenario in scenarios:
-        plan = plan_of(scenario, costs=measured_costs(scenario.field(), BLOCK_SIZE))
-        rows.append({"situation": scenario.name, **times_of(scenario, plan), **errors_of(scenario, plan)})
+        rows.append({"situation": scenario.name, **times_of(scenario), **errors_of(scenario, plan_of(scenario))})
         advance(scenario.name)
     return rows
 
@@ -325,19 +325,23 @@ def _along(start: Vector3, speed_m_s: float, clock_s: float) -> Vector3:
     return start[0] + speed_m_s * away_s, start[1], start[2]
 
 
-def times_of(scenario: Scenario, plan: Plan) -> dict[str, Any]:
-    """Microseconds per block, in turns."""
+def times_of(scenario: Scenario) -> dict[str, float]:
+    """Microseconds per block, in turns, with what effects cost measured in the same turns."""
     players = {
         "plan_us": _Player(scenario, {}),
         "all_us": _Player(scenario, everything()),
         "none_us": _Player(scenario, everything(is_on=False)),
     }
-    times_us: dict[str, list[float]] = {name: [] for name in players}
+    rounds = []
     for _ in range(_ROUNDS):
-        for name, player in players.items():
-            started_s = time.thread_time()
-            player.play()
-            times_us[name].append(1e6 * (time.thread_time() - started_s) / _BLOCKS)
-    us = {name: statistics.median(times) for name, times in times_us.items()}
-    sum_us = us["none_us"] + plan.cost_us
-    return {**us, "sum_us": sum_us, "ratio": us["plan_us"] / sum_us}
+        us = {name: _us_per_block(player) for name, player in players.items()}
+        costs = measure_costs(scenario.field(), BLOCK_SIZE)
+        us["sum_us"] = us["none_us"] + plan_of(scenario, costs=costs).cost_us
+        rounds.append({**us, "ratio": us["plan_us"] / us["sum_us"]})
+    return {name: statistics.median(each[name] for each in rounds) for name in rounds[0]}
+
+
+def _us_per_block(player: _Player) -> float:
+    started_s = time.thread_time()
+    player.play()
+    return 1e6 * (time.thread_time() - started_s) / _BLOCKS

@@ -18,6 +18,8 @@ _Singles = npt.NDArray[np.float32]
 # From own sound to shared, at constant power.
 FADE_S = 0.010
 _NOISE_S = 4.0
+# Samples of all bands' amplitudes that a core's nearest cache holds while every channel goes by.
+_STRETCH = 1024
 
 
 def shared_power(times_s: _Floats, start_s: float) -> _Floats:
@@ -62,21 +64,21 @@ class SharedTail:
         """Adds the tail to (yaw, ear, sample) `response`; `rng` chooses the part of the noise."""
         begin = int(rng.integers(self._noise.shape[-1]))
         ears = response.reshape(-1, response.shape[-1])
-        _add_modulated(self._noise, begin, self._amplitudes[take], ears[:, self._first :])
+        _add_modulated(self._noise, begin, self._amplitudes[take], ears, self._first)
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
-def _add_modulated(noise, begin, amplitude, response):
-    """Adds (band, channel, sample) noise times (band, sample) amplitude to (channel, sample), going round from `begin`
-    at the end of the noise."""
+def _add_modulated(noise, begin, amplitude, response, first):
+    """Adds (band, channel, sample) noise times (band, sample) amplitude to (channel, sample) from `first` on, going
+    round from `begin` at the end of the noise."""
     bands, channels, length = noise.shape
     samples, done = amplitude.shape[1], 0
     while done < samples:
-        count = min(samples - done, length - begin)
+        count = min(samples - done, length - begin, _STRETCH)
         for channel in range(channels):
+            target = response[channel, first + done : first + done + count]
             for band in range(bands):
                 source, gain = noise[band, channel, begin : begin + count], amplitude[band, done : done + count]
-                target = response[channel, done : done + count]
                 for index in range(count):
                     target[index] += source[index] * gain[index]
-        done, begin = done + count, 0
+        done, begin = done + count, (begin + count) % length
