@@ -151,5 +151,6 @@ def composed_irs(
 
 def _without_end(ir: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """(channel, sample) up to the last sample that is not zero, one at least."""
-    heard = np.flatnonzero(ir.any(axis=0))
-    return ir[:, : heard[-1] + 1 if heard.size else 1]
+    heard = ir != 0
+    ends = [ir.shape[1] - int(np.argmax(channel[::-1])) for channel in heard if channel.any()]
+    return ir[:, : max(ends, default=1)]

@@ -1,8 +1,8 @@
 """When a session asks which effects its situation calls for, and what it was told last.
 
 A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
-One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, and four times a second
-at most while poses change. Clocks are seconds of sound.
+One is asked for as soon as anybody comes or goes, wishes change, or something starts to move; while poses change, four
+times a second at most, and less often the more emitters there are. Clocks are seconds of sound.
 """
 
 import dataclasses
@@ -20,6 +20,8 @@ from server.scene.planner import Costs, make_plan
 from server.scene.situation import Emitter, Listener, Output, Place, Situation
 
 PERIOD_S = 0.25
+_EMITTERS_PER_PERIOD = 4
+"""Plans of more take longer, and are made less often; all look `HORIZON_S` ahead."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
 
@@ -136,7 +138,7 @@ class PlannedEffects:
         """None where an earlier one is unanswered, or nothing has changed."""
         if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
             return None
-        self._next_look_s = clock_s + PERIOD_S
+        self._next_look_s = clock_s + PERIOD_S * max(1.0, len(emitters) / _EMITTERS_PER_PERIOD)
         motion = self._listener
         situation = Situation(
             self.place,

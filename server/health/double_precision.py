@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 
+from server.acoustics.geometry import axes_of
 from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
 from server.early_reflections import EarlyReflections
 from server.field.decoder import Decoder
 from server.field.field import AcousticField, Silence
 from server.field.graph import Spectrograms
-from server.rendering.direct_path import head_axes
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.hrtf import HeadFilters
 from server.rendering.still_paths import StillPaths
@@ -145,7 +145,7 @@ class DoubleStillPaths(StillPaths):
         tables = self._tables
         heard = np.zeros(out.shape)
         for length, arrival, gains_db in zip(lengths_m, arrivals, band_gains_db, strict=True):
-            corners, weights = self._triangle(head_axes(orientation) @ arrival)
+            corners, weights = self._triangle(axes_of(orientation) @ arrival)
             levels_db = gains_db - tables.air_db_per_m * length
             cepstra = np.einsum("c,cen->en", weights, _double(tables.cepstra[corners]))
             cepstra += levels_db @ _double(tables.band_cepstra)

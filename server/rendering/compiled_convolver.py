@@ -1,113 +1,20 @@
-"""The arrays behind the compiled convolver, and impulse responses (IRs) in the layout it multiplies."""
-
-from dataclasses import dataclass
+"""The arrays behind the compiled convolver."""
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.simd import LANES, load, store
-from server.compiled import compiled
+from server.acoustics.simd import LANES
 from server.rendering import right_angle
 from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
+from server.rendering.packed_filter import PackedFilter, address, aligned, pack
 from server.rendering.partitions import Partitioning, Stage
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 
-_CACHE_LINE = 64
 _PER_SOURCE = ("current", "job_source", "job_old", "job_new")
-
-
-def _address(array: npt.NDArray[np.generic]) -> int:
-    return int(array.__array_interface__["data"][0])
-
-
-def _zeros(*shape: int) -> FloatArray:
-    """float32 at the start of a cache line; pages are mapped when first written, so what is not used costs nothing."""
-    count = int(np.prod(shape))
-    raw = np.zeros(4 * count + _CACHE_LINE, np.uint8)
-    skip = -_address(raw) % _CACHE_LINE
-    return raw[skip : skip + 4 * count].view(np.float32).reshape(shape)
-
-
-@dataclass(frozen=True)
-class PackedFilter:
-    """An IR (channel, sample) transformed for every stage; immutable, so threads may share it.
-
-    `header` holds, per stage, the address of its spectra, how many partitions they have, and the address of a digest of
-    each partition's samples.
-    """
-
-    header: IntArray
-    spectra: tuple[FloatArray, ...]
-    digests: tuple[IntArray, ...]
-
-    @property
-    def address(self) -> int:
-        return _address(self.header)
-
-
-def pack(
-    ir: FloatArray, partitioning: Partitioning, like: PackedFilter | None = None, same_from: int = 0
-) -> PackedFilter:
-    """Transform an IR (channels, n), n >= 1, n <= the partitioning's; on any thread.
-
-    From sample `same_from` on it is that of which `like` was made, and so are the stages that begin there or later.
-    """
-    channels, samples = ir.shape
-    header, spectra, digests = [], [], []
-    for number, stage in enumerate(partitioning.stages):
-        if like is not None and stage.start >= same_from:
-            header += like.header[3 * number : 3 * number + 3].tolist()
-            spectra.append(like.spectra[number])
-            digests.append(like.digests[number])
-            continue
-        count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
-        padded = np.zeros((channels, count * stage.size), np.float32)
-        piece = ir[:, stage.start : stage.start + padded.shape[1]]
-        padded[:, : piece.shape[1]] = piece
-        cut = padded.reshape(channels, count, stage.size)
-        packed = _zeros(stage.size // LANES, count, channels, 2, LANES)
-        tables = right_angle.tables(stage.size)
-        _pack(
-            _address(padded), _address(packed), count, channels, stage.size, *_addresses(tables), _zeros(3, stage.size)
-        )
-        # Hashes of bytes: equal samples, equal partitions, which an exchange need not compute.
-        digest = np.array([hash(cut[:, partition].tobytes()) for partition in range(count)], np.int64)
-        header += [_address(packed), count, _address(digest)]
-        spectra.append(packed)
-        digests.append(digest)
-    return PackedFilter(np.array(header, np.int64), tuple(spectra), tuple(digests))
-
-
-def _addresses(tables: right_angle.Tables) -> tuple[int, int, int]:
-    return _address(tables.twist), _address(tables.passes), _address(tables.lanes)
-
-
-@compiled
-def _pack(
-    samples: int,
-    packed: int,
-    count: int,
-    channels: int,
-    size: int,
-    twist: int,
-    passes: int,
-    lanes: int,
-    scratch: FloatArray,
-) -> None:
-    bins = int(scratch.ctypes.data)
-    silence = bins + 8 * size
-    for channel in range(channels):
-        for partition in range(count):
-            first = samples + 4 * (channel * count + partition) * size
-            right_angle.forward(first, silence, bins, size, twist, passes, lanes)
-            for tile in range(size // 8):
-                at = ((tile * count + partition) * channels + channel) * 16
-                store(packed, at, load(bins, 8 * tile))
-                store(packed, at + 8, load(bins, size + 8 * tile))
 
 
 class CompiledConvolver:
@@ -129,19 +36,19 @@ class CompiledConvolver:
         block_size, history = partitioning.block_size, partitioning.history_blocks
         stages = partitioning.stages
         self._partitioning = partitioning
-        self.input = _zeros(sources, block_size)
-        self.output = _zeros(channels, block_size)
+        self.input = aligned(sources, block_size)
+        self.output = aligned(channels, block_size)
         self.silent: IntArray = np.zeros(sources, np.int64)
         self.exchanged: IntArray = np.zeros(sources, np.int64)
-        self.tail_gain = _zeros(2, sources)
-        self._history = _zeros(sources, history * block_size)
+        self.tail_gain = aligned(2, sources)
+        self._history = aligned(sources, history * block_size)
         self._wanted: IntArray = np.zeros(sources, np.int64)
         # Apart from the other stages' only where both kinds of tail exist.
         self._own_tails_wanted: IntArray = np.zeros(sources, np.int64)
-        self._tail_history = _zeros(1, history * block_size)
+        self._tail_history = aligned(1, history * block_size)
         self._tail_wanted: IntArray = np.zeros(1, np.int64)
         self._tail_silent: IntArray = np.zeros(1, np.int64)
-        self._scratch = _zeros(2, stages[-1].size)
+        self._scratch = aligned(2, stages[-1].size)
         self._fade_in = raised_cosine(block_size)
         last = len(stages) - 1
         kinds = [(number, False) for number in range(len(stages)) if number < last or has_own_tails]
@@ -154,9 +61,9 @@ class CompiledConvolver:
             wanted = self._own_tails_wanted if has_shared_tail and number == last else self._wanted
             record = self._stages[place : place + 1]
             record["number"] = number
-            record["history"] = _address(self._tail_history if is_shared else self._history)
-            record["wanted"] = _address(self._tail_wanted if is_shared else wanted)
-            record["silent"] = _address(self._tail_silent if is_shared else self.silent)
+            record["history"] = address(self._tail_history if is_shared else self._history)
+            record["wanted"] = address(self._tail_wanted if is_shared else wanted)
+            record["silent"] = address(self._tail_silent if is_shared else self.silent)
             arrays.enter(record)
         self._record = np.zeros(1, CONVOLVER)
         for name, value in {
@@ -183,8 +90,8 @@ class CompiledConvolver:
             "tail_gain": self.tail_gain,
             "fade_in": self._fade_in,
         }.items():
-            self._record[name] = _address(array)
-        self.address = _address(self._record)
+            self._record[name] = address(array)
+        self.address = address(self._record)
 
     @property
     def blocks(self) -> int:
@@ -238,18 +145,19 @@ class _StageArrays:
         self.sources = sources
         self.tables = right_angle.tables(stage.size)
         self.fade_out = raised_cosine(stage.size)[::-1].copy()
-        self.spectra = _zeros(sources, stage.size // LANES, stage.partitions, 2, LANES)
-        self.mix, self.next_mix, self.surplus = (_zeros(channels, 2, stage.size) for _ in range(3))
-        self.output = _zeros(2, channels, stage.size)
+        self.spectra = aligned(sources, stage.size // LANES, stage.partitions, 2, LANES)
+        self.mix, self.next_mix, self.surplus = (aligned(channels, 2, stage.size) for _ in range(3))
+        self.output = aligned(2, channels, stage.size)
         self.current, self.job_source, self.job_old, self.job_new = (np.zeros(sources, np.int64) for _ in _PER_SOURCE)
 
     def enter(self, record: npt.NDArray[np.void]) -> None:
         """Write sizes and addresses into a STAGE record (1,)."""
         record["size"], record["ticks"] = self.stage.size, self.stage.ticks
         record["partitions"], record["sources"] = self.stage.partitions, self.sources
-        record["twist"], record["passes"], record["lanes"] = _addresses(self.tables)
+        for name in ("twist", "passes", "lanes"):
+            record[name] = address(getattr(self.tables, name))
         for name in ("fade_out", "spectra", "mix", "next_mix", "surplus", "output", *_PER_SOURCE):
-            record[name] = _address(getattr(self, name))
+            record[name] = address(getattr(self, name))
 
     def clear(self, source: int) -> None:
         if self.current[source]:

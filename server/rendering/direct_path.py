@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.compiled import HAS_NUMBA
 from server.rendering.direct_path_kernel import (
@@ -32,19 +33,6 @@ NEAR_LIMIT_M = 0.25
 _FEWEST_BINS = 64
 _ASKED = ("present", "muted", "unattenuated", "airless", "goal_m", "arrival", "band_gain_db")
 _LEVEL: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-
-
-def head_axes(quaternion: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(3, 3) from the world to a head turned by a unit quaternion (x, y, z, w)."""
-    x, y, z, w = (float(part) for part in quaternion)
-    # The transpose of the usual matrix.
-    return np.array(
-        (
-            (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
-            (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
-            (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
-        )
-    )
 
 
 class PathTarget(NamedTuple):
@@ -130,7 +118,7 @@ class DirectPath:
     def set_orientation(self, quaternion: Sequence[float] | npt.NDArray[np.floating]) -> None:
         """(x, y, z, w), unit: turns the head's axes to where they are in the world. From the next block on."""
         if self.channels == 2:
-            self.state.to_head[:] = head_axes(quaternion)
+            self.state.to_head[:] = axes_of(quaternion)
 
     def process(self, blocks: FloatArray, out: FloatArray) -> None:
         """Add to `out` (channel, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored.

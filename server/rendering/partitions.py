@@ -8,6 +8,7 @@ Letters: b block size; a stage has partitions of `size` samples, `ticks` = size 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 _GROWTH = 4
 _STAGES = 3
@@ -41,7 +42,7 @@ class Partitioning:
         if self.ir_samples < 1:
             raise ValueError("ir_samples must be at least 1")
 
-    @property
+    @cached_property
     def stages(self) -> tuple[Stage, ...]:
         stages: list[Stage] = []
         start = 0

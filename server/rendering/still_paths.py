@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
-from server.rendering.direct_path import NEAR_LIMIT_M, head_axes
+from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.fractional_delay import sinc_table
 from server.rendering.hrtf import HeadFilters, NoHead
 from server.rendering.still_paths_kernel import DoubleArray, FloatArray, StillPathTables, add_still_paths
@@ -68,7 +69,7 @@ class StillPaths:
         # One layout of each, so that one version is ever compiled.
         add_still_paths(
             self._tables,
-            head_axes(orientation),
+            axes_of(orientation),
             np.ascontiguousarray(lengths_m, np.float64),
             np.ascontiguousarray(arrivals, np.float64),
             np.ascontiguousarray(band_gains_db, np.float64),

@@ -9,9 +9,9 @@ import itertools
 import numpy as np
 
 from server.acoustics.audibility import HEARD
+from server.acoustics.geometry import axes_of
 from server.scene.effects import EffectName
 from server.scene.prediction import ALL_ON, MOST_JND, UNCHANGED, Change, Prediction
-from server.scene.reach import facing
 
 _HEAD_RADIUS_M = 0.0875
 _LATERAL_ILD_DB = 6.0
@@ -63,7 +63,7 @@ def without_head(prediction: Prediction) -> Change:
     ]
     if is_first_heard.any():
         reach = prediction.reach
-        to_the_left = np.abs(reach.paths.arrival @ facing(listener.pose.orientation)[1])
+        to_the_left = np.abs(reach.paths.arrival @ axes_of(listener.pose.orientation)[1])
         aside = 1.0 if listener.turns else float(to_the_left[is_first_heard[reach.owner]].max())
         changes += [
             _in_jnd("itd", 1e6 * _interaural_delay_s(aside, prediction.place.speed_of_sound)),

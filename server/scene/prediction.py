@@ -16,8 +16,9 @@ import numpy.typing as npt
 from server.acoustics.audibility import HEARD, ratio_in_jnd
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_power, power_to_db
+from server.acoustics.geometry import axes_of
 from server.scene.effects import EffectName
-from server.scene.reach import Reach, facing
+from server.scene.reach import Reach
 from server.scene.situation import Emitter, Reverberation, Situation
 
 Floats = npt.NDArray[np.float64]
@@ -259,7 +260,7 @@ class Prediction:
             if not emitter.is_omnidirectional:
                 mine = found.emitter == number
                 departure_db[mine] = emitter.directivity.gain_db(
-                    found.departure[mine] @ facing(emitter.pose.orientation).T
+                    found.departure[mine] @ axes_of(emitter.pose.orientation).T
                 )
         return Mirrored(found.emitter, found.length_m, found.gain_db, departure_db, found.arrival)
 

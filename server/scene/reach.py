@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.geometry import COINCIDENT_M, Quaternion
+from server.acoustics.geometry import COINCIDENT_M, axes_of
 from server.acoustics.sound_path import SoundPaths
 from server.scene.situation import Place, Situation
 
@@ -76,7 +76,7 @@ class Reach:
         for number, each in enumerate(emitters):
             if not each.is_omnidirectional:
                 of_it = np.flatnonzero(rows == number)
-                axes = facing(each.pose.orientation)
+                axes = axes_of(each.pose.orientation)
                 departure_db[of_it] = each.directivity.gain_db(paths.departure[of_it] @ axes.T)
                 straight_departure_db[of_it] = each.directivity.gain_db(straight[of_it] @ axes.T)
                 if number in turners:
@@ -90,18 +90,6 @@ class Reach:
         greatest = np.full((int(self.owner.max()) + 1, len(values)), -np.inf)
         np.maximum.at(greatest, self.owner, values.T)
         return greatest.T
-
-
-def facing(orientation: Quaternion) -> Floats:
-    """(3, 3) from the world to the frame of something turned by `orientation`."""
-    x, y, z, w = orientation
-    return np.array(
-        [
-            (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
-            (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
-            (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
-        ]
-    )
 
 
 def _within_reach(points: Floats, speeds_m_s: list[float], place: Place) -> Floats:

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.acoustics.geometry import LEVEL, Pose, Quaternion
+from server.acoustics.geometry import LEVEL, Pose, Quaternion, axes_of
 from server.errors import RequestError
 from server.protocol import ListenerPose, parse_client_message
 from server.render import PathError, read_path
-from server.rendering.direct_path import head_axes
 from tests.hard_cases.listening import Listening
 
 HERE = (2.0, 2.0, 1.5)
@@ -92,7 +91,7 @@ def test_an_orientation_of_any_length_is_that_of_unit_length(measured, numbers, 
 
 @given(st.tuples(*[st.floats(-1e6, 1e6)] * 4).filter(lambda q: math.hypot(*q) > 1e-5))
 def test_the_axes_of_any_head_are_at_right_angles_and_of_unit_length(measured, numbers):
-    axes = head_axes(Quaternion(*numbers))
+    axes = axes_of(Quaternion(*numbers))
     measured("off a rotation", np.abs(axes @ axes.T - np.eye(3)).max(), 2e-15)
     measured("off one handedness", abs(np.linalg.det(axes) - 1), 2e-15)
 
@@ -123,7 +122,7 @@ def test_a_message_whose_yaw_is_no_number_is_refused(text):
 def test_half_a_turn_from_either_side_is_one_heading(measured):
     one, other = Pose.from_yaw(HERE, math.pi), Pose.from_yaw(HERE, -math.pi)
     measured("off half a turn", abs(abs(one.yaw) - math.pi), 4e-16)
-    measured("axes apart", np.abs(head_axes(one.orientation) - head_axes(other.orientation)).max(), 4e-16)
+    measured("axes apart", np.abs(axes_of(one.orientation) - axes_of(other.orientation)).max(), 4e-16)
 
 
 def test_a_pose_keeps_the_orientation_of_another_to_the_bit(measured):

@@ -1,0 +1,155 @@
+"""Impulse responses (IRs) in the layout that the compiled convolver multiplies."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.simd import LANES, load, store
+from server.compiled import compiled
+from server.rendering import right_angle
+from server.rendering.partitions import Partitioning
+
+FloatArray = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+
+_CACHE_LINE = 64
+_PER_STAGE = 3
+_SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
+_SHIFT = np.uint64(32)
+
+
+def address(array: npt.NDArray[np.generic]) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+def aligned(*shape: int) -> FloatArray:
+    """float32 zeros at the start of a cache line; pages are mapped when first written, so what is not used costs
+    nothing."""
+    count = 1
+    for length in shape:
+        count *= length
+    raw = np.zeros(4 * count + _CACHE_LINE, np.uint8)
+    skip = -address(raw) % _CACHE_LINE
+    return raw[skip : skip + 4 * count].view(np.float32).reshape(shape)
+
+
+@dataclass(frozen=True)
+class PackedFilter:
+    """An IR (channel, sample) transformed for every stage; immutable, so threads may share it.
+
+    `header` holds, per stage, the address of its spectra, how many partitions they have, and the address of a digest of
+    each partition's samples.
+    """
+
+    header: IntArray
+    spectra: tuple[FloatArray, ...]
+    digests: tuple[IntArray, ...]
+
+    @property
+    def address(self) -> int:
+        return address(self.header)
+
+
+def pack(
+    ir: FloatArray, partitioning: Partitioning, like: PackedFilter | None = None, same_from: int = 0
+) -> PackedFilter:
+    """Transform an IR (channels, n), n >= 1, n <= the partitioning's; on any thread, which leaves the interpreter to
+    others for nearly all of it.
+
+    From sample `same_from` on it is that of which `like` was made, and so are the stages that begin there or later.
+    """
+    ir = np.ascontiguousarray(ir, np.float32)
+    channels, samples = ir.shape
+    header = np.zeros(_PER_STAGE * len(partitioning.stages), np.int64)
+    spectra: list[FloatArray] = []
+    digests: list[IntArray] = []
+    all_digests = np.zeros(sum(stage.partitions for stage in partitioning.stages), np.int64)
+    made = taken = 0
+    for number, stage in enumerate(partitioning.stages):
+        at = _PER_STAGE * number
+        if like is not None and stage.start >= same_from:
+            header[at : at + _PER_STAGE] = like.header[at : at + _PER_STAGE]
+            spectra.append(like.spectra[number])
+            digests.append(like.digests[number])
+            continue
+        count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
+        spectra.append(aligned(stage.size // LANES, count, channels, 2, LANES))
+        digests.append(all_digests[taken : taken + count])
+        header[at : at + _PER_STAGE] = address(spectra[-1]), count, address(digests[-1])
+        made, taken = number + 1, taken + count  # those that are taken over come last
+    _pack(ir, ir.view(np.uint32), _stage_tables(partitioning)[:made], header, all_digests)
+    return PackedFilter(header, tuple(spectra), tuple(digests))
+
+
+@cache
+def _stage_tables(partitioning: Partitioning) -> IntArray:
+    """(stage, 5) where each begins, the size of its partitions, and the addresses of its transform's tables."""
+    rows = []
+    for stage in partitioning.stages:
+        tables = right_angle.tables(stage.size)  # kept for good
+        rows.append((stage.start, stage.size, address(tables.twist), address(tables.passes), address(tables.lanes)))
+    return np.array(rows, np.int64)
+
+
+@compiled
+def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digests: IntArray) -> None:
+    """`words` are the bits of `ir`; `digests` are of all partitions of the stages, one after the other."""
+    channels, samples = ir.shape
+    longest = stages[-1, 1] if len(stages) > 0 else 0
+    room = np.zeros((4, longest), np.float32)
+    bins, silence = room.ctypes.data, room[2].ctypes.data
+    padded = room[3]
+    done = 0
+    for number in range(len(stages)):
+        start, size = stages[number, 0], stages[number, 1]
+        twist, passes, lanes = stages[number, 2], stages[number, 3], stages[number, 4]
+        packed, count = header[3 * number], header[3 * number + 1]
+        for partition in range(count):
+            begin = start + partition * size
+            end = min(begin + size, samples)
+            digest = _SEED
+            for channel in range(channels):
+                first = ir[channel, begin:end].ctypes.data
+                if end < begin + size:
+                    padded[: end - begin] = ir[channel, begin:end]
+                    padded[end - begin : size] = 0
+                    first = padded.ctypes.data
+                digest = _digest(words[channel, begin:end], size, digest)
+                right_angle.forward(first, silence, bins, size, twist, passes, lanes)
+                for tile in range(size // 8):
+                    at = ((tile * count + partition) * channels + channel) * 16
+                    store(packed, at, load(bins, 8 * tile))
+                    store(packed, at + 8, load(bins, size + 8 * tile))
+            digests[done] = np.int64(digest)
+            done += 1
+
+
+@compiled
+def _digest(words: Any, size: int, seed: Any) -> Any:
+    """Of bits, and zeros behind them up to `size`: the same of equal samples and of no others, but for one chance in
+    2^64. Four sums at a time, each step of which can be undone."""
+    a, b, c, d = seed, seed ^ _FACTOR, seed + _FACTOR, ~seed
+    given = len(words)
+    for n in range(0, size, 4):
+        if n + 4 <= given:
+            a, b = _mixed(a, words[n]), _mixed(b, words[n + 1])
+            c, d = _mixed(c, words[n + 2]), _mixed(d, words[n + 3])
+        else:
+            none = np.uint32(0)
+            a = _mixed(a, words[n] if n < given else none)
+            b = _mixed(b, words[n + 1] if n + 1 < given else none)
+            c = _mixed(c, words[n + 2] if n + 2 < given else none)
+            d = _mixed(d, none)
+    for other in (b, c, d):
+        a = (a ^ other) * _FACTOR
+        a ^= a >> _SHIFT
+    return a
+
+
+@compiled
+def _mixed(digest: Any, word: Any) -> Any:
+    digest = (digest ^ np.uint64(word)) * _FACTOR
+    return digest ^ (digest >> _SHIFT)
