@@ -14,7 +14,6 @@ Axes: (yaw, ear, sample) responses in single precision; spectra have bins last.
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
@@ -22,17 +21,15 @@ from scipy.signal.windows import cosine
 from scipy.sparse import coo_array
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.minimum_phase import folded_cepstrum
 from server.rendering.hrtf import HeadFilters
-from server.rendering.sphere import find_triangle
 from server.scene.manifest import Air
 from training.dataset import SPEED_OF_SOUND
 from training.scene_file import HISTOGRAM_BIN_S
+from training.simulation.head_spectra import HeadSpectra, band_weights
 from training.simulation.tracing import Arrivals, free_field_amplitude
 
 _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
-_Spectra = npt.NDArray[np.complex64]
 
 _WINDOW_S = 0.010
 _DIFFUSE_RISE_S = 0.002
@@ -45,13 +42,6 @@ def rotate_into_head(directions: _Floats, yaws: _Floats) -> _Floats:
     x, y, z = (directions[:, None, axis] for axis in range(3))
     cos, sin = np.cos(yaws), np.sin(yaws)
     return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(yaws)))], axis=-1)
-
-
-def band_weights(frequencies_hz: _Floats) -> _Floats:
-    """(band, frequency) interpolation between octave bands, linear over log frequency; columns sum to one."""
-    octave = np.log2(np.maximum(frequencies_hz, 1.0) / OCTAVE_BANDS_HZ[0])
-    position = np.clip(octave, 0, len(OCTAVE_BANDS_HZ) - 1)
-    return np.maximum(0.0, 1 - np.abs(position - np.arange(len(OCTAVE_BANDS_HZ))[:, None]))
 
 
 def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
@@ -173,36 +163,8 @@ class BinauralSynthesis:
         return band_weights(np.fft.rfftfreq(self._n_fft, 1 / self._sample_rate)).astype(np.float32)
 
     @cached_property
-    def _band_filters(self) -> _Spectra:
-        """(band, bin) logarithms of minimum-phase filters that are e in one band: times ln gains, those of a wall."""
-        return np.fft.rfft(folded_cepstrum(self._band_weights.astype(np.float64)), self._n_fft).astype(np.complex64)
-
-    @cached_property
-    def _head_filters(self) -> _Spectra:
-        """(measured direction, ear and bin) logarithms of the head's minimum-phase filters."""
-        filters = np.fft.rfft(self.head.cepstra, self._n_fft)
-        return filters.reshape(len(filters), -1).astype(np.complex64)
-
-    @cached_property
-    def _turns(self) -> _Singles:
-        """(bin,) radians per sample of delay."""
-        return (-2 * np.pi * np.fft.rfftfreq(self._n_fft)).astype(np.float32)
-
-    def _filters_from(self, directions: _Floats) -> tuple[_Spectra, _Singles]:
-        """For (..., xyz) as seen by the head: (..., ear, bin) logarithms of its minimum-phase filters, and (..., ear)
-        delays in samples after the wave passes its centre."""
-        head, mesh = self.head, self.head.triangulation
-        flat = np.ascontiguousarray(directions.reshape(-1, 3))
-        around, share = _triangles_around(mesh.across, mesh.inverses, flat)
-        corners = mesh.triangles[around]
-        parts = np.moveaxis(share.astype(np.float32), 1, 0)[..., None]
-        filters = self._head_filters[corners[:, 0]]  # gathered corner by corner, which is faster than all at once
-        filters *= parts[0]
-        for part, corner in zip(parts[1:], corners.T[1:], strict=True):
-            filters += part * self._head_filters[corner]
-        delays = np.einsum("dc,dce->de", share, head.delays_s[corners]) * head.sample_rate
-        shape = (*directions.shape[:-1], 2)
-        return filters.reshape(*shape, self._n_fft // 2 + 1), delays.reshape(shape).astype(np.float32)
+    def _ears(self) -> HeadSpectra:
+        return HeadSpectra(self.head, self._n_fft)
 
     @cached_property
     def _window(self) -> _Singles:
@@ -210,10 +172,9 @@ class BinauralSynthesis:
         return np.asarray(cosine(self._n_fft, sym=True), dtype=np.float32)
 
     @cached_property
-    def _arrival_spectra(self) -> _Spectra:
+    def _arrival_spectra(self) -> npt.NDArray[np.complex64]:
         """(bin, direction, yaw and ear)"""
-        filters, delays = self._filters_from(rotate_into_head(self.arrival_directions, self.yaws))
-        spectra = np.exp(filters + 1j * (delays[..., None] * self._turns))
+        spectra = self._ears.arriving(rotate_into_head(self.arrival_directions, self.yaws))
         return np.ascontiguousarray(np.moveaxis(spectra.reshape(len(spectra), -1, spectra.shape[-1]), -1, 0))
 
     def late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
@@ -244,30 +205,12 @@ class BinauralSynthesis:
         offset = positions - receiver
         distance = np.linalg.norm(offset, axis=-1)
         heard = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
-        filters, ears = self._filters_from(heard)
-        filters += (np.log(np.maximum(amplitudes, 1e-12)).astype(np.float32) @ self._band_filters)[:, None, None]
         delay = distance / SPEED_OF_SOUND * self._sample_rate
         start = np.floor(delay).astype(int)
         lead = round(_LEAD_S * self._sample_rate)
-        ears += (lead + delay - start).astype(np.float32)[:, None, None]
-        phase = filters.imag + ears[..., None] * self._turns
-        spectra = np.empty_like(filters)
-        np.cos(phase, out=spectra.real)
-        np.sin(phase, out=spectra.imag)
-        spectra *= np.exp(filters.real)
+        spectra = self._ears.specular(heard, amplitudes, lead + delay - start)
         taps = irfft(spectra, self._n_fft)
         for tap, at in zip(taps, start - lead, strict=True):
             first, last = max(0, -at), min(self._n_fft, self.samples - at)
             if last > first:
                 response[..., at + first : at + last] += tap[..., first:last]
-
-
-@numba.njit(cache=True, nogil=True)
-def _triangles_around(across, inverses, directions):
-    """(direction,) triangle that holds each, and (direction, 3) shares of its corners."""
-    triangles, shares = np.empty(len(directions), np.int64), np.empty((len(directions), 3))
-    triangle = 0
-    for index in range(len(directions)):
-        triangle = find_triangle(across, inverses, directions[index], triangle, shares[index])
-        triangles[index] = triangle
-    return triangles, shares

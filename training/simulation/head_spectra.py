@@ -1,0 +1,141 @@
+"""What a wave from some direction is at the ears of a level head, as spectra: minimum phase and a delay per ear, and
+the gains in octave bands of what it met on its way, as a minimum-phase filter too.
+
+Logarithms are interpolated between measured directions and added up, so every wave takes an exponential and a sine per
+bin; those of specular sound are computed eight bins at a time.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.minimum_phase import folded_cepstrum
+from server.acoustics.simd import (
+    LANES,
+    broadcast,
+    cosine_sine,
+    exponential,
+    load,
+    multiply,
+    multiply_add,
+    store,
+)
+from server.rendering.hrtf import HeadFilters
+from server.rendering.sphere import find_triangle
+
+_Floats = npt.NDArray[np.float64]
+_Singles = npt.NDArray[np.float32]
+_Spectra = npt.NDArray[np.complex64]
+
+
+def band_weights(frequencies_hz: _Floats) -> _Floats:
+    """(band, frequency) interpolation between octave bands, linear over log frequency; columns sum to one."""
+    octave = np.log2(np.maximum(frequencies_hz, 1.0) / OCTAVE_BANDS_HZ[0])
+    position = np.clip(octave, 0, len(OCTAVE_BANDS_HZ) - 1)
+    return np.maximum(0.0, 1 - np.abs(position - np.arange(len(OCTAVE_BANDS_HZ))[:, None]))
+
+
+@dataclass(frozen=True)
+class HeadSpectra:
+    """Of a head, at the frequencies of a transform of `n_fft` samples."""
+
+    head: HeadFilters
+    n_fft: int
+
+    @property
+    def bins(self) -> int:
+        return self.n_fft // 2 + 1
+
+    def arriving(self, directions: _Floats) -> _Spectra:
+        """(..., ear, bin) for (..., xyz) as seen by the head."""
+        flat = np.ascontiguousarray(directions.reshape(-1, 3))
+        nothing_met = np.ones((len(flat), len(OCTAVE_BANDS_HZ)))
+        return self.specular(flat[:, None], nothing_met, np.zeros(len(flat))).reshape(
+            *directions.shape[:-1], 2, self.bins
+        )
+
+    def specular(self, directions: _Floats, amplitudes: _Floats, delays: _Floats) -> _Spectra:
+        """(wave, yaw, ear, bin) for (wave, yaw, xyz) as seen by the head, with (wave, band) gains and (wave,) delays in
+        samples to the middle of the head."""
+        waves, yaws, _ = directions.shape
+        mesh = self.head.triangulation
+        flat = np.ascontiguousarray(directions.reshape(-1, 3))
+        triangles, shares = _triangles_around(mesh.across, mesh.inverses, flat)
+        corners = mesh.triangles[triangles]
+        later = np.einsum("dc,dce->de", shares, self.head.delays_s[corners]) * self.head.sample_rate
+        later += np.repeat(delays, yaws)[:, None]
+        gains = np.log(np.maximum(amplitudes, 1e-12)).astype(np.float32)
+        met = gains @ self._band_logs.reshape(len(gains.T), -1)
+        spectra = np.empty((waves, yaws, 2, self.bins), np.complex64)
+        _spectra(
+            corners,
+            shares.astype(np.float32),
+            (later * (-2 * np.pi / self.n_fft)).astype(np.float32),
+            met.reshape(waves, *self._band_logs.shape[1:]),
+            self._logs,
+            np.arange(self._logs.shape[-1], dtype=np.float32),
+            spectra.reshape(waves, yaws, 2 * self.bins),
+        )
+        return spectra
+
+    @cached_property
+    def _logs(self) -> _Singles:
+        """(measured direction, ear, part, bin and room for whole vectors) logarithms of the head's filters."""
+        return self._in_parts(np.fft.rfft(self.head.cepstra, self.n_fft))
+
+    @cached_property
+    def _band_logs(self) -> _Singles:
+        """(band, part, bin and room) logarithms of minimum-phase filters that are e in one band: times ln gains, those
+        of what was met."""
+        weights = band_weights(np.fft.rfftfreq(self.n_fft, 1 / self.head.sample_rate))
+        return self._in_parts(np.fft.rfft(folded_cepstrum(weights), self.n_fft))
+
+    def _in_parts(self, spectra: npt.NDArray[np.complexfloating]) -> _Singles:
+        parts = np.zeros((*spectra.shape[:-1], 2, -(-self.bins // LANES) * LANES), np.float32)
+        parts[..., 0, : self.bins], parts[..., 1, : self.bins] = spectra.real, spectra.imag
+        return parts
+
+
+@numba.njit(cache=True, nogil=True)
+def _spectra(corners, shares, turns, met, logs, numbers, spectra):
+    """Fills (wave, yaw, ear and bin) `spectra`; (direction, ear) `turns` are radians per bin, and a direction is a wave
+    at a yaw."""
+    waves, yaws, _ = spectra.shape
+    padded = logs.shape[-1]
+    bins = spectra.shape[2] // 2
+    parts = np.empty((2, padded), np.float32)
+    real, imaginary = parts[0].ctypes.data, parts[1].ctypes.data
+    for wave in range(waves):
+        for yaw in range(yaws):
+            direction = wave * yaws + yaw
+            for ear in range(2):
+                turn = broadcast(turns[direction, ear])
+                for first in range(0, padded, 8):
+                    size, phase = load(met[wave, 0].ctypes.data, first), load(met[wave, 1].ctypes.data, first)
+                    for corner in range(3):
+                        share = broadcast(shares[direction, corner])
+                        of_corner = logs[corners[direction, corner], ear]
+                        size = multiply_add(load(of_corner[0].ctypes.data, first), share, size)
+                        phase = multiply_add(load(of_corner[1].ctypes.data, first), share, phase)
+                    phase = multiply_add(load(numbers.ctypes.data, first), turn, phase)
+                    size = exponential(size)
+                    cosine, sine = cosine_sine(phase)
+                    store(real, first, multiply(size, cosine))
+                    store(imaginary, first, multiply(size, sine))
+                for number in range(bins):
+                    spectra[wave, yaw, ear * bins + number] = complex(parts[0, number], parts[1, number])
+
+
+@numba.njit(cache=True, nogil=True)
+def _triangles_around(across, inverses, directions):
+    """(direction,) triangle that holds each, and (direction, 3) shares of its corners."""
+    triangles, shares = np.empty(len(directions), np.int64), np.empty((len(directions), 3))
+    triangle = 0
+    for index in range(len(directions)):
+        triangle = find_triangle(across, inverses, directions[index], triangle, shares[index])
+        triangles[index] = triangle
+    return triangles, shares
