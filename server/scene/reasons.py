@@ -15,7 +15,7 @@ _PARAMETERS = {
     "edt": ("the early decay", "%"),
     "t60": ("the reverberation time", "%"),
     "iacc": ("the interaural correlation", ""),
-    "itd": ("the time between the ears", "us"),
+    "itd": ("the time between the ears", "µs"),
     "ild": ("the level between the ears", "dB"),
     "pitch": ("the pitch", "%"),
     "onset": ("the moment of arrival", "ms"),

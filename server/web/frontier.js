@@ -168,6 +168,7 @@ export class Frontier extends EventTarget {
     const isLeft = at > WIDTH * 0.6;
     const room = isLeft ? at - MARGIN.left : WIDTH - at;
     if (level.name.length * LETTER + 12 > room) return; // it is above the chart in any case
-    draw("text", { x: at + (isLeft ? -12 : 12), y: height - 7, class: isLeft ? "name end" : "name" }, this.#chart, level.name);
+    // The line falls to the right: above its end there is room, and beside its beginning.
+    draw("text", { x: at + (isLeft ? 8 : 12), y: height - (isLeft ? 14 : 7), class: isLeft ? "name end" : "name" }, this.#chart, level.name);
   }
 }
