@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from server.scene.effects import CATALOGUE, OF_DIRECT_SOUND, OF_RESPONSES, EffectName, Overrides
 from server.scene.listening import SHARED, without_delay
 from server.scene.plan import Decision, Plan
-from server.scene.prediction import UNCHANGED, Change, Prediction, worst
+from server.scene.prediction import UNCHANGED, Change, Floats, Off, Prediction, worst
 from server.scene.reasons import reason
 from server.scene.situation import Emitter, Situation
 
@@ -69,6 +69,8 @@ class _Planner:
         self._overrides = overrides
         self._costs = costs
         self._prediction = Prediction(situation) if situation.emitters else None
+        self._without: dict[Off, dict[str, Floats]] = {}
+        """Changes of all emitters without several effects at once: most emitters are without the same."""
 
     def plan(self) -> Plan:
         if self._prediction is None:
@@ -125,7 +127,10 @@ class _Planner:
             candidates = [name for name in off if name not in self._overrides]
             if len(off) < 2 or not candidates:
                 return
-            together = worst(self._prediction.changes([frozenset(off)]), 0, number)
+            without = frozenset(off)
+            if without not in self._without:
+                self._without[without] = self._prediction.changes([without])
+            together = worst(self._without[without], 0, number)
             if together.jnd < ENTER_JND:
                 return
             largest = max(candidates, key=lambda name: decisions[name].change_jnd)
