@@ -18,7 +18,7 @@ RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-dep
 # What renders is compiled here, for this machine's processor, and kept beside its source; on another processor a
 # container compiles at its start, a matter of half a minute, and keeps that where NUMBA_CACHE_DIR says.
 WORKDIR /
-RUN /opt/nafir/bin/python -c "from server.rendering.renderer import warm_up; warm_up([256])" \
+RUN /opt/nafir/bin/python -c "from server.rendering.warm_up import warm_up; warm_up([256])" \
     && /opt/nafir/bin/nafir ir apartment --listener 1,2,1.5 --emitter 6,3,1.5 -o /tmp/ir.wav && rm /tmp/ir.wav \
     && /opt/nafir/bin/nafir bench field --rounds 1 --poses 2
 WORKDIR /source

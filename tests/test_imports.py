@@ -1,6 +1,8 @@
 """What may import what: the server runs without torch and without `training`, and its packages depend one way."""
 
 import ast
+import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -125,3 +127,10 @@ def test_the_rule_sees_each_way_of_breaking_it(package: str, line: str) -> None:
 )
 def test_the_rule_allows_what_the_design_allows(package: str, line: str) -> None:
     assert not forbidden_imports(package, line, f"server.{package}")
+
+
+def test_what_the_image_imports_while_it_is_built_is_there() -> None:
+    imports = re.findall(r"from (server[\w.]*) import (\w+)", (ROOT / "Dockerfile").read_text())
+    assert imports
+    for module, name in imports:
+        assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
