@@ -1,8 +1,8 @@
 """When a session asks which effects its situation calls for, and what it was told last.
 
 A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
-One is asked for as soon as anybody comes or goes, wishes change, or something starts to move; while poses change, four
-times a second at most, and less often the more emitters there are. Clocks are seconds of sound.
+One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, or to move faster than it
+did; while poses change, four times a second at most, and once a second for many emitters. Clocks are seconds of sound.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from server.scene.planner import Costs, make_plan
 from server.scene.situation import Emitter, Listener, Output, Place, Situation
 
 PERIOD_S = 0.25
-_EMITTERS_PER_PERIOD = 4
-"""Plans of more take longer, and are made less often; all look `HORIZON_S` ahead."""
+_EMITTERS_PER_PERIOD, _MOST_PERIODS = 4, 4
+"""Plans of more take longer, and are made less often, well within the `HORIZON_S` that all look ahead."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
 
@@ -54,7 +54,7 @@ class PlanRequest:
     costs: Costs
 
     def plan(self) -> Plan:
-        """A millisecond or so: not for the audio thread."""
+        """Milliseconds, more of them the more emitters: not for the audio thread."""
         overrides = {**dict.fromkeys(self.corrections, True), **self.overrides}
         plan = make_plan(self.situation, previous=self.previous, overrides=overrides, costs=self.costs)
         return _explained(plan, {name: why for name, why in self.corrections.items() if name not in self.overrides})
@@ -115,9 +115,9 @@ class PlannedEffects:
         self._is_stale = True
 
     def follow_listener(self, pose: Pose, clock_s: float) -> None:
-        before = self._listener.moves(clock_s), self._listener.turns(clock_s)
-        self._listener.follow(pose, clock_s)
-        self._is_stale |= before != (self._listener.moves(clock_s), self._listener.turns(clock_s))
+        turned = self._listener.turns(clock_s)
+        self._follow(self._listener, pose, clock_s)
+        self._is_stale |= turned != self._listener.turns(clock_s)
 
     def follow_emitter(self, name: str, pose: Pose, clock_s: float) -> None:
         """One that comes is at rest until it moves."""
@@ -126,9 +126,13 @@ class PlannedEffects:
             self._emitters[name] = Motion(pose, clock_s)
             self._is_stale = True
             return
-        before = motion.moves(clock_s)
+        self._follow(motion, pose, clock_s)
+
+    def _follow(self, motion: Motion, pose: Pose, clock_s: float) -> None:
+        """What is faster than before leaves what a plan has looked at."""
+        moved, speed_m_s = motion.moves(clock_s), motion.speed_m_s(clock_s)
         motion.follow(pose, clock_s)
-        self._is_stale |= before != motion.moves(clock_s)
+        self._is_stale |= moved != motion.moves(clock_s) or motion.speed_m_s(clock_s) > speed_m_s
 
     def forget_emitter(self, name: str) -> None:
         self._emitters.pop(name, None)
@@ -138,7 +142,8 @@ class PlannedEffects:
         """None where an earlier one is unanswered, or nothing has changed."""
         if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
             return None
-        self._next_look_s = clock_s + PERIOD_S * max(1.0, len(emitters) / _EMITTERS_PER_PERIOD)
+        periods = min(max(1.0, len(emitters) / _EMITTERS_PER_PERIOD), _MOST_PERIODS)
+        self._next_look_s = clock_s + PERIOD_S * periods
         motion = self._listener
         situation = Situation(
             self.place,

@@ -6,6 +6,7 @@ from scipy.signal.windows import kaiser
 
 from server.acoustics.geometry import Pose
 from server.direct_sound import DirectSound
+from server.emitters import Emitter
 from server.errors import RequestError
 from server.field.field import AcousticField
 from server.field.levels import Levels
@@ -186,6 +187,34 @@ def test_a_pose_that_is_sent_again_moves_nothing(open_stage):
         stage.hear(0.2)
     assert len(stage.asked) == asked
     assert stage.is_folded == [True]
+
+
+@pytest.mark.parametrize("who", ["listener", "emitter"])
+def test_what_moves_faster_than_it_did_is_planned_for_at_once(mirrored_field, who):
+    planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE))
+    emitters = {str(number): Emitter(number, Pose(THERE)) for number in range(16)}
+    for name, emitter in emitters.items():
+        planned.follow_emitter(name, emitter.pose, 0.0)
+
+    def asks(clock_s, way_m):
+        if who == "listener":
+            pose = Pose((HERE[0] + way_m, *HERE[1:]))
+            planned.follow_listener(pose, clock_s)
+        else:
+            pose = Pose(HERE)
+            emitters["0"].pose = Pose((THERE[0] - way_m, *THERE[1:]))
+            planned.follow_emitter("0", emitters["0"].pose, clock_s)
+        request = planned.take_request(pose, emitters, clock_s)
+        if request is not None:
+            planned.accept(request.plan())
+        return request is not None
+
+    assert asks(0.0, 0.0)
+    assert asks(0.1, 0.1)  # it moves
+    assert not any(asks(0.1 * step, 0.1 * step) for step in range(2, 8))  # as fast as before
+    assert asks(0.8, 1.7)
+    walks = [asks(0.8 + 0.1 * step, 1.7 + 0.03 * step) for step in range(1, 40)]
+    assert 3 <= sum(walks) <= 5  # once a second, of so many
 
 
 def test_a_mono_loudspeaker_has_one_channel_and_no_head(open_stage):

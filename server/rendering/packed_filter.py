@@ -61,7 +61,7 @@ def pack(
 
     From sample `same_from` on it is that of which `like` was made, and so are the stages that begin there or later.
     """
-    ir = np.ascontiguousarray(ir, np.float32)
+    ir = np.require(ir, np.float32, ["C", "A", "W"])  # of one kind, since every kind is compiled for
     channels, samples = ir.shape
     header = np.zeros(_PER_STAGE * len(partitioning.stages), np.int64)
     spectra: list[FloatArray] = []
@@ -80,18 +80,21 @@ def pack(
         digests.append(all_digests[taken : taken + count])
         header[at : at + _PER_STAGE] = address(spectra[-1]), count, address(digests[-1])
         made, taken = number + 1, taken + count  # those that are taken over come last
-    _pack(ir, ir.view(np.uint32), _stage_tables(partitioning)[:made], header, all_digests)
+    stages, _ = _stage_tables(partitioning)
+    _pack(ir, ir.view(np.uint32), stages[:made], header, all_digests)
     return PackedFilter(header, tuple(spectra), tuple(digests))
 
 
 @cache
-def _stage_tables(partitioning: Partitioning) -> IntArray:
-    """(stage, 5) where each begins, the size of its partitions, and the addresses of its transform's tables."""
-    rows = []
-    for stage in partitioning.stages:
-        tables = right_angle.tables(stage.size)  # kept for good
-        rows.append((stage.start, stage.size, address(tables.twist), address(tables.passes), address(tables.lanes)))
-    return np.array(rows, np.int64)
+def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[right_angle.Tables, ...]]:
+    """(stage, 5) where each begins, the size of its partitions, and the addresses of its transform's tables; and those
+    tables, so that they last as long."""
+    all_tables = tuple(right_angle.tables(stage.size) for stage in partitioning.stages)
+    rows = [
+        (stage.start, stage.size, address(tables.twist), address(tables.passes), address(tables.lanes))
+        for stage, tables in zip(partitioning.stages, all_tables, strict=True)
+    ]
+    return np.array(rows, np.int64), all_tables
 
 
 @compiled

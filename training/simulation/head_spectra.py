@@ -2,7 +2,7 @@
 the gains in octave bands of what it met on its way, as a minimum-phase filter too.
 
 Logarithms are interpolated between measured directions and added up, so every wave takes an exponential and a sine per
-bin; those of specular sound are computed eight bins at a time.
+bin, which are computed eight bins at a time.
 """
 
 from dataclasses import dataclass
