@@ -92,15 +92,16 @@ def export(
     of `responses` or not measured, and HealthError for fields that break a law of `nafir check`: nothing is written.
     """
     exported: list[_Exported] = []
-    # All are opened before the first graph is made, which takes a while.
-    for field, place in [(_opened(responses, place), place) for place in runs]:
+    # All are opened, and told apart, before the first graph is made, which takes a while.
+    opened = [(_opened(responses, place), place) for place in runs]
+    _require_different([_name_of(field, place) for field, place in opened])
+    for field, place in opened:
         if isinstance(field, ImportedDataset):
             exported.append(_shaped(field))
         else:
             exported += _graphs(field, Configuration.read(place), precisions, ranks, exact_tables=exact_tables)
     names = [each.name for each in exported]
-    if doubled := {name for name in names if names.count(name) > 1}:
-        raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
+    _require_different(names)  # of lower ranks, too
     codec = exported[0].codec
     seed = 0 if exported[0].architecture == SHAPED_NEAREST else Configuration.read(runs[0]).seed
     noise = even_noise(codec.codec, np.random.default_rng([seed, 6]))
@@ -146,6 +147,23 @@ def _opened(responses: ResponseSet, place: Path) -> Learner | ImportedDataset:
     return responses
 
 
+def _name_of(field: Learner | ImportedDataset, place: Path) -> str:
+    if isinstance(field, ImportedDataset):
+        return SHAPED_NEAREST
+    if isinstance(field, FactorisedLearner):
+        return _factorised_name(len(field.field.basis))
+    return Configuration.read(place).name
+
+
+def _factorised_name(rank: int) -> str:
+    return f"factorised-r{rank}"
+
+
+def _require_different(names: list[str]) -> None:
+    if doubled := {name for name in names if names.count(name) > 1}:
+        raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
+
+
 def _graphs(
     learner: Learner,
     configuration: Configuration,
@@ -180,7 +198,8 @@ def _factorised(
             least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
             model = halve_weights(to_int8(graph, least_weights=least_weights) if precision == "int8" else graph)
             _check(model, module, poses, outputs, precision)
-            exported.append(_Exported(f"factorised-r{rank}{_suffix(precision)}", model, "factorised", rank, codec))
+            name = f"{_factorised_name(rank)}{_suffix(precision)}"
+            exported.append(_Exported(name, model, "factorised", rank, codec))
     return exported
 
 
