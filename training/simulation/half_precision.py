@@ -4,36 +4,51 @@ NumPy's own conversion takes tens of nanoseconds for each subnormal number, whic
 than it takes to simulate them.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 import numpy.typing as npt
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 _EXPONENT_SHIFT = np.uint32((127 - 15) << 23)
 _SMALLEST_NORMAL = np.uint32((127 - 14) << 23)
 _BEYOND_LARGEST = np.uint32((127 + 16) << 23)
 _INFINITE = np.uint32(0x7F800000)
-_PER_SUBNORMAL = np.float32(2.0**24)
+# Beside it the last place of a single is that of a subnormal half.
+_ALIGNING = np.float32(0.5)
+_ALIGNING_BITS = _ALIGNING.view(np.uint32)
 
 
 def to_half(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float16]:
     """The same numbers as `values.astype(np.float16)`; beyond the largest they are infinite, without a warning."""
     single = np.ascontiguousarray(values, dtype=np.float32)
     half = np.empty(single.shape, dtype=np.float16)
-    _round(single.reshape(-1), single.reshape(-1).view(np.uint32), half.reshape(-1).view(np.uint16))
+    _round(single.reshape(-1), half.reshape(-1).view(np.uint16))
     return half
 
 
+@intrinsic
+def _bits(_context: Any, _value: Any) -> Any:
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.IntType(32))
+
+    return types.uint32(types.float32), generate
+
+
 @numba.njit(cache=True, nogil=True)
-def _round(values, bits, half):
+def _round(values, half):
     for index in range(len(values)):
-        sign = (bits[index] >> np.uint32(16)) & np.uint32(0x8000)
-        size = bits[index] & np.uint32(0x7FFFFFFF)
+        magnitude = abs(values[index])
+        size, sign = _bits(magnitude), (_bits(values[index]) >> np.uint32(16)) & np.uint32(0x8000)
         # Beyond the middle, or right on it where the last digit kept is odd, is rounded up.
         rounded = (size - _EXPONENT_SHIFT + np.uint32(0xFFF) + ((size >> np.uint32(13)) & np.uint32(1))) >> np.uint32(
             13
         )
         if size < _SMALLEST_NORMAL:
-            rounded = np.uint32(np.rint(abs(values[index]) * _PER_SUBNORMAL))
+            rounded = _bits(magnitude + _ALIGNING) - _ALIGNING_BITS
         if size >= _BEYOND_LARGEST:
             rounded = np.uint32(0x7C00)
         if size > _INFINITE:

@@ -58,14 +58,15 @@ class PairSimulation:
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
     ) -> Iterator[tuple[int, _Singles, _Halves]]:
         """Each listener with the energy that its diffuse sound is drawn from, and its response without what is left to
-        geometry. The TAKES takes are independent."""
-        rng = np.random.default_rng([self.seed, 2, emitter, take])
+        geometry. The TAKES takes are independent. Noise is that of the pair and the take, whatever the plan: what one
+        plan changes is told from its responses and those of another, and not from two draws."""
         place, receivers = self.probes[emitter], self.probes[listeners]
         images = self._tracer(receivers).images(place)
-        energies = self.energies(emitter, listeners, rng)
+        energies = self.energies(emitter, listeners, np.random.default_rng([self.seed, 2, emitter, take]))
         tail = self._tail
         onsets_s = self.scene.geometry.floor_plan.path_length_m(place, receivers) / SPEED_OF_SOUND
         for row, listener in enumerate(map(int, listeners)):
+            rng = np.random.default_rng([self.seed, 5, emitter, take, listener])
             energy = energies[row]
             response = self._synthesis.specular(*images[row], receivers[row])
             if self.plan.rays:

@@ -18,6 +18,9 @@ _Singles = npt.NDArray[np.float32]
 # From own sound to shared, at constant power.
 FADE_S = 0.010
 _NOISE_S = 4.0
+# Steps of the noise's quantisation in its root mean square: reading it is what adding a tail waits for, and responses
+# are stored with fewer digits.
+_NOISE_STEPS = 4096
 # Samples of all bands' amplitudes that a core's nearest cache holds while every channel goes by.
 _STRETCH = 1024
 
@@ -56,9 +59,12 @@ class SharedTail:
         times_s = np.arange(self._first, synthesis.samples) / sample_rate
         per_sample = power_at(times_s, of_all.astype(np.float32)) / np.float32(sample_rate)
         amplitudes = np.sqrt(per_sample * shared_power(times_s, start_s))
-        self._amplitudes: _Singles = np.ascontiguousarray(amplitudes, dtype=np.float32)
+        self._amplitudes: _Singles = np.ascontiguousarray(amplitudes / _NOISE_STEPS, dtype=np.float32)
         noise = synthesis.diffuse_noise(directional, round(_NOISE_S * sample_rate), rng)
-        self._noise = noise.reshape(len(noise), -1, noise.shape[-1])
+        noise *= _NOISE_STEPS
+        limits = np.iinfo(np.int16)
+        quantised = np.clip(np.rint(noise, out=noise), limits.min, limits.max, out=noise).astype(np.int16)
+        self._noise = quantised.reshape(len(noise), -1, noise.shape[-1])
 
     def add(self, take: int, response: _Singles, rng: np.random.Generator) -> None:
         """Adds the tail to (yaw, ear, sample) `response`; `rng` chooses the part of the noise."""
@@ -80,5 +86,5 @@ def _add_modulated(noise, begin, amplitude, response, first):
             for band in range(bands):
                 source, gain = noise[band, channel, begin : begin + count], amplitude[band, done : done + count]
                 for index in range(count):
-                    target[index] += source[index] * gain[index]
+                    target[index] += np.float32(source[index]) * gain[index]
         done, begin = done + count, (begin + count) % length

@@ -14,6 +14,7 @@ Axes: (yaw, ear, sample) responses in single precision; spectra have bins last.
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
@@ -50,6 +51,15 @@ def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
     before = np.minimum(position.astype(int), energy.shape[-1] - 2)
     share = (position - before).astype(np.float32)
     return (energy[..., before] * (1 - share) + energy[..., before + 1] * share) / np.float32(HISTOGRAM_BIN_S)
+
+
+def _unit_noise(shape: tuple[int, ...], rng: np.random.Generator) -> _Singles:
+    """Uniform, of unit power: sums of a window's samples are as Gaussian as need be, and it takes a quarter as long to
+    draw as what is Gaussian already."""
+    noise = rng.random(shape, dtype=np.float32)
+    noise -= np.float32(0.5)
+    noise *= np.float32(np.sqrt(12))
+    return noise
 
 
 @dataclass(frozen=True)
@@ -130,7 +140,7 @@ class BinauralSynthesis:
         frames = samples // step
         heard = np.empty((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
         for neighbours in (0, 1):  # only bands next to each other overlap
-            noise = rng.standard_normal((len(directional), frames, step), dtype=np.float32)
+            noise = _unit_noise((len(directional), frames, step), rng)
             sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
             sections *= self._window
             spectra = np.ascontiguousarray(rfft(sections).transpose(2, 1, 0))
@@ -181,14 +191,15 @@ class BinauralSynthesis:
         """(yaw, ear, sample) diffuse sound of (direction, band, bin) energy; nothing is heard before `onset_s`."""
         step = self._n_fft // 2
         frames = -(-self.samples // step) + 1  # the first begins one step before sample 0
-        noise = rng.standard_normal((len(energy), frames + 1, step), dtype=np.float32)
-        sections = np.concatenate([noise[:, :-1], noise[:, 1:]], axis=-1)
+        # Frame by frame, so that a longer response begins with the same noise.
+        noise = _unit_noise((frames + 1, len(energy), step), rng)
+        sections = np.concatenate([noise[:-1], noise[1:]], axis=-1)
         sections *= self._window
         spectra = rfft(sections)
         times_s = np.arange(frames) * step / self._sample_rate
-        per_sample = power_at(times_s, energy) / np.float32(self._sample_rate)
-        spectra *= np.sqrt(np.moveaxis(per_sample, 1, 2) @ self._band_weights)
-        heard = np.matmul(np.ascontiguousarray(spectra.transpose(2, 1, 0)), self._arrival_spectra)
+        per_sample = np.moveaxis(power_at(times_s, energy), -1, 0) / np.float32(self._sample_rate)
+        spectra *= np.sqrt(np.ascontiguousarray(per_sample) @ self._band_weights)
+        heard = np.matmul(np.ascontiguousarray(np.moveaxis(spectra, -1, 0)), self._arrival_spectra)
         sections = irfft(np.ascontiguousarray(heard.transpose(2, 1, 0)), self._n_fft)
         sections *= self._window
         late = sections[:, :-1, step:] + sections[:, 1:, :step]
@@ -209,8 +220,16 @@ class BinauralSynthesis:
         start = np.floor(delay).astype(int)
         lead = round(_LEAD_S * self._sample_rate)
         spectra = self._ears.specular(heard, amplitudes, lead + delay - start)
-        taps = irfft(spectra, self._n_fft)
-        for tap, at in zip(taps, start - lead, strict=True):
-            first, last = max(0, -at), min(self._n_fft, self.samples - at)
-            if last > first:
-                response[..., at + first : at + last] += tap[..., first:last]
+        taps = irfft(spectra, self._n_fft).reshape(len(spectra), 2 * len(self.yaws), self._n_fft)
+        _add_at(start - lead, taps, response.reshape(-1, self.samples))
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_at(starts, taps, response):
+    """Adds (wave, channel, tap) to (channel, sample) from each wave's start on, as far as there are samples."""
+    samples, size = response.shape[1], taps.shape[2]
+    for wave in range(len(starts)):
+        first, last = max(0, -starts[wave]), min(size, samples - starts[wave])
+        for channel in range(len(response)):
+            for tap in range(first, last):
+                response[channel, starts[wave] + tap] += taps[wave, channel, tap]

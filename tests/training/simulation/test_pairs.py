@@ -45,14 +45,33 @@ def test_a_plan_of_everything_draws_whole_responses_of_each_pair(box):
     """As `BinauralSynthesis.render` has them."""
     simulation = simulation_of(box, EVERYTHING)
     _, responses = taken(simulation)
-    rng = np.random.default_rng([0, 2, 0, 0])
     probes = simulation.probes
     tracer = simulation._tracer(probes[1:])
-    arrivals = tracer.trace(probes[0], rays=EVERYTHING.rays, rng=rng)
-    for listener, arrival, response in zip(probes[1:], arrivals, responses, strict=True):
-        onset_s = np.linalg.norm(listener - probes[0]) / 343
-        expected = simulation._synthesis.render(arrival, listener, onset_s, rng)
+    arrivals = tracer.trace(probes[0], rays=EVERYTHING.rays, rng=np.random.default_rng([0, 2, 0, 0]))
+    for listener, (place, arrival, response) in enumerate(zip(probes[1:], arrivals, responses, strict=True), start=1):
+        onset_s = np.linalg.norm(place - probes[0]) / 343
+        expected = simulation._synthesis.render(arrival, place, onset_s, np.random.default_rng([0, 5, 0, 0, listener]))
         np.testing.assert_allclose(response, expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_plans_draw_the_same_noise(box):
+    """Of which fewer rays than everything on change little, and another draw as much as there is."""
+    everything, few = (simulation_of(box, SimulationPlan.everything(2, rays)) for rays in (3000, 1500))
+    other = simulation_of(box, SimulationPlan.everything(2, 3000), seed=1)
+    (_, reference), (_, fewer), (_, redrawn) = (taken(simulation) for simulation in (everything, few, other))
+    assert np.square(fewer - reference).mean() < 0.3 * np.square(redrawn - reference).mean()
+
+
+def test_a_listener_hears_the_same_whoever_else_is_asked_for(box):
+    """But for rays, which are traced to all at once."""
+    simulation = simulation_of(box, EVERYTHING)
+    energies, responses = taken(simulation)
+    rng = np.random.default_rng([0, 5, 0, 0, 2])
+    onset_s = np.linalg.norm(simulation.probes[2] - simulation.probes[0]) / 343
+    late = simulation._synthesis.late(energies[1].astype(np.float32), onset_s, rng)
+    images = simulation._tracer(simulation.probes[2:3]).images(simulation.probes[0])[0]
+    expected = late + simulation._synthesis.specular(*images, simulation.probes[2])
+    np.testing.assert_allclose(responses[1], expected, atol=1e-3 * np.abs(expected).max())
 
 
 def test_without_rays_nothing_is_traced_and_no_noise_drawn(box, monkeypatch):
