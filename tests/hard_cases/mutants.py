@@ -1,31 +1,36 @@
-"""Whether the tests would notice: each guard of `guards.toml` is removed in turn from a copy of the tree, and the tests
-that are said to watch it are run there. `python tests/hard_cases/mutants.py [NAME ...]`.
+"""Whether the tests would notice: each guard of `guards/` is removed from a copy of the tree of its own, and the tests
+that are said to watch it are run there. `python tests/hard_cases/mutants.py [NAME ...] [--jobs N] [--after NAME]`.
 
-A guard is found by its exact text, which has to be in its file once. It is caught where any of its tests fails; all of
-them have passed before with every guard in place. Each copy begins with the code that is compiled already.
+A guard is found by its exact text, which has to be in its file once. It is caught where every test that is named for it
+fails, in one of its cases at least; all of them have passed before with every guard in place. Each copy begins with the
+code that is compiled already.
 """
 
 import argparse
 import os
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-LIST = Path(__file__).with_name("guards.toml")
+LISTS = Path(__file__).with_name("guards")
 COPIED = ("server", "training", "tests", "client_examples", "pyproject.toml", "README.md")
+LONGEST_S = 1_800
 
 
 @dataclass(frozen=True)
 class Guard:
-    """`find` in `file`, and what stands there without the guard; `tests` are arguments of pytest's."""
+    """`find` in `file`, and what stands there without the guard; `tests` are functions, `path::name`, each of which
+    fails then."""
 
     name: str
     file: str
@@ -34,20 +39,56 @@ class Guard:
     tests: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Removal:
+    """What came of a guard's removal: `failed` are cases, `path::name[parameters]`."""
+
+    guard: Guard
+    failed: tuple[str, ...]
+
+    @property
+    def cases_of(self) -> Counter[str]:
+        """By function, how many."""
+        return Counter(case.partition("[")[0] for case in self.failed)
+
+    @property
+    def unnoticed_by(self) -> tuple[str, ...]:
+        return tuple(test for test in self.guard.tests if not self.cases_of[test])
+
+    @property
+    def row(self) -> str:
+        found = [f"{_name(test)} ({count})" for test, count in self.cases_of.items()]
+        found += [f"**not {_name(test)}**" for test in self.unnoticed_by]
+        return f"| {self.guard.name} | {', '.join(found)} |"
+
+
+def _name(test: str) -> str:
+    return test.rpartition("::")[2].removeprefix("test_")
+
+
 def read_guards() -> list[Guard]:
-    document = tomllib.loads(LIST.read_text())
-    return [Guard(**(entry | {"tests": tuple(entry["tests"])})) for entry in document["guard"]]
+    entries = [entry for path in sorted(LISTS.glob("*.toml")) for entry in tomllib.loads(path.read_text())["guard"]]
+    return [Guard(**(entry | {"tests": tuple(entry["tests"])})) for entry in entries]
 
 
-def run_tests(tree: Path, tests: tuple[str, ...]) -> tuple[bool, list[str]]:
-    """Whether all passed, and the names of those that did not."""
-    environment = os.environ | {"PYTHONPATH": str(tree)}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=no", *tests]
-    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
-    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    if done.returncode not in {0, 1, 2} or (done.returncode and not failed):
+def run_tests(tree: Path, tests: tuple[str, ...]) -> tuple[str, ...]:
+    """The cases that fail."""
+    report = tree / "report.xml"
+    options = ["-q", "-p", "no:cacheprovider", "--tb=no", f"--junitxml={report}", "-o", "junit_family=xunit1"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, *tests],
+        cwd=tree,
+        env=os.environ | {"PYTHONPATH": str(tree)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LONGEST_S,
+    )
+    if done.returncode not in {0, 1}:
         raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout[-2_000:]}{done.stderr[-2_000:]}")
-    return done.returncode == 0, failed
+    cases = ET.parse(report).iter("testcase")
+    wrong = [case for case in cases if case.find("failure") is not None or case.find("error") is not None]
+    return tuple(f"{case.get('file')}::{case.get('name')}" for case in wrong)
 
 
 @contextmanager
@@ -63,40 +104,45 @@ def copied_tree() -> Iterator[Path]:
         yield tree
 
 
-def remove(guard: Guard, tree: Path) -> None:
-    path = tree / guard.file
-    text = path.read_text()
-    if text.count(guard.find) != 1:
-        raise ValueError(f"{guard.name}: {guard.file} has it {text.count(guard.find)} times, not once")
-    path.write_text(text.replace(guard.find, guard.replace))
+def remove(guard: Guard) -> Removal:
+    with copied_tree() as tree:
+        path = tree / guard.file
+        text = path.read_text()
+        if text.count(guard.find) != 1:
+            raise ValueError(f"{guard.name}: {guard.file} has it {text.count(guard.find)} times, not once")
+        path.write_text(text.replace(guard.find, guard.replace))
+        return Removal(guard, run_tests(tree, guard.tests))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="guards to remove; all by default")
-    wanted = parser.parse_args().names
-    guards = [guard for guard in read_guards() if not wanted or guard.name in wanted]
-    if unknown := set(wanted) - {guard.name for guard in guards}:
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="how many at once; as many as there are cores")
+    parser.add_argument("--after", help="only the guards that come after this one, for a run that was interrupted")
+    given = parser.parse_args()
+    guards = {guard.name: guard for guard in read_guards()}
+    if unknown := {*given.names, *([given.after] if given.after else [])} - guards.keys():
         parser.error(f"no such guard: {', '.join(sorted(unknown))}")
-    everything = tuple(dict.fromkeys(test for guard in guards for test in guard.tests))
-    print(f"{len(guards)} guards; their tests with all in place ...", flush=True)
+    names = list(guards)[list(guards).index(given.after) + 1 if given.after else 0 :]
+    chosen = [guards[name] for name in names if name in given.names or not given.names]
+    print(f"{len(chosen)} guards; their tests with all in place ...", flush=True)
     with copied_tree() as tree:
-        passed, failed = run_tests(tree, everything)
-    if not passed:
-        print("fail before anything was removed: " + ", ".join(failed))
-        return 2
-    print("| guard removed | caught by |\n| --- | --- |", flush=True)
-    missed = 0
-    for guard in guards:
-        with copied_tree() as tree:
-            remove(guard, tree)
-            passed, failed = run_tests(tree, guard.tests)
-        missed += passed
-        names = list(dict.fromkeys(test.rpartition("::")[2].partition("[")[0] for test in failed))
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        print(f"| {guard.name} | {', '.join(names[:3]) + more if names else '**nothing**'} |", flush=True)
-    print(f"\n{len(guards) - missed} of {len(guards)} caught")
-    return 1 if missed else 0
+        if failed := run_tests(tree, tuple(dict.fromkeys(test for guard in chosen for test in guard.tests))):
+            print("fail before anything was removed: " + ", ".join(failed))
+            return 2
+    print("| guard removed | caught by (cases) |\n| --- | --- |", flush=True)
+    removals = []
+    with ThreadPoolExecutor(given.jobs) as pool:
+        for removal in pool.map(remove, chosen):
+            print(removal.row, flush=True)
+            removals.append(removal)
+    caught = [removal for removal in removals if not removal.unnoticed_by]
+    suite = f"{LISTS.parent.relative_to(REPOSITORY)}/"
+    cases = {case for removal in removals for case in removal.failed if case.startswith(suite)}
+    functions = {case.partition("[")[0] for case in cases}
+    print(f"\n{len(caught)} of {len(removals)} guards caught; ", end="")
+    print(f"{len(functions)} test functions and {len(cases)} cases of {suite} failed when a guard was removed")
+    return 0 if len(caught) == len(removals) else 1
 
 
 if __name__ == "__main__":

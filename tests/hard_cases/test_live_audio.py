@@ -133,11 +133,15 @@ def test_a_denormal_sample_is_silence_and_nothing_to_complain_of(measured, value
 @pytest.mark.parametrize("dtype", [np.float64, np.int16, np.int64, np.float16, np.bool_])
 def test_samples_of_other_types_come_in_as_floats(measured, dtype):
     values = np.array([0, 1, 1, 0, 1], dtype)
-    measured("largest difference", np.abs(DryAudio(values).samples - values.astype(float)).max(), 0.0)
+    samples = DryAudio(values).samples
+    assert samples.dtype == np.float32
+    measured("largest difference", np.abs(samples - values.astype(float)).max(), 0.0)
 
 
 def test_doubles_beyond_any_float_are_silence():
-    assert not DryAudio(np.array([1e300, -1e300])).samples.any()
+    samples = DryAudio(np.array([1e300, -1e300])).samples
+    assert samples.dtype == np.float32
+    assert not samples.any()
 
 
 @pytest.mark.parametrize("shape", [(2, 10), (), (1, 1, 1)])

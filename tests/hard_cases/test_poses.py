@@ -315,7 +315,10 @@ def test_listener_and_emitter_in_one_place(measured, field, filters, place):
     measured("heard at all", decibels(np.abs(heard).max()), -60.0, "dB", at_least=True)
 
 
-@pytest.mark.parametrize("orientation", [LEVEL, (0, 0.7071, 0, 0.7071), (0.5, 0.5, 0.5, 0.5), (1, 0, 0, 0)])
+@pytest.mark.parametrize(
+    "orientation",
+    [LEVEL, (0, 0.7071, 0, 0.7071), (0.5, 0.5, 0.5, 0.5), (1, 0, 0, 0), (-0.17, 0.47, 0.42, 0.86)],
+)
 def test_a_pose_is_given_back_as_it_was_taken(measured, orientation):
     pose = Pose((1.0, 2.0, 3.0), orientation)
     again = Pose(pose.position, pose.orientation)

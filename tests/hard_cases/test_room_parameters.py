@@ -175,9 +175,11 @@ def test_an_onset_outside_the_response_finds_no_direct_sound():
             direct_to_reverberant_db(response, RATE, onset=onset)
 
 
+@pytest.mark.parametrize("noise_db", [-np.inf, -40.0])
 @pytest.mark.parametrize("at", [1e-3, 0.1, 0.5])
-def test_the_decay_curve_never_rises_and_ends_in_nothing(at):
-    response = decay(0.2)
+def test_the_decay_curve_never_rises_and_ends_in_nothing(at, noise_db):
+    """Nor where the noise that is taken off it is more than there is."""
+    response = decay(0.2) + 10 ** (noise_db / 20) * np.random.default_rng(3).standard_normal((2, RATE + 240))
     response[:, round(at * RATE) + 240 :] = 0
     left = 10 ** (energy_decay_db(response, RATE) / 10)
     assert np.all(np.diff(left, axis=-1) <= 1e-12)

@@ -96,6 +96,8 @@ def test_a_removed_emitter_rings_out_and_makes_room(measured, filters):
     engine.remove_emitter("a")
     ringing = hear(engine, 2 + RUNG_OUT)
     assert not_finite(ringing) == 0
+    heard = np.abs(ringing[:, 3 * SIZE : 6 * SIZE]).max()
+    measured("heard of it while it rings out", heard, 0.1, at_least=True)
     measured("after it has rung out", np.abs(hear(engine, 20)).max(), 0.0)
     for _ in range(5):
         play(engine, noise(1, 3_000), room(2), path=ahead())

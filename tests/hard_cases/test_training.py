@@ -336,8 +336,8 @@ def _without_times(run):
     return [[value for name, value in zip(rows[0], row, strict=True) if name != "seconds"] for row in rows]
 
 
-def test_a_process_killed_by_the_system_leaves_a_run_that_goes_on(responses, whole, tmp_path):
-    """SIGKILL, as soon as the first checkpoint lies there."""
+def test_a_process_killed_by_the_system_leaves_a_run_that_goes_on(responses, whole, tmp_path, monkeypatch):
+    """SIGKILL, as soon as the first checkpoint lies there: of six steps two need not be taken again."""
     program = (
         "import sys, time, torch; torch.set_num_threads(1)\n"
         "from pathlib import Path\n"
@@ -359,7 +359,10 @@ def test_a_process_killed_by_the_system_leaves_a_run_that_goes_on(responses, who
         os.kill(process.pid, signal.SIGKILL)
     with pytest.raises(RunError, match=r"of 3 epochs are trained; run train again"):
         load_learner(responses, tmp_path)
+    steps, step = [], torch.optim.AdamW.step
+    monkeypatch.setattr("torch.optim.AdamW.step", lambda *given: steps.append(step(*given)))
     found = trained(responses, tmp_path, FACTORISED)
+    assert len(steps) == 4
     for name, values in whole[1].items():
         assert torch.equal(found[name], values), name
 
