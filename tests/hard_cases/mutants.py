@@ -3,28 +3,30 @@ that are said to watch it are run there. `python tests/hard_cases/mutants.py [NA
 
 A guard is found by its exact text, which has to be in its file once. It is caught where every test that is named for it
 fails, in one of its cases at least; all of them have passed before with every guard in place. Each copy begins with the
-code that is compiled already.
+code that is compiled already, and is run in a process of its own that begins with the libraries in place.
 """
 
 import argparse
+import io
+import multiprocessing
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree import ElementTree as ET
+
+import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LISTS = Path(__file__).with_name("guards")
 COPIED = ("server", "training", "tests", "client_examples", "pyproject.toml", "README.md")
-LONGEST_S = 1_800
+LIBRARIES = ["numba", "onnxruntime", "pydantic", "scipy.signal", "scipy.spatial", "scipy.stats", "torch"]
 
 
 @dataclass(frozen=True)
@@ -71,28 +73,19 @@ def read_guards() -> list[Guard]:
     return [Guard(**(entry | {"tests": tuple(entry["tests"])})) for entry in entries]
 
 
-def run_tests(tree: Path, tests: tuple[str, ...]) -> tuple[str, ...]:
-    """The cases that fail."""
-    report = tree / "report.xml"
-    options = ["-q", "-p", "no:cacheprovider", "--tb=no", f"--junitxml={report}", "-o", "junit_family=xunit1"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, *tests],
-        cwd=tree,
-        env=os.environ | {"PYTHONPATH": str(tree)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=LONGEST_S,
-    )
-    if done.returncode not in {0, 1}:
-        raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout[-2_000:]}{done.stderr[-2_000:]}")
-    cases = ET.parse(report).iter("testcase")
-    wrong = [case for case in cases if case.find("failure") is not None or case.find("error") is not None]
-    return tuple(f"{case.get('file')}::{case.get('name')}" for case in wrong)
+@dataclass
+class Failures:
+    """Hears from pytest which cases fail."""
+
+    cases: dict[str, None] = field(default_factory=dict)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.cases[report.nodeid] = None
 
 
 @contextmanager
-def copied_tree() -> Iterator[Path]:
+def copied_tree(without: Guard | None) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder)
         for name in COPIED:
@@ -101,17 +94,26 @@ def copied_tree() -> Iterator[Path]:
                 shutil.copytree(source, tree / name, ignore=shutil.ignore_patterns("*.pyc", ".*"))
             else:
                 shutil.copy2(source, tree / name)
+        if without is not None:
+            path = tree / without.file
+            text = path.read_text()
+            if (times := text.count(without.find)) != 1:
+                raise ValueError(f"{without.name}: {without.file} has it {times} times, not once")
+            path.write_text(text.replace(without.find, without.replace))
         yield tree
 
 
-def remove(guard: Guard) -> Removal:
-    with copied_tree() as tree:
-        path = tree / guard.file
-        text = path.read_text()
-        if text.count(guard.find) != 1:
-            raise ValueError(f"{guard.name}: {guard.file} has it {text.count(guard.find)} times, not once")
-        path.write_text(text.replace(guard.find, guard.replace))
-        return Removal(guard, run_tests(tree, guard.tests))
+def run_tests(tests: tuple[str, ...], without: Guard | None = None) -> tuple[str, ...]:
+    """The cases that fail. Once in a process: what it imports is the copy's."""
+    failures = Failures()
+    with copied_tree(without) as tree, redirect_stdout(io.StringIO()) as said:
+        os.chdir(tree)
+        os.environ["PYTHONPATH"] = sys.path[0] = str(tree)
+        status = pytest.main(["-q", "-p", "no:cacheprovider", "--tb=no", *tests], [failures])
+        os.chdir(REPOSITORY)
+    if status not in {pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED}:
+        raise RuntimeError(f"pytest ended with {status}:\n{said.getvalue()[-2_000:]}")
+    return tuple(failures.cases)
 
 
 def main() -> int:
@@ -126,22 +128,23 @@ def main() -> int:
     names = list(guards)[list(guards).index(given.after) + 1 if given.after else 0 :]
     chosen = [guards[name] for name in names if name in given.names or not given.names]
     print(f"{len(chosen)} guards; their tests with all in place ...", flush=True)
-    with copied_tree() as tree:
-        if failed := run_tests(tree, tuple(dict.fromkeys(test for guard in chosen for test in guard.tests))):
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(LIBRARIES)
+    removals = []
+    with ProcessPoolExecutor(given.jobs, context, max_tasks_per_child=1) as pool:
+        if failed := pool.submit(run_tests, tuple(dict.fromkeys(t for guard in chosen for t in guard.tests))).result():
             print("fail before anything was removed: " + ", ".join(failed))
             return 2
-    print("| guard removed | caught by (cases) |\n| --- | --- |", flush=True)
-    removals = []
-    with ThreadPoolExecutor(given.jobs) as pool:
-        for removal in pool.map(remove, chosen):
-            print(removal.row, flush=True)
-            removals.append(removal)
+        print("| guard removed | caught by (cases) |\n| --- | --- |", flush=True)
+        for guard, cases in zip(chosen, pool.map(run_tests, (guard.tests for guard in chosen), chosen), strict=True):
+            removals.append(Removal(guard, cases))
+            print(removals[-1].row, flush=True)
     caught = [removal for removal in removals if not removal.unnoticed_by]
     suite = f"{LISTS.parent.relative_to(REPOSITORY)}/"
-    cases = {case for removal in removals for case in removal.failed if case.startswith(suite)}
-    functions = {case.partition("[")[0] for case in cases}
+    all_cases = {case for removal in removals for case in removal.failed if case.startswith(suite)}
+    functions = {case.partition("[")[0] for case in all_cases}
     print(f"\n{len(caught)} of {len(removals)} guards caught; ", end="")
-    print(f"{len(functions)} test functions and {len(cases)} cases of {suite} failed when a guard was removed")
+    print(f"{len(functions)} test functions and {len(all_cases)} cases of {suite} failed when a guard was removed")
     return 0 if len(caught) == len(removals) else 1
 
 

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from server.blocks import AudioBlock, DryBlock
@@ -106,6 +106,7 @@ def test_a_stall_of_any_length_leaves_the_clock_on_its_grid(measured, block, sta
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(0, 40), st.integers(0, 2**33)), max_size=60))
+@example([None, None, 1, 0])
 def test_a_window_never_opens_further_than_it_is_wide(measured, script):
     window = SendWindow(8)
     for acknowledged in script:
