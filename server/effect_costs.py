@@ -145,7 +145,7 @@ def measure_costs(field: AcousticField, block_size: int = 256) -> Costs:
     }
     us = _time_in_turns({key: lane.play for key, lane in lanes.items()}, per=_BLOCKS)
     responses_per_block = RESPONSES_PER_S * block_size / field.sample_rate
-    late_us, early_us = _response_us(field)
+    late_us, early_us = _response_us(field, meanwhile=lanes["still", _EMITTERS].play)
 
     def between(more: str, less: str) -> tuple[float, float]:
         """Of each emitter, and of there being any."""
@@ -231,9 +231,9 @@ def _finders(field: AcousticField) -> dict[str, float]:
     return _time_in_turns(computed, per=_EMITTERS)
 
 
-def _response_us(field: AcousticField) -> tuple[float, float]:
+def _response_us(field: AcousticField, *, meanwhile: Callable[[], None]) -> tuple[float, float]:
     """What one response takes before it is made ready and faded in: of what the field holds, and of the first
-    reflections."""
+    reflections. Between one and the next sound is rendered, as in streams, so that caches hold something else."""
     start = field.bundle.manifest.start
     direct = DirectSound.of(field.bundle, kemar(field.sample_rate))
     times_us: dict[bool, list[float]] = {False: [], True: []}
@@ -241,6 +241,7 @@ def _response_us(field: AcousticField) -> tuple[float, float]:
         listener = Pose.from_yaw(start.listener, 0.1 * turn)
         for has_early, of_it in times_us.items():
             effects = EmitterEffects(early=has_early, late=bool(field.bundle.manifest.fields))
+            meanwhile()
             started_s = time.thread_time()
             composed_irs(field, direct, listener, [Emitter(0, Pose(start.emitter), effects=effects)])
             of_it.append(1e6 * (time.thread_time() - started_s))

@@ -2,7 +2,7 @@
 
 A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
 One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, or to move faster than it
-did; while poses change, four times a second at most, and once a second for many emitters. Clocks are seconds of sound.
+did; while poses change, twice a second at most, and once a second for many emitters. Clocks are seconds of sound.
 """
 
 import dataclasses
@@ -19,9 +19,9 @@ from server.scene.plan import Decision, Plan
 from server.scene.planner import Costs, make_plan
 from server.scene.situation import Emitter, Listener, Output, Place, Situation
 
-PERIOD_S = 0.25
-_EMITTERS_PER_PERIOD, _MOST_PERIODS = 4, 4
-"""Plans of more take longer, and are made less often, well within the `HORIZON_S` that all look ahead."""
+PERIOD_S = 0.5
+_EMITTERS_PER_PERIOD, _MOST_PERIODS = 8, 2
+"""Plans of more take longer, and are made less often. All are made well within the `HORIZON_S` that they look ahead."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
 
