@@ -20,6 +20,9 @@ from training.models.factorised import ExportedField, FactorisedField, FieldShap
 PLAN = FloorPlan(((0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)), 2.5)
 DB = 20 / np.log(10)
 
+# The field's levels vary by 0.73 dB from pose to pose: a bound above that would let a field pass that says nothing.
+NEARLY_DB = 0.5
+
 
 @pytest.fixture(scope="module")
 def graphs():
@@ -73,7 +76,7 @@ def root_mean_square(values):
 def test_eight_bits_say_nearly_what_thirty_two_do(graphs, poses, measured):
     exact, small, _, _ = graphs
     error = root_mean_square(levels(small, poses) - levels(exact, poses))
-    measured("error of levels", DB * error, 1.0, "dB")
+    measured("error of levels", DB * error, NEARLY_DB, "dB")
 
 
 def test_one_weight_that_fills_its_scale_spoils_its_own_column_alone(graphs, measured):
@@ -81,7 +84,7 @@ def test_one_weight_that_fills_its_scale_spoils_its_own_column_alone(graphs, mea
     _, _, exact, small = graphs
     error = levels(small, scattered(64)) - levels(exact, scattered(64))
     by_output = np.sqrt(np.mean(error**2, axis=0))
-    measured("median error of levels", DB * float(np.median(by_output)), 1.0, "dB")
+    measured("median error of levels", DB * float(np.median(by_output)), 0.1, "dB")
     assert np.isfinite(by_output).all()
 
 
@@ -100,4 +103,4 @@ def test_what_else_is_asked_in_a_call_changes_levels_by_less_than_is_heard(graph
     together = levels(small, poses)
     for row in (0, 9, 31):
         alone = levels(small, [part[row : row + 1] for part in poses])[0]
-        measured("change of levels", DB * root_mean_square(together[row] - alone), 1.0, "dB")
+        measured("change of levels", DB * root_mean_square(together[row] - alone), NEARLY_DB, "dB")
