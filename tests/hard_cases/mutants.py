@@ -73,7 +73,7 @@ def read_guards() -> list[Guard]:
     return [Guard(**(entry | {"tests": tuple(entry["tests"])})) for entry in entries]
 
 
-@dataclass
+@dataclass(eq=False)  # pytest keeps its plugins in a set
 class Failures:
     """Hears from pytest which cases fail."""
 
