@@ -10,8 +10,9 @@ from server.acoustics.decibels import power_to_db
 from server.health.energies import Energies
 from server.health.poses import EMITTER, LISTENER, Poses
 from server.rendering.direct_path import NEAR_LIMIT_M
-from server.scene.geometry import Geometry
+from server.scene.geometry import Geometry, Materials
 from server.scene.manifest import Manifest
+from server.scene.rooms import Room, rooms_of
 
 Floats = npt.NDArray[np.float64]
 
@@ -29,9 +30,15 @@ _NOTHING = float(np.finfo(np.float64).tiny)
 def diffuse_energy(geometry: Geometry) -> float:
     """Energy of a room's diffuse field, in the octave band that is absorbed least, for unit pressure at one metre:
     16 pi / R, with the room constant R = S a / (1 - a) (Kuttruff, "Room Acoustics", 5th ed., 5.44), `a` the mean
-    absorption of all surfaces S."""
-    plan, materials = geometry.floor_plan, geometry.materials
-    wall_m2 = geometry.height_m * float(np.sum(np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1)))
+    absorption of all surfaces S. Of several rooms the loudest, as if all that leaves it through its openings came
+    back."""
+    return max(_diffuse_energy(room, geometry.materials) for room in rooms_of(geometry))
+
+
+def _diffuse_energy(room: Room, materials: Materials) -> float:
+    plan = room.plan
+    around_m = float(np.sum(np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1))) - room.passage_m
+    wall_m2 = plan.height_m * around_m
     parts = (wall_m2, materials.walls), (plan.area_m2, materials.floor), (plan.area_m2, materials.ceiling)
     absorbing_m2 = np.sum([area_m2 * np.array(material.absorption) for area_m2, material in parts], axis=0)
     mean = np.maximum(absorbing_m2 / (wall_m2 + 2 * plan.area_m2), 1e-6)

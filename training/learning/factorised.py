@@ -17,7 +17,7 @@ from training.learning.naf import NafLearner
 from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
-from training.models.site import Site
+from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
 from training.responses import ResponseSet, SimulatedResponses
@@ -62,7 +62,7 @@ class FactorisedLearner:
         codec = codec_of(responses)
         self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), min(known, recipe.fine_frames))
         self.site = Site.of(responses)
-        self.field = FactorisedField(self.site.plan, self.cells, shape, responses.channels)
+        self.field = FactorisedField(self.site.plan, self.cells, shape, responses.channels, reach=Reach.of(responses))
         deficit = 0.0 if self._expected else RAYLEIGH_DEFICIT
         self._energy_error = EnergyError(self.cells, self.field.heads, deficit=deficit)
         self._targets: Targets | None = None

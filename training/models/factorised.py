@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from server.acoustics.geometry import FloorPlan
 from training.models.cells import Cells
 from training.models.propagation import Propagation
+from training.models.site import Reach
 
-_NEAREST_M = 0.25
 _AZIMUTH_HARMONICS = 5
 _YAW_HARMONICS = 3
 _POSITION_OCTAVES = 3
@@ -64,10 +64,17 @@ class FeatureGrid(nn.Module):
 
 
 class PoseEncoder(nn.Module):
-    """Listener, emitter and yaw to the features the trunk sees; `size` of them."""
+    """Listener, emitter and yaw to the features the trunk sees; `size` of them.
 
-    def __init__(self, plan: FloorPlan, shape: FieldShape) -> None:
+    Beyond its `reach` a network would go on as it pleases, so places are read as the nearest within it, and ends that
+    are nearer to each other as that near. Directions and sight are those of the places themselves.
+    """
+
+    def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
         super().__init__()
+        self._nearest_m = reach.nearest_m
+        self.register_buffer("_low", torch.tensor(reach.low, dtype=torch.float32), persistent=False)
+        self.register_buffer("_high", torch.tensor(reach.high, dtype=torch.float32), persistent=False)
         self._propagation = Propagation(plan)
         self._grid = FeatureGrid(plan, shape.grid_spacing_m, shape.grid_features)
         low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
@@ -81,17 +88,18 @@ class PoseEncoder(nn.Module):
         path = self._propagation(listener, emitter)
         cos, sin = torch.cos(yaw), torch.sin(yaw)
         towards = _turned(path.from_listener, cos, sin)
-        distance = torch.clamp(path.length, min=_NEAREST_M)
+        distance = torch.clamp(path.length, min=self._nearest_m)
         rise = (emitter[:, 2] - listener[:, 2]) / distance
         visible = path.visible[:, None]
         azimuth = _harmonics(towards, _AZIMUTH_HARMONICS)
+        heard_at, played_at = (torch.minimum(torch.maximum(end, self._low), self._high) for end in (listener, emitter))
         scalars = torch.stack([torch.log(distance), 1 / (1 + distance), rise], dim=-1)
         return torch.cat(
             [
-                self._grid(listener),
-                self._grid(emitter),
-                self._octaves(listener),
-                self._octaves(emitter),
+                self._grid(heard_at),
+                self._grid(played_at),
+                self._octaves(heard_at),
+                self._octaves(played_at),
                 azimuth,
                 azimuth * visible,
                 scalars,
@@ -154,10 +162,13 @@ class Heads(nn.Module):
 class FactorisedField(nn.Module):
     """Flat predictions (B, heads.size), in units of each output's spread about its mean over the training set."""
 
-    def __init__(self, plan: FloorPlan, cells: Cells, shape: FieldShape, channels: int = 2) -> None:
+    def __init__(
+        self, plan: FloorPlan, cells: Cells, shape: FieldShape, channels: int = 2, *, reach: Reach | None = None
+    ) -> None:
+        """Learned throughout the plan where no `reach` is given."""
         super().__init__()
         self.heads = Heads(cells, channels)
-        self.encoder = PoseEncoder(plan, shape)
+        self.encoder = PoseEncoder(plan, shape, reach or Reach.throughout(plan))
         self._inputs = nn.Linear(self.encoder.size, shape.width)
         self._hidden = nn.ModuleList(nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1))
         self._coefficients = nn.Linear(shape.width, shape.rank)

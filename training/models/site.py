@@ -10,6 +10,28 @@ from training.responses import ResponseSet, SimulatedResponses
 
 _MARGIN_M = 0.5
 _MOVES_M = 0.01
+_NEAREST_M = 0.25
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far what was learned goes: places between `low` and `high` (3,), and ends that are no nearer to each other
+    than `nearest_m`. Metres."""
+
+    low: npt.NDArray[np.float64]
+    high: npt.NDArray[np.float64]
+    nearest_m: float
+
+    @classmethod
+    def of(cls, responses: ResponseSet) -> "Reach":
+        positions = np.concatenate([responses.listener, responses.emitter])
+        apart_m = np.linalg.norm(responses.listener - responses.emitter, axis=-1)
+        return cls(positions.min(axis=0), positions.max(axis=0), max(float(apart_m.min()), _NEAREST_M))
+
+    @classmethod
+    def throughout(cls, plan: FloorPlan) -> "Reach":
+        corners = np.asarray(plan.corners, dtype=np.float64)
+        return cls(np.array([*corners.min(axis=0), 0.0]), np.array([*corners.max(axis=0), plan.height_m]), _NEAREST_M)
 
 
 @dataclass(frozen=True)

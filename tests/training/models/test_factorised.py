@@ -6,6 +6,7 @@ from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from training.models.cells import Cells
 from training.models.factorised import ExportedField, FactorisedField, FeatureGrid, FieldShape, Heads, PoseEncoder
+from training.models.site import Reach
 
 PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
 CELLS = Cells(Codec(16_000, 256, 64, 4_000, 1e-5), known_frames=12)
@@ -59,7 +60,7 @@ def test_turning_by_a_full_turn_changes_nothing(field):
 
 def test_the_head_meets_the_azimuth_it_turned_to():
     """Looking at the emitter, the encoder sees azimuth zero whatever the compass says."""
-    encoder = PoseEncoder(PLAN, SHAPE)
+    encoder = PoseEncoder(PLAN, SHAPE, Reach.throughout(PLAN))
     listener = torch.tensor([[1.0, 1.0, 1.5]]).repeat(3, 1)
     angle = torch.tensor([0.0, 0.5, 1.2])
     emitter = listener + torch.stack([0.8 * torch.cos(angle), 0.8 * torch.sin(angle), torch.zeros(3)], dim=-1)
@@ -67,6 +68,28 @@ def test_the_head_meets_the_azimuth_it_turned_to():
     start = 2 * SHAPE.grid_features + 2 * encoder._octaves(listener).shape[-1]
     azimuth = features[:, start : start + 10]
     torch.testing.assert_close(azimuth, torch.tensor([[1.0] * 5 + [0.0] * 5]).repeat(3, 1), atol=2e-3, rtol=0)
+
+
+def test_what_was_not_learned_is_what_was_learned_next_to_it():
+    """Beyond all probes, and nearer to each other than any two of them."""
+    reach = Reach(np.array([0.4, 0.4, 1.1]), np.array([5.6, 4.6, 1.9]), 0.7)
+    torch.manual_seed(0)
+    field = FactorisedField(PLAN, CELLS, SHAPE, reach=reach).eval()
+    yaw = torch.zeros(1)
+
+    def coefficients(listener, emitter):
+        return field.coefficients(torch.tensor([listener]), torch.tensor([emitter]), yaw)
+
+    inside = coefficients((0.4, 0.4, 1.5), (0.4, 3.0, 1.5))
+    # Moved along with each other, so that neither direction nor distance is another.
+    torch.testing.assert_close(coefficients((0.1, 0.4, 1.5), (0.1, 3.0, 1.5)), inside, atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        coefficients((0.4, 0.4, 0.6), (0.4, 3.0, 0.6)), coefficients((0.4, 0.4, 1.1), (0.4, 3.0, 1.1))
+    )
+    at_most = field.encoder(torch.tensor([[1.0, 1.0, 1.5]]), torch.tensor([[1.7, 1.0, 1.5]]), yaw)
+    nearer = field.encoder(torch.tensor([[1.0, 1.0, 1.5]]), torch.tensor([[1.1, 1.0, 1.5]]), yaw)
+    places = 2 * SHAPE.grid_features + 2 * field.encoder._octaves(torch.zeros(1, 3)).shape[-1]
+    torch.testing.assert_close(nearer[:, places:], at_most[:, places:], atol=1e-2, rtol=0)
 
 
 def test_neighbours_have_similar_outputs(field):
