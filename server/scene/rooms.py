@@ -5,11 +5,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
+
 from server.acoustics.geometry import FloorPlan
 from server.scene.geometry import Geometry, PlanPoint
 
 # An opening that ends nearer to a wall than this ends on it.
 _TOUCH_M = 0.001
+_LEAST_M2 = 0.001
 
 
 @dataclass(frozen=True)
@@ -28,10 +31,13 @@ def rooms_of(geometry: Geometry) -> list[Room]:
             first, last = _wall_at(corners, opening.start), _wall_at(corners, opening.end)
             if first is None or last is None or first == last:
                 continue
-            parts[index : index + 1] = [
+            sides = (
                 [opening.start, *_between(corners, first, last), opening.end],
                 [opening.end, *_between(corners, last, first), opening.start],
-            ]
+            )
+            if min(FloorPlan(tuple(side), geometry.height_m).area_m2 for side in sides) < _LEAST_M2:
+                continue  # along a wall
+            parts[index : index + 1] = sides
             break
     passages = {frozenset((opening.start, opening.end)) for opening in geometry.openings}
     return [
@@ -44,11 +50,13 @@ def rooms_of(geometry: Geometry) -> list[Room]:
 
 
 def _wall_at(corners: Sequence[PlanPoint], point: PlanPoint) -> int | None:
-    for number, start in enumerate(corners):
-        end = corners[(number + 1) % len(corners)]
-        if math.dist(start, point) + math.dist(point, end) < math.dist(start, end) + _TOUCH_M:
-            return number
-    return None
+    """The nearest wall, if it is touched."""
+    starts = np.array(corners)
+    along = np.roll(starts, -1, axis=0) - starts
+    share = np.clip(np.sum((point - starts) * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
+    distance_m = np.linalg.norm(starts + share[:, None] * along - point, axis=-1)
+    nearest = int(np.argmin(distance_m))
+    return nearest if distance_m[nearest] < _TOUCH_M else None
 
 
 def _between(corners: Sequence[PlanPoint], first: int, last: int) -> list[PlanPoint]:

@@ -24,8 +24,8 @@ class Reach:
 
     @classmethod
     def of(cls, responses: ResponseSet) -> "Reach":
-        positions = np.concatenate([responses.listener, responses.emitter])
-        apart_m = np.linalg.norm(responses.listener - responses.emitter, axis=-1)
+        listener, emitter = responses.listener[~responses.held_out], responses.emitter[~responses.held_out]
+        positions, apart_m = np.concatenate([listener, emitter]), np.linalg.norm(listener - emitter, axis=-1)
         return cls(positions.min(axis=0), positions.max(axis=0), max(float(apart_m.min()), _NEAREST_M))
 
     @classmethod

@@ -32,9 +32,10 @@ _YAWS_HEARD = 4
 @dataclass(frozen=True)
 class PlanCheck:
     """`errors` of the plan against everything on and `floor` of everything on against another draw of itself, means by
-    metric in its unit. The plan draws the noise that everything on does, so its errors are what it leaves out. Seconds
-    of one core are `everything_s` and `plan_s` for the emitters simulated, and `once_s` what the plan prepares once for
-    all `probes` that a whole simulation has as emitters."""
+    metric in its unit. The plan draws the noise that everything on does until its shared tail sets in: before that its
+    errors are what it leaves out, and of later sound they are another draw. Seconds of one core are `everything_s` and
+    `plan_s` for the emitters simulated, and `once_s` what the plan prepares once for all `probes` that a whole
+    simulation has as emitters."""
 
     scene: str
     emitters: int

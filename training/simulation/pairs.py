@@ -58,8 +58,8 @@ class PairSimulation:
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
     ) -> Iterator[tuple[int, _Singles, _Halves]]:
         """Each listener with the energy that its diffuse sound is drawn from, and its response without what is left to
-        geometry. The TAKES takes are independent. Noise is that of the pair and the take, whatever the plan: what one
-        plan changes is told from its responses and those of another, and not from two draws."""
+        geometry. The TAKES takes are independent. The noise is that of the pair and the take, whatever the plan, until
+        a shared tail sets in: what a plan changes there is told from its own doing, and not from two draws."""
         place, receivers = self.probes[emitter], self.probes[listeners]
         images = self._tracer(receivers).images(place)
         energies = self.energies(emitter, listeners, np.random.default_rng([self.seed, 2, emitter, take]))

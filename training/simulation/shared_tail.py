@@ -18,8 +18,8 @@ _Singles = npt.NDArray[np.float32]
 # From own sound to shared, at constant power.
 FADE_S = 0.010
 _NOISE_S = 4.0
-# Steps of the noise's quantisation in its root mean square: reading it is what adding a tail waits for, and responses
-# are stored with fewer digits.
+# Steps of the noise's quantisation in the root mean square of a band's loudest channel: reading it is what adding a
+# tail waits for, and responses are stored with fewer digits.
 _NOISE_STEPS = 4096
 # Samples of all bands' amplitudes that a core's nearest cache holds while every channel goes by.
 _STRETCH = 1024
@@ -59,12 +59,14 @@ class SharedTail:
         times_s = np.arange(self._first, synthesis.samples) / sample_rate
         per_sample = power_at(times_s, of_all.astype(np.float32)) / np.float32(sample_rate)
         amplitudes = np.sqrt(per_sample * shared_power(times_s, start_s))
-        self._amplitudes: _Singles = np.ascontiguousarray(amplitudes / _NOISE_STEPS, dtype=np.float32)
         noise = synthesis.diffuse_noise(directional, round(_NOISE_S * sample_rate), rng)
-        noise *= _NOISE_STEPS
+        noise = noise.reshape(len(noise), -1, noise.shape[-1])
+        loudest = np.sqrt(np.einsum("bcs,bcs->bc", noise, noise).max(axis=-1) / noise.shape[-1])
+        step = np.maximum(loudest, np.finfo(np.float32).tiny)[:, None] / _NOISE_STEPS
+        self._amplitudes: _Singles = np.ascontiguousarray(amplitudes * step, dtype=np.float32)
+        noise /= step[..., None]
         limits = np.iinfo(np.int16)
-        quantised = np.clip(np.rint(noise, out=noise), limits.min, limits.max, out=noise).astype(np.int16)
-        self._noise = quantised.reshape(len(noise), -1, noise.shape[-1])
+        self._noise = np.clip(np.rint(noise, out=noise), limits.min, limits.max, out=noise).astype(np.int16)
 
     def add(self, take: int, response: _Singles, rng: np.random.Generator) -> None:
         """Adds the tail to (yaw, ear, sample) `response`; `rng` chooses the part of the noise."""
