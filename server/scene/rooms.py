@@ -25,7 +25,7 @@ class Room:
 
 def rooms_of(geometry: Geometry) -> list[Room]:
     """One or more. Openings that do not lead from wall to wall part nothing."""
-    parts = [list(geometry.corners)]
+    parts, passages = [list(geometry.corners)], set()
     for opening in geometry.openings:
         for index, corners in enumerate(parts):
             first, last = _wall_at(corners, opening.start), _wall_at(corners, opening.end)
@@ -38,8 +38,8 @@ def rooms_of(geometry: Geometry) -> list[Room]:
             if min(FloorPlan(tuple(side), geometry.height_m).area_m2 for side in sides) < _LEAST_M2:
                 continue  # along a wall
             parts[index : index + 1] = sides
+            passages.add(frozenset((opening.start, opening.end)))
             break
-    passages = {frozenset((opening.start, opening.end)) for opening in geometry.openings}
     return [
         Room(
             FloorPlan(tuple(corners), geometry.height_m),
