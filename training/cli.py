@@ -42,17 +42,17 @@ def simulate(
     output: Folder,
     effects: simulation.Effects = "plan",
     seed: Seed = 0,
-    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one per core.")] = 0,
+    workers: Annotated[int, typer.Option(min=0, help="Threads; 0 for one per core.")] = 0,
 ) -> None:
     """Simulate what a scene calls for, between all pairs of probes. Run again after an interruption to go on."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from training.simulation.run import simulate as simulate_scene
 
-    planned = simulation.plan_of(scene, seed, effects)
-    simulation.wide_console(stderr=True).print(simulation.plan_table(planned))
+    ready = simulation.simulation_of(scene, seed, effects)
+    simulation.wide_console(stderr=True).print(simulation.plan_table(ready.plan))
     processes = workers or os.cpu_count() or 1
     with _progress() as progress:
-        dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, plan=planned)
+        dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, simulation=ready)
     trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
     typer.echo(f"{output}: {trained} pairs to train on and {held_out} held out, {len(dataset.yaws)} orientations each")
 

@@ -9,14 +9,19 @@ ones are subnormal, in steps of 6e-8: there the bits run out one by one.
 Beside each response lies the energy that its diffuse part was drawn from, the same for all yaws: natural logarithms,
 axes direction, band, bin. They are good to 0.03 dB. `training.simulation.expected` makes spectrograms of them.
 
+Where the plan has one tail for all, that is stored once, and of each pair what comes before it and where in the tail's
+noise its own begins. What is read is whole.
+
 The file also keeps the plan that it was simulated by; one from before there were plans has everything in it.
 """
 
 import json
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import h5py
 import numpy as np
@@ -25,17 +30,42 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.errors import NafirError
-from training.scene_file import SceneFile
+from training.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation.plan import SimulationPlan
+from training.simulation.shared_tail import FADE_S, SharedTail
 
 SPEED_OF_SOUND = 343.0
-FORMAT = 3
+FORMAT = 4
+_READABLE = (3, FORMAT)
+"""In format 3 every pair has a tail of its own."""
 GEOMETRIC_ORDER: Literal[1] = 1
 """Mirrored reflections of up to so many surfaces are left to geometry, as the direct sound is."""
+TAKES = ("reflected", "repeats")
+"""The second is for the repeatability of the first."""
+# A wave's filters ring for less.
+_FILTER_S = 0.020
 
 
 class DatasetError(NafirError):
     """A dataset folder that is missing, unfinished or of another format."""
+
+
+def own_duration_s(scene: SceneFile, plan: SimulationPlan) -> float:
+    """How much of a response is the receiver's own: all of it, or, in whole bins, what comes until a shared tail has
+    set in and all images been heard."""
+    if plan.tail_start_s is None:
+        return scene.simulation.duration_s
+    sides_m = *np.ptp(scene.geometry.corners, axis=0), scene.geometry.height_m
+    last_image_s = (plan.image_order + 1) * math.hypot(*sides_m) / SPEED_OF_SOUND + _FILTER_S
+    bins = math.ceil(max(plan.tail_start_s + FADE_S, last_image_s) / HISTOGRAM_BIN_S)
+    return min(scene.simulation.duration_s, HISTOGRAM_BIN_S * bins)
+
+
+class OwnResponse(NamedTuple):
+    """`samples` (yaw, ear, sample) of `own_duration_s`, and the sample of a shared tail's noise that it begins with."""
+
+    samples: npt.NDArray[np.float16]
+    tail_begin: int
 
 
 @dataclass(frozen=True)
@@ -66,13 +96,16 @@ class Dataset:
                 raise DatasetError(f"{folder}: was begun by another plan of effects; choose an empty folder")
             if existing.remaining() and not existing.keeps_energies:
                 raise DatasetError(f"{folder}: was begun when no energies were kept; choose an empty folder")
+            if existing.remaining() and not existing.keeps_tails_apart:
+                raise DatasetError(f"{folder}: was begun in format {_READABLE[0]}; choose an empty folder")
             return existing
         probes = scene.probe_positions(seed)
         yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
         held_out = _choose_held_out(len(probes), scene.simulation.held_out_share, np.random.default_rng([seed, 1]))
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "scene.toml").write_bytes(scene_path.read_bytes())
-        samples = round(scene.simulation.duration_s * scene.simulation.sample_rate)
+        own_s = own_duration_s(scene, effects)
+        samples = round(own_s * scene.simulation.sample_rate)
         shape = (len(probes), len(probes), len(yaws), 2, samples)
         # Under its own name only when whole: an interrupted start must not look like a damaged dataset.
         partial = folder / "pairs.partial"
@@ -81,9 +114,10 @@ class Dataset:
             file.attrs["effects"] = json.dumps(effects.to_json())
             file["probes"], file["yaws"], file["held_out"] = probes, yaws, held_out
             file.create_dataset("done", data=np.zeros(len(probes), dtype=bool))
-            for name in ("reflected", "repeats"):
+            for name in TAKES:
                 file.create_dataset(name, shape, np.float16, chunks=(1, 1, *shape[2:]))
-            histogram = scene.simulation.arrival_directions, len(OCTAVE_BANDS_HZ), scene.simulation.histogram_bins
+            file.create_dataset("tail_begin", (len(TAKES), *shape[:2]), np.int32)
+            histogram = scene.simulation.arrival_directions, len(OCTAVE_BANDS_HZ), round(own_s / HISTOGRAM_BIN_S)
             shape = (len(probes), len(probes), *histogram)
             file.create_dataset("log_energy", shape, np.float16, chunks=(1, 1, *histogram), fillvalue=-np.inf)
         partial.replace(folder / "pairs.h5")
@@ -98,7 +132,7 @@ class Dataset:
             scene = SceneFile.read(folder / "scene.toml")
             with h5py.File(folder / "pairs.h5", "r") as file:
                 found = file.attrs.get("format")
-                if found != FORMAT:
+                if found not in _READABLE:
                     holds = ", which holds the first reflections too" if found == 2 else ""
                     raise DatasetError(
                         f"{folder}: format {found}{holds}, expected {FORMAT}: simulate into an empty folder"
@@ -141,25 +175,45 @@ class Dataset:
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             return "log_energy" in file
 
+    @property
+    def keeps_tails_apart(self) -> bool:
+        with h5py.File(self.folder / "pairs.h5", "r") as file:
+            return bool(file.attrs["format"] == FORMAT)
+
     def remaining(self) -> list[int]:
         """Emitters not simulated yet."""
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             return [int(i) for i in np.flatnonzero(~file["done"][()])]
 
+    def write_tail(self, tail: SharedTail) -> None:
+        """Stores what all pairs share, before any of them; once."""
+        with h5py.File(self.folder / "pairs.h5", "r+") as file:
+            if "tail" in file:
+                return
+            file.pop("tail.partial", None)
+            group = file.create_group("tail.partial")
+            for name, value in vars(tail).items():
+                group[name] = value
+            file.flush()
+            file.move("tail.partial", "tail")
+
     def write(
         self,
         emitter: int,
-        responses: npt.NDArray[np.float16],
+        takes: Sequence[Mapping[int, OwnResponse]],
         log_energy: npt.NDArray[np.float16],
-        repeats: dict[int, npt.NDArray[np.float16]],
     ) -> None:
-        """Stores all listeners of one emitter (listener, yaw, ear, sample) with their (listener, direction, band, bin)
-        logarithms of energy, and second takes of its held-out pairs by listener."""
+        """Stores one emitter's responses by take and listener, of the second take those held out, and the (listener,
+        direction, band, bin) logarithms of energy of the first."""
         with h5py.File(self.folder / "pairs.h5", "r+") as file:
-            file["reflected"][emitter] = responses
+            for number, (name, responses) in enumerate(zip(TAKES, takes, strict=True)):
+                pairs, begins = file[name], file["tail_begin"][number, emitter]
+                for listener, (samples, begins[listener]) in responses.items():
+                    # A chunk is a response, as it is: HDF5 has no need to copy it first.
+                    chunk = np.ascontiguousarray(samples, pairs.dtype)
+                    pairs.id.write_direct_chunk((emitter, listener, 0, 0, 0), chunk)
+                file["tail_begin"][number, emitter] = begins
             file["log_energy"][emitter] = log_energy
-            for listener, repeat in repeats.items():
-                file["repeats"][emitter, listener] = repeat
             file.flush()
             file["done"][emitter] = True
 
@@ -168,10 +222,20 @@ class Dataset:
         chosen = self.held_out if held_out else ~self.held_out & ~np.eye(len(self.probes), dtype=bool)
         return np.argwhere(chosen)
 
-    def read(self, pairs: npt.NDArray[np.int64], name: str = "reflected") -> npt.NDArray[np.float16]:
-        """(pair, yaw, ear, sample) reflected sound, or second takes with `name` "repeats"."""
+    @cached_property
+    def tail(self) -> SharedTail | None:
+        """What all pairs share."""
         with h5py.File(self.folder / "pairs.h5", "r") as file:
-            return np.stack([file[name][emitter, listener] for emitter, listener in pairs])
+            if "tail" not in file:
+                return None
+            stored = {name: value[()] for name, value in file["tail"].items()}
+        return SharedTail(**{**stored, "start_s": float(stored["start_s"]), "first": int(stored["first"])})
+
+    def read(self, pairs: npt.NDArray[np.int64], take: str = "reflected") -> npt.NDArray[np.float32]:
+        """(pair, yaw, ear, sample) reflected sound of one of the TAKES."""
+        with h5py.File(self.folder / "pairs.h5", "r") as file:
+            responses = StoredResponses(self, file, take)
+            return np.stack([responses[emitter, listener] for emitter, listener in pairs])
 
     def read_energy(self, pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """(pair, direction, band, bin) energy that the diffuse part of `reflected` was drawn from.
@@ -182,7 +246,25 @@ class Dataset:
             raise DatasetError(f"{self.folder}: holds no energies; simulate into an empty folder")
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             logarithms = np.stack([file["log_energy"][emitter, listener] for emitter, listener in pairs])
-        return np.exp(logarithms.astype(np.float32))
+        energies = np.exp(logarithms.astype(np.float32))
+        return energies if self.tail is None else np.stack([self.tail.join(0, energy) for energy in energies])
+
+
+class StoredResponses:
+    """The reflected sound in an open dataset's `file`, of one of the TAKES, by emitter and listener."""
+
+    def __init__(self, dataset: Dataset, file: h5py.File, take: str = "reflected") -> None:
+        self._own: h5py.Dataset = file[take]
+        self._take = TAKES.index(take)
+        self._tail = dataset.tail
+        self._begins = None if self._tail is None else file["tail_begin"][self._take]
+
+    def __getitem__(self, ends: tuple[int, int]) -> npt.NDArray[np.float32]:
+        """(yaw, ear, sample)"""
+        own = self._own[ends]
+        if self._tail is None or self._begins is None:
+            return np.asarray(own, np.float32)
+        return self._tail.extend(self._take, own, int(self._begins[ends]))
 
 
 def _recorded(effects: str | None, scene: SceneFile) -> SimulationPlan:

@@ -130,7 +130,7 @@ class SimulatedResponses:
         rows = np.asarray(rows, dtype=np.int64)
         pairs, which = np.unique(self.pair[rows], return_inverse=True)
         of_pairs = self.dataset.read(self._pairs[pairs])
-        return _finite(of_pairs[which, rows % len(self.dataset.yaws)].astype(np.float32), self.file)
+        return _finite(of_pairs[which, rows % len(self.dataset.yaws)], self.file)
 
 
 @dataclass(frozen=True)

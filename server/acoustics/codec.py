@@ -10,12 +10,14 @@ holds the absolute phase.
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft
-from scipy.signal import ShortTimeFFT
-from scipy.signal.windows import hann
+
+if TYPE_CHECKING:
+    from scipy.signal import ShortTimeFFT
 
 Array = npt.NDArray[np.floating]
 
@@ -40,7 +42,10 @@ class Codec:
         return int(self._transform.p_max(self.samples) - self._transform.p_min)
 
     @cached_property
-    def _transform(self) -> ShortTimeFFT:
+    def _transform(self) -> "ShortTimeFFT":
+        from scipy.signal import ShortTimeFFT  # takes longer to import than all else that reads a scene
+        from scipy.signal.windows import hann
+
         return ShortTimeFFT(hann(self.n_fft, sym=False), self.hop, self.sample_rate, phase_shift=None)
 
     @cached_property

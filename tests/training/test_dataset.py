@@ -1,4 +1,4 @@
-import multiprocessing
+import threading
 import time
 from dataclasses import replace
 
@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from training.dataset import Dataset, DatasetError
+from training.dataset import SPEED_OF_SOUND, TAKES, Dataset, DatasetError, own_duration_s
 from training.simulation.plan import SimulationPlan
-from training.simulation.run import simulate
+from training.simulation.run import prepared, simulate
+from training.simulation.shared_tail import FADE_S
+from training.simulation.tracing import RoomTracer
 
 EVERYTHING = SimulationPlan.everything(2, 500)
 
@@ -30,8 +32,14 @@ class Impatient(Progress):
 
 
 def stored(folder):
+    arrays = {}
     with h5py.File(folder / "pairs.h5", "r") as file:
-        return {name: values[()] for name, values in file.items()}
+        file.visititems(lambda name, item: arrays.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    return arrays
+
+
+def resimulated(dataset):
+    return prepared(dataset.scene, seed=dataset.seed, plan=dataset.effects)
 
 
 def test_couples_are_held_out_in_both_directions(dataset):
@@ -47,12 +55,47 @@ def test_the_share_held_out_is_that_of_the_scene(dataset):
     assert trained + held_out == probes * (probes - 1)
 
 
-def test_pairs_are_emitter_and_listener(dataset):
+@pytest.mark.parametrize("take", TAKES)
+def test_what_is_read_is_what_was_simulated_with_the_tail_that_all_share(dataset, take):
+    simulation = resimulated(dataset)
+    assert simulation.tail is not None
+    emitter, _ = dataset.pairs(held_out=True)[0]
+    listeners = np.flatnonzero(dataset.held_out[emitter])
+    everyone = np.delete(np.arange(len(dataset.probes)), emitter)
+    number = TAKES.index(take)
+    drawn = {listener: whole for listener, _, whole in simulation.take(emitter, (everyone, listeners)[number], number)}
+    found = dataset.read(np.column_stack([np.full_like(listeners, emitter), listeners]), take)
+    for listener, response in zip(listeners, found, strict=True):
+        np.testing.assert_array_equal(response, drawn[listener])
+
+
+def test_energies_read_are_those_simulated(dataset):
+    simulation = resimulated(dataset)
+    everyone = np.arange(1, len(dataset.probes))
+    drawn = np.stack([energy for _, energy, _ in simulation.take(0, everyone, 0)])
+    found = dataset.read_energy(np.column_stack([np.zeros_like(everyone), everyone]))
+    np.testing.assert_allclose(found, drawn, rtol=0.01)
+
+
+def test_a_tail_that_all_share_is_stored_once(dataset, tiny_scene, tmp_path):
     with h5py.File(dataset.folder / "pairs.h5", "r") as file:
-        for emitter, listener in dataset.pairs(held_out=True):
-            np.testing.assert_array_equal(
-                dataset.read(np.array([[emitter, listener]]))[0], file["reflected"][emitter, listener]
-            )
+        assert file["reflected"].shape[-1] < 0.4 * dataset.samples
+        assert file["tail/noise"].shape[1:] == (2 * len(dataset.yaws), 2 * dataset.sample_rate)
+    whole = Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
+    with h5py.File(whole.folder / "pairs.h5", "r") as file:
+        assert file["reflected"].shape[-1] == whole.samples
+        assert "tail" not in file
+
+
+def test_what_is_a_receivers_own_outlasts_its_images(dataset):
+    settings = dataset.scene.simulation
+    own_s = own_duration_s(dataset.scene, dataset.effects)
+    assert dataset.effects.tail_start_s + FADE_S <= own_s < settings.duration_s
+    plan = replace(dataset.effects, image_order=5)
+    tracer = RoomTracer.of(dataset.scene, plan, dataset.probes)
+    images = zip(tracer.images(dataset.probes[0]), dataset.probes, strict=True)
+    latest_m = max(np.linalg.norm(positions - place, axis=-1).max() for (positions, _), place in images)
+    assert latest_m / SPEED_OF_SOUND < own_duration_s(dataset.scene, plan)
 
 
 def test_second_takes_share_the_mirrors_and_not_the_noise(dataset):
@@ -75,7 +118,7 @@ def test_an_interrupted_simulation_goes_on_to_the_same_data(dataset, tiny_scene,
     with pytest.raises(KeyboardInterrupt):
         simulate(tiny_scene, folder, seed=dataset.seed, workers=2, progress=progress)
     assert time.monotonic() - progress.lost_at < 15
-    assert not multiprocessing.active_children()
+    assert not any(thread.name.startswith("simulate") for thread in threading.enumerate())
     with pytest.raises(DatasetError, match="4 emitters are not simulated yet"):
         Dataset.open(folder)
 
@@ -119,11 +162,24 @@ def test_a_dataset_from_before_plans_has_everything_but_bent_sound(tiny_scene, t
     assert Dataset.open(tmp_path, finished=False).effects == replace(EVERYTHING, diffraction=False)
 
 
+def test_a_dataset_from_when_every_pair_had_its_tail_is_read_and_not_gone_on_with(tiny_scene, tmp_path):
+    dataset = Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
+    response = np.random.default_rng(0).standard_normal((len(dataset.yaws), 2, dataset.samples)).astype(np.float16)
+    with h5py.File(tmp_path / "pairs.h5", "r+") as file:
+        file.attrs["format"] = 3
+        del file["tail_begin"]
+        file["reflected"][0, 1] = response
+    opened = Dataset.open(tmp_path, finished=False)
+    np.testing.assert_array_equal(opened.read(np.array([[0, 1]]))[0], response.astype(np.float32))
+    with pytest.raises(DatasetError, match="was begun in format 3; choose an empty folder"):
+        Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
+
+
 def test_a_dataset_that_holds_the_first_reflections_is_refused_by_name(tiny_scene, tmp_path):
     Dataset.create(tmp_path, tiny_scene, 0, EVERYTHING)
     with h5py.File(tmp_path / "pairs.h5", "r+") as file:
         file.attrs["format"] = 2
-    with pytest.raises(DatasetError, match="holds the first reflections too, expected 3: simulate into an empty"):
+    with pytest.raises(DatasetError, match="holds the first reflections too, expected 4: simulate into an empty"):
         Dataset.open(tmp_path, finished=False)
 
 

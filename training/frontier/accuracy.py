@@ -17,7 +17,7 @@ from server.acoustics.audibility import in_jnd
 from server.acoustics.codec import Codec
 from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_loss
 from server.acoustics.room_parameters import RoomParameters, measure
-from training.dataset import Dataset
+from training.dataset import Dataset, StoredResponses
 from training.simulation.references import References
 
 _Floats = npt.NDArray[np.float64]
@@ -81,6 +81,7 @@ class HeldOutSample:
         turns = np.unique(np.linspace(0, len(dataset.yaws), yaws, endpoint=False).astype(int))
         with h5py.File(Path(dataset.folder) / "pairs.h5", "r") as file:
             first, second = References(dataset, file), References(dataset, file, "repeats")
+            reflected = StoredResponses(dataset, file)
             self.entries = []
             for emitter, listener in chosen:
                 pair = int(emitter) * len(dataset.probes) + int(listener)
@@ -91,7 +92,7 @@ class HeldOutSample:
                     yaws=dataset.yaws[turns],
                     visible=bool(dataset.plan.is_visible(*ends)),
                     reference=reference,
-                    reflected=file["reflected"][emitter, listener][turns].astype(np.float32),
+                    reflected=reflected[emitter, listener][turns],
                     repeat=second[pair][turns],
                     parameters=measure(reference, self._sample_rate),
                 )

@@ -74,7 +74,7 @@ def check_plan(
     for name, (of, drawn) in asked.items():  # the plan last: code is loaded by whoever comes first
         began = process_time()
         simulations[name] = PairSimulation.prepare(scene, probes, yaws, seed=drawn, plan=of)
-        for _ in simulations[name].take(0, np.array([1]), 0):  # makes what serves all emitters
+        for _ in simulations[name].own(0, np.array([1]), 0):  # makes what serves all emitters
             pass
         once_s = process_time() - began
     seconds = dict.fromkeys(simulations, 0.0)
@@ -86,11 +86,11 @@ def check_plan(
         repeated = listeners[:: round(1 / scene.simulation.held_out_share)]
         for name, simulation in simulations.items():
             began = process_time()
-            responses = np.stack([response for _, _, response in simulation.take(emitter, listeners, 0)])
-            for _ in simulation.take(emitter, repeated, 1):
+            own = [response for _, _, response in simulation.own(emitter, listeners, 0)]
+            for _ in simulation.own(emitter, repeated, 1):
                 pass
             seconds[name] += process_time() - began
-            heard = responses[:, :: max(1, len(yaws) // _YAWS_HEARD)].astype(np.float32) + known
+            heard = np.stack([simulation.whole(0, each)[:: max(1, len(yaws) // _YAWS_HEARD)] for each in own]) + known
             measured[name].append(measure(heard, scene.simulation.sample_rate))
     return PlanCheck(
         scene=scene.id,

@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from training.simulation.check import PlanCheck
+    from training.simulation.pairs import PairSimulation
     from training.simulation.plan import SimulationPlan
 
 # A caption is wrapped to its table.
@@ -33,14 +35,13 @@ def wide_console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, width=None if Console(stderr=stderr).is_terminal else 150)
 
 
-def plan_of(scene: Path, seed: int, effects: str) -> "SimulationPlan":
-    """With its costs on this host."""
-    import numpy as np
-
+def simulation_of(scene: Path, seed: int, effects: str) -> "PairSimulation":
+    """Ready, by a plan that says what it will cost on this host."""
     from training.scene_file import SceneFile
-    from training.simulation.cost import SimulationCost
+    from training.simulation.cost import with_costs
     from training.simulation.plan import overrides_among
     from training.simulation.planner import planner_of
+    from training.simulation.run import prepared
 
     read = SceneFile.read(scene)
     planner = planner_of(read, seed)
@@ -48,8 +49,8 @@ def plan_of(scene: Path, seed: int, effects: str) -> "SimulationPlan":
         plan = planner.everything
     else:
         plan = planner.plan(overrides_among({**read.effects, **_named(effects)}))
-    yaws = 2 * np.pi * np.arange(read.simulation.yaws) / read.simulation.yaws
-    return SimulationCost(read, read.probe_positions(seed), yaws).with_costs(plan)
+    simulation = prepared(read, seed=seed, plan=plan)
+    return replace(simulation, plan=with_costs(simulation))
 
 
 def _named(effects: str) -> dict[str, bool]:
@@ -79,7 +80,7 @@ def plan(
 ) -> None:
     """What simulating a scene calls for, why, and what it will take."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    planned = plan_of(scene, seed, effects)
+    planned = simulation_of(scene, seed, effects).plan
     checked = None if check is None else _check(scene, planned, check, seed)
     if as_json:
         content = planned.to_json() if checked is None else {"plan": planned.to_json(), "check": checked.to_json()}

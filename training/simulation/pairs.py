@@ -4,79 +4,98 @@ Axes: energy (direction, band, bin), responses (yaw, ear, sample), sample 0 is e
 same numbers, in whatever order and process emitters are simulated.
 """
 
-import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from time import process_time
 
 import numpy as np
 import numpy.typing as npt
 
 from server.whole_field import kemar
-from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
-from training.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND, TAKES, OwnResponse, own_duration_s
+from training.scene_file import SceneFile
 from training.simulation.half_precision import to_half
 from training.simulation.plan import SimulationPlan
 from training.simulation.rays import sphere_directions
-from training.simulation.shared_tail import FADE_S, SharedTail, joined, shared_power
+from training.simulation.shared_tail import SharedTail, shared_power
 from training.simulation.synthesis import BinauralSynthesis
+from training.simulation.tail_noise import draw_tail
 from training.simulation.tracing import RoomTracer
 
 _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
-_Halves = npt.NDArray[np.float16]
 
 # So many tell how late sound decays, and where it comes from.
 _TAIL_PROBES = 8
-TAKES = 2
-"""The second is for the repeatability of the first."""
 
 
 @dataclass(frozen=True)
 class PairSimulation:
-    """`probes` (probe, 3) and `yaws` (yaw,), radians; `tails` (take, direction, band, bin) is the late energy that all
-    receivers share, None where each has its own. `prepare` traces it."""
+    """`probes` (probe, 3) and `yaws` (yaw,), radians; `tail` is the late sound that all receivers share, None where
+    each has its own. `prepare` makes it, in `prepared_s` seconds of one core. Threads may share a simulation."""
 
     scene: SceneFile
     probes: _Floats
     yaws: _Floats
     seed: int
     plan: SimulationPlan
-    tails: _Floats | None
+    tail: SharedTail | None = None
+    prepared_s: float = 0.0
 
     @classmethod
     def prepare(
         cls, scene: SceneFile, probes: _Floats, yaws: _Floats, *, seed: int, plan: SimulationPlan
     ) -> "PairSimulation":
-        tails = None
-        if plan.tail_start_s is not None:
-            generators = (np.random.default_rng([seed, 3, take]) for take in range(TAKES))
-            tails = np.stack([_tail_energy(scene, probes, plan, rng) for rng in generators])
-        return cls(scene, probes, yaws, seed, plan, tails)
+        began_s = process_time()
+        simulation = cls(scene, probes, yaws, seed, plan)
+        if plan.tail_start_s is None:
+            return simulation
+        generators = [np.random.default_rng([seed, 3, take]) for take in range(len(TAKES))]
+        with ThreadPoolExecutor(len(TAKES)) as pool:
+            traced = pool.map(partial(_tail_energy, scene, probes, plan), generators)
+            synthesis = simulation._synthesis  # reads a head meanwhile
+            energies = np.stack(list(traced))
+        noise = np.random.default_rng([seed, 4])
+        tail = draw_tail(synthesis, energies, start_s=plan.tail_start_s, rng=noise)
+        return replace(simulation, tail=tail, prepared_s=process_time() - began_s)
 
     def take(
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
-    ) -> Iterator[tuple[int, _Singles, _Halves]]:
+    ) -> Iterator[tuple[int, _Singles, _Singles]]:
         """Each listener with the energy that its diffuse sound is drawn from, and its response without what is left to
-        geometry. The TAKES takes are independent. The noise is that of the pair and the take, whatever the plan, until
-        a shared tail sets in: what a plan changes there is told from its own doing, and not from two draws."""
+        geometry."""
+        for listener, energy, own in self.own(emitter, listeners, take):
+            joined = energy if self.tail is None else self.tail.join(take, energy)
+            yield listener, joined, self.whole(take, own)
+
+    def whole(self, take: int, own: OwnResponse) -> _Singles:
+        """A response with what is shared."""
+        if self.tail is None:
+            return own.samples.astype(np.float32)
+        return self.tail.extend(take, own.samples, own.tail_begin)
+
+    def own(
+        self, emitter: int, listeners: npt.NDArray[np.integer], take: int
+    ) -> Iterator[tuple[int, _Singles, OwnResponse]]:
+        """Each listener with what is its own of energy and response: all of both, or what comes before a shared tail.
+
+        The TAKES takes are independent. The noise is that of the pair and the take, whatever the plan, until a shared
+        tail sets in: what a plan changes there is told from its own doing, and not from two draws."""
         place, receivers = self.probes[emitter], self.probes[listeners]
         images = self._tracer(receivers).images(place)
         energies = self.energies(emitter, listeners, np.random.default_rng([self.seed, 2, emitter, take]))
-        tail = self._tail
         onsets_s = self.scene.geometry.floor_plan.path_length_m(place, receivers) / SPEED_OF_SOUND
         for row, listener in enumerate(map(int, listeners)):
             rng = np.random.default_rng([self.seed, 5, emitter, take, listener])
-            energy = energies[row]
-            response = self._synthesis.specular(*images[row], receivers[row])
+            response = self._own_synthesis.specular(*images[row], receivers[row])
             if self.plan.rays:
-                own = self._own_synthesis.late(energy, onsets_s[row], rng)
-                own *= self._own_amplitude
-                response[..., : own.shape[-1]] += own
-            if tail is not None:
-                tail.add(take, response, rng)
-                energy = joined(energy, tail.energies[take], tail.start_s)
-            yield listener, energy, to_half(response)
+                late = self._own_synthesis.late(energies[row], onsets_s[row], rng)
+                late *= self._own_amplitude
+                response += late
+            begin = 0 if self.tail is None else self.tail.begin(rng)
+            yield listener, energies[row], OwnResponse(to_half(response), begin)
 
     def energies(
         self, emitter: int, listeners: npt.NDArray[np.integer], rng: np.random.Generator
@@ -90,11 +109,7 @@ class PairSimulation:
 
     @cached_property
     def _own_s(self) -> float:
-        """How much of a receiver's diffuse sound is its own, in whole bins."""
-        start_s, duration_s = self.plan.tail_start_s, self.scene.simulation.duration_s
-        if start_s is None:
-            return duration_s
-        return HISTOGRAM_BIN_S * math.ceil((start_s + FADE_S) / HISTOGRAM_BIN_S)
+        return own_duration_s(self.scene, self.plan)
 
     @cached_property
     def _synthesis(self) -> BinauralSynthesis:
@@ -115,13 +130,6 @@ class PairSimulation:
         if self.plan.tail_start_s is None:
             return np.ones(len(times_s), dtype=np.float32)
         return np.sqrt(1 - shared_power(times_s, self.plan.tail_start_s)).astype(np.float32)
-
-    @cached_property
-    def _tail(self) -> SharedTail | None:
-        if self.plan.tail_start_s is None or self.tails is None:
-            return None
-        rng = np.random.default_rng([self.seed, 4])
-        return SharedTail(self._synthesis, self.tails, start_s=self.plan.tail_start_s, rng=rng)
 
 
 def _tail_energy(scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator) -> _Floats:

@@ -152,7 +152,8 @@ class Predictions:
         return Prediction(change_jnd, "level", reason)
 
     def rays(self) -> int:
-        """As many per emitter as keep their part in the spread of clarity small, up to those the scene file allows.
+        """As many per emitter as keep their part in the spread of clarity small, on average over receivers, up to
+        those the scene file allows.
 
         A ray that fills the room crosses a sphere of radius r so often per metre: pi r**2 / V.
         """
@@ -161,9 +162,9 @@ class Predictions:
             return most
         variance_db = _RAY_VARIANCE * self.room.clarity_spread_db(_EARLY_S) ** 2
         crossings = _CHORDS * (10 / np.log(10)) ** 2 / variance_db
-        radius_m = float(receiver_radii(self.floor_plan, self.probes).min())
-        per_ray = SPEED_OF_SOUND * _EARLY_S * np.pi * radius_m**2 / self.room.volume_m3
-        return min(most, int(np.ceil(crossings / per_ray / 100)) * 100)
+        per_ray = SPEED_OF_SOUND * _EARLY_S * np.pi * receiver_radii(self.floor_plan, self.probes) ** 2
+        rays = float(np.mean(crossings * self.room.volume_m3 / per_ray))
+        return min(most, int(np.ceil(rays / 100)) * 100)
 
     @property
     def _pairs(self) -> tuple[_Floats, _Floats]:

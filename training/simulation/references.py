@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.whole_field import kemar
-from training.dataset import GEOMETRIC_ORDER, Dataset
+from training.dataset import GEOMETRIC_ORDER, Dataset, StoredResponses
 from training.simulation.direct_paths import DirectPaths
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
@@ -56,16 +56,15 @@ class GeometricSound:
 
 
 class References:
-    """Whole responses of an open dataset by flat pair index, emitter-major; `take` is "reflected" or "repeats"."""
+    """Whole responses of an open dataset by flat pair index, emitter-major; `take` is one of the TAKES."""
 
     def __init__(self, dataset: Dataset, file: h5py.File, take: str = "reflected") -> None:
-        self._reflected: h5py.Dataset = file[take]
+        self._reflected = StoredResponses(dataset, file, take)
         self._geometric = GeometricSound(dataset)
         self._probes = len(dataset.probes)
 
     def __getitem__(self, pair: int) -> _Responses:
         """(yaw, ear, sample)"""
         emitter, listener = divmod(int(pair), self._probes)
-        reflected = np.asarray(self._reflected[emitter, listener], dtype=np.float32)
-        geometric = self._geometric
-        return reflected + geometric.direct(emitter, listener) + geometric.first_reflections(emitter, listener)
+        direct, first = self._geometric.direct, self._geometric.first_reflections
+        return self._reflected[emitter, listener] + direct(emitter, listener) + first(emitter, listener)

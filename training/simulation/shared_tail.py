@@ -2,25 +2,24 @@
 
 Energies are axes (direction, band, bin) of HISTOGRAM_BIN_S, as those of `training.simulation.tracing`. What is shared
 are the energies and where they come from; the noise that they are drawn with is long, and every response takes another
-part of it.
+part of it. `training.simulation.tail_noise` draws it.
 """
+
+from dataclasses import dataclass
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
 from training.scene_file import HISTOGRAM_BIN_S
-from training.simulation.synthesis import BinauralSynthesis, power_at
 
 _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
 
 # From own sound to shared, at constant power.
 FADE_S = 0.010
-_NOISE_S = 4.0
-# Steps of the noise's quantisation in the root mean square of a band's loudest channel: reading it is what adding a
-# tail waits for, and responses are stored with fewer digits.
-_NOISE_STEPS = 4096
+BANDS_AT_ONCE = 4
+"""Of the noise, whose bands are a multiple of it: that spares their sum trips to memory."""
 # Samples of all bands' amplitudes that a core's nearest cache holds while every channel goes by.
 _STRETCH = 1024
 
@@ -30,49 +29,38 @@ def shared_power(times_s: _Floats, start_s: float) -> _Floats:
     return np.asarray(np.sin(np.pi / 2 * np.clip((times_s - start_s) / FADE_S, 0, 1)) ** 2)
 
 
-def joined(own: _Singles, tail: _Singles, start_s: float) -> _Singles:
-    """(direction, band, bin) energy of a receiver whose own is known for the first bins and ends in a shared tail."""
-    share = shared_power((np.arange(tail.shape[-1]) + 0.5) * HISTOGRAM_BIN_S, start_s).astype(np.float32)
-    energy = tail * share
-    known = own.shape[-1]
-    energy[..., :known] += own * (1 - share[:known])
-    return energy
-
-
+@dataclass(frozen=True)
 class SharedTail:
-    """Late sound of (take, direction, band, bin) `energies`, of which the part before `start_s` is not used. Its noise
-    is (band, yaw and ear, sample), of unit power per sample over all directions, and has no end. Read only once made.
-    """
+    """`energies` (take, direction, band, bin) are what each receiver gets: from the same directions at all times, and
+    of those before `start_s` nothing. `noise` (band, yaw and ear, sample) has no end, and is heard with (take, band,
+    sample) `amplitudes` from sample `first` of a response on."""
 
-    def __init__(
-        self, synthesis: BinauralSynthesis, energies: _Floats, *, start_s: float, rng: np.random.Generator
-    ) -> None:
-        sample_rate = synthesis.head.sample_rate
-        late = energies[..., int(start_s / HISTOGRAM_BIN_S) :].sum(axis=(0, -1))
-        total = late.sum(axis=0)
-        directional = np.divide(late, total, out=np.full_like(late, 1 / len(late)), where=total > 0)
-        of_all = energies.sum(axis=1)
-        self.start_s = start_s
-        self.energies: _Singles = (directional[..., None] * of_all[:, None]).astype(np.float32)
-        """(take, direction, band, bin) what each receiver gets: from the same directions at all times."""
-        self._first = round(start_s * sample_rate)
-        times_s = np.arange(self._first, synthesis.samples) / sample_rate
-        per_sample = power_at(times_s, of_all.astype(np.float32)) / np.float32(sample_rate)
-        amplitudes = np.sqrt(per_sample * shared_power(times_s, start_s))
-        noise = synthesis.diffuse_noise(directional, round(_NOISE_S * sample_rate), rng)
-        noise = noise.reshape(len(noise), -1, noise.shape[-1])
-        loudest = np.sqrt(np.einsum("bcs,bcs->bc", noise, noise).max(axis=-1) / noise.shape[-1])
-        step = np.maximum(loudest, np.finfo(np.float32).tiny)[:, None] / _NOISE_STEPS
-        self._amplitudes: _Singles = np.ascontiguousarray(amplitudes * step, dtype=np.float32)
-        noise /= step[..., None]
-        limits = np.iinfo(np.int16)
-        self._noise = np.clip(np.rint(noise, out=noise), limits.min, limits.max, out=noise).astype(np.int16)
+    start_s: float
+    first: int
+    energies: _Singles
+    noise: npt.NDArray[np.int16]
+    amplitudes: _Singles
 
-    def add(self, take: int, response: _Singles, rng: np.random.Generator) -> None:
-        """Adds the tail to (yaw, ear, sample) `response`; `rng` chooses the part of the noise."""
-        begin = int(rng.integers(self._noise.shape[-1]))
+    def begin(self, rng: np.random.Generator) -> int:
+        """The sample of the noise that a response begins with."""
+        return int(rng.integers(self.noise.shape[-1]))
+
+    def extend(self, take: int, own: npt.NDArray[np.floating], begin: int) -> _Singles:
+        """(yaw, ear, sample) response that is, at first, a receiver's own, which ends after the fade."""
+        response = np.zeros((*own.shape[:-1], self.first + self.amplitudes.shape[-1]), np.float32)
+        response[..., : own.shape[-1]] = own
         ears = response.reshape(-1, response.shape[-1])
-        _add_modulated(self._noise, begin, self._amplitudes[take], ears, self._first)
+        _add_modulated(self.noise, begin, self.amplitudes[take], ears, self.first)
+        return response
+
+    def join(self, take: int, own: _Singles) -> _Singles:
+        """(direction, band, bin) energy of a receiver whose own is known for the first bins."""
+        tail = self.energies[take]
+        share = shared_power((np.arange(tail.shape[-1]) + 0.5) * HISTOGRAM_BIN_S, self.start_s).astype(np.float32)
+        energy = tail * share
+        known = own.shape[-1]
+        energy[..., :known] += own * (1 - share[:known])
+        return energy
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
@@ -83,10 +71,19 @@ def _add_modulated(noise, begin, amplitude, response, first):
     samples, done = amplitude.shape[1], 0
     while done < samples:
         count = min(samples - done, length - begin, _STRETCH)
+        heard, played = slice(begin, begin + count), slice(done, done + count)
         for channel in range(channels):
             target = response[channel, first + done : first + done + count]
-            for band in range(bands):
-                source, gain = noise[band, channel, begin : begin + count], amplitude[band, done : done + count]
+            for band in range(0, bands, BANDS_AT_ONCE):
+                one, gain_one = noise[band, channel, heard], amplitude[band, played]
+                two, gain_two = noise[band + 1, channel, heard], amplitude[band + 1, played]
+                three, gain_three = noise[band + 2, channel, heard], amplitude[band + 2, played]
+                four, gain_four = noise[band + 3, channel, heard], amplitude[band + 3, played]
                 for index in range(count):
-                    target[index] += np.float32(source[index]) * gain[index]
+                    target[index] += (
+                        np.float32(one[index]) * gain_one[index]
+                        + np.float32(two[index]) * gain_two[index]
+                        + np.float32(three[index]) * gain_three[index]
+                        + np.float32(four[index]) * gain_four[index]
+                    )
         done, begin = done + count, (begin + count) % length

@@ -18,7 +18,6 @@ import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
-from scipy.signal.windows import cosine
 from scipy.sparse import coo_array
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
@@ -179,7 +178,7 @@ class BinauralSynthesis:
     @cached_property
     def _window(self) -> _Singles:
         """Before the transform and after it: its square, at steps of half its length, adds up to one."""
-        return np.asarray(cosine(self._n_fft, sym=True), dtype=np.float32)
+        return np.sin(np.pi * (np.arange(self._n_fft) + 0.5) / self._n_fft).astype(np.float32)
 
     @cached_property
     def _arrival_spectra(self) -> npt.NDArray[np.complex64]:

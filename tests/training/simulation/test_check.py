@@ -10,21 +10,15 @@ import pytest
 from training.cli import main
 from training.scene_file import SceneFile
 from training.simulation.check import check_plan
-from training.simulation.cost import SimulationCost
-from training.simulation.pairs import PairSimulation
+from training.simulation.cost import predicted_s, with_costs
 from training.simulation.plan import SimulatedEffect, SimulationPlan
 from training.simulation.planner import planner_of
+from training.simulation.run import prepared
 
 
 @pytest.fixture(scope="module")
 def box(tiny_scene):
     return SceneFile.read(tiny_scene)
-
-
-@pytest.fixture(scope="module")
-def cost(box):
-    yaws = 2 * np.pi * np.arange(box.simulation.yaws) / box.simulation.yaws
-    return SimulationCost(box, box.probe_positions(0), yaws)
 
 
 @pytest.fixture
@@ -64,26 +58,27 @@ def test_what_is_predicted_to_be_inaudible_is_about_the_floor(box):
         assert check.errors[name] < 2 * check.floor[name]  # of ten pairs
 
 
-def test_the_predicted_cost_is_about_what_it_takes(box, cost):
-    plan = SimulationPlan.everything(2, 3000)
-    predicted = cost.of(plan)
-    simulation = PairSimulation.prepare(box, cost.probes, cost.yaws, seed=0, plan=plan)
-    everyone = np.arange(len(cost.probes))
+def test_the_predicted_cost_is_about_what_it_takes(box):
+    simulation = prepared(box, seed=0, plan=SimulationPlan.everything(2, 3000))
+    predicted = predicted_s(simulation)
+    everyone = np.arange(len(simulation.probes))
     began = process_time()
     for emitter in everyone:
-        for _ in simulation.take(emitter, np.delete(everyone, emitter), 0):
+        for _ in simulation.own(emitter, np.delete(everyone, emitter), 0):
             pass
     taken = process_time() - began
     assert taken / 2 < predicted < 4 * taken  # second takes are in it, too
 
 
-def test_more_rays_are_predicted_to_take_longer(cost):
-    few, many = (cost.of(SimulationPlan.everything(1, rays)) for rays in (2_000, 200_000))
+def test_more_rays_are_predicted_to_take_longer(box):
+    few, many = (
+        predicted_s(prepared(box, seed=0, plan=SimulationPlan.everything(1, rays))) for rays in (2_000, 200_000)
+    )
     assert many > 5 * few
 
 
-def test_what_is_off_is_told_with_what_it_saves(box, cost):
-    plan = cost.with_costs(planner_of(box, 0).plan({}))
+def test_what_is_off_is_told_with_what_it_saves(box):
+    plan = with_costs(prepared(box, seed=0, plan=planner_of(box, 0).plan({})))
     costs = {each.name: each.cost_s for each in plan.decisions}
     assert plan.cost_s > 0
     assert costs[SimulatedEffect.PER_SOURCE_TAIL] >= 0

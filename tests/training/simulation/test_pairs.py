@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from training.dataset import TAKES
 from training.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation import pairs
 from training.simulation.pairs import PairSimulation
 from training.simulation.plan import SimulatedEffect, SimulationPlan
 from training.simulation.planner import planner_of
 from training.simulation.rays import RayTracer
-from training.simulation.shared_tail import SharedTail
 from training.simulation.synthesis import BinauralSynthesis
 
 YAWS = 2 * np.pi * np.arange(4) / 4
@@ -77,7 +77,7 @@ def test_a_listener_hears_the_same_whoever_else_is_asked_for(box):
 def test_without_rays_nothing_is_traced_and_no_noise_drawn(box, monkeypatch):
     monkeypatch.setattr(RayTracer, "trace", None)
     monkeypatch.setattr(BinauralSynthesis, "late", None)
-    monkeypatch.setattr(SharedTail, "__init__", None)
+    monkeypatch.setattr(pairs, "draw_tail", None)
     plan = planner_of(box, 0).plan({SimulatedEffect.LATE_REVERBERATION: False, SimulatedEffect.EARLY_REFLECTIONS: True})
     energies, responses = taken(simulation_of(box, plan))
     assert not energies.any()
@@ -95,7 +95,7 @@ def test_a_shared_tail_is_traced_once_and_rays_of_pairs_end_with_it(box, monkeyp
     monkeypatch.setattr(RayTracer, "trace", counted)
     simulation = simulation_of(box, planner_of(box, 0).plan({}))
     once = len(traced_s)
-    assert once == pairs.TAKES * len(simulation.probes)  # from all over the room, which has few probes
+    assert once == len(TAKES) * len(simulation.probes)  # from all over the room, which has few probes
     taken(simulation)
     taken(simulation, emitter=1)
     assert len(traced_s) == once + 2

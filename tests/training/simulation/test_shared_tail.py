@@ -6,8 +6,9 @@ import pytest
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from training.scene_file import HISTOGRAM_BIN_S
 from training.simulation.rays import sphere_directions
-from training.simulation.shared_tail import FADE_S, SharedTail, joined, shared_power
+from training.simulation.shared_tail import FADE_S, shared_power
 from training.simulation.synthesis import BinauralSynthesis
+from training.simulation.tail_noise import draw_tail
 
 RATE, SAMPLES, START_S = 24_000, 7200, 0.06
 BINS = round(SAMPLES / RATE / HISTOGRAM_BIN_S)
@@ -30,14 +31,13 @@ def energies():
 
 @pytest.fixture(scope="module")
 def tail(synthesis, energies):
-    return SharedTail(synthesis, energies, start_s=START_S, rng=np.random.default_rng(0))
+    return draw_tail(synthesis, energies, start_s=START_S, rng=np.random.default_rng(0))
 
 
-def draws(add, count):
-    responses = np.zeros((count, len(YAWS), 2, SAMPLES), dtype=np.float32)
-    for response in responses:
-        add(response)
-    return responses.astype(np.float64)
+def draws(tail, take, rng, count):
+    """Of receivers that have nothing of their own."""
+    silence = np.zeros((len(YAWS), 2, round(0.08 * RATE)), dtype=np.float16)
+    return np.stack([tail.extend(take, silence, tail.begin(rng)) for _ in range(count)]).astype(np.float64)
 
 
 def octave_energies(responses, first):
@@ -56,7 +56,7 @@ def test_it_is_what_each_would_draw_of_its_own(synthesis, energies, tail, take):
     """Per octave, ear and orientation, after the fade."""
     rng, first = np.random.default_rng(1), round((START_S + FADE_S) * RATE)
     own = np.stack([synthesis.late(energies[take].astype(np.float32), 0.01, rng) for _ in range(40)])
-    shared = draws(lambda response: tail.add(take, response, rng), 40)
+    shared = draws(tail, take, rng, 40)
     difference_db = 10 * np.log10(octave_energies(shared, first) / octave_energies(own.astype(float), first))
     # 40 draws of an octave of 88 Hz for about 50 ms leave 0.3 dB, the one noise of all 0.25 dB more.
     assert np.abs(difference_db).max() < 1.5
@@ -66,7 +66,7 @@ def test_it_is_what_each_would_draw_of_its_own(synthesis, energies, tail, take):
 def test_ears_are_as_coherent_as_of_their_own(synthesis, energies, tail):
     rng, first = np.random.default_rng(2), round((START_S + FADE_S) * RATE)
     own = np.stack([synthesis.late(energies[0].astype(np.float32), 0.01, rng) for _ in range(30)]).astype(float)
-    shared = draws(lambda response: tail.add(0, response, rng), 30)
+    shared = draws(tail, 0, rng, 30)
 
     def coherence(responses):
         spectra = np.fft.rfft(responses[..., first:])
@@ -83,7 +83,7 @@ def test_ears_are_as_coherent_as_of_their_own(synthesis, energies, tail):
 
 def test_pairs_take_different_parts_of_the_noise(tail):
     rng = np.random.default_rng(3)
-    one, other = draws(lambda response: tail.add(0, response, rng), 2)
+    one, other = draws(tail, 0, rng, 2)
     late = slice(round((START_S + FADE_S) * RATE), None)
     correlations = [
         np.corrcoef(one[yaw, ear, late], other[yaw, ear, late])[0, 1] for yaw in range(len(YAWS)) for ear in (0, 1)
@@ -92,7 +92,7 @@ def test_pairs_take_different_parts_of_the_noise(tail):
 
 
 def test_nothing_is_added_before_it_starts(tail):
-    (response,) = draws(lambda response: tail.add(0, response, np.random.default_rng(4)), 1)
+    (response,) = draws(tail, 0, np.random.default_rng(4), 1)
     assert not response[..., : round(START_S * RATE)].any()
     assert response[..., round(START_S * RATE) + 1 :].all(axis=(0, 1)).any()
 
@@ -109,7 +109,7 @@ def test_energies_join_without_a_step(tail):
     """A receiver whose own energy is that of all gets nothing but what it had."""
     whole = tail.energies[0]
     known = round((START_S + FADE_S) / HISTOGRAM_BIN_S) + 1
-    np.testing.assert_allclose(joined(whole[..., :known], whole, START_S), whole, rtol=1e-5)
+    np.testing.assert_allclose(tail.join(0, whole[..., :known]), whole, rtol=1e-5)
 
 
 def test_the_expected_energy_is_that_of_the_directions_seen(energies, tail):
