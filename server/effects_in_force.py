@@ -36,10 +36,14 @@ class EffectsInForce:
         return self._renderer.sample_clock / self._sample_rate
 
     @property
+    def wants_other_ears(self) -> bool:
+        """Whether another number of ears is called for than everything is heard with."""
+        return self.shared.channels != self._renderer.channels
+
+    @property
     def awaits_ears(self) -> bool:
-        """Whether another number of ears is called for than everything is heard with, and there is room to switch."""
-        channels = self.shared.channels
-        return channels != self._renderer.channels and self._renderer.can_hear_with(channels)
+        """Whether other ears are called for, and there is room to switch."""
+        return self.wants_other_ears and self._renderer.can_hear_with(self.shared.channels)
 
     @property
     def channels(self) -> int:

@@ -98,7 +98,7 @@ class ResponsesInForce:
         self._waits_for_change = False
 
     def retry(self) -> None:
-        """Ask again after a failure: somebody has come."""
+        """Look again at what to ask for: somebody has come, or is decided about."""
         self._waits_for_change = False
 
     def enforce_plan(self) -> list[ServerMessage]:
@@ -115,6 +115,8 @@ class ResponsesInForce:
         outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter, listener)]
         if not outdated and not self._effects.awaits_ears:
             self._accepted_pose_id = self.newest_pose_id
+            # Room for other ears comes by itself; whatever else calls for an IR is told.
+            self._waits_for_change = not self._effects.wants_other_ears
             return None
         clock = self._renderer.sample_clock
         if clock < self._next_request_clock and all(emitter.token is not None for emitter in outdated):
@@ -145,6 +147,7 @@ class ResponsesInForce:
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""
         self._in_flight = None
+        self._waits_for_change = False
         if response.request.level not in {self._wanted.level, self.heard.level}:
             return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
         pose_id = response.request.pose_id

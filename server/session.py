@@ -246,6 +246,7 @@ class Session:
         planned.give_up()
         for emitter in self._emitters.values():
             emitter.is_decided = True
+        self._responses.retry()
         return [Error(code="plan_failure", message="no plan of effects could be made")]
 
     def begin_block(self) -> None:
