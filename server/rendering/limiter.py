@@ -151,7 +151,30 @@ if HAS_NUMBA:
                 beyond += not abs(value) <= limit
         return beyond == 0
 
+    @compiled
+    def _interpolate(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
+        """out[i] = sum over k of taps[k] samples[i + k]"""
+        out[:] = 0
+        for k in range(taps.size):
+            tap, from_k = taps[k], samples[k:]
+            for i in range(out.size):
+                out[i] += tap * from_k[i]
+
+    @compiled
+    def _raise_to(samples: FloatArray, peak: FloatArray) -> None:
+        """Have `peak` be no less than the magnitude of any sample."""
+        for i in range(peak.size):
+            peak[i] = max(peak[i], abs(samples[i]))
+
 else:
+
+    def _interpolate(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
+        out.fill(0)
+        for k, tap in enumerate(taps):
+            out += tap * samples[k : k + out.size]
+
+    def _raise_to(samples: FloatArray, peak: FloatArray) -> None:
+        np.maximum(peak, np.abs(samples), peak)
 
     def _is_within(samples: FloatArray, limit: np.float32) -> bool:
         return bool(np.all(np.abs(samples) <= limit))
@@ -174,14 +197,13 @@ def _find_peaks(signal: FloatArray, table: FloatArray, peak: FloatArray) -> None
     size = peak.size
     ahead = _TAPS // 2
     between = np.zeros(size, np.float32)  # after the samples from `ahead` before the block on
+    read = np.zeros(size, np.float32)
     peak[:] = 0
     for channel in range(signal.shape[0]):
-        np.maximum(peak, np.abs(signal[channel, signal.shape[1] - size :]), peak)
+        _raise_to(signal[channel, signal.shape[1] - size :], peak)
         for phase in range(table.shape[0]):
-            read = np.zeros(size, np.float32)
-            for tap in range(_TAPS):
-                read += table[phase, tap] * signal[channel, tap : tap + size]
-            np.maximum(between, np.abs(read), between)
+            _interpolate(signal[channel], table[phase], read)
+            _raise_to(read, between)
     known = size - ahead
     peak[:known] = np.maximum(peak[:known], between[ahead:])
     peak[: known + 1] = np.maximum(peak[: known + 1], between[ahead - 1 :])
