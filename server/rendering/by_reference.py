@@ -26,7 +26,7 @@ class Reference:
 
     def __init__(self, value: NamedTuple) -> None:
         self.value = value
-        self._type = ReferenceType(typeof(value))
+        self.kind = ReferenceType(typeof(value))
         # As numba lays arrays out: who owns them (nobody, here), sizes, address, shape and strides, a word each.
         words = [word for field in value for word in _words(field)]
         self._words = np.array(words, np.int64)
@@ -64,7 +64,7 @@ class _ReferenceModel(models.PrimitiveModel):
 
 @typeof_impl.register(Reference)
 def _type_of_reference(value: Reference, _context: Any) -> ReferenceType:
-    return value._type
+    return value.kind
 
 
 @unbox(ReferenceType)

@@ -19,7 +19,7 @@ from server.rendering.sources import ClipPlayer, Source
 
 if HAS_NUMBA:
     from server.rendering.by_reference import Reference
-    from server.rendering.mixing_kernel import enter_convolver, mix_mixers, record_of
+    from server.rendering.mixing_kernel import enter_convolver, mixing_with, record_of
 
 
 class Mixer:
@@ -134,7 +134,8 @@ def mix_all(mixers: Sequence[Mixer]) -> None:
         mixer.follow()
     if HAS_NUMBA:
         like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
-        mix_mixers(np.array([mixer.address for mixer in mixers], np.int64), like)
+        mix = mixing_with(None if like is None else like.kind)
+        mix(np.array([mixer.address for mixer in mixers], np.int64), like)
         for mixer in mixers:
             if mixer.convolver is not None:
                 mixer.convolver.release()

@@ -1,14 +1,16 @@
 """The compiled part of `server.rendering.mixing`."""
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import carray
+from numba import carray, types
 
 from server.acoustics.simd import broadcast, load, multiply, multiply_add, pointer, store
 from server.compiled import compiled
-from server.rendering.by_reference import Reference, reference_at
+from server.rendering.by_reference import Reference, ReferenceType, reference_at
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
 from server.rendering.flush_to_zero import flush_to_zero, restore
@@ -62,6 +64,15 @@ def mix_mixers(addresses: npt.NDArray[np.int64], like: Reference | None) -> None
     restore(mode)
 
 
+@cache
+def mixing_with(kind: ReferenceType | None) -> Callable[[npt.NDArray[np.int64], Reference | None], None]:
+    """`mix_mixers` for references of one kind. Numba, called without, finds out which kind it is with every call, and in
+    Python."""
+    signature = types.Array(types.int64, 1, "C"), types.none if kind is None else kind
+    mix_mixers.compile(signature)  # type: ignore[attr-defined]
+    return mix_mixers.get_overload(signature)  # type: ignore[attr-defined]
+
+
 @compiled
 def _play(mixer) -> None:
     """Fill the rows of slots that play a clip, as `server.rendering.sources.ClipPlayer` does."""
@@ -81,8 +92,7 @@ def _play(mixer) -> None:
             if count == 0:  # only once, and over
                 dry[slot, written:] = 0
                 break
-            for n in range(count):
-                dry[slot, written + n] = values[at[slot] + n]
+            dry[slot, written : written + count] = values[at[slot] : at[slot] + count]
             written += count
             at[slot] += count
             if loops[slot] != 0 and at[slot] == samples[slot]:
