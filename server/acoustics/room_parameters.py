@@ -40,6 +40,10 @@ _Integers = npt.NDArray[np.int64]
 DIRECT_SOUND_S = 0.0025
 _DIRECT_LEAD_S = 0.001
 _DIRECT_SEARCH_S = 0.003
+_DIRECT_PEAK_S = 0.001
+"""From its first sign to its largest sample. What floors and walls return soon after is louder at a far ear."""
+_BETWEEN_EARS_S = 0.001
+"""Of the direct sound at the nearer ear, for interaural time differences: what follows are reflections."""
 _LAG_LIMIT_S = 0.001  # ISO 3382-1 B.2: interaural lags within +-1 ms
 _EARLY_S = 0.080  # ISO 3382-1 B.2: IACC early
 _LOWPASS_HZ = 3000.0  # Katz and Noisternig, J. Acoust. Soc. Am. 135, 3530, 2014
@@ -202,15 +206,16 @@ def _binaural(ir: npt.ArrayLike) -> npt.NDArray[np.generic]:
 
 
 def _direct_sample(responses: npt.NDArray[np.generic], onset: npt.ArrayLike, sample_rate: float) -> _Integers:
-    """Largest sample `(..., channel)` within 3 ms of the expected onset; -1 where nothing is there."""
+    """Largest sample `(..., channel)` of the first sound within 3 ms of the expected onset; -1 where there is none."""
     expected = np.broadcast_to(np.asarray(onset, dtype=np.int64), responses.shape[:-1]).reshape(-1)
-    reach = round(_DIRECT_SEARCH_S * sample_rate)
+    reach, length = round(_DIRECT_SEARCH_S * sample_rate), round(_DIRECT_PEAK_S * sample_rate)
     peaks = np.full(len(expected), -1)
     for row, (at, response) in enumerate(zip(expected, responses.reshape(len(expected), -1), strict=True)):
         start = max(int(at) - reach, 0)
         nearby = np.abs(response[start : int(at) + reach + 1])
         if at >= 0 and len(nearby) and nearby.max() > 0.0:
-            peaks[row] = start + int(np.argmax(nearby))
+            first = int(onset_sample(nearby))
+            peaks[row] = start + first + int(np.argmax(nearby[first : first + length + 1]))
     return peaks.reshape(responses.shape[:-1])
 
 
@@ -296,7 +301,7 @@ def _itd_s(responses: npt.NDArray[np.generic], direct_at: _Integers, sample_rate
     ears = responses.reshape(-1, 2, responses.shape[-1])
     peaks = direct_at.reshape(-1, 2)
     lead, lags = round(_DIRECT_LEAD_S * sample_rate), round(_LAG_LIMIT_S * sample_rate)
-    length = lead + round(DIRECT_SOUND_S * sample_rate) + lags
+    length = lead + round(_BETWEEN_EARS_S * sample_rate) + lags
     size = scipy.fft.next_fast_len(length + lags, real=True)
     frequencies = np.fft.rfftfreq(size, 1.0 / sample_rate)
     # A raised cosine from pass to stop over an octave: a brick wall would ring for longer than the window.

@@ -184,6 +184,13 @@ class TestDirectToReverberantRatio:
         assert_allclose(direct_to_reverberant_db(ir, RATE), 10.0 * np.log10(1.25 / 0.0625), atol=1e-6)
         assert_allclose(direct_to_reverberant_db(ir, RATE, direct_s=0.001), 10.0 * np.log10(1.0 / 0.3125), atol=1e-6)
 
+    def test_a_louder_reflection_soon_after_is_no_direct_sound(self) -> None:
+        ir = np.zeros((1, 4_800))
+        ir[0, 100], ir[0, 100 + 70], ir[0, 100 + 480] = 0.5, 1.0, 0.25  # 2.9 ms later, and 20 ms
+        expected_db = 10.0 * np.log10(0.25 / 1.0625)
+        assert_allclose(direct_to_reverberant_db(ir, RATE, onset=100), expected_db, atol=1e-6)
+        assert_allclose(direct_to_reverberant_db(ir, RATE, onset=130), expected_db, atol=1e-6)
+
     def test_without_a_direct_sound_where_it_is_expected_is_refused(self) -> None:
         ir = np.zeros((2, 16_800))
         ir[:, 5_000:] = decaying_noise(0.3)[:, :11_800]
@@ -237,6 +244,14 @@ class TestInterauralTimeDifference:
         time_s = np.arange(4_800) / RATE
         pulse = np.exp(-0.5 * np.square((time_s[np.newaxis] - 0.05 - np.array([[0.0], [expected_s]])) / 1.2e-4))
         assert_allclose(interaural_time_difference_s(pulse, RATE), expected_s, atol=4e-6)
+
+    def test_of_the_direct_sound_and_not_of_what_returns_soon_after(self) -> None:
+        time_s = np.arange(4_800) / RATE
+        pulses = np.zeros((2, len(time_s)))
+        for at_s, itd_s, gain in ((0.05, 3e-4, 1.0), (0.0529, -5e-4, 1.6)):
+            arrivals_s = np.array([[at_s], [at_s + itd_s]])
+            pulses += gain * np.exp(-0.5 * np.square((time_s - arrivals_s) / 1.2e-4))
+        assert_allclose(interaural_time_difference_s(pulses, RATE), 3e-4, atol=1e-5)
 
     def test_follows_a_measured_head(self) -> None:
         """Woodworth: a sphere of 8.75 cm at 90 degrees has 656 microseconds."""

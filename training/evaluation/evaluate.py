@@ -29,6 +29,8 @@ from training.evaluation.held_out import EvaluationError, HeldOut, Responses
 
 FLOOR = "floor"
 METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS)
+# Means that are nearer to each other are taken for luck of the draw.
+_STANDARD_ERRORS = 2.0
 # A method that cannot be measured where another can must not win by leaving those entries out.
 _MISSING_ALLOWANCE = 0.01
 _TIMED_PAIRS = 7
@@ -59,7 +61,8 @@ class Column:
 @dataclass(frozen=True)
 class Result:
     """A column measured. ms: of one response on one core, everything included; beats: baselines whose mean error is
-    larger over the entries both could be measured in, by metric."""
+    larger over the entries both could be measured in, by metric; surpassed_by: fields and baselines whose error is
+    smaller by more than two standard errors of the difference over pairs."""
 
     name: str
     kind: Kind
@@ -68,6 +71,7 @@ class Result:
     ms: float | None
     summaries: Mapping[str, Summary]
     beats: Mapping[str, tuple[str, ...]]
+    surpassed_by: Mapping[str, tuple[str, ...]]
     errors: Mapping[str, _Errors] = field(repr=False, compare=False)
 
 
@@ -110,6 +114,7 @@ class Evaluation:
                         **asdict(result.summaries[metric.name]),
                         "times_floor": _ratio(result.summaries[metric.name], floor, metric),
                         "beats": list(result.beats[metric.name]),
+                        "surpassed_by": list(result.surpassed_by[metric.name]),
                     }
                     for metric in METRICS
                 },
@@ -183,7 +188,6 @@ def evaluate(
         name: {metric.name: np.stack([entry[number][metric.name] for entry in by_pair]) for metric in METRICS}
         for number, name in enumerate(names)
     }
-    baselines = [column.name for column in columns if column.kind == "baseline"]
     return Evaluation(
         data=held_out.name,
         pairs=len(held_out),
@@ -192,7 +196,7 @@ def evaluate(
         yaws=len(held_out.heard),
         channels=held_out.channels,
         left_out=held_out.left_out,
-        results=tuple(_result(column, held_out, errors, baselines) for column in columns),
+        results=tuple(_result(column, held_out, errors, columns) for column in columns),
     )
 
 
@@ -222,15 +226,11 @@ def milliseconds_per_response(column: Column, held_out: HeldOut) -> float | None
 
 
 def _result(
-    column: Column, held_out: HeldOut, errors: Mapping[str, Mapping[str, _Errors]], baselines: Sequence[str]
+    column: Column, held_out: HeldOut, errors: Mapping[str, Mapping[str, _Errors]], columns: Sequence[Column]
 ) -> Result:
     ours = errors[column.name]
-    beats = {
-        metric.name: tuple(
-            name for name in baselines if name != column.name and _beats(ours[metric.name], errors[name][metric.name])
-        )
-        for metric in METRICS
-    }
+    rivals = [other.name for other in columns if other.kind != "floor" and other is not column]
+    baselines = [other.name for other in columns if other.kind == "baseline" and other is not column]
     return Result(
         name=column.name,
         kind=column.kind,
@@ -238,7 +238,14 @@ def _result(
         storage_bytes=column.storage_bytes,
         ms=None if column.kind == "floor" else milliseconds_per_response(column, held_out),
         summaries={metric.name: summarise(ours[metric.name]) for metric in METRICS},
-        beats=beats,
+        beats={
+            metric.name: tuple(name for name in baselines if _beats(ours[metric.name], errors[name][metric.name]))
+            for metric in METRICS
+        },
+        surpassed_by={
+            metric.name: tuple(name for name in rivals if _surpasses(errors[name][metric.name], ours[metric.name]))
+            for metric in METRICS
+        },
         errors=ours,
     )
 
@@ -255,3 +262,13 @@ def _beats(ours: _Errors, theirs: _Errors) -> bool:
     if not both.any() or only_theirs.sum() > _MISSING_ALLOWANCE * ours.size:
         return False
     return bool(ours[both].mean() < theirs[both].mean())
+
+
+def _surpasses(ours: _Errors, theirs: _Errors) -> bool:
+    """By more than chance: entries of one pair are no draws of their own."""
+    gains = (theirs - ours).reshape(len(ours), -1)
+    measured = ~np.isnan(gains)
+    gain = np.sum(gains, axis=1, where=measured)[measured.any(axis=1)] / measured.sum(axis=1)[measured.any(axis=1)]
+    if len(gain) < 2:
+        return False
+    return bool(gain.mean() > _STANDARD_ERRORS * gain.std(ddof=1) / np.sqrt(len(gain)))

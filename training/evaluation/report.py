@@ -14,7 +14,7 @@ _PUBLISHED_OTHERS = ("inras", "neraf", "minaf", "avr")
 
 def report(evaluation: Evaluation, published: PublishedTable) -> Table:
     """The table for people: mean error and, dim, how many entries are missing. Bold is the best of fields and
-    baselines; green a field that beats every baseline there is."""
+    baselines, and whatever cannot be told from it; green a field that beats every baseline there is."""
     table = Table(title=_title(evaluation), caption=_caption(evaluation, published), caption_justify="left")
     table.add_column("method")
     for metric in METRICS:
@@ -23,7 +23,7 @@ def report(evaluation: Evaluation, published: PublishedTable) -> Table:
     table.add_column("time\n(ms)", justify="right")
     best = {metric.name: _best(evaluation, metric) for metric in METRICS}
     for result in evaluation.results:
-        cells = [_cell(evaluation, result, metric, best[metric.name]) for metric in METRICS]
+        cells = [_cell(evaluation, result, metric, result.name in best[metric.name]) for metric in METRICS]
         table.add_row(result.name, *cells, _storage(result), _time(result), end_section=not _printed(result, published))
         if _printed(result, published):
             table.add_row(
@@ -48,7 +48,7 @@ def markdown(evaluation: Evaluation, published: PublishedTable) -> str:
         cells = []
         for metric in METRICS:
             cell = _figure(result, metric)
-            if result.summaries[metric.name].mean is not None and result.name == best[metric.name]:
+            if result.summaries[metric.name].mean is not None and result.name in best[metric.name]:
                 cell = f"**{cell}**"
             if (printed := published.errors.get(result.method, {}).get(metric.name)) is not None:
                 cell += f" ({printed:.3g})"
@@ -70,7 +70,7 @@ def _caption(evaluation: Evaluation, published: PublishedTable) -> str:
 
 
 def _sentences(evaluation: Evaluation, published: PublishedTable) -> Iterator[str]:
-    yield "Mean errors; bold: the best method."
+    yield "Mean errors; bold: the best method, and all that are within two standard errors of the difference from it."
     yield "DRR and ITD are of pairs in sight."
     if evaluation.channels == 1:
         yield "One microphone: nothing to compare between ears."
@@ -87,18 +87,20 @@ def _head(metric: Metric) -> str:
     return f"{metric.label}\n({metric.unit})" if metric.unit else f"{metric.label}\n"
 
 
-def _best(evaluation: Evaluation, metric: Metric) -> str | None:
+def _best(evaluation: Evaluation, metric: Metric) -> set[str]:
+    """The method of the least mean error, and those that it does not surpass."""
     means = {
         result.name: mean
         for result in evaluation.results
         if result.kind != "floor" and (mean := result.summaries[metric.name].mean) is not None
     }
-    return min(means, key=means.__getitem__, default=None)
+    least = min(means, key=means.__getitem__, default=None)
+    return {name for name in means if least not in evaluation.of(name).surpassed_by[metric.name]}
 
 
-def _cell(evaluation: Evaluation, result: Result, metric: Metric, best: str | None) -> Text:
+def _cell(evaluation: Evaluation, result: Result, metric: Metric, is_best: bool) -> Text:
     text = Text(_figure(result, metric))
-    if result.name == best:
+    if is_best:
         text.stylize("bold")
     baselines = evaluation.baselines
     if result.kind == "field" and baselines and len(result.beats[metric.name]) == len(baselines):

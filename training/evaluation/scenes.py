@@ -27,9 +27,11 @@ class ResultError(NafirError):
 
 @dataclass(frozen=True)
 class Method:
-    """Mean errors by metric, those that could be measured, and milliseconds per response."""
+    """Mean errors by metric, those that could be measured, the methods that err less by more than chance, and
+    milliseconds per response."""
 
     errors: Mapping[str, float]
+    surpassed_by: Mapping[str, Sequence[str]]
     ms: float | None
     storage_bytes: int | None
 
@@ -57,7 +59,7 @@ class SceneResult:
             level = ours.split()[-1]
             naf = next((name for name in fields if _is_naf(columns[name])), None)
             names = {ours: level, naf: _NAF}
-            methods = {names.get(name, name): _method(column) for name, column in columns.items()}
+            methods = {names.get(name, name): _method(column, names) for name, column in columns.items()}
             scene = str(values["data"]).removesuffix(" (simulated)")
             return cls(scene, values["pairs"], values["visible_pairs"], values["yaws"], level, methods)
         except OSError as exc:
@@ -79,32 +81,35 @@ class SceneResult:
             "visible_pairs": self.visible_pairs,
             "yaws": self.yaws,
             "level": self.level,
-            "worse_than_naf": [] if naf is None else self.worse_than(naf),
+            "worse_than_naf": [] if naf is None else self.worse_than(_NAF),
             "methods": {
                 name: {"errors": dict(method.errors), "ms": method.ms, "storage_bytes": method.storage_bytes}
                 for name, method in self.methods.items()
             },
         }
 
-    def worse_than(self, other: Method) -> list[str]:
-        """Metrics in which the default level errs more."""
-        return [name for name, error in self.ours.errors.items() if error > other.errors.get(name, float("inf"))]
+    def worse_than(self, other: str) -> list[str]:
+        """Metrics in which the default level errs more, and not by chance."""
+        return [name for name, surpassing in self.ours.surpassed_by.items() if other in surpassing]
 
 
 def _is_naf(column: Mapping[str, Any]) -> bool:
     return str(column["method"]).startswith(_NAF)
 
 
-def _method(column: Mapping[str, Any]) -> Method:
-    means = {name: summary["mean"] for name, summary in column["metrics"].items()}
+def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
+    metrics = column["metrics"]
     return Method(
-        {name: mean for name, mean in means.items() if mean is not None}, column["ms"], column["storage_bytes"]
+        {name: summary["mean"] for name, summary in metrics.items() if summary["mean"] is not None},
+        {name: [names.get(other, other) for other in summary["surpassed_by"]] for name, summary in metrics.items()},
+        column["ms"],
+        column["storage_bytes"],
     )
 
 
 def markdown(results: Sequence[SceneResult]) -> str:
-    """A row per scene and method; bold is the default level where neither naf nor nearest errs less. Below it, scene by
-    scene, what the paper's network does better."""
+    """A row per scene and method; bold is the default level where neither naf nor nearest errs less by more than two
+    standard errors of the difference over pairs. Below it, scene by scene, what the paper's network does better."""
     heads = [f"{metric.label} ({metric.unit})" if metric.unit else metric.label for metric in METRICS]
     lines = [
         "| scene | method | " + " | ".join([*heads, "ms"]) + " |",
@@ -112,14 +117,14 @@ def markdown(results: Sequence[SceneResult]) -> str:
     ]
     for result in results:
         shown = {name: result.methods[name] for name in (result.level, _NAF, _NEAREST, FLOOR) if name in result.methods}
-        rivals = [method for name, method in shown.items() if name not in {result.level, FLOOR}]
+        lost = {name: result.worse_than(name) for name in shown}
         for name, method in shown.items():
             cells = []
             for metric in METRICS:
                 error = method.errors.get(metric.name)
                 cell = "" if error is None else short(error)
                 if error is not None and method is result.ours:
-                    is_best = all(error <= rival.errors.get(metric.name, float("inf")) for rival in rivals)
+                    is_best = not any(metric.name in worse for worse in lost.values())
                     cell = f"**{cell}**" if is_best else cell
                 cells.append(cell)
             first = result.scene if method is result.ours else ""
@@ -134,9 +139,9 @@ def _remarks(results: Sequence[SceneResult]) -> list[str]:
         naf = result.methods.get(_NAF)
         if naf is None:
             continue
-        worse = [metric.label for metric in METRICS if metric.name in result.worse_than(naf)]
+        worse = [metric.label for metric in METRICS if metric.name in result.worse_than(_NAF)]
         faster = "" if naf.ms is None or result.ours.ms is None else f", {short(naf.ms / result.ours.ms)} times as fast"
-        said = f"errs more than naf in {', '.join(worse)}" if worse else "errs less than naf in every metric"
+        said = f"errs more than naf in {', '.join(worse)}" if worse else "errs no more than naf in any metric"
         drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {result.yaws} orientations"
         remarks.append(f"- {result.scene} ({drawn}): {said}{faster}.")
     return remarks

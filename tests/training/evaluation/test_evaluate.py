@@ -90,6 +90,21 @@ def test_each_baseline_is_beaten_on_its_own(evaluated) -> None:
     assert field.beats["level"] == ("poor",)
 
 
+def test_only_what_errs_less_beyond_chance_surpasses(evaluated) -> None:
+    """Levels of baselines are off by 3.5 and 4.4 dB at every pair; two draws of the same are off by their noise."""
+    twin = column("twin", lambda pair: simulated(pair, seed=7))
+    evaluation = evaluated(lambda pair: simulated(pair, seed=1), baselines=(*DEFAULT, twin))
+    assert evaluation.of("field").surpassed_by["level"] == ()
+    assert evaluation.of("twin").surpassed_by["level"] == ()
+    assert evaluation.of("nearest").surpassed_by["level"] == ("field", "twin")
+    assert evaluation.of("linear").surpassed_by["level"] == ("field", "nearest", "twin")
+    table = markdown(evaluation, SOUNDSPACES).splitlines()
+    levels = {row.split("|")[1].strip(): row.split("|")[9].strip() for row in table[4:]}
+    assert levels["field"].startswith("**")
+    assert levels["twin"].startswith("**")
+    assert not levels["nearest"].startswith("**")
+
+
 def test_hidden_pairs_have_no_direct_sound_and_are_counted(evaluated) -> None:
     evaluation = evaluated(reference)
     for result in evaluation.results:

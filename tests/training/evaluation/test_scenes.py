@@ -7,7 +7,7 @@ from training.evaluation.scenes import ResultError, SceneResult, markdown, step_
 
 
 def column(kind, method, error, ms=None):
-    summary = {"mean": error, "median": error, "count": 4, "missing": 0}
+    summary = {"mean": error, "median": error, "count": 4, "missing": 0, "surpassed_by": []}
     metrics = {metric.name: dict(summary) for metric in METRICS}
     return {"kind": kind, "method": method, "storage_bytes": 1000, "ms": ms, "metrics": metrics}
 
@@ -22,6 +22,8 @@ def result(tmp_path):
         "floor": column("floor", "", 0.5),
     }
     columns["naf"]["metrics"]["edt"]["mean"] = 0.75
+    columns["bundle factorised-r16"]["metrics"]["edt"]["surpassed_by"] = ["naf"]
+    columns["naf"]["metrics"]["c50"]["mean"] = 0.95  # not told from 1.0
     columns["nearest"]["metrics"]["t60"]["mean"] = None
 
     def write(**changes):
@@ -43,7 +45,8 @@ def test_the_default_level_stands_first_and_is_bold_where_nobody_errs_less(resul
         ["", "nearest"],
         ["", "floor"],
     ]
-    edt, t60 = (heads.index(head) for head in ("EDT (ms)", "T60 (%)"))
+    edt, t60, c50 = (heads.index(head) for head in ("EDT (ms)", "T60 (%)", "C50 (dB)"))
+    assert (ours[c50], naf[c50]) == ("**1.00**", "0.950")
     assert (ours[t60], nearest[t60]) == ("**1.00**", "")
     assert (ours[edt], naf[edt]) == ("1.00", "0.750")
     assert lines[-1] == ("- flat (2 pairs, 1 in sight, 2 orientations): errs more than naf in EDT, 1500 times as fast.")
