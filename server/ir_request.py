@@ -151,6 +151,8 @@ def composed_irs(
 
 def _without_end(ir: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """(channel, sample) up to the last sample that is not zero, one at least."""
+    if ir[:, -1].any():
+        return ir  # nearly always, and at once
     heard = ir != 0
     ends = [ir.shape[1] - int(np.argmax(channel[::-1])) for channel in heard if channel.any()]
     return ir[:, : max(ends, default=1)]
