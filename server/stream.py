@@ -4,6 +4,7 @@ A `Stream` and its session belong to the audio thread that renders them; only `o
 """
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -91,6 +92,8 @@ class Stream:
         self.pose_times = PoseTimes()
         self.reverberation_times = PoseTimes()
         self.next_block = 0
+        self.due_s = math.inf
+        """When that should be rendered; never before the stream has started."""
         self.load = 0.0
         """Share of a core that its blocks have taken of late."""
         self._levels = levels
@@ -143,15 +146,12 @@ class Stream:
     def start(self, origin_s: float) -> None:
         """Block 0 plays at `origin_s`."""
         self._clock = StreamClock(origin_s=origin_s, block_s=self.block_s, lead=self._lead)
+        self.due_s = self._clock.due_s(self.next_block)
 
     @property
     def clock(self) -> StreamClock:
         assert self._clock is not None, "the stream has not started"
         return self._clock
-
-    @property
-    def due_s(self) -> float:
-        return self.clock.due_s(self.next_block)
 
     @property
     def has_news(self) -> bool:
@@ -219,6 +219,7 @@ class Stream:
         if self.clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
             self.clock.slip(self.next_block, now_s)
         self.next_block += 1
+        self.due_s = self.clock.due_s(self.next_block)
         if self.next_block * self.block_s >= self._next_status_s:
             self._next_status_s += 1.0
             outgoing += self.session.complaints()

@@ -66,8 +66,7 @@ def mix_mixers(addresses: npt.NDArray[np.int64], like: Reference | None) -> None
 
 @cache
 def mixing_with(kind: ReferenceType | None) -> Callable[[npt.NDArray[np.int64], Reference | None], None]:
-    """`mix_mixers` for references of one kind. Numba, called without, finds out which kind it is with every call, and in
-    Python."""
+    """`mix_mixers` for references of one kind, which numba, called without, finds out in Python with every call."""
     signature = types.Array(types.int64, 1, "C"), types.none if kind is None else kind
     mix_mixers.compile(signature)  # type: ignore[attr-defined]
     return mix_mixers.get_overload(signature)  # type: ignore[attr-defined]
