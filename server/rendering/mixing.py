@@ -108,6 +108,9 @@ class Mixer:
     def stop(self, slot: int) -> None:
         """Have a slot fall silent."""
         self.plays[slot] = 0
+        self.dry[slot] = 0
+        if HAS_NUMBA and self.convolver is not None:
+            self.convolver.compiled.input[slot] = 0
         self.clip[slot] = 0
         self._clips.pop(slot, None)
         self._sources.pop(slot, None)

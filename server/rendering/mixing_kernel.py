@@ -100,17 +100,14 @@ def _play(mixer) -> None:
 
 @compiled
 def _scale(mixer) -> None:
-    """Apply gains in place, and send what is left to the convolver."""
+    """Apply gains in place, and send what is left to the convolver. Rows that play nothing are silent already."""
     slots, size = mixer.slots, mixer.block_size
     plays = carray(pointer(mixer.plays), (slots,), np.int64)
     gain = carray(pointer(mixer.gain), (2, slots), np.float32)
     send = carray(pointer(mixer.send), (2, slots), np.float32)
     for slot in range(slots):
         row = slot * size
-        if plays[slot] == 0:
-            for n in range(0, size, 8):
-                store(mixer.dry, row + n, broadcast(np.float32(0)))
-        else:
+        if plays[slot] != 0:
             start, change = broadcast(gain[0, slot]), broadcast(gain[1, slot] - gain[0, slot])
             for n in range(0, size, 8):
                 scaled = multiply_add(change, load(mixer.fade_in, n), start)
@@ -118,10 +115,11 @@ def _scale(mixer) -> None:
             gain[0, slot] = gain[1, slot]
         if mixer.sent == 0:
             continue
-        start, change = broadcast(send[0, slot]), broadcast(send[1, slot] - send[0, slot])
-        for n in range(0, size, 8):
-            scaled = multiply_add(change, load(mixer.fade_in, n), start)
-            store(mixer.sent, row + n, multiply(load(mixer.dry, row + n), scaled))
+        if plays[slot] != 0:
+            start, change = broadcast(send[0, slot]), broadcast(send[1, slot] - send[0, slot])
+            for n in range(0, size, 8):
+                scaled = multiply_add(change, load(mixer.fade_in, n), start)
+                store(mixer.sent, row + n, multiply(load(mixer.dry, row + n), scaled))
         send[0, slot] = send[1, slot]
 
 
