@@ -23,7 +23,7 @@ from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, CodecParameters, FieldFile, Manifest, QualityLevel
 from training.evaluation.held_out import measured_pairs
 from training.evaluation.shaped import ShapedNearest
-from training.graphs import halve_weights, pose_by_pose, to_int8, to_onnx
+from training.graphs import halve_weights, pose_by_pose, to_int8, to_onnx, with_weights
 from training.learning.factorised import FactorisedLearner
 from training.learning.learner import Learner
 from training.learning.naf import NafLearner
@@ -193,7 +193,7 @@ def _factorised(
     for field in (whole, *(whole.truncated(rank, *trained_at) for rank in lower)):
         rank = len(field.basis)
         module = ExportedField(field, cells).eval()
-        graph = to_onnx(module, _tensors(poses, 2), outputs)
+        graph = to_onnx(module, _tensors(poses, 2), outputs) if field is whole else with_weights(graph, module)
         for precision in precisions:
             least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
             model = halve_weights(to_int8(graph, least_weights=least_weights) if precision == "int8" else graph)

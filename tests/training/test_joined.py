@@ -153,15 +153,15 @@ def test_joined_to_the_simulated_reflections_nothing_counts_twice(pairs, apartme
         joined = pair.reflected + direct_paths(pair, apartment.air) + first_reflections(pair, apartment)
         ratios.append(pair.drr_db(joined) - pair.drr_db(reference))
         energies.append(energy_db(joined) - energy_db(reference))
-    assert np.abs(ratios).mean() < 0.15
-    assert np.abs(energies).mean() < 0.15
+    assert np.abs(ratios).mean() < 0.05
+    assert np.abs(energies).mean() < 0.05
     # A direct sound more, or less, and this is what it would be.
     once, twice = ([pair.drr_db(pair.reflected + n * pair.direct) for pair in pairs] for n in (1, 2))
     assert np.mean(np.array(twice) - once) > 2
-    # And this, without the first reflections.
+    # And this, without the first reflections: several times what is allowed.
     without = [pair.drr_db(pair.reflected + pair.direct) for pair in pairs]
     whole = [pair.drr_db(pair.reflected + pair.direct + pair.first) for pair in pairs]
-    assert np.abs(np.array(without) - whole).mean() > 1
+    assert np.abs(np.array(without) - whole).mean() > 0.6
 
 
 def test_the_bundled_field_is_the_reflected_sound(pairs, field):
