@@ -189,11 +189,12 @@ def _factorised(
     poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
     codec = _codec_parameters(cells.codec, cells.known_frames)
     outputs = _outputs(learner)
+    traced = to_onnx(ExportedField(whole, cells).eval(), _tensors(poses, 2), outputs)
     exported = []
     for field in (whole, *(whole.truncated(rank, *trained_at) for rank in lower)):
         rank = len(field.basis)
         module = ExportedField(field, cells).eval()
-        graph = to_onnx(module, _tensors(poses, 2), outputs) if field is whole else with_weights(graph, module)
+        graph = traced if field is whole else with_weights(traced, module)
         for precision in precisions:
             least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
             model = halve_weights(to_int8(graph, least_weights=least_weights) if precision == "int8" else graph)
