@@ -18,7 +18,7 @@ SWEEP ?= --phases-of none --reuse-of factorised-r16
 # Which of the held-out pairs a bundle's own errors are of: by default all.
 MEASURE ?=
 # Tests that watch the clock, and so have the machine to themselves.
-TIMED := tests/integration tests/bench tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
+TIMED := tests/integration tests/bench/test_sessions.py tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
 
 VENV := .venv
 BIN := $(VENV)/bin

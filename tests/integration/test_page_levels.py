@@ -1,0 +1,77 @@
+"""Quality levels on the page: the frontier is a picture to choose from while one listens."""
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from server.scene.bundle import BUNDLED, Bundle, write_bundle
+from server.scene.manifest import Cost, FrontierPoint
+from tests import visitor
+from tests.visitor import free_port, level_db, listen, open_page, serving, start
+
+browser = visitor.browser
+pytestmark = visitor.needs_browser
+
+
+@pytest.fixture(scope="module")
+def several_levels(tmp_path_factory) -> Iterator[str]:
+    """A server of the apartment at three quality levels, with figures as if they had been measured."""
+    apartment = Bundle.load(BUNDLED / "apartment")
+    (standard, *_) = apartment.manifest.levels
+
+    def level(name: str, ms: float, worse: float, **changes):
+        assert standard.accuracy is not None
+        errors = {metric: worse * error for metric, error in standard.accuracy.errors.items()}
+        cost = Cost(ms_p50=ms, ms_p99=2 * ms, storage_mb=1.0, memory_mb=1.0, host="elsewhere")
+        accuracy = standard.accuracy.model_copy(update={"errors": errors})
+        return standard.model_copy(update={"name": name, "accuracy": accuracy, "cost": cost, **changes})
+
+    levels = (level("standard", 1.0, 1.0), level("fine", 40.0, 0.9), level("quick", 0.1, 1.5, ir_rate_hz=20.0))
+    measured = FrontierPoint(level=level("near", 0.9, 1.05), architecture="factorised")
+    manifest = apartment.manifest.model_copy(update={"levels": levels, "frontier": (measured,)})
+    files = {name: (apartment.folder / name).read_bytes() for name in manifest.files}
+    folder = tmp_path_factory.mktemp("scenes") / "apartment"
+    write_bundle(folder, manifest, files)
+    with serving(free_port(), "--bundle", str(folder)) as url:
+        yield url
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, several_levels, width):
+    context = browser.new_context(viewport={"width": width, "height": 800})
+    page = open_page(context, several_levels)
+    marks = page.locator("#frontier .level")
+    assert [mark.get_attribute("data-level") for mark in marks.all()] == ["quick", "standard", "fine"]
+    boxes = [mark.locator(".dot").bounding_box() for mark in marks.all()]
+    assert boxes[0]["x"] < boxes[1]["x"] < boxes[2]["x"], "costlier is further right"
+    assert boxes[0]["y"] < boxes[1]["y"] < boxes[2]["y"], "more accurate is lower"
+    assert page.locator("#frontier .heard").count() == 0
+    (measured,) = page.locator("#frontier .measured").all()
+    assert measured.get_attribute("data-level") == "near"
+    assert boxes[0]["x"] < measured.locator(".dot").bounding_box()["x"] < boxes[1]["x"]
+    options = page.locator("#level-choice option").all_inner_texts()
+    assert [option.split(",")[0] for option in options] == ["Automatic", "fine", "standard", "quick"]
+
+    start(page)
+    page.wait_for_function("nafir.state().level !== null")
+    page.select_option("#level-choice", "quick")
+    page.wait_for_function("nafir.state().level === 'quick'")
+    assert page.inner_text("#level") == "quick"
+    assert page.locator("#frontier .heard").get_attribute("data-level") == "quick"
+    assert re.search(r"^\d\d:\d\d:\d\d ?quick.*: as you chose$", page.inner_text("#level-changes"), re.MULTILINE)
+    page.locator("#frontier [data-level=fine] .touch").click()
+    page.wait_for_function("nafir.state().level === 'fine'")
+    assert page.input_value("#level-choice") == "fine"
+    assert np.all(level_db(listen(page)) > -70)
+    chart, rail = page.locator("#frontier").bounding_box(), page.locator("#quality").bounding_box()
+    assert rail["x"] <= chart["x"]
+    assert chart["x"] + chart["width"] <= rail["x"] + rail["width"]
+
+    # A stream that begins anew begins with what was chosen.
+    page.click("#play")
+    page.wait_for_function("nafir.state().level === null")
+    start(page)
+    page.wait_for_function("nafir.state().level === 'fine'")
+    context.close()

@@ -1,0 +1,81 @@
+"""What the player's buffer promises, on a simulated clock: blocks of 256 come in, quanta of 128 go out, at 24 kHz."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests import visitor
+
+browser = visitor.browser
+server = visitor.server
+page = visitor.page
+pytestmark = visitor.needs_browser
+
+
+SIMULATE = """async ({ seconds, skew, delays }) => {
+  const { JitterBuffer } = await import(new URL("jitterbuffer.js", document.baseURI));
+  const rate = 24_000;
+  const buffer = new JitterBuffer({ sampleRate: rate });
+  const tone = (n) => 0.5 * Math.sin((2 * Math.PI * 220 * n) / rate);
+  const played = [];
+  const heard = [];
+  const fills = [];
+  const underruns = [];
+  let sent = 0;
+  for (let now = 0; now < seconds * rate; now += 128) {
+    // The sender's clock runs `skew` fast; a block leaves when it is whole and comes in order after its delay.
+    for (;;) {
+      const delay = delays.length ? delays[(sent / 256) % delays.length] : 0;
+      if ((sent + 256) / (1 + skew) + delay * rate > now) break;
+      const left = Float32Array.from({ length: 256 }, (_, i) => tone(sent + i));
+      buffer.push({ left, right: left.map((value) => -value), sampleClock: sent, poseId: sent / 256, late: false });
+      sent += 256;
+    }
+    const left = new Float32Array(128);
+    const right = new Float32Array(128);
+    for (const { poseId, offset } of buffer.pull(left, right)) heard.push([poseId, played.length + offset]);
+    played.push(...left);
+    fills.push(buffer.fill / rate);
+    underruns.push(buffer.counters.underruns);
+  }
+  let steepest = 0;
+  for (let i = 1; i < played.length; i++) steepest = Math.max(steepest, Math.abs(played[i] - played[i - 1]));
+  return { played: played.slice(0, 3 * rate), heard, fills, underruns, steepest, counters: buffer.counters };
+}"""
+
+
+def tone(samples: np.ndarray) -> np.ndarray:
+    return 0.5 * np.sin(2 * np.pi * 220 * samples / 24_000)
+
+
+STEEPEST_TONE = 0.5 * 2 * math.pi * 220 / 24_000
+
+
+def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged(page):
+    run = page.evaluate(SIMULATE, {"seconds": 30, "skew": 0, "delays": []})
+    assert run["counters"]["underruns"] == run["counters"]["splices"] == 0
+    # Pose n is heard with the first sample of block n, and so says where in the tone the output is.
+    pose, at = run["heard"][-1]
+    delay = at - 256 * pose
+    assert 0.05 < delay / 24_000 < 0.1
+    assert all(at - 256 * pose == delay for pose, at in run["heard"][1:])
+    played = np.asarray(run["played"])
+    first = np.flatnonzero(played)[0] + 64  # past the fade-in
+    np.testing.assert_allclose(played[first:], tone(np.arange(first, len(played)) - delay), atol=1e-7)
+
+
+@pytest.mark.parametrize("skew", [1e-3, -1e-3])
+def test_clock_drift_is_absorbed_without_dropouts_or_clicks(page, skew):
+    run = page.evaluate(SIMULATE, {"seconds": 50, "skew": skew, "delays": []})
+    assert run["counters"]["underruns"] == run["counters"]["gaps"] == run["counters"]["overflows"] == 0
+    assert run["counters"]["splices"] > 0
+    assert max(run["fills"][-2000:]) < 0.1
+    assert run["steepest"] < 1.5 * STEEPEST_TONE
+
+
+def test_after_a_few_dropouts_the_buffer_outgrows_the_jitter(page):
+    delays = [0.0] * 40 + [0.11] + [0.0] * 52
+    run = page.evaluate(SIMULATE, {"seconds": 40, "skew": 0, "delays": delays})
+    assert run["underruns"][-1] == run["underruns"][len(run["underruns"]) // 4] <= 5
+    assert run["steepest"] < 1.5 * STEEPEST_TONE

@@ -1,0 +1,27 @@
+"""What a visitor sees of the page, on narrow screens and wide ones."""
+
+import re
+
+import pytest
+
+from tests import visitor
+from tests.visitor import open_page
+
+browser = visitor.browser
+server = visitor.server
+pytestmark = visitor.needs_browser
+
+
+@pytest.mark.parametrize("width", [360, 820, 1280])
+def test_nothing_is_cut_off(browser, server, width):
+    context = browser.new_context(viewport={"width": width, "height": 800})
+    page = open_page(context, server)
+    assert page.evaluate("document.scrollingElement.scrollWidth") <= width
+    cut_off = page.evaluate(
+        """() => [...document.querySelectorAll("h1, h2, #scene-name, button, dt, dd, .hint, figcaption, output")]
+            .filter((node) => node.offsetParent && node.scrollWidth > node.clientWidth + 1 && node.clientWidth > 0)
+            .map((node) => node.textContent.trim())"""
+    )
+    assert cut_off == []
+    assert re.fullmatch(r".+ · Nafir", page.title())
+    context.close()

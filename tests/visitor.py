@@ -1,0 +1,113 @@
+"""A visitor of the page: a real browser, a real server, and what then comes out of the loudspeakers.
+
+Levels are in decibels relative to full scale. Modules that visit take the fixtures they need by name.
+"""
+
+import contextlib
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from server.scene.bundle import bundled_scenes
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+needs_browser = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on the PATH (Debian: apt-get install chromium)"),
+    pytest.mark.skipif(
+        not any(folder.name == "apartment" for folder in bundled_scenes()), reason="the apartment is not bundled"
+    ),
+]
+
+CHROMIUM_ARGUMENTS = ["--no-sandbox", "--autoplay-policy=no-user-gesture-required", "--disable-dev-shm-usage"]
+LISTENING_S = 2.5
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextlib.contextmanager
+def serving(port: int, *options: str) -> Iterator[str]:
+    """A server of its own process, ready to stream."""
+    command = [sys.executable, "-c", "from server.cli import main; main()", "serve", "--port", str(port), *options]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    url = f"http://127.0.0.1:{port}"
+    try:
+        deadline = time.monotonic() + 180  # the first time ever, everything is compiled
+        while True:
+            assert process.poll() is None, "the server ended before it was ready"
+            assert time.monotonic() < deadline, "the server was not ready within three minutes"
+            with contextlib.suppress(urllib.error.URLError, ConnectionError):
+                urllib.request.urlopen(f"{url}/readyz", timeout=5).close()
+                break
+            time.sleep(0.1)
+        yield url
+    finally:
+        process.terminate()
+        process.wait(timeout=20)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    with serving(free_port()) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=CHROMIUM_ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+def open_page(context, url: str):
+    page = context.new_page()
+    page.goto(url)
+    page.evaluate("nafir.ready")
+    return page
+
+
+@pytest.fixture
+def page(browser, server):
+    """The page, loaded; fails a test that leaves an error in the console."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    complaints: list[str] = []
+    context.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    context.on("weberror", lambda error: complaints.append(str(error.error)))
+    yield open_page(context, server)
+    context.close()
+    assert complaints == []
+
+
+def start(page) -> None:
+    page.click("#play")
+    page.wait_for_function("nafir.state().connection === 'live' && nafir.state().poses.heard >= 0", timeout=20_000)
+
+
+def listen(page, *, seconds: float = LISTENING_S) -> np.ndarray:
+    """(2, n): what is played in the seconds to come."""
+    page.wait_for_timeout(1000 * seconds)
+    ears = page.evaluate(
+        "seconds => nafir.capture(seconds).then(({ left, right }) => [left, right].map((ear) => Array.from(ear)))",
+        seconds,
+    )
+    return np.asarray(ears, np.float64)
+
+
+def level_db(samples: np.ndarray) -> np.ndarray:
+    """(2,) RMS of each ear."""
+    return 10 * np.log10(np.mean(samples**2, axis=-1) + 1e-20)
