@@ -12,7 +12,8 @@ from torch import nn
 
 from server.field.graph import INPUTS
 
-_OPSET = 18
+_OPSET = 20
+"""The first with a node for GELU."""
 _HALVE_ABOVE_BYTES = 16_384
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 from torch import Tensor, nn
 
 from server.acoustics.geometry import FloorPlan
@@ -57,10 +58,11 @@ class FeatureGrid(nn.Module):
         self._features = nn.Parameter(torch.randn(len(nodes), features) * 0.1)
 
     def forward(self, position: Tensor) -> Tensor:
-        squared = torch.sum((position[:, None, :2] - self._nodes) ** 2, dim=-1)
+        """(..., 2 or 3) metres to (..., features)."""
+        offset = position[..., None, :2] - self._nodes
         # An infinite precision would be 0 times infinity on a node.
         precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
-        return torch.softmax(-squared * precision, dim=-1) @ self._features
+        return torch.softmax(-torch.sum(offset * offset, dim=-1) * precision, dim=-1) @ self._features
 
 
 class PoseEncoder(nn.Module):
@@ -81,25 +83,33 @@ class PoseEncoder(nn.Module):
         box = np.array([(*low, 0.0), (*high, plan.height_m)], dtype=np.float32)
         self.register_buffer("_centre", torch.tensor(box.mean(axis=0)), persistent=False)
         self.register_buffer("_half_size", torch.tensor((box[1] - box[0]) / 2), persistent=False)
+        quarter = np.pi / 2
+        octaves = quarter * 2.0 ** np.arange(_POSITION_OCTAVES)
+        for name, values in (
+            ("octaves", np.hstack([np.tile(octave * np.eye(3), 2) for octave in octaves])),
+            ("octave_phases", np.tile(np.repeat([0.0, quarter], 3), _POSITION_OCTAVES)),
+            ("yaw_multiples", np.tile(np.arange(1, _YAW_HARMONICS + 1), 2)),
+            ("yaw_phases", np.repeat([quarter, 0.0], _YAW_HARMONICS)),
+            ("turns", [[1, 0, 0, 1], [0, 1, -1, 0]]),
+        ):
+            self.register_buffer(f"_{name}", torch.tensor(np.array(values), dtype=torch.float32), persistent=False)
         poses = torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1)
         self.size = self(*poses).shape[-1]
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
         path = self._propagation(listener, emitter)
-        cos, sin = torch.cos(yaw), torch.sin(yaw)
-        towards = _turned(path.from_listener, cos, sin)
-        distance = torch.clamp(path.length, min=self._nearest_m)
-        rise = (emitter[:, 2] - listener[:, 2]) / distance
+        # Sines alone, cosines being those of angles a quarter turn ahead: fewer nodes.
+        heading = torch.sin(yaw[:, None] * self._yaw_multiples + self._yaw_phases)
+        distance = torch.clamp(path.length[:, None], min=self._nearest_m)
+        rise = (emitter[:, 2:] - listener[:, 2:]) / distance
         visible = path.visible[:, None]
-        azimuth = _harmonics(towards, _AZIMUTH_HARMONICS)
-        heard_at, played_at = (torch.minimum(torch.maximum(end, self._low), self._high) for end in (listener, emitter))
-        scalars = torch.stack([torch.log(distance), 1 / (1 + distance), rise], dim=-1)
+        azimuth = self._azimuth(path.from_listener, heading)
+        ends = torch.minimum(torch.maximum(torch.stack([listener, emitter], dim=1), self._low), self._high)
+        scalars = torch.cat([torch.log(distance), 1 / (1 + distance), rise], dim=-1)
         return torch.cat(
             [
-                self._grid(heard_at),
-                self._grid(played_at),
-                self._octaves(heard_at),
-                self._octaves(played_at),
+                self._grid(ends).flatten(1),
+                self._waves(ends).flatten(1),
                 azimuth,
                 azimuth * visible,
                 scalars,
@@ -107,34 +117,29 @@ class PoseEncoder(nn.Module):
                 visible,
                 path.from_listener,
                 path.from_emitter,
-                _harmonics(torch.stack([cos, sin], dim=-1), _YAW_HARMONICS),
+                heading,
             ],
             dim=-1,
         )
 
-    def _octaves(self, position: Tensor) -> Tensor:
+    def _waves(self, position: Tensor) -> Tensor:
         scaled = (position - self._centre) / self._half_size
-        waves = [scaled]
-        for octave in range(_POSITION_OCTAVES):
-            angle = scaled * (np.pi / 2 * 2**octave)
-            waves += [torch.sin(angle), torch.cos(angle)]
-        return torch.cat(waves, dim=-1)
+        return torch.cat([scaled, torch.sin(scaled @ self._octaves + self._octave_phases)], dim=-1)
 
+    def _azimuth(self, direction: Tensor, heading: Tensor) -> Tensor:
+        """cos and sin of the first multiples of the angle of a direction in plan (B, 2) as the head sees it, by
+        recurrence (no branch cut)."""
+        cos, sin = heading[:, :1], heading[:, _YAW_HARMONICS : _YAW_HARMONICS + 1]
+        towards = torch.cat([cos, -sin], dim=-1)[:, None] @ self._turning(direction)
+        harmonics = [towards]
+        turning = self._turning(towards[:, 0])
+        for _ in range(_AZIMUTH_HARMONICS - 1):
+            harmonics.append(harmonics[-1] @ turning)
+        return torch.cat(harmonics, dim=1).transpose(1, 2).flatten(1)
 
-def _turned(direction: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """World direction in plan as the head sees it."""
-    x, y = direction[:, 0], direction[:, 1]
-    return torch.stack([x * cos + y * sin, y * cos - x * sin], dim=-1)
-
-
-def _harmonics(unit: Tensor, count: int) -> Tensor:
-    """cos and sin of the first multiples of a direction's angle, by recurrence (no trigonometry, no branch cut)."""
-    real, imaginary = [unit[:, 0]], [unit[:, 1]]
-    for _ in range(count - 1):
-        a, b = real[-1], imaginary[-1]
-        real.append(a * unit[:, 0] - b * unit[:, 1])
-        imaginary.append(a * unit[:, 1] + b * unit[:, 0])
-    return torch.stack(real + imaginary, dim=-1)
+    def _turning(self, unit: Tensor) -> Tensor:
+        """(B, 2, 2) that turn rows by the angle of unit vectors (B, 2)."""
+        return (unit @ self._turns).reshape(-1, 2, 2)
 
 
 class Heads(nn.Module):
@@ -219,42 +224,55 @@ class FactorisedField(nn.Module):
 
 class ExportedField(nn.Module):
     """The contract's outputs from a trained field: cells spread to frames and bins, phasors turned into phase and
-    certainty."""
+    certainty.
+
+    What is spread over frequency alike lies side by side in the basis, and spreading over time comes last, so that few
+    nodes of the graph move large arrays.
+    """
 
     def __init__(self, field: FactorisedField, cells: Cells) -> None:
         super().__init__()
         self._field = field
+        heads = field.heads
+        self._pooled = [name for name in ("late", "interaural") if name in heads.shapes]
+        order = self._order(heads)
         # Units and level correction cost nothing where the basis and one offset have them.
-        self.register_buffer("_basis", field.basis.detach() * field.spread, persistent=False)
-        self.register_buffer("_offset", field.mean + field.level_correction, persistent=False)
+        self.register_buffer("_basis", (field.basis.detach() * field.spread)[:, order], persistent=False)
+        self.register_buffer("_offset", (field.mean + field.level_correction)[order], persistent=False)
         for name, matrix in (
-            ("bands", cells.bands.spread().T),
-            ("late_frames", cells.late_frames.spread()),
+            ("bands", np.ascontiguousarray(cells.bands.spread().T)),
+            ("fine_and_late_frames", block_diag(np.eye(cells.fine_frames), cells.late_frames.spread())),
             ("all_frames", cells.all_frames.spread()),
         ):
-            self.register_buffer(f"_{name}", torch.tensor(np.ascontiguousarray(matrix)), persistent=False)
+            self.register_buffer(f"_{name}", torch.tensor(matrix, dtype=torch.float32), persistent=False)
         nominal = torch.tensor(cells.codec.nominal_advance, dtype=torch.float32)
         self.register_buffer("_nominal_advance", nominal, persistent=False)
         self._silence = float(np.log(cells.codec.log_floor))
 
+    def _order(self, heads: Heads) -> Tensor:
+        """Of the flat output: pooled cells of all heads (channel or part, band, frames of one head after another), then
+        the fine frames and the phasors as they were."""
+        numbers = {name: torch.arange(part.start, part.stop) for name, part in heads.slices.items()}
+        pooled = torch.cat([numbers[name].reshape(heads.shapes[name]) for name in self._pooled], dim=-1)
+        self._pooled_shape = tuple(pooled.shape)
+        return torch.cat([pooled.flatten(), numbers["fine"], numbers["phasor"]])
+
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
-        heads = self._field.heads
+        shapes = self._field.heads.shapes
         flat = torch.addmm(self._offset, self._field.coefficients(listener, emitter, yaw), self._basis)
-
-        def head(name: str) -> Tensor:
-            return flat[:, heads.slices[name]].reshape(-1, *heads.shapes[name])
-
-        late = self._bands @ head("late") @ self._late_frames
-        log_magnitude = torch.clamp(torch.cat([head("fine"), late], dim=-1), min=self._silence)
-        phasor = head("phasor")
-        frequency, certainty = self._phase(phasor[:, 0], phasor[:, 1])
-        if "interaural" not in heads.shapes:
-            return log_magnitude, frequency, certainty
-        return log_magnitude, frequency, certainty, self._bands @ head("interaural") @ self._all_frames
+        _, *phasor = shapes["phasor"]
+        sizes = [int(np.prod(shape)) for shape in (self._pooled_shape, shapes["fine"], phasor, phasor)]
+        pooled, fine, real, imaginary = torch.split(flat, sizes, dim=1)
+        spread = self._bands @ pooled.reshape(-1, *self._pooled_shape)
+        late, *interaural = torch.split(spread, [shapes[name][-1] for name in self._pooled], dim=-1)
+        cells = torch.cat([fine.reshape(-1, *shapes["fine"]), late], dim=-1)
+        log_magnitude = torch.clamp(cells, min=self._silence) @ self._fine_and_late_frames
+        frequency, certainty = self._phase(real.reshape(-1, *phasor), imaginary.reshape(-1, *phasor))
+        return log_magnitude, frequency, certainty, *(part @ self._all_frames for part in interaural)
 
     def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
         """Instantaneous frequency and certainty of mean phasors (B, ear, frequency, frame)."""
-        certainty = torch.sqrt(real**2 + imaginary**2 + 1e-12)
+        certainty = torch.sqrt(real * real + imaginary * imaginary + 1e-12)
         phase = torch.atan2(imaginary, real)
         advance = phase[..., 1:] - phase[..., :-1] - self._nominal_advance
         wrapped = advance - 2 * np.pi * torch.floor((advance + np.pi) / (2 * np.pi))

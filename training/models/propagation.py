@@ -7,6 +7,7 @@ Agrees with `server.acoustics.geometry.FloorPlan` (tested); points are (B, 3).
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -28,57 +29,86 @@ class Path:
 
 
 class Propagation(nn.Module):
-    """Shortest paths through a floor plan, round its reflex corners."""
+    """Shortest paths through a floor plan, round its reflex corners.
+
+    A graph of many small nodes takes longer than what they compute, so all lines are looked along at once, by products
+    and sums over whole vectors; where there is nothing to see round, there is nothing to compute.
+    """
 
     def __init__(self, plan: FloorPlan) -> None:
         super().__init__()
-        bends = plan.bend_corners if len(plan.bend_corners) else np.asarray(plan.corners)[:1]
-        lengths = plan.bend_lengths_m if len(plan.bend_corners) else np.full((1, 1), np.inf)
-        self.register_buffer("_start", torch.tensor(plan.walls[:, 0], dtype=torch.float32), persistent=False)
-        self.register_buffer("_end", torch.tensor(plan.walls[:, 1], dtype=torch.float32), persistent=False)
-        self.register_buffer("_bends", torch.tensor(bends, dtype=torch.float32), persistent=False)
-        between = torch.tensor(np.minimum(lengths, _FAR), dtype=torch.float32)
-        self.register_buffer("_between", between, persistent=False)
+        self._bend_count = len(plan.bend_corners)
+        walls = plan.walls
+        edges = walls[:, 1] - walls[:, 0]
+        between = np.minimum(plan.bend_lengths_m, _FAR) if self._bend_count else ()
+        for name, values in (
+            ("start", walls[:, 0]),
+            ("end", walls[:, 1]),
+            ("normals", _turned_left(edges)),
+            ("bends", np.reshape(plan.bend_corners, (self._bend_count, 2))),
+            ("between", np.reshape(between, (self._bend_count, self._bend_count))),
+            ("turn_left", _turned_left(np.eye(2))),
+        ):
+            self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.float32), persistent=False)
 
     def forward(self, listener: Tensor, emitter: Tensor) -> Path:
         p, q = listener[:, :2], emitter[:, :2]
-        visible = self._visible(p[:, None], q[:, None])[:, 0]
-        bends = self._bends.expand(p.shape[0], -1, -1)
-        to_p, to_q = self._reach(p, bends), self._reach(q, bends)
-        via = to_p[:, :, None] + self._between + to_q[:, None, :]
-        first = via.amin(dim=2).argmin(dim=1)
-        last = via.amin(dim=1).argmin(dim=1)
-        bent = via.amin(dim=(1, 2))
-        sight = visible[:, None]
-        plan_length = torch.where(visible, _norm(p - q), bent)
-        towards = torch.where(sight, q, self._bends[first])
-        back = torch.where(sight, p, self._bends[last])
-        rise = listener[:, 2] - emitter[:, 2]
+        rise = listener[:, 2:] - emitter[:, 2:]
+        if not self._bend_count:
+            plan_length, visible = _norm(p - q), torch.ones_like(rise)
+            towards, back = q, p
+        else:
+            plan_length, visible, towards, back = self._shortest(p, q)
         return Path(
-            torch.sqrt(plan_length**2 + rise**2 + 1e-9),
-            (towards - p) / (_norm(towards - p)[:, None] + 1e-4),
-            (back - q) / (_norm(back - q)[:, None] + 1e-4),
-            visible.to(p.dtype),
+            torch.sqrt(plan_length**2 + rise**2 + 1e-9)[:, 0],
+            _direction(towards - p),
+            _direction(back - q),
+            visible[:, 0],
         )
 
-    def _reach(self, points: Tensor, bends: Tensor) -> Tensor:
-        """(B, bend) distance in plan to each corner, far where it cannot be seen."""
-        origin = points[:, None]
-        return torch.where(self._visible(origin, bends), _norm(origin - bends), torch.full_like(bends[..., 0], _FAR))
+    def _shortest(self, p: Tensor, q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Length in plan and sight (B, 1); where the path goes from p, and from q, first (B, 2)."""
+        count = self._bend_count
+        bends = self._bends.expand(p.shape[0], -1, -1)
+        here, there = p[:, None], q[:, None]
+        froms = torch.cat([here, here.expand(-1, count, -1), there.expand(-1, count, -1)], dim=1)
+        tos = torch.cat([there, bends, bends], dim=1)
+        sees = self._visible(froms, tos)
+        reach = torch.where(sees, _norm(froms - tos)[..., 0], _FAR)
+        via = reach[:, 1 : 1 + count, None] + self._between + reach[:, None, 1 + count :]
+        by_first, by_last = via.amin(dim=2), via.amin(dim=1)
+        sight = sees[:, :1]
+        return (
+            torch.where(sight, reach[:, :1], by_first.amin(dim=1, keepdim=True)),
+            sight.to(p.dtype),
+            torch.where(sight, q, self._bends[by_first.argmin(dim=1)]),
+            torch.where(sight, p, self._bends[by_last.argmin(dim=1)]),
+        )
 
-    def _visible(self, a: Tensor, b: Tensor) -> Tensor:
-        """(B, N) sight between (B, 1 or N, 2) points; a line that grazes a corner is free."""
-        p, q = a[:, :, None], b[:, :, None]
-        crosses = (_side(self._start, self._end, p) * _side(self._start, self._end, q) < -_TOUCH) & (
-            _side(p, q, self._start) * _side(p, q, self._end) < -_TOUCH
+    def _visible(self, froms: Tensor, tos: Tensor) -> Tensor:
+        """(B, N) sight between (B, N, 2) points; a line that grazes a corner is free."""
+        p, q = froms[:, :, None], tos[:, :, None]
+        across = (q - p) @ self._turn_left
+        crosses = (_dot(p - self._start, self._normals) * _dot(q - self._start, self._normals) < -_TOUCH) & (
+            _dot(self._start - p, across) * _dot(self._end - p, across) < -_TOUCH
         )
         return ~crosses.any(dim=-1)
 
 
+def _turned_left(offsets: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(n, 2) by a quarter of a turn: their scalar products are what others' cross products with them would be."""
+    x, y = np.asarray(offsets, dtype=np.float64).T
+    return np.stack([-y, x], axis=-1)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return torch.sum(a * b, dim=-1)
+
+
 def _norm(offset: Tensor) -> Tensor:
-    return torch.sqrt(torch.sum(offset**2, dim=-1) + 1e-12)
+    """With an axis of one in place of the last."""
+    return torch.sqrt(torch.sum(offset * offset, dim=-1, keepdim=True) + 1e-12)
 
 
-def _side(origin: Tensor, tip: Tensor, point: Tensor) -> Tensor:
-    edge, offset = tip - origin, point - origin
-    return edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0]
+def _direction(offset: Tensor) -> Tensor:
+    return offset / (_norm(offset) + 1e-4)

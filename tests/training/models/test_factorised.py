@@ -65,7 +65,7 @@ def test_the_head_meets_the_azimuth_it_turned_to():
     angle = torch.tensor([0.0, 0.5, 1.2])
     emitter = listener + torch.stack([0.8 * torch.cos(angle), 0.8 * torch.sin(angle), torch.zeros(3)], dim=-1)
     features = encoder(listener, emitter, angle)
-    start = 2 * SHAPE.grid_features + 2 * encoder._octaves(listener).shape[-1]
+    start = 2 * SHAPE.grid_features + 2 * encoder._waves(listener).shape[-1]
     azimuth = features[:, start : start + 10]
     torch.testing.assert_close(azimuth, torch.tensor([[1.0] * 5 + [0.0] * 5]).repeat(3, 1), atol=2e-3, rtol=0)
 
@@ -88,7 +88,7 @@ def test_what_was_not_learned_is_what_was_learned_next_to_it():
     )
     at_most = field.encoder(torch.tensor([[1.0, 1.0, 1.5]]), torch.tensor([[1.7, 1.0, 1.5]]), yaw)
     nearer = field.encoder(torch.tensor([[1.0, 1.0, 1.5]]), torch.tensor([[1.1, 1.0, 1.5]]), yaw)
-    places = 2 * SHAPE.grid_features + 2 * field.encoder._octaves(torch.zeros(1, 3)).shape[-1]
+    places = 2 * SHAPE.grid_features + 2 * field.encoder._waves(torch.zeros(1, 3)).shape[-1]
     torch.testing.assert_close(nearer[:, places:], at_most[:, places:], atol=1e-2, rtol=0)
 
 
