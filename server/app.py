@@ -17,23 +17,25 @@ from server.answers import Answers
 from server.audio_engine import AudioEngine
 from server.calibration import calibrate
 from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
-from server.effect_costs import measured_costs
+from server.effect_costs import measure_costs
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.ir_request import compute_irs
 from server.load import AUTO, Offer
 from server.places import place_of_field
-from server.priority import become_background
+from server.priority import Breaks, become_background
 from server.problems import install_problems
 from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
 from server.rendering.warm_up import warm_up
-from server.routes import api, health
+from server.routes import api, documents, health
 from server.session import Session
 from server.settings import Settings
 from server.streaming import StreamHost
 
 _CALIBRATION_POSES = 3
 _COSTS_AFTER_S = 5.0
+_COSTS_SHARE = 0.05
+"""Of a core."""
 WEB = Path(__file__).parent / "web"
 
 _logger = logging.getLogger(__name__)
@@ -80,13 +82,14 @@ def create_app(
     app = FastAPI(
         title="Nafir",
         version=version("nafir"),
-        description="Renders how a place sounds, in real time.",
+        description="Renders how a place sounds, in real time. Live streams are described at /asyncapi.json.",
         lifespan=lifespan,
         docs_url="/docs",
         redoc_url=None,
     )
     install_problems(app)
     app.include_router(health)
+    app.include_router(documents)
     app.include_router(api)
     app.mount("/", StaticFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
@@ -105,14 +108,18 @@ async def _become_ready(host: StreamHost) -> None:
     _logger.info("ready: %s", ", ".join(host.scenes))
     # Nothing waits for these: whoever came first is served first.
     await asyncio.sleep(_COSTS_AFTER_S)
+    breaks = Breaks(_COSTS_SHARE)
     with ThreadPoolExecutor(1, "nafir-costs", initializer=become_background) as measuring:
-        await asyncio.get_running_loop().run_in_executor(measuring, _measure_effects, host)
+        try:
+            await asyncio.get_running_loop().run_in_executor(measuring, _measure_effects, host, breaks)
+        finally:
+            breaks.call_off()
 
 
-def _measure_effects(host: StreamHost) -> None:
+def _measure_effects(host: StreamHost, breaks: Breaks) -> None:
     """See what effects cost here. Plans of streams opened before do not say."""
     for scene, levels in host.scenes.items():
-        host.effect_costs[scene] = measured_costs(levels.default)
+        host.effect_costs[scene] = measure_costs(levels.default, rest=breaks.rest)
 
 
 def _warm_up(host: StreamHost) -> None:

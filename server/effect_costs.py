@@ -1,7 +1,8 @@
 """What effects cost on this host: renderers with and without each, side by side, for a fraction of a second.
 
 Microseconds of one core, per block and emitter. Bytes per emitter. They are medians of rounds in which all take turns,
-in time of the thread that measures, so that what else runs meanwhile counts little.
+in time of the thread that measures, so that what else runs meanwhile counts little. Whoever measures beside streams
+hands in `rest`, called every fraction of a millisecond or so, which may take a break.
 """
 
 import statistics
@@ -40,6 +41,12 @@ _ROUNDS = 5
 _LONGEST_S = 0.25
 _Key = TypeVar("_Key", bound=Hashable)
 
+Rest = Callable[[], None]
+
+
+def _no_rest() -> None:
+    pass
+
 
 class _Placed(NamedTuple):
     pose: Pose
@@ -63,6 +70,7 @@ class _Lane:
         exchanges: bool = False,
         distance: bool = True,
         air: bool = True,
+        rest: Rest = _no_rest,
     ) -> None:
         manifest, rate = field.bundle.manifest, field.sample_rate
         channels = 2 if head else 1
@@ -81,7 +89,7 @@ class _Lane:
         rng = np.random.default_rng(0)
         decay = 10 ** (-3 * np.arange(field.ir_samples) / field.ir_samples)
         self._names = [str(number) for number in range(emitters)]
-        self._moves, self._block = moves, 0
+        self._moves, self._block, self._rest = moves, 0, rest
         self._exchanged: list[FloatArray] = []
         self._blocks_per_response = max(1, round(rate / block_size / RESPONSES_PER_S))
         for name in self._names:
@@ -93,6 +101,7 @@ class _Lane:
                 if exchanges:
                     self._exchanged.append(noise)
             self._renderer.hear_direct(name, is_heard=direct, distance=distance, air=air)
+            rest()
         self._walk()
 
     def play(self) -> None:
@@ -103,6 +112,7 @@ class _Lane:
                 for name, response in zip(self._names, self._exchanged, strict=False):
                     self._renderer.set_ir(name, self._renderer.prepare(response))
             self._renderer.process()
+            self._rest()
 
     def _walk(self) -> None:
         """A centimetre on, and a little turned, block by block."""
@@ -120,8 +130,8 @@ def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
     return measure_costs(field, block_size)
 
 
-def measure_costs(field: AcousticField, block_size: int = 256) -> Costs:
-    """Of a field's scene, now: half a second, and longer where nothing is compiled yet."""
+def measure_costs(field: AcousticField, block_size: int = 256, *, rest: Rest = _no_rest) -> Costs:
+    """Of a field's scene, now: half a second of work, and longer where nothing is compiled yet."""
     made: dict[str, dict[str, Any]] = {
         "still": {},
         "without direct": {"direct": False},
@@ -139,7 +149,7 @@ def measure_costs(field: AcousticField, block_size: int = 256) -> Costs:
     else:
         made = {name: {**options, "response": False} for name, options in made.items()}
     lanes = {
-        (name, count): _Lane(field, block_size, emitters=count, **options)
+        (name, count): _Lane(field, block_size, emitters=count, rest=rest, **options)
         for name, options in made.items()
         for count in (1, _EMITTERS)
     }

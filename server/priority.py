@@ -1,4 +1,5 @@
-"""Who goes first on a busy machine: threads that render sound before all others, threads that prepare it last.
+"""Who goes first on a busy machine: threads that render sound before all others, threads that prepare it last, and what
+nobody waits for now and then.
 
 Priorities belong to the calling thread; where the system has none per thread, or allows none, nothing changes.
 """
@@ -6,6 +7,10 @@ Priorities belong to the calling thread; where the system has none per thread, o
 import contextlib
 import os
 import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import CancelledError
 
 _REAL_TIME = 20
 """Above every ordinary thread, below what keeps the machine itself alive (1 to 99)."""
@@ -31,3 +36,35 @@ def become_background() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)  # 0 is the calling thread here, the process elsewhere
+
+
+class Breaks:
+    """Long work of one thread, of which it does at most a `share` of the time, about `stretch_s` at once.
+
+    A priority is not enough: on a core that streams fill, work at the lowest takes what impulse responses need, and,
+    put aside while it holds the interpreter's lock, keeps those waiting that come before it.
+    """
+
+    def __init__(
+        self, share: float, *, stretch_s: float = 0.002, thread_time_s: Callable[[], float] = time.thread_time
+    ) -> None:
+        self._rest_per_work = 1 / share - 1
+        self._stretch_s = stretch_s
+        self._thread_time_s = thread_time_s
+        self._since_s: float | None = None
+        self._is_over = threading.Event()
+
+    def rest(self) -> None:
+        """To be called often, by the thread that works; raises CancelledError once it was called off."""
+        now_s = self._thread_time_s()
+        if self._since_s is None:
+            self._since_s = now_s
+        if (worked_s := now_s - self._since_s) < self._stretch_s:
+            return
+        if self._is_over.wait(worked_s * self._rest_per_work):
+            raise CancelledError
+        self._since_s = self._thread_time_s()
+
+    def call_off(self) -> None:
+        """Have the work end with its next break, which may be the one it has now; on any thread."""
+        self._is_over.set()

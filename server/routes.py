@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request, Response, WebSocket
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import FiniteFloat
 
+from server.asyncapi import document
 from server.catalogue import describe_scene, playable_clips
 from server.errors import RequestError
 from server.field.levels import Levels
@@ -38,6 +39,7 @@ CACHE_CONTROL = "public, max-age=3600"
 
 api = APIRouter(prefix="/v1")
 health = APIRouter()
+documents = APIRouter(include_in_schema=False)
 
 LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
 PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"])]
@@ -64,6 +66,12 @@ async def metrics(request: Request) -> Response:
     """For Prometheus."""
     body = await anyio.to_thread.run_sync(exposition, ServerCollector(_host(request)))
     return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+
+@documents.get("/asyncapi.json")
+def asyncapi() -> Response:
+    """Of the stream what /openapi.json is of the rest; in a thread, for the first answer is long in the making."""
+    return Response(document(), media_type="application/json")
 
 
 @api.get("/scenes")
@@ -173,11 +181,12 @@ async def plan(
     )
     field = _levels(request, scene).default
     query.check(field)
+    costs = _host(request).effect_costs.get(scene)
     return await _cached(
         request,
         entity_tag(field, "plan", asdict(query), "json"),
         "application/json",
-        lambda: rounded(PlanDocument.of(scene, query.plan(field))).encode(),
+        lambda: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
     )
 
 

@@ -1,12 +1,14 @@
 import os
 import sys
 import threading
+import time
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import pytest
 
-from server.priority import become_background, become_real_time
+from server.priority import Breaks, become_background, become_real_time
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="priorities of single threads are Linux's")
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="priorities of single threads are Linux's")
 
 
 def in_a_thread(function):
@@ -18,6 +20,7 @@ def in_a_thread(function):
     return returned[0]
 
 
+@on_linux
 def test_real_time_is_reached_or_the_reason_is_told_and_other_threads_stay_ordinary():
     def try_it():
         reason = become_real_time()
@@ -32,6 +35,7 @@ def test_real_time_is_reached_or_the_reason_is_told_and_other_threads_stay_ordin
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
+@on_linux
 def test_where_real_time_is_forbidden_the_reason_is_told(monkeypatch):
     def forbid(*_):
         raise PermissionError(1, "Operation not permitted")
@@ -40,6 +44,7 @@ def test_where_real_time_is_forbidden_the_reason_is_told(monkeypatch):
     assert become_real_time() == "Operation not permitted"
 
 
+@on_linux
 def test_a_thread_in_the_background_yields_and_the_others_do_not():
     def try_it():
         become_background()
@@ -48,3 +53,37 @@ def test_a_thread_in_the_background_yields_and_the_others_do_not():
     before = os.getpriority(os.PRIO_PROCESS, 0)
     assert in_a_thread(try_it) == 5
     assert os.getpriority(os.PRIO_PROCESS, 0) == before
+
+
+def test_work_with_breaks_rests_in_proportion_once_it_has_worked_long_enough():
+    worked_s = 0.0
+    breaks = Breaks(0.25, stretch_s=0.1, thread_time_s=lambda: worked_s)
+
+    def rested_s():
+        began_s = time.perf_counter()
+        breaks.rest()
+        return time.perf_counter() - began_s
+
+    breaks.rest()
+    worked_s = 0.09
+    assert min(rested_s() for _ in range(10)) < 0.09
+    worked_s = 0.11
+    assert rested_s() >= 3 * 0.11
+    assert min(rested_s() for _ in range(10)) < 0.09
+    worked_s = 0.22
+    assert rested_s() >= 3 * 0.1
+
+
+def test_work_called_off_ends_with_the_break_it_has():
+    breaks = Breaks(1e-6, stretch_s=0.001)
+
+    def work():
+        while True:
+            breaks.rest()
+
+    with ThreadPoolExecutor(1) as thread:
+        working = thread.submit(work)
+        time.sleep(0.05)
+        breaks.call_off()
+        with pytest.raises(CancelledError):
+            working.result(timeout=5)
