@@ -33,7 +33,7 @@ class Asked(Protocol):
 
 
 class Ask(Protocol):
-    """Impulse responses (batch, channel, sample) for poses in metres and radians."""
+    """Impulse responses (batch, channel, sample), in an array of their own, for poses in metres and radians."""
 
     def __call__(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
@@ -121,16 +121,9 @@ def composed_irs(
     """(B, channel, sample) the responses of emitters, of the parts that their effects call for: the field is asked for
     none but those whose late part is, or somebody else in its place is if there is one to `ask`."""
     count = len(emitters)
-    places = [emitter.pose.position for emitter in emitters]
-    late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
-    held_channels = 2 if direct.binauralization is None else 1
-    held = np.zeros((count, held_channels, field.ir_samples), np.float32)
-    if late:
-        heads = np.tile(np.asarray(listener.position), (len(late), 1))
-        held[late] = (ask or field.impulse_responses)(heads, np.asarray(places)[late], np.full(len(late), listener.yaw))
-        if direct.field_gain != 1.0:
-            held *= np.float32(direct.field_gain)
+    held = _held(field, direct, listener, emitters, ask or field.impulse_responses)
     if direct.binauralization is not None:
+        places = [emitter.pose.position for emitter in emitters]
         return direct.binauralization.hear(held, listener, places) if channels == 2 else held
     irs = without_head(held, field.sample_rate) if channels == 1 else held
     early = direct.early(channels)
@@ -147,6 +140,25 @@ def composed_irs(
         direct.add(whole, listener, [emitters[row] for row in standing])
         irs[standing] = whole
     return irs
+
+
+def _held(
+    field: Field, direct: DirectSound, listener: Pose, emitters: Sequence[Asked], ask: Ask
+) -> npt.NDArray[np.float32]:
+    """(B, channel, sample) of the field, an array of its own; zeros for those whose late part is off."""
+    late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
+    channels = 2 if direct.binauralization is None else 1
+    if not late:
+        return np.zeros((len(emitters), channels, field.ir_samples), np.float32)
+    heads = np.tile(np.asarray(listener.position), (len(late), 1))
+    answer = ask(heads, np.array([emitters[row].pose.position for row in late]), np.full(len(late), listener.yaw))
+    if direct.field_gain != 1.0:
+        answer *= np.float32(direct.field_gain)
+    if len(late) == len(emitters):
+        return answer
+    held = np.zeros((len(emitters), channels, field.ir_samples), np.float32)
+    held[late] = answer
+    return held
 
 
 def _without_end(ir: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -36,8 +36,10 @@ def serve() -> None:
     from server.bench.scene import CLIP, SAMPLE_RATE, SCENE, BankField
     from server.cli import server_options
     from server.field.levels import Levels
+    from server.memory import give_back_large_arrays
     from server.settings import Settings
 
+    give_back_large_arrays()
     with tempfile.TemporaryDirectory() as folder, socket.socket() as listener:
         clip = Path(folder) / f"{CLIP}.wav"
         soundfile.write(clip, 0.05 * noise(0, _CLIP_S * SAMPLE_RATE), SAMPLE_RATE, subtype="FLOAT")

@@ -1,5 +1,6 @@
 """Impulse responses (IRs) in the layout that the compiled convolver multiplies."""
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -9,6 +10,7 @@ import numpy.typing as npt
 
 from server.acoustics.simd import LANES, load, store
 from server.compiled import compiled
+from server.memory import Spares
 from server.rendering import right_angle
 from server.rendering.partitions import Partitioning
 
@@ -19,6 +21,8 @@ _CACHE_LINE = 64
 _PER_STAGE = 3
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _SHIFT = np.uint64(32)
+_SPARES = Spares(32 * 1024 * 1024)
+"""A few dozen responses of a second: each that is exchanged leaves what the next one needs."""
 
 
 def address(array: npt.NDArray[np.generic]) -> int:
@@ -76,7 +80,8 @@ def pack(
             digests.append(like.digests[number])
             continue
         count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
-        spectra.append(aligned(stage.size // LANES, count, channels, 2, LANES))
+        shape = stage.size // LANES, count, channels, 2, LANES
+        spectra.append(_SPARES.take(4 * math.prod(shape)).view(np.float32).reshape(shape))  # all of it is written below
         digests.append(all_digests[taken : taken + count])
         header[at : at + _PER_STAGE] = address(spectra[-1]), count, address(digests[-1])
         made, taken = number + 1, taken + count  # those that are taken over come last
