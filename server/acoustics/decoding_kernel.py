@@ -1,8 +1,9 @@
-"""Predicted spectrograms to responses in one go: the compiled counterpart of `server.acoustics.decoding`'s NumPy path.
+"""Predicted spectrograms to responses in one go: the compiled counterpart of `server.field.decoder`'s NumPy path.
 
-Bins are worked on one after the other and frames eight at a time. Of each bin, magnitudes and coherence become rows
-that are read shifted by the delay, so that frozen noise meets them at its own time; what has been composed for eight
-frames is transformed while it is at hand. Letters: t frames from emission on, j frames of the aligned prediction.
+Eight frames are worked on at a time, from prediction to response, so that what is between them never leaves the nearest
+cache. Predictions are read as much earlier as they are delayed, so that frozen noise meets them at its own time; of a
+frame's share that is left, each bin keeps what its last eight frames were. Letters: t frames from emission on, j frames
+of the aligned prediction.
 """
 
 import math
@@ -11,9 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.cache_lines import zeros_on_lines
 from server.acoustics.phase import MOST_COHERENT, UNDECIDED
 from server.acoustics.simd import (
     LANES,
+    any_above,
     at_least,
     broadcast,
     cosine_sine,
@@ -27,15 +30,15 @@ from server.acoustics.simd import (
     store,
     subtract,
 )
-from server.acoustics.stft_kernel import Windows, analyse, impose_magnitudes, place_bin, synthesise
+from server.acoustics.stft_kernel import Windows, one_before, place_bin, synthesise_next
 from server.compiled import compiled
 
 Float32 = npt.NDArray[np.float32]
 
 WHOLE, START, TARGETS = 0, 1, 2
 """What `decode` is for: a response; what iterations can start from, and their targets; targets alone."""
-_PADDING = 2 * LANES
-"""Zeros before a row and after it: what a delayed vector may reach."""
+_NOTHING = -1e30
+"""Logarithm of the magnitude where nothing is predicted."""
 
 
 class Shape(NamedTuple):
@@ -52,44 +55,49 @@ class Shape(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """`rows` magnitudes left and right, coherence real and imaginary, targets left and right, with zeros around them;
-    `known_rows` phases and certainties of both ears. Spectra are (bin, left and right real and imaginary, frame)."""
+    """`edge` (4, bin, 8) is a prediction's eight frames where it begins or ends: logarithms left and right, coherence
+    real and imaginary. `last` (bin, 6, 8) has what the next eight frames need of the last: the noise's magnitudes left
+    and right, its coherence real and imaginary, targets left and right. `known` (bin, 6, frame) are phasors left and
+    right, real and imaginary, and certainties, with eight zeros before and after them; `known_row` phases and
+    certainties of both ears for one bin. `frames`, `carried` and `rows` are `synthesise_next`'s, `sounded` (2, sample)
+    what it gives where that is not all heard. `targets` are (bin, ear, frame); the totals (2, sample)."""
 
-    rows: Float32
-    known_rows: Float32
-    spectra: Float32
-    known_spectra: Float32
-    targets: Float32
+    edge: Float32
+    last: Float32
+    known_row: Float32
+    known: Float32
     frames: Float32
+    carried: Float32
+    rows: Float32
+    sounded: Float32
+    targets: Float32
     more_frames: Float32
     total: Float32
     other_total: Float32
-    known_total: Float32
 
     @classmethod
     def of(cls, shape: Shape, n_fft: int, *, iterates: bool) -> "Workspace":
-        hop, width, known_width = n_fft // 4, _whole_vectors(shape.frames), _whole_vectors(shape.known)
-        length = (width + 3) * hop
-
-        def zeros(*lengths: int) -> Float32:
-            return np.zeros(lengths, dtype=np.float32)
+        hop, width, known_width = n_fft // 4, whole_vectors(shape.frames), whole_vectors(shape.known)
+        length = (width + 3) * hop if iterates else 0
 
         return cls(
-            rows=zeros(6, _PADDING + width + _PADDING),
-            known_rows=zeros(4, width),
-            spectra=zeros(shape.bins, 4, width),
-            known_spectra=zeros(shape.bins, 4, known_width),
-            targets=zeros(shape.bins, 2, width if iterates else 0),
-            frames=zeros(2 * n_fft * LANES),
-            more_frames=zeros(2 * n_fft * LANES if iterates else 0),
-            total=zeros(2, length),
-            other_total=zeros(2, length if iterates else 0),
-            known_total=zeros(2, (known_width + 3) * hop),
+            edge=zeros_on_lines(4, shape.bins, LANES),
+            last=zeros_on_lines(shape.bins, 6, LANES),
+            known_row=zeros_on_lines(4, known_width),
+            known=zeros_on_lines(shape.bins, 6, LANES + known_width + LANES),
+            frames=zeros_on_lines(2 * n_fft * LANES),
+            carried=zeros_on_lines(hop, 2, 3, LANES),
+            rows=zeros_on_lines(2, LANES, LANES),
+            sounded=zeros_on_lines(2, LANES * hop),
+            targets=zeros_on_lines(shape.bins, 2, width if iterates else 0),
+            more_frames=zeros_on_lines(2 * n_fft * LANES if iterates else 0),
+            total=zeros_on_lines(2, length),
+            other_total=zeros_on_lines(2, length),
         )
 
 
 @compiled
-def _whole_vectors(frames: int) -> int:
+def whole_vectors(frames: int) -> int:
     return (frames + LANES - 1) // LANES * LANES
 
 
@@ -111,50 +119,18 @@ def decode(
     """Predictions as of `server.field.graph.Spectrograms`, `aligned` (B,) the sample, not necessarily whole, at which
     each of them starts; to `output` (B, 2, sample). Targets are left in `work`, those of the last row."""
     for row in range(output.shape[0]):
-        whole, share, first, stop = _delay(aligned[row], shape, windows.n_fft // 4)
         start = math.floor(aligned[row])
-        for bin_ in range(shape.bins):
-            _read_known(frequency[row], certainty[row], bin_, shape, work)
-            _separate(log_magnitude[row], interaural[row], bin_, aligned[row] - start, shape, windows.n_fft, work)
-            if purpose != WHOLE:
-                _delay_targets(bin_, whole, share, first, stop, shape, work)
-            if purpose != TARGETS:
-                _compose(bin_, whole, share, first, stop, noise, work)
-        if purpose == TARGETS:
-            continue
-        response = output[row]
-        _synthesise_all(work.spectra, first, stop, windows, work.frames, work.total)
-        _take(work.total, shape, response)
-        if shape.known > 0:
-            _synthesise_all(work.known_spectra, 0, shape.known, windows, work.frames, work.known_total)
-            _add(work.known_total, start, shape, response)
+        turn = -2.0 * math.pi / windows.n_fft * (aligned[row] - start)
+        _know(frequency[row], certainty[row], turn, shape, work)
+        _add_noise(log_magnitude[row], interaural[row], aligned[row], shape, windows, noise, purpose, work, output[row])
+        if purpose != TARGETS:
+            _add_known(log_magnitude[row], interaural[row], start, shape, windows, work, output[row])
         if purpose == WHOLE:
-            _open(gate, start, response)
+            open_gate(gate, start, output[row])
 
 
 @compiled
-def iterate(
-    iterations: int,
-    from_zero_phase: bool,
-    aligned: float,
-    shape: Shape,
-    windows: Windows,
-    gate: Float32,
-    work: Workspace,
-    response: Float32,
-) -> None:
-    """As `server.acoustics.phase.griffin_lim`, in place: the phases of the response's transform, or none, the
-    magnitudes of the targets in `work`, and a response again."""
-    _, _, first, stop = _delay(aligned, shape, windows.n_fft // 4)
-    if from_zero_phase:
-        _synthesise_targets(first, stop, windows, work)
-        _take(work.total, shape, response)
-    _griffin_lim(iterations, first, stop, shape, windows, work, response)
-    _open(gate, math.floor(aligned), response)
-
-
-@compiled
-def _delay(aligned, shape, hop):
+def delay_of(aligned, shape, hop):
     """Whole frames and a share of one; the first frame that can sound, in whole vectors, and the one after the last."""
     limit = float((shape.frames + 1) * hop)
     delay = min(limit, max(-limit, aligned)) / hop
@@ -164,112 +140,192 @@ def _delay(aligned, shape, hop):
 
 
 @compiled
-def _read_known(frequency, certainty, bin_, shape, work) -> None:
-    """Phases, summed up from their advances, and certainties of one bin."""
-    for ear in range(2):
-        phase = 0.0
-        for j in range(shape.known):
-            phase += frequency[ear, bin_, j]
-            phase -= 2 * math.pi * math.floor(phase / (2 * math.pi) + 0.5)
-            # Four hops are one window: a bin's centre advances by whole quarters of a turn.
-            work.known_rows[ear, j] = phase + 0.5 * math.pi * (bin_ * j % 4)
-            work.known_rows[2 + ear, j] = 1.0 if shape.all_is_certain else certainty[ear, bin_, j]
+def _know(frequency, certainty, turn, shape, work) -> None:
+    """Phasors, bin k turned by k `turn`, and certainties of the frames whose phase is known, summed up from its
+    advances."""
+    rows, row = work.known_row.ctypes.data, work.known_row.shape[1]
+    width = work.known.shape[2]
+    for bin_ in range(shape.bins):
+        for ear in range(2):
+            phase = 0.0
+            for j in range(shape.known):
+                phase += frequency[ear, bin_, j]
+                phase -= 2 * math.pi * math.floor(phase / (2 * math.pi) + 0.5)
+                # Four hops are one window: a bin's centre advances by whole quarters of a turn.
+                work.known_row[ear, j] = phase + 0.5 * math.pi * (bin_ * j % 4) + bin_ * turn
+                work.known_row[2 + ear, j] = 1.0 if shape.all_is_certain else certainty[ear, bin_, j]
+        known = work.known[bin_].ctypes.data
+        for j in range(0, shape.known, LANES):
+            for ear in range(2):
+                cosine, sine = cosine_sine(load(rows, ear * row + j))
+                size = load(rows, (2 + ear) * row + j)
+                store(known, 2 * ear * width + LANES + j, multiply(cosine, size))
+                store(known, (2 * ear + 1) * width + LANES + j, multiply(sine, size))
+                store(known, (4 + ear) * width + LANES + j, size)
 
 
 @compiled
-def _separate(log_magnitude, interaural, bin_, fraction, shape, n_fft, work) -> None:
-    """As `server.acoustics.phase.separate`: the noise's part to rows, the known part, later by `fraction` of a sample,
-    to its spectra."""
-    zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
-    undecided, most = broadcast(np.float32(UNDECIDED)), broadcast(np.float32(MOST_COHERENT))
-    floor = broadcast(np.float32(shape.log_floor))
-    turn = -2.0 * math.pi * bin_ / n_fft * fraction
-    cos, sin = broadcast(np.float32(math.cos(turn))), broadcast(np.float32(math.sin(turn)))
-    left, right = log_magnitude[0, bin_].ctypes.data, log_magnitude[1, bin_].ctypes.data
-    real, imaginary = interaural[0, bin_].ctypes.data, interaural[1, bin_].ctypes.data
-    rows, row = work.rows.ctypes.data, work.rows.shape[1]
-    known_rows, known_row = work.known_rows.ctypes.data, work.known_rows.shape[1]
-    known = work.known_spectra[bin_].ctypes.data
-    known_width = work.known_spectra.shape[2]
-    for vector in range(0, shape.used, LANES):
-        j = min(vector, shape.frames - LANES)
-        ml = at_least(subtract(exponential(load(left, j)), floor), zero)
-        mr = at_least(subtract(exponential(load(right, j)), floor), zero)
-        cr, ci = load(real, j), load(imaginary, j)
-        at = _PADDING + j
-        store(rows, 4 * row + at, ml)
-        store(rows, 5 * row + at, mr)
-        if vector < shape.known:
-            cl, cr_ = load(known_rows, 2 * known_row + j), load(known_rows, 3 * known_row + j)
-            cos_l, sin_l = cosine_sine(load(known_rows, j))
-            cos_r, sin_r = cosine_sine(load(known_rows, known_row + j))
-            al, bl = multiply(cos_l, cl), multiply(sin_l, cl)
-            ar, br = multiply(cos_r, cr_), multiply(sin_r, cr_)
-            store(known, j, multiply(ml, multiply_subtract(bl, sin, multiply(al, cos))))
-            store(known, known_width + j, multiply(ml, multiply_add(bl, cos, multiply(al, sin))))
-            store(known, 2 * known_width + j, multiply(mr, multiply_subtract(br, sin, multiply(ar, cos))))
-            store(known, 3 * known_width + j, multiply(mr, multiply_add(br, cos, multiply(ar, sin))))
-            ul = square_root(at_least(multiply_subtract(cl, cl, one), zero))
-            ur = square_root(at_least(multiply_subtract(cr_, cr_, one), zero))
-            share = at_least(multiply(ul, ur), undecided)
-            cr = divide(multiply_subtract(bl, br, multiply_subtract(al, ar, cr)), share)
-            ci = divide(multiply_add(al, br, multiply_subtract(bl, ar, ci)), share)
-            ml, mr = multiply(ml, ul), multiply(mr, ur)
-        scale = divide(most, square_root(at_least(multiply_add(cr, cr, multiply(ci, ci)), one)))
-        store(rows, at, ml)
-        store(rows, row + at, mr)
-        store(rows, 2 * row + at, multiply(cr, scale))
-        store(rows, 3 * row + at, multiply(ci, scale))
-    for at in range(_PADDING + shape.used, _PADDING + _whole_vectors(shape.used)):
-        for number in range(6):
-            work.rows[number, at] = 0
+def _predicted(log_magnitude, interaural, j, shape, work):
+    """Where eight frames from `j` on are: addresses of the left ear's logarithms and of the coherence's real part, how
+    far those of the other ear and the imaginary part are from these, and one bin from the next."""
+    if j >= 0 and j + LANES <= shape.used:
+        levels, coherences = log_magnitude.ctypes.data + 4 * j, interaural.ctypes.data + 4 * j
+        return levels, coherences, log_magnitude.strides[0] // 4, log_magnitude.strides[1] // 4
+    for bin_ in range(shape.bins):
+        for lane in range(LANES):
+            is_there = 0 <= j + lane < shape.used
+            for part in range(2):
+                work.edge[part, bin_, lane] = log_magnitude[part, bin_, j + lane] if is_there else _NOTHING
+                work.edge[2 + part, bin_, lane] = interaural[part, bin_, j + lane] if is_there else 0.0
+    return work.edge.ctypes.data, work.edge[2].ctypes.data, LANES * shape.bins, LANES
 
 
 @compiled
-def _delayed(rows, at, share):
-    """Between a row's values from `at` on and those one frame before."""
-    now, before = load(rows, at), load(rows, at - 1)
+def _magnitude(levels, at, floor):
+    return at_least(subtract(exponential(load(levels, at)), floor), broadcast(np.float32(0.0)))
+
+
+@compiled
+def _later(last, at, now, share):
+    """Between a bin's eight values and those one frame before; they are kept in place of the eight before them."""
+    before = one_before(last, at, now)
     return multiply_add(subtract(before, now), share, now)
 
 
 @compiled
-def _compose(bin_, whole, share, first, stop, noise, work) -> None:
-    """Frozen noise of the rows' magnitudes and coherence, delayed by `whole` frames and a share of one, to spectra."""
+def _add_noise(log_magnitude, interaural, aligned, shape, windows, noise, purpose, work, response) -> None:
+    """To a response that is nothing as yet."""
+    hop = windows.n_fft // 4
+    whole, share, first, stop = delay_of(aligned, shape, hop)
+    end = min(shape.samples, response.shape[1])
+    at = min(end, max(0, first * hop - shape.frame_lead))
+    _clear(work.last)
+    _clear(work.carried)
+    if purpose != TARGETS:
+        silence(response, 0, at)
+    if whole < 0:  # what sounds at once is preceded by what would have sounded before
+        _compose(-LANES, whole, share, log_magnitude, interaural, shape, windows.n_fft, noise, purpose, work)
+    for t in range(first, stop, LANES):
+        _compose(t, whole, share, log_magnitude, interaural, shape, windows.n_fft, noise, purpose, work)
+        if purpose != TARGETS:
+            at = _sound(t * hop - shape.frame_lead, 0, end, False, windows, work, response)
+    if purpose != TARGETS:
+        if first < stop and at < end:
+            _clear(work.frames)
+            at = _sound(at, 0, end, False, windows, work, response)
+        silence(response, min(end, at), response.shape[1])
+    if purpose != WHOLE:
+        for bin_ in range(shape.bins):
+            for ear in range(2):
+                for t in range(shape.frames, work.targets.shape[2]):
+                    work.targets[bin_, ear, t] = 0
+
+
+@compiled
+def _compose(t, whole, share, log_magnitude, interaural, shape, n_fft, noise, purpose, work) -> None:
+    """Eight frames, from frame `t` on, of frozen noise that makes up the rest, as `server.acoustics.phase.separate` and
+    `correlated_noise` do, delayed by `whole` frames and a share of one; and of targets, if any are asked for."""
     zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
-    rows, row, width = work.rows.ctypes.data, work.rows.shape[1], work.spectra.shape[2]
-    spectra, white = work.spectra[bin_].ctypes.data, noise[bin_].ctypes.data
-    later = broadcast(share)
-    for t in range(first, stop, LANES):
-        at = _PADDING + t - whole
-        ml, mr = _delayed(rows, at, later), _delayed(rows, row + at, later)
-        cr, ci = _delayed(rows, 2 * row + at, later), _delayed(rows, 3 * row + at, later)
-        own = square_root(at_least(subtract(one, multiply_add(cr, cr, multiply(ci, ci))), zero))
-        lr, li = load(white, t), load(white, width + t)
-        rr = multiply_add(cr, lr, multiply_add(ci, li, multiply(own, load(white, 2 * width + t))))
-        ri = multiply_subtract(ci, lr, multiply_add(cr, li, multiply(own, load(white, 3 * width + t))))
-        store(spectra, t, multiply(ml, lr))
-        store(spectra, width + t, multiply(ml, li))
-        store(spectra, 2 * width + t, multiply(mr, rr))
-        store(spectra, 3 * width + t, multiply(mr, ri))
+    undecided, most = broadcast(np.float32(UNDECIDED)), broadcast(np.float32(MOST_COHERENT))
+    floor, later = broadcast(np.float32(shape.log_floor)), broadcast(share)
+    j = t - whole
+    levels, coherences, other, step = _predicted(log_magnitude, interaural, j, shape, work)
+    is_known = -LANES < j < shape.known
+    known_width, width = work.known.shape[2], work.targets.shape[2]
+    heard = max(0, t)  # what comes of frames before is overwritten
+    frames, white = work.frames.ctypes.data, noise[heard // LANES].ctypes.data
+    for bin_ in range(shape.bins):
+        at = bin_ * step
+        last = work.last[bin_].ctypes.data
+        ml, mr = _magnitude(levels, at, floor), _magnitude(levels, other + at, floor)
+        if purpose != WHOLE:
+            targets = work.targets[bin_].ctypes.data
+            store(targets, heard, _later(last, 4 * LANES, ml, later))
+            store(targets, width + heard, _later(last, 5 * LANES, mr, later))
+            if purpose == TARGETS:
+                continue
+        cr, ci = load(coherences, at), load(coherences, other + at)
+        if is_known:
+            known, to = work.known[bin_].ctypes.data, LANES + j
+            al, bl = load(known, to), load(known, known_width + to)
+            ar, br = load(known, 2 * known_width + to), load(known, 3 * known_width + to)
+            cl, cr_ = load(known, 4 * known_width + to), load(known, 5 * known_width + to)
+            ul = square_root(at_least(multiply_subtract(cl, cl, one), zero))
+            ur = square_root(at_least(multiply_subtract(cr_, cr_, one), zero))
+            both = at_least(multiply(ul, ur), undecided)
+            cr = divide(multiply_subtract(bl, br, multiply_subtract(al, ar, cr)), both)
+            ci = divide(multiply_add(al, br, multiply_subtract(bl, ar, ci)), both)
+            ml, mr = multiply(ml, ul), multiply(mr, ur)
+        scale, square = most, multiply_add(cr, cr, multiply(ci, ci))
+        if any_above(square, one):  # hardly ever
+            scale = divide(most, square_root(at_least(square, one)))
+        ml, mr = _later(last, 0, ml, later), _later(last, LANES, mr, later)
+        cr = _later(last, 2 * LANES, multiply(cr, scale), later)
+        ci = _later(last, 3 * LANES, multiply(ci, scale), later)
+        own = square_root(at_least(multiply_subtract(cr, cr, multiply_subtract(ci, ci, one)), zero))
+        of_bin = 4 * LANES * bin_
+        lr, li = load(white, of_bin), load(white, of_bin + LANES)
+        own_re, own_im = multiply(own, load(white, of_bin + 2 * LANES)), multiply(own, load(white, of_bin + 3 * LANES))
+        rr = multiply_add(cr, lr, multiply_add(ci, li, own_re))
+        ri = multiply_subtract(ci, lr, multiply_add(cr, li, own_im))
+        place_bin(frames, n_fft, bin_, multiply(ml, lr), multiply(ml, li), multiply(mr, rr), multiply(mr, ri))
 
 
 @compiled
-def _delay_targets(bin_, whole, share, first, stop, shape, work) -> None:
-    """Whole magnitudes, delayed as the noise's are; none after the last frame."""
-    rows, row, width = work.rows.ctypes.data, work.rows.shape[1], work.targets.shape[2]
-    targets = work.targets[bin_].ctypes.data
-    later = broadcast(share)
-    for t in range(first, stop, LANES):
-        at = _PADDING + t - whole
-        store(targets, t, _delayed(rows, 4 * row + at, later))
-        store(targets, width + t, _delayed(rows, 5 * row + at, later))
+def _add_known(log_magnitude, interaural, start, shape, windows, work, response) -> None:
+    """The known part from sample `start` of the response on, as far as both reach."""
+    frames = work.frames.ctypes.data
+    floor = broadcast(np.float32(shape.log_floor))
+    width = work.known.shape[2]
+    begin, end = max(0, start), min(response.shape[1], start + shape.samples)
+    at = start - shape.frame_lead
+    _clear(work.carried)
+    for j in range(0, shape.known, LANES):
+        levels, _, other, step = _predicted(log_magnitude, interaural, j, shape, work)
+        for bin_ in range(shape.bins):
+            known = work.known[bin_].ctypes.data
+            ml = _magnitude(levels, bin_ * step, floor)
+            mr = _magnitude(levels, other + bin_ * step, floor)
+            place_bin(
+                frames,
+                windows.n_fft,
+                bin_,
+                multiply(ml, load(known, LANES + j)),
+                multiply(ml, load(known, width + LANES + j)),
+                multiply(mr, load(known, 2 * width + LANES + j)),
+                multiply(mr, load(known, 3 * width + LANES + j)),
+            )
+        at = _sound(at, begin, end, True, windows, work, response)
+    if shape.known > 0 and shape.known + 3 > whole_vectors(shape.known):
+        _clear(work.frames)
+        _sound(at, begin, end, True, windows, work, response)
+
+
+@compiled
+def _sound(at, begin, end, is_added, windows, work, response):
+    """What is complete with eight frames more, to the response from sample `at` on, or what of it lies between `begin`
+    and `end`; the sample after it."""
+    frames, carried, rows = work.frames.ctypes.data, work.carried.ctypes.data, work.rows.ctypes.data
+    sounded, stop = work.sounded, at + work.sounded.shape[1]
+    if not is_added and at >= begin and stop <= end:
+        synthesise_next(frames, windows, carried, rows, response.ctypes.data + 4 * at, response.strides[0] // 4)
+        return stop
+    synthesise_next(frames, windows, carried, rows, sounded.ctypes.data, sounded.shape[1])
     for ear in range(2):
-        for t in range(shape.frames, width):
-            work.targets[bin_, ear, t] = 0
+        for n in range(max(begin, at), min(end, stop)):
+            response[ear, n] = sounded[ear, n - at] + (response[ear, n] if is_added else np.float32(0.0))
+    return stop
 
 
 @compiled
-def _silence(signals, begin, end) -> None:
+def _clear(values) -> None:
+    """A whole number of vectors."""
+    for n in range(0, values.size, LANES):
+        store(values.ctypes.data, n, broadcast(np.float32(0.0)))
+
+
+@compiled
+def silence(signals, begin, end) -> None:
     # A slice set to zero would do the same, and take seconds to compile.
     for ear in range(2):
         for n in range(begin, end):
@@ -277,87 +333,9 @@ def _silence(signals, begin, end) -> None:
 
 
 @compiled
-def _synthesise_all(spectra, first, stop, windows, frames, total) -> None:
-    _silence(total, 0, total.shape[1])
-    width = spectra.shape[2]
-    at = frames.ctypes.data
-    for t in range(first, stop, LANES):
-        for bin_ in range(spectra.shape[0]):
-            parts = spectra[bin_].ctypes.data
-            place_bin(
-                at,
-                windows.n_fft,
-                bin_,
-                load(parts, t),
-                load(parts, width + t),
-                load(parts, 2 * width + t),
-                load(parts, 3 * width + t),
-            )
-        synthesise(at, windows, total, t)
-
-
-@compiled
-def _synthesise_targets(first, stop, windows, work) -> None:
-    """With zero phase."""
-    _silence(work.total, 0, work.total.shape[1])
-    zero = broadcast(np.float32(0.0))
-    width = work.targets.shape[2]
-    at = work.frames.ctypes.data
-    for t in range(first, stop, LANES):
-        for bin_ in range(work.targets.shape[0]):
-            targets = work.targets[bin_].ctypes.data
-            sign = broadcast(np.float32(1 - 2 * (bin_ % 2)))
-            left, right = multiply(load(targets, t), sign), multiply(load(targets, width + t), sign)
-            place_bin(at, windows.n_fft, bin_, left, zero, right, zero)
-        synthesise(at, windows, work.total, t)
-
-
-@compiled
-def _griffin_lim(iterations, first, stop, shape, windows, work, response) -> None:
-    lead, end, length = shape.frame_lead, shape.frame_lead + shape.samples, work.total.shape[1]
-    count = min(shape.samples, response.shape[1])
-    analysed, placed = work.frames.ctypes.data, work.more_frames.ctypes.data
-    total, other = work.total, work.other_total
-    _silence(total, 0, length)
-    for ear in range(2):
-        for n in range(count):
-            total[ear, lead + n] = response[ear, n]
-    for _ in range(iterations):
-        _silence(other, 0, length)
-        for t in range(first, stop, LANES):
-            analyse(analysed, windows, total, t)
-            impose_magnitudes(analysed, placed, windows, work.targets, t)
-            synthesise(placed, windows, other, t)
-        _silence(other, 0, lead)
-        _silence(other, end, length)
-        total, other = other, total
-    _take(total, shape, response)
-
-
-@compiled
-def _take(total, shape, response) -> None:
-    count = min(shape.samples, response.shape[1])
-    for ear in range(2):
-        for n in range(count):
-            response[ear, n] = total[ear, shape.frame_lead + n]
-    _silence(response, count, response.shape[1])
-
-
-@compiled
-def _add(known_total, start, shape, response) -> None:
-    """The known part from sample `start` of the response on, as far as both reach."""
-    lead = shape.frame_lead
-    begin = max(0, start)
-    end = min(response.shape[1], start + min(shape.samples, known_total.shape[1] - lead))
-    for ear in range(2):
-        for n in range(begin, end):
-            response[ear, n] += known_total[ear, lead + n - start]
-
-
-@compiled
-def _open(gate, start, response) -> None:
+def open_gate(gate, start, response) -> None:
     """Silence before sample `start`, and the gate's rise from there on."""
-    _silence(response, 0, min(max(0, start), response.shape[1]))
+    silence(response, 0, min(max(0, start), response.shape[1]))
     for ear in range(2):
         for n in range(max(0, start), min(response.shape[1], start + gate.size)):
             response[ear, n] *= gate[n - start]

@@ -68,45 +68,88 @@ def _is_odd_power(points: int) -> bool:
 @compiled
 def transform_lanes(values: int, points: int, passes: int) -> None:
     """Forward, in place; `passes` is the address of `twiddles(points)`."""
+    transform_but_last(values, points, passes)
+    size = LANES * points
+    if first_span(points) == 0:
+        return
+    for at in range(0, size, 4 * LANES):
+        y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(values, size, at, LANES)
+        store(values, at, y0r)
+        store(values, size + at, y0i)
+        store(values, at + 8, y1r)
+        store(values, size + at + 8, y1i)
+        store(values, at + 16, y2r)
+        store(values, size + at + 16, y2i)
+        store(values, at + 24, y3r)
+        store(values, size + at + 24, y3i)
+
+
+@compiled
+def transform_but_last(values: int, points: int, passes: int) -> None:
+    """All passes but the last, whose butterflies are of four neighbours each and turn nothing."""
     size = LANES * points
     table = 0
-    span = first_span(points)
     if _is_odd_power(points):
-        half = points // 2
-        for j in range(half):
-            at, to = 8 * j, 8 * (j + half)
-            ar, ai, br, bi = load(values, at), load(values, size + at), load(values, to), load(values, size + to)
-            store(values, at, add(ar, br))
-            store(values, size + at, add(ai, bi))
-            dr, di = subtract(ar, br), subtract(ai, bi)
-            c, s = load_broadcast(passes, table + 2 * j), load_broadcast(passes, table + 2 * j + 1)
-            store(values, to, multiply_subtract(di, s, multiply(dr, c)))
-            store(values, size + to, multiply_add(di, c, multiply(dr, s)))
-        table += 2 * half
-    while span > 0:
+        _halve(values, points, passes)
+        table += points
+    span = first_span(points)
+    while span > 1:
         for j in range(span):
-            t = table + 6 * j
-            c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
-            c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
-            c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
-            for group in range(j, points, 4 * span):
-                p0, p1 = 8 * group, 8 * (group + span)
-                p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
-                ar, ai, br, bi = load(values, p0), load(values, size + p0), load(values, p1), load(values, size + p1)
-                cr, ci, dr, di = load(values, p2), load(values, size + p2), load(values, p3), load(values, size + p3)
-                er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
-                gr, gi = add(br, dr), add(bi, di)
-                hr, hi = subtract(bi, di), subtract(dr, br)  # -i (b - d)
-                store(values, p0, add(er, gr))
-                store(values, size + p0, add(ei, gi))
-                yr, yi = add(fr, hr), add(fi, hi)
-                store(values, p1, multiply_subtract(yi, s1, multiply(yr, c1)))
-                store(values, size + p1, multiply_add(yi, c1, multiply(yr, s1)))
-                yr, yi = subtract(er, gr), subtract(ei, gi)
-                store(values, p2, multiply_subtract(yi, s2, multiply(yr, c2)))
-                store(values, size + p2, multiply_add(yi, c2, multiply(yr, s2)))
-                yr, yi = subtract(fr, hr), subtract(fi, hi)
-                store(values, p3, multiply_subtract(yi, s3, multiply(yr, c3)))
-                store(values, size + p3, multiply_add(yi, c3, multiply(yr, s3)))
+            # A range of such a step would divide to find its length.
+            at = LANES * j
+            while at < size:
+                _turned_butterfly(values, size, at, LANES * span, passes, table + 6 * j)
+                at += 4 * LANES * span
         table += 6 * span
         span //= 4
+
+
+@compiled
+def _halve(values, points, passes) -> None:
+    """The pass of radix 2."""
+    size, half = LANES * points, points // 2
+    for j in range(half):
+        at, to = 8 * j, 8 * (j + half)
+        ar, ai, br, bi = load(values, at), load(values, size + at), load(values, to), load(values, size + to)
+        store(values, at, add(ar, br))
+        store(values, size + at, add(ai, bi))
+        _store_turned(values, size, to, subtract(ar, br), subtract(ai, bi), passes, 2 * j)
+
+
+@compiled
+def butterfly(values: int, size: int, at: int, step: int):
+    """Four points `step` apart, real and imaginary part of each: their transform."""
+    p1, p2, p3 = at + step, at + 2 * step, at + 3 * step
+    ar, ai, br, bi = load(values, at), load(values, size + at), load(values, p1), load(values, size + p1)
+    cr, ci, dr, di = load(values, p2), load(values, size + p2), load(values, p3), load(values, size + p3)
+    er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
+    gr, gi = add(br, dr), add(bi, di)
+    hr, hi = subtract(bi, di), subtract(dr, br)  # -i (b - d)
+    return (
+        add(er, gr),
+        add(ei, gi),
+        add(fr, hr),
+        add(fi, hi),
+        subtract(er, gr),
+        subtract(ei, gi),
+        subtract(fr, hr),
+        subtract(fi, hi),
+    )
+
+
+@compiled
+def _turned_butterfly(values, size, at, step, passes, t) -> None:
+    y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(values, size, at, step)
+    store(values, at, y0r)
+    store(values, size + at, y0i)
+    _store_turned(values, size, at + step, y1r, y1i, passes, t)
+    _store_turned(values, size, at + 2 * step, y2r, y2i, passes, t + 2)
+    _store_turned(values, size, at + 3 * step, y3r, y3i, passes, t + 4)
+
+
+@compiled
+def _store_turned(values, size, at, re, im, passes, t) -> None:
+    # Loaded where they are needed, factors take no registers in the meantime.
+    c, s = load_broadcast(passes, t), load_broadcast(passes, t + 1)
+    store(values, at, multiply_subtract(im, s, multiply(re, c)))
+    store(values, size + at, multiply_add(im, c, multiply(re, s)))

@@ -25,6 +25,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.cache_lines import on_lines
 from server.acoustics.codec import Codec
 
 Real = npt.NDArray[np.float32]
@@ -53,10 +54,12 @@ class FrozenNoise:
 
     @cached_property
     def parts(self) -> Real:
-        """(frequency, 4, frame) left and right, real and imaginary; with silent frames to a multiple of eight."""
+        """(frame // 8, frequency, 4, 8) left and right, real and imaginary, of eight frames after the other as they are
+        decoded; with silent frames to a multiple of eight."""
         left, right = self.spectrogram
         parts = np.stack([left.real, left.imag, right.real, right.imag], axis=1)
-        return np.pad(parts, [(0, 0), (0, 0), (0, -parts.shape[-1] % 8)])
+        parts = np.pad(parts, [(0, 0), (0, 0), (0, -parts.shape[-1] % 8)])
+        return on_lines(parts.reshape(*parts.shape[:2], -1, 8).transpose(2, 0, 1, 3))
 
 
 def separate(magnitude: Real, known_phase: Real, certainty: Real, coherence: Complex) -> tuple[Complex, Real, Complex]:

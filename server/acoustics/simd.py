@@ -27,7 +27,10 @@ _INTEGERS = ir.VectorType(_INT32, LANES)
 _LN_2 = (0.693359375, math.log(2) - 0.693359375)
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
-# Lanes of two vectors, 0-7 and 8-15, that the steps of a transposition bring together.
+_LAST_FIRST = [7, 0, 1, 2, 3, 4, 5, 6]
+# Lanes of two vectors, 0-7 and 8-15: the first of one and the rest of the other; and what the steps of a transposition
+# bring together.
+_FIRST_THEN = [0, 9, 10, 11, 12, 13, 14, 15]
 _LOW_1, _HIGH_1 = [0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]
 _LOW_2, _HIGH_2 = [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]
 _LOW_4, _HIGH_4 = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
@@ -203,6 +206,37 @@ def choose_below(_context: Any, _x: Any, _limit: Any, _below: Any, _else: Any) -
         return builder.select(builder.fcmp_ordered("<", x, limit), below, otherwise)
 
     return float32x8(float32x8, float32x8, float32x8, float32x8), generate
+
+
+@intrinsic
+def any_above(_context: Any, _x: Any, _limit: Any) -> Any:
+    """Whether x > limit in any lane."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        lanes = builder.bitcast(builder.fcmp_ordered(">", *args), ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", lanes, ir.Constant(ir.IntType(LANES), 0))
+
+    return types.boolean(float32x8, float32x8), generate
+
+
+@intrinsic
+def rotate(_context: Any, _x: Any) -> Any:
+    """The last value first."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return _shuffle(builder, args[0], args[0], _LAST_FIRST)
+
+    return float32x8(float32x8), generate
+
+
+@intrinsic
+def with_first(_context: Any, _first: Any, _x: Any) -> Any:
+    """x but for its first value, which is that of the other."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return _shuffle(builder, *args, _FIRST_THEN)
+
+    return float32x8(float32x8, float32x8), generate
 
 
 @intrinsic

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.cache_lines import on_lines
 from server.acoustics.codec import Codec
-from server.acoustics.lane_fft import order, transform_lanes, twiddles
+from server.acoustics.lane_fft import butterfly, order, transform_but_last, transform_lanes, twiddles
 from server.acoustics.phase import NO_PHASE
 from server.acoustics.simd import (
     LANES,
@@ -21,12 +22,16 @@ from server.acoustics.simd import (
     choose_below,
     divide,
     load,
+    load_broadcast,
+    load_int,
     multiply,
     multiply_add,
+    rotate,
     square_root,
     store,
     subtract,
     transpose,
+    with_first,
 )
 from server.compiled import compiled
 
@@ -47,8 +52,8 @@ class Windows(NamedTuple):
     def of(cls, codec: Codec) -> "Windows":
         return cls(
             codec.n_fft,
-            codec.window.astype(np.float32),
-            (codec.dual_window / codec.n_fft).astype(np.float32),
+            on_lines(codec.window),
+            on_lines(codec.dual_window / codec.n_fft),
             twiddles(codec.n_fft),
             np.argsort(order(codec.n_fft)),
         )
@@ -112,6 +117,77 @@ def synthesise(frames: int, windows: Windows, total: Float32, first: int) -> Non
             store(signal, at, multiply_add(samples[6], weight, load(signal, at)))
             at += hop
             store(signal, at, multiply_add(samples[7], weight, load(signal, at)))
+
+
+@compiled
+def synthesise_next(frames: int, windows: Windows, carried: int, rows: int, to: int, other: int) -> None:
+    """Eight frames, those after the last eight: what is complete with them, eight hops of the left ear to address `to`
+    and of the right `other` floats on. What was placed in `frames` is lost.
+
+    `carried` (hop, 2, 3, 8) keeps what their neighbours will add to, and `rows` (2, 8, 8) is room.
+    """
+    transform_but_last(frames, windows.n_fft, windows.passes.ctypes.data)
+    add_up(frames, windows, carried, rows, to, other)
+
+
+@compiled
+def add_up(frames: int, windows: Windows, carried: int, rows: int, to: int, other: int) -> None:
+    """Of `synthesise_next`, what follows on all but the last pass of the transform."""
+    hop, size = windows.n_fft // 4, LANES * windows.n_fft
+    window, places = windows.synthesis.ctypes.data, windows.places.ctypes.data
+    for n in range(0, hop, LANES):
+        for i in range(LANES):
+            # The last pass finds the samples that lie a hop apart; of the inverse, parts are exchanged.
+            r0, l0, r1, l1, r2, l2, r3, l3 = butterfly(frames, size, LANES * load_int(places, n + i), LANES)
+            w0, w1 = load_broadcast(window, n + i), load_broadcast(window, hop + n + i)
+            w2, w3 = load_broadcast(window, 2 * hop + n + i), load_broadcast(window, 3 * hop + n + i)
+            kept = 6 * LANES * (n + i)
+            store(rows, LANES * i, _overlapped(carried, kept, l0, l1, l2, l3, w0, w1, w2, w3))
+            store(rows, LANES * (LANES + i), _overlapped(carried, kept + 3 * LANES, r0, r1, r2, r3, w0, w1, w2, w3))
+        _store_columns(rows, 0, to, n, hop)
+        _store_columns(rows, LANES * LANES, to, other + n, hop)
+
+
+@compiled
+def one_before(last: int, at: int, now):
+    """Of a row's eight values those one before each; what is needed for the next eight is kept in `last` at `at`."""
+    turned = rotate(now)
+    before = with_first(load(last, at), turned)
+    store(last, at, turned)
+    return before
+
+
+@compiled
+def _overlapped(carried, at, x0, x1, x2, x3, w0, w1, w2, w3):
+    """One sample of each of eight hops, from those of eight frames' four hops: the second adds to the first of the
+    frame after it, and so on."""
+    total = multiply_add(x2, w2, one_before(carried, at, multiply(x3, w3)))
+    total = multiply_add(x1, w1, one_before(carried, at + LANES, total))
+    return multiply_add(x0, w0, one_before(carried, at + 2 * LANES, total))
+
+
+@compiled
+def _store_columns(rows, first, to, at, step) -> None:
+    columns = transpose(
+        (
+            load(rows, first),
+            load(rows, first + 8),
+            load(rows, first + 16),
+            load(rows, first + 24),
+            load(rows, first + 32),
+            load(rows, first + 40),
+            load(rows, first + 48),
+            load(rows, first + 56),
+        )
+    )
+    store(to, at, columns[0])
+    store(to, at + step, columns[1])
+    store(to, at + 2 * step, columns[2])
+    store(to, at + 3 * step, columns[3])
+    store(to, at + 4 * step, columns[4])
+    store(to, at + 5 * step, columns[5])
+    store(to, at + 6 * step, columns[6])
+    store(to, at + 7 * step, columns[7])
 
 
 @compiled

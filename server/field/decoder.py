@@ -21,8 +21,8 @@ if HAS_NUMBA:
         Shape,
         Workspace,
         decode,
-        iterate,
     )
+    from server.acoustics.griffin_lim_kernel import iterate
     from server.acoustics.simd import LANES
     from server.acoustics.stft_kernel import Windows
 

@@ -1,0 +1,24 @@
+"""Arrays that begin where a line of the cache does: vectors that lie across two lines take twice as long."""
+
+import numpy as np
+import numpy.typing as npt
+
+Float32 = npt.NDArray[np.float32]
+
+LINE_BYTES = 64
+
+
+def zeros_on_lines(*lengths: int) -> Float32:
+    """As `numpy.zeros`, which promises 16 bytes."""
+    size = int(np.prod(lengths))
+    line = LINE_BYTES // np.float32().itemsize
+    whole = np.zeros(size + line, dtype=np.float32)
+    skipped = -whole.ctypes.data % LINE_BYTES // whole.itemsize
+    return whole[skipped : skipped + size].reshape(lengths)
+
+
+def on_lines(values: npt.NDArray[np.floating]) -> Float32:
+    """A copy."""
+    copy = zeros_on_lines(*values.shape)
+    copy[...] = values
+    return copy
