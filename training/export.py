@@ -14,6 +14,7 @@ import onnx
 import torch
 from torch import nn
 
+from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.errors import NafirError
 from server.field.graph import INPUTS, OUTPUTS, RESPONSE
@@ -187,7 +188,7 @@ def _factorised(
     trained_at = _tensors(_poses(learner.responses, _TRUNCATION_POSES, configuration.seed), _TRUNCATION_POSES)
     lower = sorted({rank for rank in ranks if rank < len(whole.basis)}, reverse=True)
     poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
-    codec = _codec_parameters(cells.codec, cells.known_frames)
+    codec = _codec_parameters(cells.codec, cells.known_frames, cells.all_frames)
     outputs = _outputs(learner)
     traced = to_onnx(ExportedField(whole, cells).eval(), _tensors(poses, 2), outputs)
     exported = []
@@ -246,7 +247,7 @@ def _outputs(learner: FactorisedLearner | NafLearner) -> tuple[str, ...]:
     return OUTPUTS[: 2 + learner.responses.channels]
 
 
-def _codec_parameters(codec: Codec, known_frames: int) -> CodecParameters:
+def _codec_parameters(codec: Codec, known_frames: int, frames: Axis | None = None) -> CodecParameters:
     return CodecParameters(
         sample_rate=codec.sample_rate,
         n_fft=codec.n_fft,
@@ -255,6 +256,7 @@ def _codec_parameters(codec: Codec, known_frames: int) -> CodecParameters:
         lead_samples=LEAD_SAMPLES,
         known_frames=known_frames,
         log_floor=codec.log_floor,
+        frame_cells=None if frames is None else tuple(frames.widths.tolist()),
     )
 
 

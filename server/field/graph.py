@@ -4,16 +4,19 @@ A graph answers in one of two ways. Most give spectrograms, to be decoded; some 
 is aligned: sample `lead_samples` of the coded response is the earliest arrival.
 
 Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians. Of scenes heard by
-one microphone there is one channel in place of the ears, and no coherence between them.
+one microphone there is one channel in place of the ears, and no coherence between them. A graph may tell cells of
+frames (`CodecParameters.frame_cells`) in place of frames: late sound is smooth, and most of the time would go into
+copying what is one number.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.cells import Axis
 from server.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
 from server.scene.bundle import Bundle
@@ -40,6 +43,13 @@ class Spectrograms:
     instantaneous_frequency: Float32
     certainty: Float32
     interaural: Float32
+
+    def spread(self, axis: Axis | None) -> "Spectrograms":
+        """Of every frame, where these are of an axis' cells."""
+        if axis is None:
+            return self
+        to_frames = axis.spread()
+        return replace(self, log_magnitude=self.log_magnitude @ to_frames, interaural=self.interaural @ to_frames)
 
     @property
     def coherence(self) -> npt.NDArray[np.complex64]:
@@ -112,7 +122,11 @@ class FieldGraph:
         return list(self._session.run(self._outputs, _feed(listeners, emitters, yaws)))
 
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
-        """Not of a graph that gives responses."""
+        """Of every frame. Not of a graph that gives responses."""
+        return self.predictions(listeners, emitters, yaws).spread(self.parameters.frame_axis)
+
+    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+        """As the graph tells them: of every frame or of their cells. Not of a graph that gives responses."""
         said = self.run(listeners, emitters, yaws)
         if self.channels == 1:
             rows, _, *axes = said[0].shape
@@ -141,7 +155,8 @@ class FieldGraph:
         if self.gives_responses:
             return {RESPONSE: (1, self.channels, self.parameters.samples)}
         codec, known = self.parameters.codec, self.parameters.known_frames
-        every, first = (1, self.channels, codec.bins, codec.frames), (1, self.channels, codec.bins, known)
+        every = (1, self.channels, codec.bins, self.parameters.columns)
+        first = (1, self.channels, codec.bins, known)
         return dict(zip(self._outputs, (every, first, first, every), strict=False))
 
 

@@ -52,7 +52,8 @@ class Predictions:
         if self.graph.gives_responses:
             magnitude = np.abs(codec.transform(outputs[0])).astype(np.float32)
         else:
-            magnitude = codec.magnitude(outputs[0])
+            axis = self.graph.parameters.frame_axis
+            magnitude = codec.magnitude(outputs[0] if axis is None else outputs[0] @ axis.spread())
         in_bands = self._bands @ np.square(magnitude)
         starts = np.arange(0, in_bands.shape[-1], self._frames)
         return np.add.reduceat(in_bands.astype(np.float64), starts, axis=-1)

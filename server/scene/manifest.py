@@ -16,6 +16,7 @@ from pydantic import Field, field_validator, model_validator
 
 from server.acoustics.air import absorption_db_per_m
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from server.scene.effects import EffectName
@@ -68,7 +69,9 @@ class CodecParameters(Strict):
     """How the field's spectrograms are to be read.
 
     `samples` is the length of a response after alignment: sample `lead_samples` is the moment sound can first arrive.
-    `known_frames` is the number of frames whose phase the field predicts.
+    `known_frames` is the number of frames whose phase the field predicts. Where there are `frame_cells`, each column of
+    log-magnitude and coherence stands for so many frames in place of one: it is what their centre has, and values
+    between two centres go linearly from one to the other.
     """
 
     sample_rate: Annotated[int, Field(ge=8000, le=96000)]
@@ -78,6 +81,7 @@ class CodecParameters(Strict):
     lead_samples: Annotated[int, Field(ge=0)]
     known_frames: Annotated[int, Field(ge=0)]
     log_floor: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    frame_cells: tuple[Annotated[int, Field(ge=1)], ...] | None = None
 
     @model_validator(mode="after")
     def _overlaps_four_times(self) -> "CodecParameters":
@@ -93,7 +97,19 @@ class CodecParameters(Strict):
             raise ValueError(f"lead_samples must be below samples, {self.samples}")
         if self.known_frames > self.codec.frames:
             raise ValueError(f"known_frames must not exceed the {self.codec.frames} frames of a response")
+        if self.frame_cells is not None and sum(self.frame_cells) != self.codec.frames:
+            raise ValueError(f"frame_cells must cover the {self.codec.frames} frames of a response")
         return self
+
+    @property
+    def frame_axis(self) -> Axis | None:
+        """Of the cells of frames; None where every frame is told."""
+        return None if self.frame_cells is None else Axis(np.cumsum([0, *self.frame_cells]))
+
+    @property
+    def columns(self) -> int:
+        """That log-magnitude has: frames, or cells of them."""
+        return self.codec.frames if self.frame_cells is None else len(self.frame_cells)
 
     @property
     def codec(self) -> Codec:

@@ -75,6 +75,8 @@ def test_damaged_manifest_names_the_field(bundle_copy, changes, field):
     [
         (("codec", "lead_samples"), 4_000, "codec: .*lead_samples"),
         (("codec", "known_frames"), 1_000, "codec: .*known_frames"),
+        (("codec", "frame_cells"), [2, 4], "codec: .*frame_cells must cover the 66 frames"),
+        (("codec", "frame_cells"), [0, 65], r"codec\.frame_cells"),
         (("start", "listener"), [9.0, 2.5, 1.5], r"start\.listener"),
         (("start", "listener"), [0.1, 2.5, 1.5], r"start\.listener"),
         (("start", "emitter"), [6.0, 3.0, 2.5], r"start\.emitter"),

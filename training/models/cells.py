@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 
 # Widths in frames after the fine ones, then in bins: (width, count) runs, the last repeated to the end.
@@ -25,33 +26,6 @@ def _edges(total: int, runs: tuple[tuple[int, int | None], ...], start: int = 0)
             edges.append(min(total, edges[-1] + width))
             count = None if count is None else count - 1
     return np.array(edges)
-
-
-@dataclass(frozen=True)
-class Axis:
-    """A partition of `edges[-1] - edges[0]` consecutive steps into cells."""
-
-    edges: npt.NDArray[np.int64]
-
-    @property
-    def cells(self) -> int:
-        return len(self.edges) - 1
-
-    @property
-    def widths(self) -> npt.NDArray[np.int64]:
-        return np.diff(self.edges)
-
-    def pool(self) -> npt.NDArray[np.float32]:
-        """(step, cell) averaging matrix, steps counted from the first edge."""
-        step = np.arange(self.edges[0], self.edges[-1])[:, None]
-        inside = (step >= self.edges[:-1]) & (step < self.edges[1:])
-        return (inside / self.widths).astype(np.float32)
-
-    def spread(self) -> npt.NDArray[np.float32]:
-        """(cell, step) linear interpolation between cell centres, constant beyond the outermost."""
-        centres = (self.edges[:-1] + self.edges[1:] - 1) / 2
-        steps = np.arange(self.edges[0], self.edges[-1])
-        return np.stack([np.interp(steps, centres, row) for row in np.eye(self.cells)]).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """The factorised field: pose -> K coefficients -> learned time-frequency basis (a branch-trunk network).
 
 The contract is that of every field: `listener` (B, 3), `emitter` (B, 3), `yaw` (B,) in; `log_magnitude` (B, 2,
-frequency, frame), `instantaneous_frequency` and `phase_certainty` (B, 2, frequency, known frame),
-`interaural_coherence` (B, 2, frequency, frame; real and imaginary) out. Everything between (geometry, encodings, grid,
-normalisation) lives in the graph.
+frequency, cell of frames), `instantaneous_frequency` and `phase_certainty` (B, 2, frequency, known frame),
+`interaural_coherence` (B, 2, frequency, cell of frames; real and imaginary) out. Everything between (geometry,
+encodings, grid, normalisation) lives in the graph.
 
 Inside, four heads share the coefficients: log-magnitude of the fine frames and of the late cells, mean phasors of the
 known frames, and mean interaural phasors of all cells (see `training.models.cells`). A field of one channel (a
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag
 from torch import Tensor, nn
 
 from server.acoustics.geometry import FloorPlan
@@ -60,9 +59,10 @@ class FeatureGrid(nn.Module):
     def forward(self, position: Tensor) -> Tensor:
         """(..., 2 or 3) metres to (..., features)."""
         offset = position[..., None, :2] - self._nodes
+        squared = torch.sum(offset * offset, dim=-1)
         # An infinite precision would be 0 times infinity on a node.
         precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
-        return torch.softmax(-torch.sum(offset * offset, dim=-1) * precision, dim=-1) @ self._features
+        return torch.softmax(-squared * precision, dim=-1) @ self._features
 
 
 class PoseEncoder(nn.Module):
@@ -223,11 +223,10 @@ class FactorisedField(nn.Module):
 
 
 class ExportedField(nn.Module):
-    """The contract's outputs from a trained field: cells spread to frames and bins, phasors turned into phase and
-    certainty.
+    """The contract's outputs from a trained field: cells spread to bins, phasors turned into phase and certainty. Over
+    time they stay cells, `cells.all_frames`, for whoever decodes them to spread.
 
-    What is spread over frequency alike lies side by side in the basis, and spreading over time comes last, so that few
-    nodes of the graph move large arrays.
+    What is spread over frequency alike lies side by side in the basis, so that few nodes move large arrays.
     """
 
     def __init__(self, field: FactorisedField, cells: Cells) -> None:
@@ -239,11 +238,7 @@ class ExportedField(nn.Module):
         # Units and level correction cost nothing where the basis and one offset have them.
         self.register_buffer("_basis", (field.basis.detach() * field.spread)[:, order], persistent=False)
         self.register_buffer("_offset", (field.mean + field.level_correction)[order], persistent=False)
-        for name, matrix in (
-            ("bands", np.ascontiguousarray(cells.bands.spread().T)),
-            ("fine_and_late_frames", block_diag(np.eye(cells.fine_frames), cells.late_frames.spread())),
-            ("all_frames", cells.all_frames.spread()),
-        ):
+        for name, matrix in (("bands", np.ascontiguousarray(cells.bands.spread().T)),):
             self.register_buffer(f"_{name}", torch.tensor(matrix, dtype=torch.float32), persistent=False)
         nominal = torch.tensor(cells.codec.nominal_advance, dtype=torch.float32)
         self.register_buffer("_nominal_advance", nominal, persistent=False)
@@ -265,10 +260,9 @@ class ExportedField(nn.Module):
         pooled, fine, real, imaginary = torch.split(flat, sizes, dim=1)
         spread = self._bands @ pooled.reshape(-1, *self._pooled_shape)
         late, *interaural = torch.split(spread, [shapes[name][-1] for name in self._pooled], dim=-1)
-        cells = torch.cat([fine.reshape(-1, *shapes["fine"]), late], dim=-1)
-        log_magnitude = torch.clamp(cells, min=self._silence) @ self._fine_and_late_frames
+        log_magnitude = torch.clamp(torch.cat([fine.reshape(-1, *shapes["fine"]), late], dim=-1), min=self._silence)
         frequency, certainty = self._phase(real.reshape(-1, *phasor), imaginary.reshape(-1, *phasor))
-        return log_magnitude, frequency, certainty, *(part @ self._all_frames for part in interaural)
+        return log_magnitude, frequency, certainty, *interaural
 
     def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
         """Instantaneous frequency and certainty of mean phasors (B, ear, frequency, frame)."""

@@ -114,7 +114,7 @@ def test_phase_is_coded_as_the_codec_does(field):
 
 
 def test_a_flat_prediction_comes_out_where_it_belongs(field):
-    """With constant heads, every output of the contract is that constant, in frames and bins of the codec."""
+    """With constant heads, every output of the contract is that constant, in cells of frames and bins of the codec."""
     heads = field.heads
     with torch.no_grad():
         field.basis.zero_()
@@ -127,13 +127,14 @@ def test_a_flat_prediction_comes_out_where_it_belongs(field):
     outputs = ExportedField(field, CELLS)(*poses(2))
     log_magnitude, frequency, certainty, coherence = (output.detach().numpy() for output in outputs)
     codec = CELLS.codec
-    assert log_magnitude.shape == (2, 2, codec.bins, codec.frames)
+    columns = CELLS.all_frames.cells
+    assert log_magnitude.shape == (2, 2, codec.bins, columns)
     np.testing.assert_allclose(log_magnitude[..., : CELLS.fine_frames], -2, atol=1e-5)
     np.testing.assert_allclose(log_magnitude[..., CELLS.fine_frames :], -3, atol=1e-5)
     assert frequency.shape == certainty.shape == (2, 2, codec.bins, CELLS.known_frames)
     np.testing.assert_allclose(np.exp(1j * codec.integrate(frequency)), 1, atol=1e-3)
     np.testing.assert_allclose(certainty, 0.6, atol=1e-5)
-    assert coherence.shape == (2, 2, codec.bins, codec.frames)
+    assert coherence.shape == (2, 2, codec.bins, columns)
     np.testing.assert_allclose(coherence[:, 0], 0.3, atol=1e-5)
     np.testing.assert_allclose(coherence[:, 1], -0.4, atol=1e-5)
 
