@@ -4,7 +4,7 @@ Binary messages, little endian, full scale 1, at the scene's rate; the first byt
 `s16` two's complement with 32767 for full scale.
 """
 
-import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal, Self
 
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.errors import RequestError
+from server.layout import Layout
 
 FloatArray = npt.NDArray[np.float32]
 Encoding = Literal["f32", "s16"]
@@ -35,12 +36,13 @@ def _decode(data: bytes, encoding: Encoding, offset: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class AudioBlock:
-    """One block of audio: `samples` (channel, frame) float32.
+    """One block of audio: `samples` (channel, frame).
 
     `sequence` counts blocks sent and has no gaps; `sample_clock` is the clock of the first frame and jumps over blocks
     the server skipped. `pose_id` is the newest pose that the direct paths of this block are on their way to;
     `reverberation_pose_id` is the newest pose whose impulse responses are all in effect, and with `is_exchange` this
-    block fades to them. With `is_limited` it would have been too loud, and was turned down.
+    block fades to them. With `is_late` it left when a player that keeps `buffer_blocks` in hand had run out of them.
+    With `is_limited` it would have been too loud, and was turned down.
     """
 
     sequence: int
@@ -52,20 +54,28 @@ class AudioBlock:
     is_late: bool = False
     is_limited: bool = False
 
+    type: ClassVar[str] = "audio_block"
     KIND: ClassVar[int] = 1
-    _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBHIQIII")
-    HEADER_BYTES: ClassVar[int] = _LAYOUT.size
-    _EXCHANGE: ClassVar[int] = 1
-    _LATE: ClassVar[int] = 2
-    _LIMITED: ClassVar[int] = 4
+    FLAGS: ClassVar[Mapping[str, int]] = {"is_exchange": 1, "is_late": 2, "is_limited": 4}
+    LAYOUT: ClassVar[Layout] = Layout(
+        ("kind", "B", f"always {KIND}"),
+        ("flags", "B", "sum of " + ", ".join(f"{bit} {name}" for name, bit in FLAGS.items())),
+        ("channels", "H", "2, or 1 for a mono output"),
+        ("sequence", "I", "of blocks sent, from 0, without gaps, modulo 2^32"),
+        ("sample_clock", "Q", "samples from the start of the stream to the first frame"),
+        ("pose_id", "I", "newest pose of the direct sound"),
+        ("reverberation_pose_id", "I", "newest pose of what follows the direct sound"),
+        ("frames", "I", "samples of each channel"),
+        then="the frames, channels interleaved (left, right), in the encoding of the hello",
+    )
+    HEADER_BYTES: ClassVar[int] = LAYOUT.size
 
     def serialize(self, encoding: Encoding) -> bytes:
-        """28-byte header (kind u8 = 1, flags u8: 1 exchange, 2 late, 4 limited, channels u16, sequence u32, sample
-        clock u64, pose id u32, reverberation pose id u32, frames u32), then the frames, channels interleaved."""
+        """By LAYOUT."""
         channels, frames = self.samples.shape
-        flags = self._EXCHANGE * self.is_exchange | self._LATE * self.is_late | self._LIMITED * self.is_limited
+        flags = sum(bit * getattr(self, name) for name, bit in self.FLAGS.items())
         poses = self.pose_id, self.reverberation_pose_id
-        header = self._LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
+        header = self.LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
         return header + _encode(self.samples.T, encoding)
 
     @classmethod
@@ -73,7 +83,7 @@ class AudioBlock:
         """Raises ValueError for anything but a whole audio block."""
         if len(data) < cls.HEADER_BYTES or data[0] != cls.KIND:
             raise ValueError("not an audio block")
-        _, flags, channels, sequence, sample_clock, pose_id, reverberation_pose_id, frames = cls._LAYOUT.unpack_from(
+        _, flags, channels, sequence, sample_clock, pose_id, reverberation_pose_id, frames = cls.LAYOUT.unpack_from(
             data
         )
         interleaved = _decode(data, encoding, cls.HEADER_BYTES)
@@ -85,9 +95,7 @@ class AudioBlock:
             pose_id,
             reverberation_pose_id,
             np.ascontiguousarray(interleaved.reshape(frames, channels).T),
-            bool(flags & cls._EXCHANGE),
-            bool(flags & cls._LATE),
-            bool(flags & cls._LIMITED),
+            **{name: bool(flags & bit) for name, bit in cls.FLAGS.items()},
         )
 
 
@@ -101,27 +109,30 @@ class DryBlock:
 
     type: ClassVar[str] = "dry_block"
     KIND: ClassVar[int] = 3
-    _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBHII")
     _ENCODINGS: ClassVar[tuple[Encoding, ...]] = ("f32", "s16")
     _LONGEST_ID: ClassVar[int] = 256
+    LAYOUT: ClassVar[Layout] = Layout(
+        ("kind", "B", f"always {KIND}"),
+        ("encoding", "B", "of the frames: " + ", ".join(f"{code} {name}" for code, name in enumerate(_ENCODINGS))),
+        ("id_bytes", "H", f"length of the id, at most {_LONGEST_ID}"),
+        ("sequence", "I", "greater than that of the emitter's block before"),
+        ("frames", "I", "samples, at least 1"),
+        then="the id in UTF-8, filled up with zeros to a multiple of four bytes; the samples, of one channel",
+    )
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """kind u8 = 3, encoding u8 (0 f32, 1 s16), bytes of the id u16, sequence u32, frames u32; the id in UTF-8,
-        filled up with zeros to a multiple of four bytes; the frames.
-
-        Raises RequestError malformed_block.
-        """
-        if len(data) < cls._LAYOUT.size:
-            raise _malformed(f"a dry block begins with {cls._LAYOUT.size} bytes, not {len(data)}", "header")
-        _, encoding, id_bytes, sequence, frames = cls._LAYOUT.unpack_from(data)
+        """By LAYOUT. Raises RequestError malformed_block."""
+        if len(data) < cls.LAYOUT.size:
+            raise _malformed(f"a dry block begins with {cls.LAYOUT.size} bytes, not {len(data)}", "header")
+        _, encoding, id_bytes, sequence, frames = cls.LAYOUT.unpack_from(data)
         if encoding >= len(cls._ENCODINGS):
             raise _malformed(f"encoding {encoding} is neither 0 (f32) nor 1 (s16)", "encoding")
         if id_bytes > cls._LONGEST_ID:
             raise _malformed(f"an id has at most {cls._LONGEST_ID} bytes, not {id_bytes}", "id")
-        start = cls._LAYOUT.size + id_bytes
+        start = cls.LAYOUT.size + id_bytes
         try:
-            identifier = data[cls._LAYOUT.size : start].decode()
+            identifier = data[cls.LAYOUT.size : start].decode()
         except UnicodeDecodeError as exc:
             raise _malformed("the id is not UTF-8", "id") from exc
         start += -id_bytes % 4
@@ -132,7 +143,7 @@ class DryBlock:
 
     def serialize(self, encoding: Encoding) -> bytes:
         identifier = self.id.encode()
-        header = self._LAYOUT.pack(
+        header = self.LAYOUT.pack(
             self.KIND, self._ENCODINGS.index(encoding), len(identifier), self.sequence, self.samples.size
         )
         return header + identifier + bytes(-len(identifier) % 4) + _encode(self.samples, encoding)

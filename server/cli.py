@@ -291,6 +291,14 @@ def plan(
         print_plan(document)
 
 
+@app.command()
+def protocol() -> None:
+    """Print the AsyncAPI document of the live stream, as a server has it at /asyncapi.json."""
+    from server.asyncapi import document
+
+    typer.echo(document())
+
+
 def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "RenderedEmitter":
     """`CLIP@x,y,z`, where CLIP names a bundled clip, or else an audio file."""
     from server.acoustics.geometry import Pose

@@ -8,7 +8,6 @@ Every type here parses and serialises itself, so the tests, the documentation an
 definition. What a client sends is validated here, once; a `RequestError` carries the code that goes back to it.
 """
 
-import struct
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
@@ -20,6 +19,7 @@ from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose, Quaternion
 from server.blocks import DryBlock, Encoding
 from server.errors import RequestError
+from server.layout import Layout
 from server.load import AUTO
 from server.message import Message, Position
 from server.scene.situation import Output
@@ -70,11 +70,12 @@ class ListenerStart(_Directed):
 
 
 class Hello(Message):
-    """First message. `sample_rate` may be left out; given, it has to be the scene's. `buffer_blocks` is how many blocks
-    ahead of real time the server runs: more survives a worse network, less is heard sooner. `hrtf` names the head to
-    hear through, one of GET /v1/hrtfs. `level` names a quality level of the scene, or leaves it to the server (auto):
-    the best that its host computes in time, and a cheaper one under load. `output` is what the sound is heard from: a
-    mono loudspeaker gets blocks of one channel. `effects` switches some on or off whatever the plan would decide."""
+    """The first message: asks for a scene, and how to hear it. `sample_rate` may be left out; given, it has to be the
+    scene's. `buffer_blocks` is how many blocks ahead of real time the server runs: more survives a worse network, less
+    is heard sooner. `hrtf` names the head to hear through, one of GET /v1/hrtfs. `level` names a quality level of the
+    scene, or leaves it to the server (auto): the best that its host computes in time, and a cheaper one under load.
+    `output` is what the sound is heard from: a mono loudspeaker gets blocks of one channel. `effects` switches some on
+    or off whatever the plan would decide."""
 
     type: Literal["hello"] = "hello"
     protocol: int
@@ -124,7 +125,7 @@ class DirectivityPattern(Message):
 
 
 class AddEmitter(_Directed):
-    """An emitter that plays a clip, or, with `live`, what the client sends for it in dry blocks (`server.blocks`).
+    """An emitter that plays a clip, or, with `live`, what the client sends for it in dry blocks.
 
     Its front matters to its directivity only; without one it is equally loud all round.
     """
@@ -177,30 +178,38 @@ class SetEffects(Message):
 
 
 class RemoveEmitter(Message):
+    """An emitter falls silent and its id is free again."""
+
     type: Literal["remove_emitter"] = "remove_emitter"
     id: EmitterId
 
 
 class ListenerPose(_Directed):
-    """Newest pose of the listener; as text, or as the 36-byte binary form of `parse_binary`."""
+    """Newest pose of the listener, as text or in 36 bytes."""
 
     type: Literal["listener"] = "listener"
     pose_id: PoseId
 
     KIND: ClassVar[int] = 2
-    _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBHI7f")
+    LAYOUT: ClassVar[Layout] = Layout(
+        ("kind", "B", f"always {KIND}"),
+        ("zeros", "3x", "fill the header up"),
+        ("pose_id", "I", "greater than any before, of the listener and of emitters"),
+        ("position", "3f", "x, y, z in metres"),
+        ("orientation", "4f", "quaternion x, y, z, w; the identity looks along +x"),
+    )
 
     @classmethod
     def parse_binary(cls, data: bytes) -> Self:
-        """kind u8 = 2, three zero bytes, pose id u32, position 3 x f32, orientation 4 x f32 (x, y, z, w).
+        """By LAYOUT.
 
         Raises RequestError: unknown_message for another kind, malformed_pose for a wrong length or impossible numbers.
         """
         if not data or data[0] != cls.KIND:
             raise RequestError("unknown_message", f"binary message of unknown kind {data[0] if data else 'none'}")
-        if len(data) != cls._LAYOUT.size:
-            raise RequestError("malformed_pose", f"a binary pose has {cls._LAYOUT.size} bytes, not {len(data)}")
-        _, _, _, pose_id, *numbers = cls._LAYOUT.unpack(data)
+        if len(data) != cls.LAYOUT.size:
+            raise RequestError("malformed_pose", f"a binary pose has {cls.LAYOUT.size} bytes, not {len(data)}")
+        _, pose_id, *numbers = cls.LAYOUT.unpack(data)
         try:
             return cls(pose_id=pose_id, position=tuple(numbers[:3]), orientation=tuple(numbers[3:]))
         except ValidationError as exc:
@@ -208,7 +217,7 @@ class ListenerPose(_Directed):
 
     def serialize_binary(self) -> bytes:
         pose = self.pose
-        return self._LAYOUT.pack(self.KIND, 0, 0, self.pose_id, *pose.position, *pose.orientation)
+        return self.LAYOUT.pack(self.KIND, self.pose_id, *pose.position, *pose.orientation)
 
 
 class Acknowledge(Message):
@@ -219,6 +228,8 @@ class Acknowledge(Message):
 
 
 class Ping(Message):
+    """Asks for a pong at once, to measure the way there and back."""
+
     type: Literal["ping"] = "ping"
     id: Annotated[int, Field(ge=0, lt=2**53)]  # what JavaScript counts exactly
 

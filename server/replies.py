@@ -74,13 +74,15 @@ class EmitterAdded(Message):
 
 
 class EmitterRemoved(Message):
+    """The emitter is gone, and its id free."""
+
     type: Literal["emitter_removed"] = "emitter_removed"
     id: str
 
 
 class LevelChanged(Message):
     """From `sample_clock` on another quality is heard: impulse responses of `level`, at most `ir_rate_hz` a second for
-    each emitter or, where that is None, one with every pose; with `shared_tail` all emitters share one late tail.
+    each emitter or, where that is null, one with every pose; with `shared_tail` all emitters share one late tail.
 
     `reason` is chosen (by the client), load (there is too much to do for what was heard before) or recovered (there no
     longer is).
@@ -132,7 +134,7 @@ class PlanChanged(Message):
 
 
 class Durations(Message):
-    """Milliseconds that a half, 99 % and 99.9 % did not exceed; None before the first."""
+    """Milliseconds that a half, 99 % and 99.9 % did not exceed; null before the first."""
 
     p50: float | None
     p99: float | None
@@ -159,7 +161,7 @@ class LiveStatus(Message):
 
 
 class Status(Message):
-    """Once a second. Counts and durations run from the start of the stream.
+    """How the stream does, once a second. Counts and durations run from the start of the stream.
 
     `buffer_ms` is how far ahead of real time it is. `render_ms` is what a block costs; of blocks rendered together with
     other streams', its share. `lateness_ms` is how long after it was due a block was ready to be sent: what it cost,
@@ -189,6 +191,8 @@ class Status(Message):
 
 
 class Pong(Message):
+    """Answer to the ping of this id."""
+
     type: Literal["pong"] = "pong"
     id: int
 

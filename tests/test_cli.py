@@ -15,6 +15,7 @@ import pytest
 import soundfile
 
 from server.acoustics.geometry import Pose
+from server.asyncapi import document
 from server.cli import main
 from server.clips import ClipLibrary
 from server.direct_sound import DirectSound
@@ -109,6 +110,12 @@ def test_ir_says_what_is_wrong_in_one_line(nafir, bundle, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     check_error(nafir("ir", bundle.folder, *arguments), word)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_protocol_prints_the_document_that_a_server_has(nafir):
+    code, said, _ = nafir("protocol")
+    assert code == 0
+    assert said == document() + "\n"
 
 
 def test_an_unknown_scene_is_named(nafir, tmp_path):
