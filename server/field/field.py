@@ -128,6 +128,8 @@ class AcousticField:
     def _compute_all(
         self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None = None
     ) -> Float32:
+        if len(yaws) <= _CHUNK:
+            return self._compute(listeners, emitters, yaws, cache)
         responses = np.empty((len(yaws), self.channels, self.ir_samples), dtype=np.float32)
         for start in range(0, len(yaws), _CHUNK):
             part = slice(start, start + _CHUNK)
@@ -173,7 +175,7 @@ class AcousticField:
             predicted = predicted.twice()
         if cache is None:
             responses = self._decoder.decode(predicted, aligned)
-            return self._finite(responses, listeners, emitters)[:, : self.channels]
+            return np.ascontiguousarray(self._finite(responses, listeners, emitters)[:, : self.channels])
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
         # One after the other: each may start from the one before it.
         for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
@@ -181,12 +183,13 @@ class AcousticField:
             responses[rows] = self._decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
             self._finite(responses[rows], listeners[rows], emitters[rows])  # before others start from it
             cache.keep(*pose, responses[row])
-        return responses[:, : self.channels]
+        return np.ascontiguousarray(responses[:, : self.channels])
 
     def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
         """The responses. Raises FieldError naming the first that is not finite."""
         # A sum is quicker to look at than its parts; what overflows it is no response either.
-        wrong = ~np.isfinite(np.sum(np.square(responses), axis=(1, 2)))
+        flat = responses.reshape(len(responses), -1)
+        wrong = ~np.isfinite(np.vecdot(flat, flat))
         if wrong.any():
             at = int(np.argmax(wrong))
             raise FieldError(
