@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from server.acoustics.simd import LANES, load, store
 from server.compiled import compiled
-from server.memory import Spares
 from server.rendering import right_angle
 from server.rendering.partitions import Partitioning
+from server.rendering.spares import Spares
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
