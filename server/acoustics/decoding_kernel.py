@@ -56,13 +56,15 @@ class Shape(NamedTuple):
 
 class Workspace(NamedTuple):
     """`edge` (4, bin, 8) is a prediction's eight frames where it begins or ends: logarithms left and right, coherence
-    real and imaginary. `last` (bin, 6, 8) has what the next eight frames need of the last: the noise's magnitudes left
-    and right, its coherence real and imaginary, targets left and right. `known` (bin, 6, frame) are phasors left and
-    right, real and imaginary, and certainties, with eight zeros before and after them; `known_row` phases and
-    certainties of both ears for one bin. `frames`, `carried` and `rows` are `synthesise_next`'s, `sounded` (2, sample)
-    what it gives where that is not all heard. `targets` are (bin, ear, frame); the totals (2, sample)."""
+    real and imaginary; `magnitudes` are (bin, 2, 8). `last` (bin, 6, 8) has what the next eight frames need of the
+    last: the noise's magnitudes left and right, its coherence real and imaginary, targets left and right. `known` (bin,
+    6, frame) are phasors left and right, real and imaginary, and certainties, with eight zeros before and after them;
+    `known_row` phases and certainties of both ears for one bin. `frames`, `carried` and `rows` are `synthesise_next`'s,
+    `sounded` (2, sample) what it gives where that is not all heard. `targets` are (bin, ear, frame); the totals
+    (2, sample)."""
 
     edge: Float32
+    magnitudes: Float32
     last: Float32
     known_row: Float32
     known: Float32
@@ -82,6 +84,7 @@ class Workspace(NamedTuple):
 
         return cls(
             edge=zeros_on_lines(4, shape.bins, LANES),
+            magnitudes=zeros_on_lines(shape.bins, 2, LANES),
             last=zeros_on_lines(shape.bins, 6, LANES),
             known_row=zeros_on_lines(4, known_width),
             known=zeros_on_lines(shape.bins, 6, LANES + known_width + LANES),
@@ -150,7 +153,7 @@ def _know(frequency, certainty, turn, shape, work) -> None:
             phase = 0.0
             for j in range(shape.known):
                 phase += frequency[ear, bin_, j]
-                phase -= 2 * math.pi * math.floor(phase / (2 * math.pi) + 0.5)
+                phase -= 2 * math.pi * math.floor(phase * (0.5 / math.pi) + 0.5)
                 # Four hops are one window: a bin's centre advances by whole quarters of a turn.
                 work.known_row[ear, j] = phase + 0.5 * math.pi * (bin_ * j % 4) + bin_ * turn
                 work.known_row[2 + ear, j] = 1.0 if shape.all_is_certain else certainty[ear, bin_, j]
@@ -181,8 +184,14 @@ def _predicted(log_magnitude, interaural, j, shape, work):
 
 
 @compiled
-def _magnitude(levels, at, floor):
-    return at_least(subtract(exponential(load(levels, at)), floor), broadcast(np.float32(0.0)))
+def _find_magnitudes(levels, other, step, shape, work) -> None:
+    """Of eight frames, from logarithms at `levels`: by themselves, for the constants take most registers."""
+    zero, floor = broadcast(np.float32(0.0)), broadcast(np.float32(shape.log_floor))
+    magnitudes = work.magnitudes.ctypes.data
+    for bin_ in range(shape.bins):
+        at, to = bin_ * step, 2 * LANES * bin_
+        store(magnitudes, to, at_least(subtract(exponential(load(levels, at)), floor), zero))
+        store(magnitudes, to + LANES, at_least(subtract(exponential(load(levels, other + at)), floor), zero))
 
 
 @compiled
@@ -227,9 +236,11 @@ def _compose(t, whole, share, log_magnitude, interaural, shape, n_fft, noise, pu
     `correlated_noise` do, delayed by `whole` frames and a share of one; and of targets, if any are asked for."""
     zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
     undecided, most = broadcast(np.float32(UNDECIDED)), broadcast(np.float32(MOST_COHERENT))
-    floor, later = broadcast(np.float32(shape.log_floor)), broadcast(share)
+    later = broadcast(share)
     j = t - whole
     levels, coherences, other, step = _predicted(log_magnitude, interaural, j, shape, work)
+    _find_magnitudes(levels, other, step, shape, work)
+    magnitudes = work.magnitudes.ctypes.data
     is_known = -LANES < j < shape.known
     known_width, width = work.known.shape[2], work.targets.shape[2]
     heard = max(0, t)  # what comes of frames before is overwritten
@@ -237,7 +248,7 @@ def _compose(t, whole, share, log_magnitude, interaural, shape, n_fft, noise, pu
     for bin_ in range(shape.bins):
         at = bin_ * step
         last = work.last[bin_].ctypes.data
-        ml, mr = _magnitude(levels, at, floor), _magnitude(levels, other + at, floor)
+        ml, mr = load(magnitudes, 2 * LANES * bin_), load(magnitudes, 2 * LANES * bin_ + LANES)
         if purpose != WHOLE:
             targets = work.targets[bin_].ctypes.data
             store(targets, heard, _later(last, 4 * LANES, ml, later))
@@ -275,17 +286,17 @@ def _compose(t, whole, share, log_magnitude, interaural, shape, n_fft, noise, pu
 def _add_known(log_magnitude, interaural, start, shape, windows, work, response) -> None:
     """The known part from sample `start` of the response on, as far as both reach."""
     frames = work.frames.ctypes.data
-    floor = broadcast(np.float32(shape.log_floor))
+    magnitudes = work.magnitudes.ctypes.data
     width = work.known.shape[2]
     begin, end = max(0, start), min(response.shape[1], start + shape.samples)
     at = start - shape.frame_lead
     _clear(work.carried)
     for j in range(0, shape.known, LANES):
         levels, _, other, step = _predicted(log_magnitude, interaural, j, shape, work)
+        _find_magnitudes(levels, other, step, shape, work)
         for bin_ in range(shape.bins):
             known = work.known[bin_].ctypes.data
-            ml = _magnitude(levels, bin_ * step, floor)
-            mr = _magnitude(levels, other + bin_ * step, floor)
+            ml, mr = load(magnitudes, 2 * LANES * bin_), load(magnitudes, 2 * LANES * bin_ + LANES)
             place_bin(
                 frames,
                 windows.n_fft,

@@ -25,6 +25,8 @@ _INTEGERS = ir.VectorType(_INT32, LANES)
 
 # Split so that small multiples of the first parts are exact (Cody and Waite 1980).
 _LN_2 = (0.693359375, math.log(2) - 0.693359375)
+# (exp(x) - 1 - x) / x**2, the highest power first: nearest to exp within half of ln 2, relative, to 1.05e-7.
+_EXPONENTIAL = [8.31250137619232e-3, 4.1890331599848334e-2, 0.16667115387827203, 0.49999230308875753]
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
 _LAST_FIRST = [7, 0, 1, 2, 3, 4, 5, 6]
@@ -249,15 +251,18 @@ def square_root(_context: Any, _x: Any) -> Any:
 
 @intrinsic
 def exponential(_context: Any, _x: Any) -> Any:
-    """exp(x) to 2e-7; of less than -87 or more than 88 that of these."""
+    """exp(x) to 2.2e-7; of less than -87 or more than 88 that of these."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         low, high = _constant(-87.0), _constant(88.0)
         x = builder.select(builder.fcmp_ordered("<", args[0], low), low, args[0])
         x = builder.select(builder.fcmp_ordered(">", x, high), high, x)
         halvings, rest = _nearest_multiple(builder, x, _LN_2, 1 / math.log(2))
-        # Taylor's, within half of ln 2; the next term is below 3e-8.
-        value = _polynomial(builder, rest, [1 / math.factorial(power) for power in range(7, -1, -1)])
+        # Its halves side by side: one after the other, powers would wait for each other.
+        square = builder.fmul(rest, rest)
+        high = _polynomial(builder, rest, _EXPONENTIAL[:2])
+        value = _call(builder, "fma", square, high, _polynomial(builder, rest, _EXPONENTIAL[2:]))
+        value = _call(builder, "fma", square, value, builder.fadd(rest, _constant(1.0)))
         bits = builder.shl(halvings, ir.Constant(_INTEGERS, [23] * LANES))
         scale = builder.add(bits, ir.Constant(_INTEGERS, [127 << 23] * LANES))
         return builder.fmul(value, builder.bitcast(scale, _VECTOR))
