@@ -37,8 +37,8 @@ def answer(session, levels):
 
 
 def graph_calls(field, monkeypatch):
-    calls, spectrograms = [], field.graph.spectrograms
-    monkeypatch.setattr(field.graph, "spectrograms", lambda *poses: calls.append(poses) or spectrograms(*poses))
+    calls, predictions = [], field.graph.predictions
+    monkeypatch.setattr(field.graph, "predictions", lambda *poses: calls.append(poses) or predictions(*poses))
     return calls
 
 

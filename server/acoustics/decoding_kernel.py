@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.cache_lines import zeros_on_lines
+from server.acoustics.columns_kernel import NOTHING, Columns, spread_columns
 from server.acoustics.phase import MOST_COHERENT, UNDECIDED
 from server.acoustics.simd import (
     LANES,
@@ -37,8 +38,6 @@ Float32 = npt.NDArray[np.float32]
 
 WHOLE, START, TARGETS = 0, 1, 2
 """What `decode` is for: a response; what iterations can start from, and their targets; targets alone."""
-_NOTHING = -1e30
-"""Logarithm of the magnitude where nothing is predicted."""
 
 
 class Shape(NamedTuple):
@@ -55,15 +54,15 @@ class Shape(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """`edge` (4, bin, 8) is a prediction's eight frames where it begins or ends: logarithms left and right, coherence
-    real and imaginary; `magnitudes` are (bin, 2, 8). `last` (bin, 6, 8) has what the next eight frames need of the
-    last: the noise's magnitudes left and right, its coherence real and imaginary, targets left and right. `known` (bin,
-    6, frame) are phasors left and right, real and imaginary, and certainties, with eight zeros before and after them;
-    `known_row` phases and certainties of both ears for one bin. `frames`, `carried` and `rows` are `synthesise_next`'s,
-    `sounded` (2, sample) what it gives where that is not all heard. `targets` are (bin, ear, frame); the totals
-    (2, sample)."""
+    """`eight` (4, bin, 8) are a prediction's frames where it begins or ends, or tells cells: logarithms left and right,
+    coherence real and imaginary; `magnitudes` are (bin, 2, 8). `last` (bin, 6, 8) has what the next eight frames need
+    of the last: the noise's magnitudes left and right, its coherence real and imaginary, targets left and right.
+    `known` (bin, 6, frame) are phasors left and right, real and imaginary, and certainties, with eight zeros before and
+    after them; `known_row` phases and certainties of both ears for one bin. `frames`, `carried` and `rows` are
+    `synthesise_next`'s, `sounded` (2, sample) what it gives where that is not all heard. `targets` are (bin, ear,
+    frame); the totals (2, sample)."""
 
-    edge: Float32
+    eight: Float32
     magnitudes: Float32
     last: Float32
     known_row: Float32
@@ -83,7 +82,7 @@ class Workspace(NamedTuple):
         length = (width + 3) * hop if iterates else 0
 
         return cls(
-            edge=zeros_on_lines(4, shape.bins, LANES),
+            eight=zeros_on_lines(4, shape.bins, LANES),
             magnitudes=zeros_on_lines(shape.bins, 2, LANES),
             last=zeros_on_lines(shape.bins, 6, LANES),
             known_row=zeros_on_lines(4, known_width),
@@ -111,6 +110,7 @@ def decode(
     certainty: Float32,
     interaural: Float32,
     aligned: npt.NDArray[np.float64],
+    columns: Columns,
     shape: Shape,
     windows: Windows,
     noise: Float32,
@@ -119,15 +119,27 @@ def decode(
     work: Workspace,
     output: Float32,
 ) -> None:
-    """Predictions as of `server.field.graph.Spectrograms`, `aligned` (B,) the sample, not necessarily whole, at which
-    each of them starts; to `output` (B, 2, sample). Targets are left in `work`, those of the last row."""
+    """Predictions as of `server.field.graph.Spectrograms`, of frames or of `columns`; `aligned` (B,) the sample, not
+    necessarily whole, at which each of them starts; to `output` (B, 2, sample). Targets are left in `work`, those of
+    the last row."""
     for row in range(output.shape[0]):
         start = math.floor(aligned[row])
         turn = -2.0 * math.pi / windows.n_fft * (aligned[row] - start)
         _know(frequency[row], certainty[row], turn, shape, work)
-        _add_noise(log_magnitude[row], interaural[row], aligned[row], shape, windows, noise, purpose, work, output[row])
+        _add_noise(
+            log_magnitude[row],
+            interaural[row],
+            aligned[row],
+            columns,
+            shape,
+            windows,
+            noise,
+            purpose,
+            work,
+            output[row],
+        )
         if purpose != TARGETS:
-            _add_known(log_magnitude[row], interaural[row], start, shape, windows, work, output[row])
+            _add_known(log_magnitude[row], interaural[row], start, columns, shape, windows, work, output[row])
         if purpose == WHOLE:
             open_gate(gate, start, output[row])
 
@@ -168,19 +180,27 @@ def _know(frequency, certainty, turn, shape, work) -> None:
 
 
 @compiled
-def _predicted(log_magnitude, interaural, j, shape, work):
+def _predicted(log_magnitude, interaural, j, columns, shape, work):
     """Where eight frames from `j` on are: addresses of the left ear's logarithms and of the coherence's real part, how
     far those of the other ear and the imaginary part are from these, and one bin from the next."""
-    if j >= 0 and j + LANES <= shape.used:
+    if columns.first.size > 0:
+        spread_columns(columns, j, log_magnitude, interaural, work.eight)
+    elif j >= 0 and j + LANES <= shape.used:
         levels, coherences = log_magnitude.ctypes.data + 4 * j, interaural.ctypes.data + 4 * j
         return levels, coherences, log_magnitude.strides[0] // 4, log_magnitude.strides[1] // 4
-    for bin_ in range(shape.bins):
+    else:
+        _copy_what_is_there(log_magnitude, interaural, j, shape.used, work.eight)
+    return work.eight.ctypes.data, work.eight[2].ctypes.data, LANES * shape.bins, LANES
+
+
+@compiled
+def _copy_what_is_there(log_magnitude, interaural, j, used, eight) -> None:
+    for bin_ in range(eight.shape[1]):
         for lane in range(LANES):
-            is_there = 0 <= j + lane < shape.used
+            is_there = 0 <= j + lane < used
             for part in range(2):
-                work.edge[part, bin_, lane] = log_magnitude[part, bin_, j + lane] if is_there else _NOTHING
-                work.edge[2 + part, bin_, lane] = interaural[part, bin_, j + lane] if is_there else 0.0
-    return work.edge.ctypes.data, work.edge[2].ctypes.data, LANES * shape.bins, LANES
+                eight[part, bin_, lane] = log_magnitude[part, bin_, j + lane] if is_there else NOTHING
+                eight[2 + part, bin_, lane] = interaural[part, bin_, j + lane] if is_there else 0.0
 
 
 @compiled
@@ -202,7 +222,7 @@ def _later(last, at, now, share):
 
 
 @compiled
-def _add_noise(log_magnitude, interaural, aligned, shape, windows, noise, purpose, work, response) -> None:
+def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, noise, purpose, work, response) -> None:
     """To a response that is nothing as yet."""
     hop = windows.n_fft // 4
     whole, share, first, stop = delay_of(aligned, shape, hop)
@@ -213,9 +233,9 @@ def _add_noise(log_magnitude, interaural, aligned, shape, windows, noise, purpos
     if purpose != TARGETS:
         silence(response, 0, at)
     if whole < 0:  # what sounds at once is preceded by what would have sounded before
-        _compose(-LANES, whole, share, log_magnitude, interaural, shape, windows.n_fft, noise, purpose, work)
+        _compose(-LANES, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, work)
     for t in range(first, stop, LANES):
-        _compose(t, whole, share, log_magnitude, interaural, shape, windows.n_fft, noise, purpose, work)
+        _compose(t, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, work)
         if purpose != TARGETS:
             at = _sound(t * hop - shape.frame_lead, 0, end, False, windows, work, response)
     if purpose != TARGETS:
@@ -231,14 +251,14 @@ def _add_noise(log_magnitude, interaural, aligned, shape, windows, noise, purpos
 
 
 @compiled
-def _compose(t, whole, share, log_magnitude, interaural, shape, n_fft, noise, purpose, work) -> None:
+def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, noise, purpose, work) -> None:
     """Eight frames, from frame `t` on, of frozen noise that makes up the rest, as `server.acoustics.phase.separate` and
     `correlated_noise` do, delayed by `whole` frames and a share of one; and of targets, if any are asked for."""
     zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
     undecided, most = broadcast(np.float32(UNDECIDED)), broadcast(np.float32(MOST_COHERENT))
     later = broadcast(share)
     j = t - whole
-    levels, coherences, other, step = _predicted(log_magnitude, interaural, j, shape, work)
+    levels, coherences, other, step = _predicted(log_magnitude, interaural, j, columns, shape, work)
     _find_magnitudes(levels, other, step, shape, work)
     magnitudes = work.magnitudes.ctypes.data
     is_known = -LANES < j < shape.known
@@ -283,7 +303,7 @@ def _compose(t, whole, share, log_magnitude, interaural, shape, n_fft, noise, pu
 
 
 @compiled
-def _add_known(log_magnitude, interaural, start, shape, windows, work, response) -> None:
+def _add_known(log_magnitude, interaural, start, columns, shape, windows, work, response) -> None:
     """The known part from sample `start` of the response on, as far as both reach."""
     frames = work.frames.ctypes.data
     magnitudes = work.magnitudes.ctypes.data
@@ -292,7 +312,7 @@ def _add_known(log_magnitude, interaural, start, shape, windows, work, response)
     at = start - shape.frame_lead
     _clear(work.carried)
     for j in range(0, shape.known, LANES):
-        levels, _, other, step = _predicted(log_magnitude, interaural, j, shape, work)
+        levels, _, other, step = _predicted(log_magnitude, interaural, j, columns, shape, work)
         _find_magnitudes(levels, other, step, shape, work)
         for bin_ in range(shape.bins):
             known = work.known[bin_].ctypes.data

@@ -14,6 +14,7 @@ from server.field.graph import Spectrograms
 from server.scene.manifest import CodecParameters, Phase
 
 if HAS_NUMBA:
+    from server.acoustics.columns_kernel import Columns
     from server.acoustics.decoding_kernel import (
         START,
         TARGETS,
@@ -57,8 +58,10 @@ class Decoder:
         self._known = min(parameters.known_frames, self._used)
         self._gate = onset_gate(parameters)
         n_fft = self._codec.n_fft
-        self._is_compiled = is_compiled and n_fft & (n_fft - 1) == 0 and self._codec.frames >= LANES
+        self._axis = parameters.frame_axis
+        self._is_compiled = is_compiled and n_fft & (n_fft - 1) == 0 and parameters.columns >= LANES
         if self._is_compiled:
+            self._columns = Columns.of(self._axis, self._used)
             self._windows = Windows.of(self._codec)
             self._shape = Shape(
                 bins=self._codec.bins,
@@ -73,7 +76,8 @@ class Decoder:
             self._workspaces: list[Workspace] = []
 
     def decode(self, predicted: Spectrograms, aligned: Floats, near: Sequence[Float32 | None] | None = None) -> Float32:
-        """(B, 2, ir_samples) of predictions whose first sample is at `aligned` (B,), whole or not, of the response.
+        """(B, 2, ir_samples) of predictions, of frames or of their cells, whose first sample is at `aligned` (B,),
+        whole or not, of the response.
 
         `near` (B) are responses to take over the phase from, where there are any and the phase is warm.
         """
@@ -120,6 +124,7 @@ class Decoder:
             predicted.certainty,
             predicted.interaural,
             aligned,
+            self._columns,
             self._shape,
             self._windows,
             self._noise.parts,
@@ -132,7 +137,7 @@ class Decoder:
     def decode_with_numpy(self, predicted: Spectrograms, aligned: Floats, near: Sequence[Float32 | None]) -> Float32:
         """What `decode` does where nothing can be compiled."""
         codec, phase = self._codec, self._phase
-        predicted = self._first_frames(predicted)
+        predicted = self._first_frames(predicted.spread(self._axis))
         start = np.floor(aligned).astype(int)
         certainty = predicted.certainty if phase.kind != "integrated" else np.ones_like(predicted.certainty)
         magnitude = codec.magnitude(predicted.log_magnitude)

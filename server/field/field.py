@@ -169,7 +169,7 @@ class AcousticField:
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, yaws)
             return self._finite(self._placed(coded, aligned), listeners, emitters)
-        predicted = self.graph.spectrograms(listeners, emitters, yaws)
+        predicted = self.graph.predictions(listeners, emitters, yaws)
         if self.channels == 1:
             # Decoders have two ears; a lone microphone is the left one.
             predicted = predicted.twice()

@@ -39,6 +39,7 @@ class DoubleDecoder(Decoder):
         parameters = field.graph.parameters
         self.ir_samples = field.ir_samples
         self._codec = parameters.codec
+        self._frame_axis = parameters.frame_axis
         self._gate = gate
         self._phase = field.level.phase
         self._used = field.level.frames or self._codec.frames
@@ -50,6 +51,7 @@ class DoubleDecoder(Decoder):
         self, predicted: Spectrograms, aligned: _Floats, near: Sequence[_Float32 | None] | None = None
     ) -> _Float32:
         near = near or [None] * len(aligned)
+        predicted = predicted.spread(self._frame_axis)
         rows = [
             self._decode(predicted[row : row + 1], float(start), response)
             for row, (start, response) in enumerate(zip(aligned, near, strict=True))

@@ -6,7 +6,8 @@ from numpy.testing import assert_allclose
 from onnx import TensorProto, helper, numpy_helper
 
 from server.errors import BundleError
-from server.field.field import AcousticField
+from server.field.decoder import Decoder
+from server.field.field import AcousticField, frozen_noise
 from server.field.graph import OUTPUTS
 from server.field.levels import Levels
 from server.scene.bundle import write_bundle
@@ -110,6 +111,17 @@ def test_spectrograms_and_energy_are_of_frames(fields):
     found, expected = cells.spectrograms(*POSE), frames.spectrograms(*POSE)
     assert_allclose(found.log_magnitude, expected.log_magnitude, atol=1e-5)
     assert_allclose(found.coherence, expected.coherence, atol=1e-5)
+
+
+def test_numpy_decodes_cells_as_compiled_code_does(fields, codec):
+    field, _ = fields("frozen")
+    noise = frozen_noise(field.bundle, field.graph)
+    compiled, plain = (
+        Decoder(codec, noise, ir_samples=codec.samples, phase=Phase(), is_compiled=is_compiled)
+        for is_compiled in (True, False)
+    )
+    predicted, at = field.graph.predictions(*POSE), np.array([130.4])
+    assert difference_db(compiled.decode(predicted, at), plain.decode(predicted, at)) < -90
 
 
 def test_cells_that_the_graph_does_not_have_are_a_bundle_error(bundle, tmp_path, codec, told):

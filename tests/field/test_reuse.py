@@ -28,8 +28,8 @@ def reusing(bundle, graph, kept=None, **reuse):
 
 def counted(field, monkeypatch):
     """How many poses its graph is asked for."""
-    asked, spectrograms = [], field.graph.spectrograms
-    monkeypatch.setattr(field.graph, "spectrograms", lambda *poses: asked.extend(poses[2]) or spectrograms(*poses))
+    asked, predictions = [], field.graph.predictions
+    monkeypatch.setattr(field.graph, "predictions", lambda *poses: asked.extend(poses[2]) or predictions(*poses))
     return asked
 
 
