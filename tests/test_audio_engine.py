@@ -158,10 +158,10 @@ def test_after_a_stall_streams_still_fall_due_apart(stage):
 
 
 def test_the_gap_that_a_stream_leaves_is_filled_first(stage):
-    streams = [stage.open(lead=1)[0] for _ in range(PHASES)]
+    _, leaving, *_ = [stage.open(lead=1)[0] for _ in range(2 * PHASES)]
     stage.run(3 * BLOCK_S)
-    gap = (streams[2].due_s - stage.clock.now_s) % BLOCK_S
-    stage.engine.close(streams[2])
+    gap = (leaving.due_s - stage.clock.now_s) % BLOCK_S
+    stage.engine.close(leaving)
     late, _ = stage.open(lead=1)
     stage.run(3 * BLOCK_S)
     assert (late.due_s - stage.clock.now_s) % BLOCK_S == pytest.approx(gap, abs=1e-6)
