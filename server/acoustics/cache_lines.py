@@ -9,7 +9,8 @@ LINE_BYTES = 64
 
 
 def zeros_on_lines(*lengths: int) -> Float32:
-    """As `numpy.zeros`, which promises 16 bytes."""
+    """As `numpy.zeros`, which promises 16 bytes. Pages are mapped when first written, so what is not used costs
+    nothing."""
     size = int(np.prod(lengths))
     line = LINE_BYTES // np.float32().itemsize
     whole = np.zeros(size + line, dtype=np.float32)

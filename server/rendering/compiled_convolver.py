@@ -3,12 +3,13 @@
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.cache_lines import zeros_on_lines
 from server.acoustics.simd import LANES
 from server.rendering import right_angle
 from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
-from server.rendering.packed_filter import PackedFilter, address, aligned, pack
+from server.rendering.packed_filter import PackedFilter, address, pack
 from server.rendering.partitions import Partitioning, Stage
 
 FloatArray = npt.NDArray[np.float32]
@@ -36,19 +37,19 @@ class CompiledConvolver:
         block_size, history = partitioning.block_size, partitioning.history_blocks
         stages = partitioning.stages
         self._partitioning = partitioning
-        self.input = aligned(sources, block_size)
-        self.output = aligned(channels, block_size)
+        self.input = zeros_on_lines(sources, block_size)
+        self.output = zeros_on_lines(channels, block_size)
         self.silent: IntArray = np.zeros(sources, np.int64)
         self.exchanged: IntArray = np.zeros(sources, np.int64)
-        self.tail_gain = aligned(2, sources)
-        self._history = aligned(sources, history * block_size)
+        self.tail_gain = zeros_on_lines(2, sources)
+        self._history = zeros_on_lines(sources, history * block_size)
         self._wanted: IntArray = np.zeros(sources, np.int64)
         # Apart from the other stages' only where both kinds of tail exist.
         self._own_tails_wanted: IntArray = np.zeros(sources, np.int64)
-        self._tail_history = aligned(1, history * block_size)
+        self._tail_history = zeros_on_lines(1, history * block_size)
         self._tail_wanted: IntArray = np.zeros(1, np.int64)
         self._tail_silent: IntArray = np.zeros(1, np.int64)
-        self._scratch = aligned(2, stages[-1].size)
+        self._scratch = zeros_on_lines(2, stages[-1].size)
         self._fade_in = raised_cosine(block_size)
         last = len(stages) - 1
         kinds = [(number, False) for number in range(len(stages)) if number < last or has_own_tails]
@@ -145,9 +146,9 @@ class _StageArrays:
         self.sources = sources
         self.tables = right_angle.tables(stage.size)
         self.fade_out = raised_cosine(stage.size)[::-1].copy()
-        self.spectra = aligned(sources, stage.size // LANES, stage.partitions, 2, LANES)
-        self.mix, self.next_mix, self.surplus = (aligned(channels, 2, stage.size) for _ in range(3))
-        self.output = aligned(2, channels, stage.size)
+        self.spectra = zeros_on_lines(sources, stage.size // LANES, stage.partitions, 2, LANES)
+        self.mix, self.next_mix, self.surplus = (zeros_on_lines(channels, 2, stage.size) for _ in range(3))
+        self.output = zeros_on_lines(2, channels, stage.size)
         self.current, self.job_source, self.job_old, self.job_new = (np.zeros(sources, np.int64) for _ in _PER_SOURCE)
 
     def enter(self, record: npt.NDArray[np.void]) -> None:

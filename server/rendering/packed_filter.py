@@ -17,7 +17,6 @@ from server.rendering.spares import Spares
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 
-_CACHE_LINE = 64
 _PER_STAGE = 3
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _SHIFT = np.uint64(32)
@@ -27,17 +26,6 @@ _SPARES = Spares(32 * 1024 * 1024)
 
 def address(array: npt.NDArray[np.generic]) -> int:
     return int(array.__array_interface__["data"][0])
-
-
-def aligned(*shape: int) -> FloatArray:
-    """float32 zeros at the start of a cache line; pages are mapped when first written, so what is not used costs
-    nothing."""
-    count = 1
-    for length in shape:
-        count *= length
-    raw = np.zeros(4 * count + _CACHE_LINE, np.uint8)
-    skip = -address(raw) % _CACHE_LINE
-    return raw[skip : skip + 4 * count].view(np.float32).reshape(shape)
 
 
 @dataclass(frozen=True)
