@@ -4,7 +4,7 @@ Streams come and go, each with megabytes of filters and spectra, on several thre
 leave in a heap per thread, between blocks that live longer, and raises by itself the size from which an array has
 pages of its own; so a server for hostile clients (`nafir soak`) held four times what it used.
 
-Pages of its own are fresh ones, which take time: `server.rendering.spares` are for what comes and goes many times a
+Pages of its own are fresh ones, which take time: `server.acoustics.spares` are for what comes and goes many times a
 second.
 """
 
@@ -12,13 +12,13 @@ import ctypes
 import platform
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h
-_LARGE_BYTES = 64 * 1024
-"""Less than a stage of an impulse response; many times what asking for pages costs."""
+_LARGE_BYTES = 96 * 1024
+"""Less than an impulse response, or a stage of one; more than what a field's graph says of one."""
 _HEAPS = 2
 
 
 def give_back_large_arrays() -> bool:
-    """Have arrays from 64 KiB on be pages of their own, which go back to the system with them; whether this system's
+    """Have arrays from 96 KiB on be pages of their own, which go back to the system with them; whether this system's
     allocator can be told so. From now on, for the whole process."""
     if platform.libc_ver()[0] != "glibc":
         return False

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.phase import FrozenNoise, correlated_noise, delayed, griffin_lim, separate, zero_phase
+from server.acoustics.spares import Spares
 from server.compiled import HAS_NUMBA
 from server.field.graph import Spectrograms
 from server.scene.manifest import CodecParameters, Phase
@@ -31,6 +32,8 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 _RISE_S = 0.0003
+_SPARES = Spares(16 * 1024 * 1024)
+"""A request's responses wait for those of the next."""
 
 
 class Decoder:
@@ -84,7 +87,8 @@ class Decoder:
         near = near or [None] * len(aligned)
         if not self._is_compiled:
             return self.decode_with_numpy(predicted, aligned, near)
-        responses = np.empty((len(aligned), 2, self.ir_samples), dtype=np.float32)
+        responses = _SPARES.take(len(aligned) * 2 * self.ir_samples * 4).view(np.float32)
+        responses = responses.reshape(len(aligned), 2, self.ir_samples)
         try:
             work = self._workspaces.pop()
         except IndexError:

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.simd import LANES, load, store
+from server.acoustics.spares import Spares
 from server.compiled import compiled
 from server.rendering import right_angle
 from server.rendering.partitions import Partitioning
-from server.rendering.spares import Spares
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]

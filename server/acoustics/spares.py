@@ -15,7 +15,7 @@ from server.acoustics.cache_lines import LINE_BYTES
 
 Bytes = npt.NDArray[np.uint8]
 
-_LARGE_BYTES = 64 * 1024
+_LARGE_BYTES = 96 * 1024
 """From which on arrays have pages of their own (`server.memory`)."""
 
 

@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 
-from server.rendering.spares import Spares
+from server.acoustics.spares import Spares
 
 MIB = 1024 * 1024
 
