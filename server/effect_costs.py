@@ -2,7 +2,7 @@
 
 Microseconds of one core, per block and emitter. Bytes per emitter. They are medians of rounds in which all take turns,
 in time of the thread that measures, so that what else runs meanwhile counts little. Whoever measures beside streams
-hands in `rest`, called every fraction of a millisecond or so, which may take a break.
+hands in `rest`, called every few milliseconds between what is timed, which may take a break.
 """
 
 import statistics
@@ -89,7 +89,7 @@ class _Lane:
         rng = np.random.default_rng(0)
         decay = 10 ** (-3 * np.arange(field.ir_samples) / field.ir_samples)
         self._names = [str(number) for number in range(emitters)]
-        self._moves, self._block, self._rest = moves, 0, rest
+        self._moves, self._block = moves, 0
         self._exchanged: list[FloatArray] = []
         self._blocks_per_response = max(1, round(rate / block_size / RESPONSES_PER_S))
         for name in self._names:
@@ -112,7 +112,6 @@ class _Lane:
                 for name, response in zip(self._names, self._exchanged, strict=False):
                     self._renderer.set_ir(name, self._renderer.prepare(response))
             self._renderer.process()
-            self._rest()
 
     def _walk(self) -> None:
         """A centimetre on, and a little turned, block by block."""
@@ -153,9 +152,9 @@ def measure_costs(field: AcousticField, block_size: int = 256, *, rest: Rest = _
         for name, options in made.items()
         for count in (1, _EMITTERS)
     }
-    us = _time_in_turns({key: lane.play for key, lane in lanes.items()}, per=_BLOCKS)
+    us = _time_in_turns({key: lane.play for key, lane in lanes.items()}, per=_BLOCKS, rest=rest)
     responses_per_block = RESPONSES_PER_S * block_size / field.sample_rate
-    late_us, early_us = _response_us(field, meanwhile=lanes["still", _EMITTERS].play)
+    late_us, early_us = _response_us(field, meanwhile=lanes["still", _EMITTERS].play, rest=rest)
 
     def between(more: str, less: str) -> tuple[float, float]:
         """Of each emitter, and of there being any."""
@@ -241,7 +240,7 @@ def _finders(field: AcousticField) -> dict[str, float]:
     return _time_in_turns(computed, per=_EMITTERS)
 
 
-def _response_us(field: AcousticField, *, meanwhile: Callable[[], None]) -> tuple[float, float]:
+def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: Rest) -> tuple[float, float]:
     """What one response takes before it is made ready and faded in: of what the field holds, and of the first
     reflections. Between one and the next sound is rendered, as in streams, so that caches hold something else."""
     start = field.bundle.manifest.start
@@ -251,6 +250,7 @@ def _response_us(field: AcousticField, *, meanwhile: Callable[[], None]) -> tupl
         listener = Pose.from_yaw(start.listener, 0.1 * turn)
         for has_early, of_it in times_us.items():
             effects = EmitterEffects(early=has_early, late=bool(field.bundle.manifest.fields))
+            rest()
             meanwhile()
             started_s = time.thread_time()
             composed_irs(field, direct, listener, [Emitter(0, Pose(start.emitter), effects=effects)])
@@ -261,11 +261,12 @@ def _response_us(field: AcousticField, *, meanwhile: Callable[[], None]) -> tupl
     return late_us, max(0.0, whole_us - late_us)
 
 
-def _time_in_turns(lanes: dict[_Key, Callable[[], object]], *, per: int) -> dict[_Key, float]:
+def _time_in_turns(lanes: dict[_Key, Callable[[], object]], *, per: int, rest: Rest = _no_rest) -> dict[_Key, float]:
     """Microseconds of each, divided by `per`; a first round warms up."""
     times_s: dict[_Key, list[float]] = {name: [] for name in lanes}
     for _ in range(_ROUNDS + 1):
         for name, lane in lanes.items():
+            rest()
             started_s = time.thread_time()
             lane()
             times_s[name].append(time.thread_time() - started_s)

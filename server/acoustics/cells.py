@@ -30,4 +30,11 @@ class Axis:
         """(cell, step) linear interpolation between cell centres, constant beyond the outermost."""
         centres = (self.edges[:-1] + self.edges[1:] - 1) / 2
         steps = np.arange(self.edges[0], self.edges[-1])
-        return np.stack([np.interp(steps, centres, row) for row in np.eye(self.cells)]).astype(np.float32)
+        later = np.clip(np.searchsorted(centres, steps), min(1, self.cells - 1), self.cells - 1)
+        before = np.maximum(later - 1, 0)
+        apart = np.where(later > before, centres[later] - centres[before], 1.0)
+        share = np.clip((steps - centres[before]) / apart, 0, 1)
+        weights = np.zeros((self.cells, len(steps)), dtype=np.float32)
+        weights[later, steps - self.edges[0]] = share
+        weights[before, steps - self.edges[0]] += (1 - share).astype(np.float32)
+        return weights

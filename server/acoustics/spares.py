@@ -17,6 +17,8 @@ Bytes = npt.NDArray[np.uint8]
 
 _LARGE_BYTES = 96 * 1024
 """From which on arrays have pages of their own (`server.memory`)."""
+_FEWEST = 2
+"""Arrays of the largest size that may wait."""
 
 
 class Spares:
@@ -58,13 +60,17 @@ class Spares:
         return None
 
     def _keep(self, array: Bytes) -> None:
+        if array.size > self._most_bytes // _FEWEST:
+            return  # it would drive out all the others
+        superfluous = []  # let go of without the lock
         # It may come from a collection of garbage amid `_find` on this very thread.
         if self._lock.acquire(blocking=False):
             try:
                 self._waiting.append(array)
                 self._bytes += array.size
                 while self._bytes > self._most_bytes:
-                    self._bytes -= self._waiting.popleft().size
+                    superfluous.append(self._waiting.popleft())
+                    self._bytes -= superfluous[-1].size
             finally:
                 self._lock.release()
 

@@ -15,7 +15,7 @@ from server.field.graph import Spectrograms
 from server.scene.manifest import CodecParameters, Phase
 
 if HAS_NUMBA:
-    from server.acoustics.columns_kernel import Columns
+    from server.acoustics.columns_kernel import FEWEST, Columns
     from server.acoustics.decoding_kernel import (
         START,
         TARGETS,
@@ -57,12 +57,13 @@ class Decoder:
         self._codec = parameters.codec
         self._phase = phase
         self._noise = noise
-        self._used = self._codec.frames if frames is None else frames
+        self._used = self._codec.frames if frames is None else min(frames, self._codec.frames)
         self._known = min(parameters.known_frames, self._used)
         self._gate = onset_gate(parameters)
         n_fft = self._codec.n_fft
         self._axis = parameters.frame_axis
-        self._is_compiled = is_compiled and n_fft & (n_fft - 1) == 0 and parameters.columns >= LANES
+        self._is_compiled = is_compiled and n_fft & (n_fft - 1) == 0 and self._codec.frames >= LANES
+        self._is_compiled = self._is_compiled and parameters.columns >= FEWEST
         if self._is_compiled:
             self._columns = Columns.of(self._axis, self._used)
             self._windows = Windows.of(self._codec)

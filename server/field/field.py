@@ -128,7 +128,7 @@ class AcousticField:
     def _compute_all(
         self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None = None
     ) -> Float32:
-        if len(yaws) <= _CHUNK:
+        if 0 < len(yaws) <= _CHUNK:
             return self._compute(listeners, emitters, yaws, cache)
         responses = np.empty((len(yaws), self.channels, self.ir_samples), dtype=np.float32)
         for start in range(0, len(yaws), _CHUNK):

@@ -81,7 +81,7 @@ class CodecParameters(Strict):
     lead_samples: Annotated[int, Field(ge=0)]
     known_frames: Annotated[int, Field(ge=0)]
     log_floor: Annotated[float, Field(gt=0, allow_inf_nan=False)]
-    frame_cells: tuple[Annotated[int, Field(ge=1)], ...] | None = None
+    frame_cells: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(max_length=2048)] | None = None
 
     @model_validator(mode="after")
     def _overlaps_four_times(self) -> "CodecParameters":

@@ -38,13 +38,20 @@ def test_an_array_is_not_let_go_of_while_a_view_is_left():
 
 
 def test_no_more_wait_than_may_and_the_oldest_go_first():
-    spares = Spares(3 * MIB)
-    held = [spares.take(size) for size in (2 * MIB, MIB, MIB)]
+    spares = Spares(4 * MIB)
+    held = [spares.take(size) for size in (2 * MIB, MIB, MIB, MIB)]
     wanted = place(held[-1])
     while held:
         del held[0]
-    assert spares.nbytes == 2 * MIB
+    assert spares.nbytes == 3 * MIB
     assert place(spares.take(MIB)) == wanted
+
+
+def test_an_array_that_would_drive_out_the_others_does_not_wait():
+    spares = Spares(3 * MIB)
+    useful, large = spares.take(MIB), spares.take(2 * MIB)
+    del useful, large
+    assert spares.nbytes == MIB
 
 
 def test_small_arrays_do_not_wait():

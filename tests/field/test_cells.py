@@ -5,10 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 from onnx import TensorProto, helper, numpy_helper
 
+from server.acoustics.phase import FrozenNoise
 from server.errors import BundleError
 from server.field.decoder import Decoder
 from server.field.field import AcousticField, frozen_noise
-from server.field.graph import OUTPUTS
+from server.field.graph import OUTPUTS, Spectrograms
 from server.field.levels import Levels
 from server.scene.bundle import write_bundle
 from server.scene.manifest import FieldFile, Phase, QualityLevel
@@ -122,6 +123,32 @@ def test_numpy_decodes_cells_as_compiled_code_does(fields, codec):
     )
     predicted, at = field.graph.predictions(*POSE), np.array([130.4])
     assert difference_db(compiled.decode(predicted, at), plain.decode(predicted, at)) < -90
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8])
+def test_few_cells_are_decoded_as_numpy_does(codec, count):
+    """Compiled from three on."""
+    widths = (codec.codec.frames // count,) * (count - 1)
+    few = codec.model_copy(update={"frame_cells": (*widths, codec.codec.frames - sum(widths))})
+    rng = np.random.default_rng(count)
+    shape, known = (1, 2, codec.codec.bins, count), (1, 2, codec.codec.bins, codec.known_frames)
+    told = Spectrograms(
+        *(values.astype(np.float32) for values in (rng.normal(-3, 1, shape), np.zeros(known), np.zeros(known))),
+        rng.uniform(-0.7, 0.7, shape).astype(np.float32),
+    )
+    noise = FrozenNoise.from_signal(codec.codec, rng.standard_normal((2, codec.samples)))
+    found, expected = (
+        Decoder(few, noise, ir_samples=codec.samples, phase=Phase(), is_compiled=is_compiled).decode(
+            told, np.array([100.3])
+        )
+        for is_compiled in (True, False)
+    )
+    assert difference_db(found, expected) < -90
+
+
+def test_no_poses_have_no_responses(field):
+    none = np.zeros((0, 3))
+    assert field.impulse_responses(none, none, np.zeros(0)).shape == (0, 2, field.ir_samples)
 
 
 def test_cells_that_the_graph_does_not_have_are_a_bundle_error(bundle, tmp_path, codec, told):
