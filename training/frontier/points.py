@@ -12,6 +12,8 @@ from server.scene.manifest import Accuracy, Cost, QualityLevel
 _Floats = npt.NDArray[np.float64]
 _MISSING_ALLOWANCE = 0.01
 OFFERED_APART = 3.0
+ALIKE = 1.03
+"""Errors, below one JND most of them, whose difference nobody would wait for."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +72,14 @@ def _is_better(ours: _Floats, theirs: _Floats) -> bool:
 
 
 def default_point(best: Sequence[Point], *, ms: float) -> Point:
-    """The most accurate of Pareto-optimal points whose response takes at most `ms` where nothing was kept, or else the
-    one whose takes least."""
-    quick = (point for point in reversed(best) if point.cost.ms_miss <= ms)
-    return next(quick, min(best, key=lambda point: point.cost.ms_miss))
+    """Of Pareto-optimal points whose response takes at most `ms` where nothing was kept the one whose takes least, of
+    those hardly less accurate (`ALIKE`) than the most accurate of them; where none does, the one whose takes least."""
+    quick = [point for point in best if point.cost.ms_miss <= ms]
+    if not quick:
+        return min(best, key=lambda point: point.cost.ms_miss)
+    least = min(point.audible_error for point in quick)
+    alike = [point for point in quick if point.audible_error <= ALIKE * least]
+    return min(alike, key=lambda point: point.cost.ms_miss)
 
 
 def offered_points(best: Sequence[Point], default: Point) -> list[Point]:

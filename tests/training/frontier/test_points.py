@@ -68,6 +68,13 @@ def test_the_default_is_the_most_accurate_in_time(ms, chosen) -> None:
     assert default_point(best, ms=ms).level.name == chosen
 
 
+@pytest.mark.parametrize(("error", "chosen"), [(0.305, "b"), (0.32, "c")])
+def test_the_default_waits_for_no_difference_that_nobody_hears(error, chosen) -> None:
+    best = [point("a", 1, 0.5), point("b", 2, error), point("c", 3, 0.3)]
+    assert default_point(best, ms=8).level.name == chosen
+    assert default_point([*best, point("slower", 9, 0.1)], ms=8).level.name == chosen
+
+
 def test_what_is_rarely_computed_is_no_quicker_for_it_when_it_is() -> None:
     """A deadline has to bear the pose that finds nothing kept."""
     best = pareto([point("a", 1, 0.5), point("reusing", 2, 0.4, miss_ms=9), point("c", 3, 0.3)])
