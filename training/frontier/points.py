@@ -14,6 +14,8 @@ _MISSING_ALLOWANCE = 0.01
 OFFERED_APART = 3.0
 ALIKE = 1.03
 """Errors, below one JND most of them, whose difference nobody would wait for."""
+AS_SOON = 1.1
+"""Times whose difference may be the host's mood."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,18 @@ def _is_better(ours: _Floats, theirs: _Floats) -> bool:
 
 
 def default_point(best: Sequence[Point], *, ms: float) -> Point:
-    """Of Pareto-optimal points whose response takes at most `ms` where nothing was kept the one whose takes least, of
-    those hardly less accurate (`ALIKE`) than the most accurate of them; where none does, the one whose takes least."""
+    """The most accurate of Pareto-optimal points whose response takes at most `ms` where nothing was kept; or rather,
+    of those hardly less accurate (`ALIKE`), the most accurate that takes hardly longer (`AS_SOON`) than the quickest.
+    Where none is in time, the one whose response takes least."""
     quick = [point for point in best if point.cost.ms_miss <= ms]
     if not quick:
         return min(best, key=lambda point: point.cost.ms_miss)
     least = min(point.audible_error for point in quick)
     alike = [point for point in quick if point.audible_error <= ALIKE * least]
-    return min(alike, key=lambda point: point.cost.ms_miss)
+    soonest_ms = min(point.cost.ms_miss for point in alike)
+    return min(
+        (point for point in alike if point.cost.ms_miss <= AS_SOON * soonest_ms), key=lambda point: point.audible_error
+    )
 
 
 def offered_points(best: Sequence[Point], default: Point) -> list[Point]:

@@ -88,8 +88,8 @@ class Frontier:
 @dataclass(frozen=True)
 class Effort:
     """How much is measured: held-out `pairs` at `yaws` each; a walk of `walk_s`, of which a level that computes every
-    response anew gets `budget_s`; the default level is, of those whose response takes at most `default_ms`, the quickest
-    that is about as accurate as the most accurate."""
+    response anew gets `budget_s`; the default level is, of those whose response takes at most `default_ms`, the
+    quickest that is about as accurate as the most accurate."""
 
     pairs: int = 40
     yaws: int = 3

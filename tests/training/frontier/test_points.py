@@ -73,6 +73,7 @@ def test_the_default_waits_for_no_difference_that_nobody_hears(error, chosen) ->
     best = [point("a", 1, 0.5), point("b", 2, error), point("c", 3, 0.3)]
     assert default_point(best, ms=8).level.name == chosen
     assert default_point([*best, point("slower", 9, 0.1)], ms=8).level.name == chosen
+    assert default_point([*best, point("d", 3.2, 0.298)], ms=8).level.name == {"b": "b", "c": "d"}[chosen]
 
 
 def test_what_is_rarely_computed_is_no_quicker_for_it_when_it_is() -> None:
