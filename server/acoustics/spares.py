@@ -4,6 +4,7 @@ Fresh pages are cleared where they are first written, which on a virtual machine
 them, and are taken away again on the thread that lets go.
 """
 
+import math
 import threading
 from collections import deque
 from typing import Any
@@ -44,6 +45,10 @@ class Spares:
             return _aligned(size)
         found = self._find(size)
         return np.asarray(_Lent(self, _aligned(size) if found is None else found))
+
+    def floats(self, *shape: int) -> npt.NDArray[np.float32]:
+        """As `take`."""
+        return self.take(4 * math.prod(shape)).view(np.float32).reshape(shape)
 
     def _find(self, size: int) -> Bytes | None:
         if self._lock.acquire(blocking=False):

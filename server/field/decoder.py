@@ -88,8 +88,7 @@ class Decoder:
         near = near or [None] * len(aligned)
         if not self._is_compiled:
             return self.decode_with_numpy(predicted, aligned, near)
-        responses = _SPARES.take(len(aligned) * 2 * self.ir_samples * 4).view(np.float32)
-        responses = responses.reshape(len(aligned), 2, self.ir_samples)
+        responses = _SPARES.floats(len(aligned), 2, self.ir_samples)
         try:
             work = self._workspaces.pop()
         except IndexError:

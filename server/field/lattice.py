@@ -90,13 +90,18 @@ class Lattice:
         return float(self._paths.find(np.array(listener), np.array([emitter])).length_m[0])
 
 
-def moved(response: npt.NDArray[np.float32], later_samples: int) -> npt.NDArray[np.float32]:
+def moved(
+    response: npt.NDArray[np.float32], later_samples: int, result: npt.NDArray[np.float32] | None = None
+) -> npt.NDArray[np.float32]:
     """(channel, sample) a response so many samples later, silent before; what comes after its end or before its
-    beginning is lost."""
+    beginning is lost. Written to `result` where there is one."""
     later_samples = max(-response.shape[1], min(later_samples, response.shape[1]))
-    result = np.zeros_like(response)
+    if result is None:
+        result = np.empty_like(response)
     if later_samples >= 0:
+        result[:, :later_samples] = 0
         result[:, later_samples:] = response[:, : response.shape[1] - later_samples]
     else:
         result[:, :later_samples] = response[:, -later_samples:]
+        result[:, later_samples:] = 0
     return result

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import Vector3
 from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.spares import Spares
 from server.bounded_cache import BoundedCache
 from server.field.lattice import Lattice, Node, Snapped, moved
 from server.scene.bundle import Bundle
@@ -21,6 +22,7 @@ Kept = BoundedCache[tuple[object, ...], object]
 """What all levels of a scene keep, by whatever it depends on."""
 
 KEPT_BYTES = 64 * 1024 * 1024
+_SPARES = Spares(16 * 1024 * 1024)
 
 
 class NodeResponses:
@@ -55,7 +57,11 @@ class NodeResponses:
 
     def responses(self, listeners: Floats, emitters: Floats, yaws: Floats) -> Float32:
         """(B, channel, sample), arrays of their own."""
-        return np.stack([moved(self.at(node), later) for node, later in self._snapped(listeners, emitters, yaws)])
+        found = [(self.at(node), later) for node, later in self._snapped(listeners, emitters, yaws)]
+        responses = _SPARES.floats(len(found), *found[0][0].shape)
+        for (response, later), result in zip(found, responses, strict=True):
+            moved(response, later, result)
+        return responses
 
     def nodes(self, listeners: Floats, emitters: Floats, yaws: Floats) -> tuple[Floats, Floats, Floats]:
         """Listeners, emitters and yaws of the nodes."""
