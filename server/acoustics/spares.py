@@ -48,7 +48,7 @@ class Spares:
 
     def floats(self, *shape: int) -> npt.NDArray[np.float32]:
         """As `take`."""
-        return self.take(4 * math.prod(shape)).view(np.float32).reshape(shape)
+        return self.take(math.prod(shape) * np.dtype(np.float32).itemsize).view(np.float32).reshape(shape)
 
     def _find(self, size: int) -> Bytes | None:
         if self._lock.acquire(blocking=False):

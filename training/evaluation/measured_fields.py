@@ -7,12 +7,12 @@ in. Measured responses hold their direct sound, so nothing is joined to them.
 Axes: B poses; (B, channel, frequency, frame) and (B, channel, sample).
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import nn
 
 from server.acoustics.codec import Codec
 from server.acoustics.phase import FrozenNoise, correlated_noise, separate
@@ -39,15 +39,14 @@ def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
         raise EvaluationError(f"{run}: was trained on a simulated scene; export it and evaluate the bundle")
     learner = load_learner(responses, run)
     codec: Codec
-    module: nn.Module
+    predict: Callable[..., tuple[torch.Tensor, ...]]
     if isinstance(learner, FactorisedLearner):
-        codec, module = learner.cells.codec, ExportedField(learner.field, learner.cells)
+        codec, predict = learner.cells.codec, ExportedField(learner.field, learner.cells).eval().of_frames
     elif isinstance(learner, NafLearner):
-        codec, module = learner.codec, NafGraph(learner.field, learner.codec, tabled=True)
+        codec, predict = learner.codec, NafGraph(learner.field, learner.codec, tabled=True).eval()
     else:
         raise TypeError(f"{type(learner)} cannot be evaluated")
     configuration = Configuration.read(run)
-    module.eval()
     noise = FrozenNoise.from_signal(codec, even_noise(codec, np.random.default_rng([configuration.seed, 6])))
     listeners, emitters = held_out.listeners, held_out.emitters
 
@@ -59,7 +58,7 @@ def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
             held_out.yaws[turns],
         )
         with torch.no_grad():
-            answers = module(*(torch.from_numpy(np.array(pose, dtype=np.float32)) for pose in poses))
+            answers = predict(*(torch.from_numpy(np.array(pose, dtype=np.float32)) for pose in poses))
         aligned = decoded(tuple(answer.numpy() for answer in answers), codec, noise)
         later = float(held_out.delays_s[held_out.held_out[index]]) * held_out.sample_rate - LEAD_SAMPLES
         return moved_later(aligned, later)

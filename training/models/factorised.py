@@ -243,6 +243,7 @@ class ExportedField(nn.Module):
         nominal = torch.tensor(cells.codec.nominal_advance, dtype=torch.float32)
         self.register_buffer("_nominal_advance", nominal, persistent=False)
         self._silence = float(np.log(cells.codec.log_floor))
+        self._to_frames = torch.from_numpy(cells.all_frames.spread())
 
     def _order(self, heads: Heads) -> Tensor:
         """Of the flat output: pooled cells of all heads (channel or part, band, frames of one head after another), then
@@ -263,6 +264,11 @@ class ExportedField(nn.Module):
         log_magnitude = torch.clamp(torch.cat([fine.reshape(-1, *shapes["fine"]), late], dim=-1), min=self._silence)
         frequency, certainty = self._phase(real.reshape(-1, *phasor), imaginary.reshape(-1, *phasor))
         return log_magnitude, frequency, certainty, *interaural
+
+    def of_frames(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
+        """The same of every frame."""
+        log_magnitude, frequency, certainty, *interaural = self(listener, emitter, yaw)
+        return log_magnitude @ self._to_frames, frequency, certainty, *(part @ self._to_frames for part in interaural)
 
     def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
         """Instantaneous frequency and certainty of mean phasors (B, ear, frequency, frame)."""

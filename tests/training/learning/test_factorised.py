@@ -59,7 +59,7 @@ def test_what_a_microphone_heard_is_learned(measured, mono_run):
         torch.from_numpy(part[rows].astype(np.float32)) for part in (measured.listener, measured.emitter, measured.yaw)
     )
     with torch.no_grad():
-        log_magnitude, frequency, certainty = (output.numpy() for output in field(*poses))
+        log_magnitude, frequency, certainty = (output.numpy() for output in field.of_frames(*poses))
     codec = learner.cells.codec
     assert log_magnitude.shape == (len(rows), 1, codec.bins, codec.frames)
     # Two frames whose windows have the click near their middle.
