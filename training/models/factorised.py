@@ -238,8 +238,7 @@ class ExportedField(nn.Module):
         # Units and level correction cost nothing where the basis and one offset have them.
         self.register_buffer("_basis", (field.basis.detach() * field.spread)[:, order], persistent=False)
         self.register_buffer("_offset", (field.mean + field.level_correction)[order], persistent=False)
-        for name, matrix in (("bands", np.ascontiguousarray(cells.bands.spread().T)),):
-            self.register_buffer(f"_{name}", torch.tensor(matrix, dtype=torch.float32), persistent=False)
+        self.register_buffer("_bands", torch.tensor(np.ascontiguousarray(cells.bands.spread().T)), persistent=False)
         nominal = torch.tensor(cells.codec.nominal_advance, dtype=torch.float32)
         self.register_buffer("_nominal_advance", nominal, persistent=False)
         self._silence = float(np.log(cells.codec.log_floor))
