@@ -30,8 +30,8 @@ def test_a_message_far_too_long_closes_its_own_connection_only(served):
     with connect(url) as good, connect(url) as bad:
         good.send(HELLO)
         bad.send(HELLO)
-        bad.send("x" * (2 * 1024 * 1024))
-        with pytest.raises(ConnectionClosedError) as closed:
+        with pytest.raises(ConnectionClosedError) as closed:  # while it still sends, or when it listens
+            bad.send("x" * (2 * 1024 * 1024))
             _ = [bad.recv(timeout=5) for _ in range(10_000)]
         assert closed.value.rcvd.code == 1009
         blocks = blocks_for(good, 0.5)
