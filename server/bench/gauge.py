@@ -2,6 +2,7 @@
 moment it has handed the socket the first audio block that follows it, or a newer one.
 
 `/bench/begin` begins a measurement of the streams that are open, and `/bench/report` tells what was measured since.
+`/bench/settled` says whether the server is done with what it does only once, after it has started.
 """
 
 import json
@@ -87,6 +88,9 @@ class Gauge:
             case "http", "/bench/begin":
                 self._begin(scope["state"]["host"])
                 await _answer({}, send)
+            case "http", "/bench/settled":
+                host = scope["state"]["host"]
+                await _answer({"is_settled": host.effect_costs.keys() >= host.scenes.keys()}, send)
             case "http", "/bench/report":
                 await _answer(self._report(), send)
             case "websocket", _:

@@ -188,14 +188,15 @@ class _Trial:
 
 @contextlib.contextmanager
 def _serve(core: int) -> Iterator[int]:
-    """The port of a server that is ready, on one core."""
+    """The port of a server on one core, which is ready and has measured what effects cost there."""
     command = [sys.executable, "-m", "server.bench.host", str(core)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
             port = _read_port(process.stdout)
-            _wait_until_ready(port)
+            _wait_until(lambda: _is_ready(port))
+            _wait_until(lambda: _get(f"http://127.0.0.1:{port}/bench/settled")["is_settled"])
             yield port
         finally:
             process.stdin.close()
@@ -209,19 +210,23 @@ def _read_port(stdout: IO[str]) -> int:
     return int(json.loads(line)["port"])
 
 
-def _wait_until_ready(port: int) -> None:
+def _wait_until(is_so: Callable[[], bool]) -> None:
     until_s = time.monotonic() + _READY_S
-    while time.monotonic() < until_s:
-        try:
-            _get(f"http://127.0.0.1:{port}/readyz")
-        except urllib.error.HTTPError as answer:
-            answer.close()
-        except OSError:
-            pass
-        else:
-            return
+    while not is_so():
+        if time.monotonic() > until_s:
+            raise NafirError(f"the bench's server was not ready after {_READY_S:.0f} s")
         time.sleep(0.1)
-    raise NafirError(f"the bench's server was not ready after {_READY_S:.0f} s")
+
+
+def _is_ready(port: int) -> bool:
+    try:
+        _get(f"http://127.0.0.1:{port}/readyz")
+    except urllib.error.HTTPError as answer:
+        answer.close()
+        return False
+    except OSError:
+        return False
+    return True
 
 
 def _get(url: str) -> dict[str, Any]:
