@@ -195,7 +195,7 @@ def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
 
 
 def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> None:
-    """Gives the field what a finished run learned. Raises RunError if the run is unfinished."""
+    """Gives the field what a finished run learned. Raises RunError if the run is unfinished, or of another network."""
     state = load_checkpoint(run, torch.device("cpu"))
     if not state["finished"]:
         length = (
@@ -204,7 +204,10 @@ def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> 
             else f"{state['seconds'] / 60:.1f} of {configuration.minutes:g} minutes"
         )
         raise RunError(f"{run}: {length} are trained; run train again")
-    field.load_state_dict(state["field"])
+    try:
+        field.load_state_dict(state["field"])
+    except RuntimeError as exc:
+        raise RunError(f"{run}: was trained by another version of this program; train again") from exc
     field.eval()
 
 

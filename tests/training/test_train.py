@@ -112,16 +112,17 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configura
     targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True))
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
-        poses = (torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw))
-        predicted = field.in_physical_units(field(*poses))
+        features = field.encoder(*map(torch.from_numpy, (targets.listener, targets.emitter, targets.yaw)))
+        predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
+        correction = field.level_correction[field.encoder.sight(features)[:, 0].long()]
     part = field.heads.slices["late"]
     raw, corrected, true = (
-        level[:, part].double().mul(2).exp().sum() for level in (predicted, predicted + field.level_correction, flat)
+        level[:, part].double().mul(2).exp().sum() for level in (predicted, predicted + correction, flat)
     )
     assert abs(torch.log(corrected / true)) < abs(torch.log(raw / true))
     assert torch.log(corrected / true).abs() < 0.1
     for name in ("phasor", "interaural"):
-        assert not field.level_correction[field.heads.slices[name]].any()
+        assert not field.level_correction[:, field.heads.slices[name]].any()
 
 
 def test_a_run_says_how_long_it_took_with_its_targets(dataset, run, tmp_path):

@@ -17,6 +17,7 @@ from training.learning.naf import NafLearner
 from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
+from training.models.level_correction import PowerBalance
 from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
@@ -159,23 +160,19 @@ class FactorisedLearner:
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> None:
-        """What to add to predicted log-magnitudes so that their power is right on average over the training set.
-
-        A regression on log-magnitude predicts the mean of the log, 2.5 dB below the log of the mean power for noise.
-        Residuals say by how much, output by output.
-        """
+        """Correct levels by what they lack on average over the training set."""
         if not self.recipe.level_correction:
             return
-        field = self.field
-        power = torch.zeros_like(field.mean)
+        field, levels = self.field, self.field.heads.levels
+        balance = PowerBalance(field.heads.areas)
         sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
         for start in range(0, len(sample), 256):
             poses, (flat, _) = self.batch(sample[start : start + 256], None)
-            predicted = field.in_physical_units(field(*(pose.to(power.device) for pose in poses)))
-            power += torch.exp(2 * (flat.to(power.device).float() - predicted)).sum(dim=0) / len(sample)
-        for name in _LEVEL_HEADS:
-            part = field.heads.slices[name]
-            field.level_correction[part] = 0.5 * torch.log(power[part])
+            features = field.encoder(*(pose.to(field.mean.device) for pose in poses))
+            predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
+            true = flat[:, levels].to(field.mean.device).float()
+            balance.add(true, predicted[:, levels], field.encoder.sight(features))
+        field.level_correction[:, levels] = balance.missing()
 
 
 def _rows_of(source: Targets | Lessons, rows: Rows) -> tuple[npt.NDArray[np.floating], ...]:

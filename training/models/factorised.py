@@ -19,11 +19,14 @@ from torch import Tensor, nn
 
 from server.acoustics.geometry import FloorPlan
 from training.models.cells import Cells
+from training.models.level_correction import PowerBalance
 from training.models.propagation import Propagation
 from training.models.site import Reach
 
 _AZIMUTH_HARMONICS = 5
 _YAW_HARMONICS = 3
+_AFTER_SIGHT = 2 + 2 + 2 * _YAW_HARMONICS
+"""Features that follow the one that tells sight: where the path goes from either end, and the heading."""
 _POSITION_OCTAVES = 3
 _MOST_LOG_PRECISION = 14.0
 """A bandwidth of a millimetre."""
@@ -58,8 +61,8 @@ class FeatureGrid(nn.Module):
 
     def forward(self, position: Tensor) -> Tensor:
         """(..., 2 or 3) metres to (..., features)."""
-        offset = position[..., None, :2] - self._nodes
-        squared = torch.sum(offset * offset, dim=-1)
+        offset = position[..., :2, None] - self._nodes.T
+        squared = torch.sum(offset * offset, dim=-2)
         # An infinite precision would be 0 times infinity on a node.
         precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
         return torch.softmax(-squared * precision, dim=-1) @ self._features
@@ -78,6 +81,8 @@ class PoseEncoder(nn.Module):
         self.register_buffer("_low", torch.tensor(reach.low, dtype=torch.float32), persistent=False)
         self.register_buffer("_high", torch.tensor(reach.high, dtype=torch.float32), persistent=False)
         self._propagation = Propagation(plan)
+        self.sees_all = self._propagation.sees_all
+        """Whether no pair is out of sight."""
         self._grid = FeatureGrid(plan, shape.grid_spacing_m, shape.grid_features)
         low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
         box = np.array([(*low, 0.0), (*high, plan.height_m)], dtype=np.float32)
@@ -122,6 +127,10 @@ class PoseEncoder(nn.Module):
             dim=-1,
         )
 
+    def sight(self, features: Tensor) -> Tensor:
+        """(B, 1) of the features: whether the ends see each other, 1 or 0."""
+        return features[:, -_AFTER_SIGHT - 1 : -_AFTER_SIGHT]
+
     def _waves(self, position: Tensor) -> Tensor:
         scaled = (position - self._centre) / self._half_size
         return torch.cat([scaled, torch.sin(scaled @ self._octaves + self._octave_phases)], dim=-1)
@@ -162,10 +171,17 @@ class Heads(nn.Module):
         }
         self.levels = slice(self.slices["fine"].start, self.slices["late"].stop)
         self.size = int(bounds[-1])
+        late_areas = np.outer(cells.bands.widths, cells.late_frames.widths)
+        areas = [np.ones(self.sizes[0]), np.tile(late_areas.ravel(), channels)]
+        self.register_buffer("areas", torch.tensor(np.concatenate(areas), dtype=torch.float32), persistent=False)
 
 
 class FactorisedField(nn.Module):
-    """Flat predictions (B, heads.size), in units of each output's spread about its mean over the training set."""
+    """Flat predictions (B, heads.size), in units of each output's spread about its mean over the training set.
+
+    `level_correction` (2, heads.size) is what predicted levels lack, of pairs out of sight and in sight
+    (`training.models.level_correction`).
+    """
 
     def __init__(
         self, plan: FloorPlan, cells: Cells, shape: FieldShape, channels: int = 2, *, reach: Reach | None = None
@@ -180,14 +196,18 @@ class FactorisedField(nn.Module):
         self.basis = nn.Parameter(torch.randn(shape.rank, self.heads.size) / np.sqrt(shape.rank))
         self.register_buffer("mean", torch.zeros(self.heads.size))
         self.register_buffer("spread", torch.ones(self.heads.size))
-        self.register_buffer("level_correction", torch.zeros(self.heads.size))
+        self.register_buffer("level_correction", torch.zeros(2, self.heads.size))
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
         return self.coefficients(listener, emitter, yaw) @ self.basis
 
     def coefficients(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
         """(B, rank), of the basis."""
-        hidden = nn.functional.gelu(self._inputs(self.encoder(listener, emitter, yaw)))
+        return self.coefficients_of(self.encoder(listener, emitter, yaw))
+
+    def coefficients_of(self, features: Tensor) -> Tensor:
+        """`coefficients`, of what the encoder makes of poses."""
+        hidden = nn.functional.gelu(self._inputs(features))
         for layer in self._hidden:
             hidden = hidden + nn.functional.gelu(layer(hidden))
         return self._coefficients(hidden)
@@ -201,7 +221,8 @@ class FactorisedField(nn.Module):
         """
         if not 0 < rank < len(self.basis):
             raise ValueError(f"rank: {rank} is not between 1 and {len(self.basis) - 1}")
-        coefficients = self.coefficients(listener, emitter, yaw)
+        features = self.encoder(listener, emitter, yaw)
+        coefficients = self.coefficients_of(features)
         root = torch.linalg.qr(coefficients / len(coefficients) ** 0.5).R
         directions = torch.linalg.svd(root @ self.basis, full_matrices=False).Vh[:rank]
         # Coefficients of equal size, so that eight bits do for all of them together.
@@ -212,10 +233,14 @@ class FactorisedField(nn.Module):
         layer.weight.copy_(turn.T @ self._coefficients.weight)
         layer.bias.copy_(turn.T @ self._coefficients.bias)
         field.basis = nn.Parameter(directions * size[:, None])
-        lost = (coefficients @ self.basis - coefficients @ turn @ field.basis) * self.spread
-        for name in ("fine", "late"):
-            part = self.heads.slices[name]
-            field.level_correction[part] += 0.5 * torch.log(torch.exp(2 * lost[:, part]).mean(dim=0))
+        balance = PowerBalance(self.heads.areas)
+        levels = self.heads.levels
+        balance.add(
+            self.in_physical_units(coefficients @ self.basis)[:, levels],
+            self.in_physical_units(coefficients @ turn @ field.basis)[:, levels],
+            self.encoder.sight(features),
+        )
+        field.level_correction[:, levels] += balance.missing()
         return field
 
     def in_physical_units(self, flat: Tensor) -> Tensor:
@@ -235,10 +260,17 @@ class ExportedField(nn.Module):
         heads = field.heads
         self._pooled = [name for name in ("late", "interaural") if name in heads.shapes]
         order = self._order(heads)
-        # Units and level correction cost nothing where the basis and one offset have them.
-        self.register_buffer("_basis", (field.basis.detach() * field.spread)[:, order], persistent=False)
-        self.register_buffer("_offset", (field.mean + field.level_correction)[order], persistent=False)
-        self.register_buffer("_bands", torch.tensor(np.ascontiguousarray(cells.bands.spread().T)), persistent=False)
+        # Units and level correction cost nothing where the basis and one offset have them; sight is a row of its own.
+        out_of_sight, in_sight = field.level_correction
+        basis = torch.cat([field.basis.detach() * field.spread, (out_of_sight - in_sight)[None]])
+        if field.encoder.sees_all:
+            basis = basis[:-1]
+        self.register_buffer("_basis", basis[:, order], persistent=False)
+        self.register_buffer("_offset", (field.mean + in_sight)[order], persistent=False)
+        # The first bands are bins; the others need the last of these to be spread.
+        self._narrow = int(np.argmax(np.append(cells.bands.widths, 2) > 1))
+        wide = cells.bands.spread()[self._narrow - 1 :, self._narrow :]
+        self.register_buffer("_bands", torch.tensor(np.ascontiguousarray(wide.T)), persistent=False)
         nominal = torch.tensor(cells.codec.nominal_advance, dtype=torch.float32)
         self.register_buffer("_nominal_advance", nominal, persistent=False)
         self._silence = float(np.log(cells.codec.log_floor))
@@ -254,11 +286,16 @@ class ExportedField(nn.Module):
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
         shapes = self._field.heads.shapes
-        flat = torch.addmm(self._offset, self._field.coefficients(listener, emitter, yaw), self._basis)
+        features = self._field.encoder(listener, emitter, yaw)
+        coefficients = self._field.coefficients_of(features)
+        if not self._field.encoder.sees_all:
+            coefficients = torch.cat([coefficients, 1 - self._field.encoder.sight(features)], dim=1)
+        flat = torch.addmm(self._offset, coefficients, self._basis)
         _, *phasor = shapes["phasor"]
         sizes = [int(np.prod(shape)) for shape in (self._pooled_shape, shapes["fine"], phasor, phasor)]
         pooled, fine, real, imaginary = torch.split(flat, sizes, dim=1)
-        spread = self._bands @ pooled.reshape(-1, *self._pooled_shape)
+        pooled = pooled.reshape(-1, *self._pooled_shape)
+        spread = torch.cat([pooled[:, :, : self._narrow], self._bands @ pooled[:, :, self._narrow - 1 :]], dim=2)
         late, *interaural = torch.split(spread, [shapes[name][-1] for name in self._pooled], dim=-1)
         log_magnitude = torch.clamp(torch.cat([fine.reshape(-1, *shapes["fine"]), late], dim=-1), min=self._silence)
         frequency, certainty = self._phase(real.reshape(-1, *phasor), imaginary.reshape(-1, *phasor))

@@ -32,7 +32,8 @@ class Propagation(nn.Module):
     """Shortest paths through a floor plan, round its reflex corners.
 
     A graph of many small nodes takes longer than what they compute, so all lines are looked along at once, by products
-    and sums over whole vectors; where there is nothing to see round, there is nothing to compute.
+    and sums over whole vectors, whose last axis is the longest; where there is nothing to see round, there is nothing
+    to compute.
     """
 
     def __init__(self, plan: FloorPlan) -> None:
@@ -42,19 +43,24 @@ class Propagation(nn.Module):
         edges = walls[:, 1] - walls[:, 0]
         between = np.minimum(plan.bend_lengths_m, _FAR) if self._bend_count else ()
         for name, values in (
-            ("start", walls[:, 0]),
-            ("end", walls[:, 1]),
-            ("normals", _turned_left(edges)),
+            ("start", walls[:, 0].T[:, None]),
+            ("end", walls[:, 1].T[:, None]),
+            ("normals", _turned_left(edges).T[:, None]),
             ("bends", np.reshape(plan.bend_corners, (self._bend_count, 2))),
             ("between", np.reshape(between, (self._bend_count, self._bend_count))),
-            ("turn_left", _turned_left(np.eye(2))),
+            ("turn_left", _turned_left(np.eye(2)).T),
         ):
             self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.float32), persistent=False)
+
+    @property
+    def sees_all(self) -> bool:
+        """Whether there is nothing to see round."""
+        return self._bend_count == 0
 
     def forward(self, listener: Tensor, emitter: Tensor) -> Path:
         p, q = listener[:, :2], emitter[:, :2]
         rise = listener[:, 2:] - emitter[:, 2:]
-        if not self._bend_count:
+        if self.sees_all:
             plan_length, visible = _norm(p - q), torch.ones_like(rise)
             towards, back = q, p
         else:
@@ -69,12 +75,12 @@ class Propagation(nn.Module):
     def _shortest(self, p: Tensor, q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Length in plan and sight (B, 1); where the path goes from p, and from q, first (B, 2)."""
         count = self._bend_count
-        bends = self._bends.expand(p.shape[0], -1, -1)
-        here, there = p[:, None], q[:, None]
-        froms = torch.cat([here, here.expand(-1, count, -1), there.expand(-1, count, -1)], dim=1)
-        tos = torch.cat([there, bends, bends], dim=1)
+        bends = self._bends.T.expand(p.shape[0], -1, -1)
+        here, there = p[..., None], q[..., None]
+        froms = torch.cat([here, here.expand(-1, -1, count), there.expand(-1, -1, count)], dim=2)
+        tos = torch.cat([there, bends, bends], dim=2)
         sees = self._visible(froms, tos)
-        reach = torch.where(sees, _norm(froms - tos)[..., 0], _FAR)
+        reach = torch.where(sees, _norm(froms - tos, dim=1)[:, 0], _FAR)
         via = reach[:, 1 : 1 + count, None] + self._between + reach[:, None, 1 + count :]
         by_first, by_last = via.amin(dim=2), via.amin(dim=1)
         sight = sees[:, :1]
@@ -86,11 +92,12 @@ class Propagation(nn.Module):
         )
 
     def _visible(self, froms: Tensor, tos: Tensor) -> Tensor:
-        """(B, N) sight between (B, N, 2) points; a line that grazes a corner is free."""
-        p, q = froms[:, :, None], tos[:, :, None]
-        across = (q - p) @ self._turn_left
-        crosses = (_dot(p - self._start, self._normals) * _dot(q - self._start, self._normals) < -_TOUCH) & (
-            _dot(self._start - p, across) * _dot(self._end - p, across) < -_TOUCH
+        """(B, N) sight between (B, 2, N) points; a line that grazes a corner is free."""
+        p, q = froms[..., None], tos[..., None]
+        across = (self._turn_left @ (tos - froms))[..., None]
+        after_start = p - self._start
+        crosses = (_dot(after_start, self._normals) * _dot(q - self._start, self._normals) < -_TOUCH) & (
+            _dot(after_start, across) * _dot(p - self._end, across) < -_TOUCH
         )
         return ~crosses.any(dim=-1)
 
@@ -102,12 +109,13 @@ def _turned_left(offsets: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return torch.sum(a * b, dim=-1)
+    """Scalar products (B, N, wall) over axis 1."""
+    return torch.sum(a * b, dim=1)
 
 
-def _norm(offset: Tensor) -> Tensor:
-    """With an axis of one in place of the last."""
-    return torch.sqrt(torch.sum(offset * offset, dim=-1, keepdim=True) + 1e-12)
+def _norm(offset: Tensor, dim: int = -1) -> Tensor:
+    """With an axis of one in place of `dim`."""
+    return torch.sqrt(torch.sum(offset * offset, dim=dim, keepdim=True) + 1e-12)
 
 
 def _direction(offset: Tensor) -> Tensor:
