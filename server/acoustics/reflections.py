@@ -25,6 +25,28 @@ Integers = npt.NDArray[np.int64]
 _LEAST_POWER = 1e-10
 
 
+class FirstEcho:
+    """When a room can answer at the earliest: sound that has touched a surface has come at least as far as from the
+    emitter's image behind the nearest one that both ends are in front of. Safe to share between threads."""
+
+    def __init__(self, plan: FloorPlan) -> None:
+        start, end = plan.walls[:, 0], plan.walls[:, 1]
+        along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
+        inward = np.stack([-along[:, 1], along[:, 0], np.zeros(len(along))], axis=-1)
+        self._normals = np.concatenate([inward, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]]).T
+        offsets = -np.sum(inward[:, :2] * start, axis=-1)
+        self._offsets = np.concatenate([offsets, [-plan.floor_m, plan.height_m]])
+
+    def length_m(self, listeners: Floats, emitters: Floats) -> Floats:
+        """(n,) least length of such a path between points (n, 3) inside the room."""
+        from_listener = listeners @ self._normals + self._offsets
+        from_emitter = emitters @ self._normals + self._offsets
+        in_front = (from_listener > -TOUCH_M) & (from_emitter > -TOUCH_M)
+        # The square of the way to an image is longer by four times the product of both ends' distances from the mirror.
+        farther = 4 * np.min(np.where(in_front, from_listener * from_emitter, np.inf), axis=-1)
+        return np.asarray(np.sqrt(np.maximum(np.sum((listeners - emitters) ** 2, axis=-1) + farther, 0.0)))
+
+
 def mirror_gain_db(absorption: npt.ArrayLike, scattering: npt.ArrayLike) -> Floats:
     """(...) level of what a surface mirrors, from the energy shares it absorbs and, of the rest, scatters; -100 dB at
     least."""

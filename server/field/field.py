@@ -13,6 +13,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.geometry import Vector3
 from server.acoustics.phase import FrozenNoise
+from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
 from server.bounded_cache import BoundedCache
 from server.errors import BundleError, FieldError
@@ -30,6 +31,8 @@ Floats = npt.NDArray[np.float64]
 _CHUNK = 32
 _NEVER = 2.0**31
 """Samples: no index reaches as far."""
+_EAR_AHEAD_S = 0.00026
+"""Sound reaches the nearer ear at most so much sooner than the middle of the head, 87.5 mm away."""
 
 
 class AcousticField:
@@ -52,10 +55,14 @@ class AcousticField:
         self.graph = graph
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
         opening = graph.parameters
+        self._first_echo: FirstEcho | None = None
         if bundle.manifest.direct_sound == "field":
             # Measured sound may arrive before geometry has it: the gate opens with the first sample that is coded.
             opening = opening.model_copy(update={"lead_samples": 0})
+        else:
+            self._first_echo = FirstEcho(bundle.floor_plan)
         self._gate = onset_gate(opening)
+        self._rise = self._gate[opening.lead_samples :]
         self._decoder: Decoder | None = None
         if graph.gives_responses:
             if level.frames is not None or level.phase != Phase():
@@ -168,14 +175,17 @@ class AcousticField:
             raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, yaws)
-            return self._finite(self._placed(coded, aligned), listeners, emitters)
+            return self._after_first_echo(
+                self._finite(self._placed(coded, aligned), listeners, emitters), listeners, emitters
+            )
         predicted = self.graph.predictions(listeners, emitters, yaws)
         if self.channels == 1:
             # Decoders have two ears; a lone microphone is the left one.
             predicted = predicted.twice()
         if cache is None:
             responses = self._decoder.decode(predicted, aligned)
-            return np.ascontiguousarray(self._finite(responses, listeners, emitters)[:, : self.channels])
+            self._finite(responses, listeners, emitters)
+            return self._after_first_echo(np.ascontiguousarray(responses[:, : self.channels]), listeners, emitters)
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
         # One after the other: each may start from the one before it.
         for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
@@ -183,7 +193,17 @@ class AcousticField:
             responses[rows] = self._decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
             self._finite(responses[rows], listeners[rows], emitters[rows])  # before others start from it
             cache.keep(*pose, responses[row])
-        return np.ascontiguousarray(responses[:, : self.channels])
+        return self._after_first_echo(np.ascontiguousarray(responses[:, : self.channels]), listeners, emitters)
+
+    def _after_first_echo(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
+        """The responses, silent until a surface can have answered: windows of a codec are longer than a first
+        reflection takes, and what they smear before it would count, and be heard, as direct sound."""
+        if self._first_echo is not None:
+            echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
+            opens = np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(int) - len(self._rise)
+            for response, at in zip(responses, opens.tolist(), strict=True):
+                apply_gate(self._rise, response, at)
+        return responses
 
     def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
         """The responses. Raises FieldError naming the first that is not finite."""

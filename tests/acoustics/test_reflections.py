@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from server.acoustics import reflections
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
+from server.acoustics.reflections import FirstEcho, ReflectionFinder, mirror_gain_db
 
 SCENE = Path(__file__).resolve().parents[2] / "training" / "scenes" / "apartment.toml"
 GEOMETRY = tomllib.loads(SCENE.read_text())["geometry"]
@@ -206,3 +206,29 @@ def test_without_numba_numpy_answers(monkeypatch):
     monkeypatch.setattr(reflections, "HAS_NUMBA", False)
     monkeypatch.setattr(reflections, "find_reflections", None)
     assert_same(ReflectionFinder(APARTMENT, GAINS_DB).find((1.0, 1.0, 1.5), emitters), expected)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_no_reflection_comes_before_the_first_echo(name):
+    plan, finder = PLANS[name], FINDERS[name]
+    echo = FirstEcho(plan)
+    margins = []
+    for listener, emitter in pairs(plan, 200, 11):
+        earliest = float(echo.length_m(listener[None], emitter[None])[0])
+        assert earliest >= np.linalg.norm(listener - emitter)
+        found = one(finder, listener, emitter)
+        margins += [float(found.length_m.min()) - earliest] if len(found.length_m) else []
+    assert min(margins) >= -1e-9
+    # A bound, and hardly less than what it bounds where a surface in front of both is there to mirror.
+    assert np.median(margins) < 1e-9
+
+
+def test_the_first_echo_of_a_box_is_its_nearest_image():
+    listeners, emitters = points_inside(BOX, 50, 3), points_inside(BOX, 50, 4)
+    nearest = [one(FINDERS["box"], *pair).length_m.min() for pair in zip(listeners, emitters, strict=True)]
+    np.testing.assert_allclose(FirstEcho(BOX).length_m(listeners, emitters), nearest)
+
+
+def test_on_a_surface_the_echo_is_there_at_once():
+    ends = np.array([[1.0, 2.0, 0.0]]), np.array([[4.0, 1.0, 1.2]])
+    np.testing.assert_allclose(FirstEcho(BOX).length_m(*ends), np.linalg.norm(ends[0] - ends[1], axis=-1))

@@ -41,15 +41,27 @@ def test_nothing_is_heard_before_sound_can_arrive(field):
     assert np.abs(response[:, arrival : arrival + 400]).max() > 0
 
 
+def test_nothing_is_heard_before_a_surface_can_have_answered(field):
+    """Two metres apart, a metre above the floor, the nearest surface: sound by way of it has come 2.83 m. What a codec's
+    window smears before that would count as direct sound."""
+    listener, emitter = (3.0, 2.5, 1.0), (5.0, 2.5, 1.0)
+    response = field.impulse_responses([listener], [emitter], [0.3])[0]
+    echo = np.sqrt(8.0) / field.bundle.manifest.speed_of_sound * field.sample_rate
+    nearer_ear = echo - 0.0875 / field.bundle.manifest.speed_of_sound * field.sample_rate
+    assert not response[:, : int(nearer_ear - 0.0004 * field.sample_rate)].any()
+    assert np.abs(response[:, int(nearer_ear) : int(nearer_ear) + 100]).max() > 0
+
+
 def test_level_follows_the_graph(field):
     """The graph's magnitude is 1 / (distance + 0.2): four times that sum is 12 dB, whatever the phase.
 
-    On average over distances: each arrival meets another stretch of the frozen noise.
+    On average over distances: each arrival meets another stretch of the frozen noise. Both ends are on the floor, which
+    answers at once.
     """
     near = np.linspace(0.3, 1.1, 33)
     far = 4 * (near + 0.2) - 0.2
-    emitters = [(2.0 + distance, 2.5, 1.5) for distance in (*near, *far)]
-    responses = field.impulse_responses([(2.0, 2.5, 1.5)] * len(emitters), emitters, np.zeros(len(emitters)))
+    emitters = [(2.0 + distance, 2.5, 0.0) for distance in (*near, *far)]
+    responses = field.impulse_responses([(2.0, 2.5, 0.0)] * len(emitters), emitters, np.zeros(len(emitters)))
     levels = level_db(responses).reshape(2, len(near), 2)
     assert_allclose(np.mean(levels[0] - levels[1]), 20 * np.log10(4.0), atol=0.2)
 
