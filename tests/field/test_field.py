@@ -42,8 +42,8 @@ def test_nothing_is_heard_before_sound_can_arrive(field):
 
 
 def test_nothing_is_heard_before_a_surface_can_have_answered(field):
-    """Two metres apart, a metre above the floor, the nearest surface: sound by way of it has come 2.83 m. What a codec's
-    window smears before that would count as direct sound."""
+    """Two metres apart, a metre above the floor, the nearest surface: sound by way of it has come 2.83 m. What the
+    window of a codec smears before that would count as direct sound."""
     listener, emitter = (3.0, 2.5, 1.0), (5.0, 2.5, 1.0)
     response = field.impulse_responses([listener], [emitter], [0.3])[0]
     echo = np.sqrt(8.0) / field.bundle.manifest.speed_of_sound * field.sample_rate
