@@ -28,7 +28,7 @@ from server.compiled import compiled
 def twiddles(points: int) -> npt.NDArray[np.float32]:
     """Of each pass in turn: six floats per butterfly of radix 4, two of radix 2; `points` is a power of two."""
     passes = [np.zeros(0)]
-    if _is_odd_power(points):
+    if is_odd_power(points):
         turn = np.exp(-2j * np.pi * np.arange(points // 2) / points)
         passes.append(np.stack([turn.real, turn.imag], axis=-1).ravel())
     span = first_span(points)
@@ -44,7 +44,7 @@ def order(points: int) -> npt.NDArray[np.int64]:
     """(points,) the frequency that each position holds after the transform."""
     frequencies, length = np.arange(1), 1
     while length < points:
-        radix = 2 if length * 2 == points and _is_odd_power(points) else 4
+        radix = 2 if length * 2 == points and is_odd_power(points) else 4
         frequencies = np.concatenate([frequencies * radix + digit for digit in range(radix)])
         length *= radix
     return frequencies
@@ -53,11 +53,12 @@ def order(points: int) -> npt.NDArray[np.int64]:
 @compiled
 def first_span(points: int) -> int:
     """Of the radix-4 passes: a quarter of what is left to transform after the pass of radix 2, where there is one."""
-    return points // 8 if _is_odd_power(points) else points // 4
+    return points // 8 if is_odd_power(points) else points // 4
 
 
 @compiled
-def _is_odd_power(points: int) -> bool:
+def is_odd_power(points: int) -> bool:
+    """Of two: whether the first pass is one of radix 2."""
     power = 0
     while points > 1:
         points >>= 1
@@ -68,7 +69,15 @@ def _is_odd_power(points: int) -> bool:
 @compiled
 def transform_lanes(values: int, points: int, passes: int) -> None:
     """Forward, in place; `passes` is the address of `twiddles(points)`."""
-    transform_but_last(values, points, passes)
+    if is_odd_power(points):
+        _halve(values, points, passes)
+    transform_halved(values, points, passes)
+
+
+@compiled
+def transform_halved(values: int, points: int, passes: int) -> None:
+    """What `transform_lanes` does after the pass of radix 2, where there is one."""
+    _turned_passes(values, points, passes)
     size = LANES * points
     if first_span(points) == 0:
         return
@@ -87,11 +96,16 @@ def transform_lanes(values: int, points: int, passes: int) -> None:
 @compiled
 def transform_but_last(values: int, points: int, passes: int) -> None:
     """All passes but the last, whose butterflies are of four neighbours each and turn nothing."""
-    size = LANES * points
-    table = 0
-    if _is_odd_power(points):
+    if is_odd_power(points):
         _halve(values, points, passes)
-        table += points
+    _turned_passes(values, points, passes)
+
+
+@compiled
+def _turned_passes(values, points, passes) -> None:
+    """Of radix 4, but for the last."""
+    size = LANES * points
+    table = points if is_odd_power(points) else 0
     span = first_span(points)
     while span > 1:
         for j in range(span):
@@ -113,7 +127,7 @@ def _halve(values, points, passes) -> None:
         ar, ai, br, bi = load(values, at), load(values, size + at), load(values, to), load(values, size + to)
         store(values, at, add(ar, br))
         store(values, size + at, add(ai, bi))
-        _store_turned(values, size, to, subtract(ar, br), subtract(ai, bi), passes, 2 * j)
+        store_turned(values, size, to, subtract(ar, br), subtract(ai, bi), passes, 2 * j)
 
 
 @compiled
@@ -142,13 +156,14 @@ def _turned_butterfly(values, size, at, step, passes, t) -> None:
     y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(values, size, at, step)
     store(values, at, y0r)
     store(values, size + at, y0i)
-    _store_turned(values, size, at + step, y1r, y1i, passes, t)
-    _store_turned(values, size, at + 2 * step, y2r, y2i, passes, t + 2)
-    _store_turned(values, size, at + 3 * step, y3r, y3i, passes, t + 4)
+    store_turned(values, size, at + step, y1r, y1i, passes, t)
+    store_turned(values, size, at + 2 * step, y2r, y2i, passes, t + 2)
+    store_turned(values, size, at + 3 * step, y3r, y3i, passes, t + 4)
 
 
 @compiled
-def _store_turned(values, size, at, re, im, passes, t) -> None:
+def store_turned(values, size, at, re, im, passes, t) -> None:
+    """A point, multiplied by the twiddle at `t`."""
     # Loaded where they are needed, factors take no registers in the meantime.
     c, s = load_broadcast(passes, t), load_broadcast(passes, t + 1)
     store(values, at, multiply_subtract(im, s, multiply(re, c)))

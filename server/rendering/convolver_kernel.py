@@ -315,12 +315,10 @@ def _synthesise(convolver, stage, channel, out) -> None:
     """The samples of a channel at `out` (size,), faded from the filters before where any were exchanged."""
     size = stage.size
     bins = stage.mix + 4 * channel * 2 * size
-    right_angle.inverse(bins, size, stage.passes, stage.lanes)
-    right_angle.second_half(bins, size, stage.twist, out)
+    right_angle.inverse(bins, out, size, stage.twist, stage.passes, stage.lanes)
     if stage.fades > 0:
         surplus = stage.surplus + 4 * channel * 2 * size
-        right_angle.inverse(surplus, size, stage.passes, stage.lanes)
-        right_angle.second_half(surplus, size, stage.twist, convolver.scratch)
+        right_angle.inverse(surplus, convolver.scratch, size, stage.twist, stage.passes, stage.lanes)
         for n in range(0, size, 8):
             faded = multiply_add(load(convolver.scratch, n), load(stage.fade_out, n), load(out, n))
             store(out, n, faded)

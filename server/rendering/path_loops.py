@@ -81,8 +81,8 @@ def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: Fl
     """The second half (f,) of a window from its spectrum (2, f), which is used up."""
     size = mix.shape[1]
     bins = int(mix.ctypes.data)
-    right_angle.inverse(bins, size, int(passes.ctypes.data), int(lanes.ctypes.data))
-    right_angle.second_half(bins, size, int(twist.ctypes.data), int(out.ctypes.data))
+    to = int(out.ctypes.data)
+    right_angle.inverse(bins, to, size, int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data))
 
 
 @compiled

@@ -18,7 +18,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.lane_fft import first_span, order, transform_lanes, twiddles
+from server.acoustics.lane_fft import (
+    first_span,
+    is_odd_power,
+    order,
+    store_turned,
+    transform_halved,
+    transform_lanes,
+    twiddles,
+)
 from server.acoustics.simd import (
     LANES,
     add,
@@ -70,12 +78,21 @@ def _parts(values: npt.NDArray[np.complex128]) -> npt.NDArray[np.float32]:
 def forward(first: int, second: int, bins: int, size: int, twist: int, passes: int, lanes: int) -> None:
     """Transform the window whose halves (n,) are at addresses `first` and `second` to `bins` (2, n); all addresses."""
     vectors = size // 8
-    for n in range(0, size, 8):
-        a, b = load(first, n), load(second, n)
-        c, s = load(twist, n), load(twist, size + n)
-        store(bins, n, multiply_add(b, s, multiply(a, c)))  # (a - i b)(c + i s)
-        store(bins, size + n, multiply_subtract(b, c, multiply(a, s)))
-    transform_lanes(bins, vectors, passes)
+    if is_odd_power(vectors):
+        half = size // 2
+        for n in range(0, half, 8):
+            ar, ai = _twisted(first, second, n, size, twist)
+            br, bi = _twisted(first, second, half + n, size, twist)
+            store(bins, n, add(ar, br))
+            store(bins, size + n, add(ai, bi))
+            store_turned(bins, size, half + n, subtract(ar, br), subtract(ai, bi), passes, n // 4)
+        transform_halved(bins, vectors, passes)
+    else:
+        for n in range(0, size, 8):
+            re, im = _twisted(first, second, n, size, twist)
+            store(bins, n, re)
+            store(bins, size + n, im)
+        transform_lanes(bins, vectors, passes)
     for at in range(0, size, 64):
         re, im = _load_8(bins, at), _load_8(bins, size + at)
         cos, sin = _load_8(lanes, at), _load_8(lanes, size + at)
@@ -86,8 +103,15 @@ def forward(first: int, second: int, bins: int, size: int, twist: int, passes: i
 
 
 @compiled
-def inverse(bins: int, size: int, passes: int, lanes: int) -> None:
-    """Undo `forward` in place but for the twist, and n times too large: `finish` takes the samples from there."""
+def _twisted(first, second, n, size, twist):
+    a, b = load(first, n), load(second, n)
+    c, s = load(twist, n), load(twist, size + n)
+    return multiply_add(b, s, multiply(a, c)), multiply_subtract(b, c, multiply(a, s))  # (a - i b)(c + i s)
+
+
+@compiled
+def inverse(bins: int, out: int, size: int, twist: int, passes: int, lanes: int) -> None:
+    """Write the second half (n,) of the window, the half overlap-save keeps, to `out`; the bins are used up."""
     vectors = size // 8
     for at in range(0, size, 64):
         im, re = _eight_points(_load_8(bins, size + at), _load_8(bins, at))  # parts swapped: the inverse
@@ -107,7 +131,8 @@ def inverse(bins: int, size: int, passes: int, lanes: int) -> None:
             c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
             c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
             c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
-            for group in range(j, vectors, 4 * span):
+            group = j  # a range of such a step would divide to find its length
+            while group < vectors:
                 p0, p1 = 8 * group, 8 * (group + span)
                 p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
                 ar, ai = load(bins, p0), load(bins, size + p0)
@@ -128,28 +153,27 @@ def inverse(bins: int, size: int, passes: int, lanes: int) -> None:
                 store(bins, size + p2, subtract(ei, gi))
                 store(bins, p3, subtract(fr, hr))
                 store(bins, size + p3, subtract(fi, hi))
+                group += 4 * span
         span *= 4
+    scale = broadcast(np.float32(-1.0 / size))
     if is_odd:
-        half = vectors // 2
-        for j in range(half):
-            at, to = 8 * j, 8 * (j + half)
-            c, s = load_broadcast(passes, 2 * j), load_broadcast(passes, 2 * j + 1)
-            ar, ai, yr, yi = load(bins, at), load(bins, size + at), load(bins, to), load(bins, size + to)
+        half = size // 2
+        for n in range(0, half, 8):
+            m = half + n
+            c, s = load_broadcast(passes, n // 4), load_broadcast(passes, n // 4 + 1)
+            ar, ai, yr, yi = load(bins, n), load(bins, size + n), load(bins, m), load(bins, size + m)
             br, bi = multiply_add(yi, s, multiply(yr, c)), multiply_subtract(yr, s, multiply(yi, c))
-            store(bins, at, add(ar, br))
-            store(bins, size + at, add(ai, bi))
-            store(bins, to, subtract(ar, br))
-            store(bins, size + to, subtract(ai, bi))
+            _untwist(add(ar, br), add(ai, bi), n, size, twist, scale, out)
+            _untwist(subtract(ar, br), subtract(ai, bi), m, size, twist, scale, out)
+    else:
+        for n in range(0, size, 8):
+            _untwist(load(bins, n), load(bins, size + n), n, size, twist, scale, out)
 
 
 @compiled
-def second_half(bins: int, size: int, twist: int, out: int) -> None:
-    """Write the second half (n,) of the window, the half overlap-save keeps, of what `inverse` left, to `out`."""
-    scale = broadcast(np.float32(-1.0 / size))
-    for n in range(0, size, 8):
-        # -Im((re + i im)(c - i s))
-        part = multiply_subtract(load(bins, n), load(twist, size + n), multiply(load(bins, size + n), load(twist, n)))
-        store(out, n, multiply(part, scale))
+def _untwist(re, im, n, size, twist, scale, out) -> None:
+    part = multiply_subtract(re, load(twist, size + n), multiply(im, load(twist, n)))  # -Im((re + i im)(c - i s))
+    store(out, n, multiply(part, scale))
 
 
 @compiled

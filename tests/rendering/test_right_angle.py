@@ -32,8 +32,9 @@ def second_half(bins):
     size = bins.shape[1]
     tables = right_angle.tables(size)
     out = np.zeros(size, np.float32)
-    right_angle.inverse(address(bins), size, address(tables.passes), address(tables.lanes))
-    right_angle.second_half(address(bins), size, address(tables.twist), address(out))
+    right_angle.inverse(
+        address(bins), address(out), size, address(tables.twist), address(tables.passes), address(tables.lanes)
+    )
     return out
 
 
