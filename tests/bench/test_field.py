@@ -5,8 +5,9 @@ import pytest
 from server.bench.field import measure_levels
 from server.calibration import calibrate
 from server.field.levels import Levels
+from server.field.reuse import KEPT_BYTES
 from server.scene.bundle import write_bundle
-from server.scene.manifest import Phase, QualityLevel
+from server.scene.manifest import Phase, QualityLevel, Reuse
 
 
 @pytest.fixture(scope="module")
@@ -31,3 +32,12 @@ def test_the_dear_level_costs_more_and_it_is_decoding_that_costs(levels):
 def test_calibration_tells_them_apart_too(levels, filters):
     costs_ms = calibrate(levels, filters)
     assert costs_ms["dear"] > 2 * costs_ms["standard"]
+
+
+def test_where_responses_are_kept_the_room_for_them_is_full(bundle, tmp_path):
+    reusing = QualityLevel(name="reusing", field="arithmetic", reuse=Reuse(spacing_m=0.1, turn_deg=15))
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    manifest = bundle.manifest.model_copy(update={"levels": (reusing,)})
+    levels = Levels.load(write_bundle(tmp_path / "scene", manifest, files))
+    measure_levels(levels, rounds=1, poses=2)
+    assert levels.kept.bytes > 0.9 * KEPT_BYTES
