@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import COINCIDENT_M, TOUCH_M, FloorPlan
-from server.acoustics.reflections_kernel import CEILING, FLOOR, WALL, find_reflections
+from server.acoustics.reflections_kernel import CEILING, FLOOR, WALL, find_first_echoes, find_reflections
 from server.compiled import HAS_NUMBA
 
 Floats = npt.NDArray[np.float64]
@@ -33,18 +33,19 @@ class FirstEcho:
         start, end = plan.walls[:, 0], plan.walls[:, 1]
         along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
         inward = np.stack([-along[:, 1], along[:, 0], np.zeros(len(along))], axis=-1)
-        self._normals = np.concatenate([inward, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]]).T
+        self._normals = np.concatenate([inward, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]])
         offsets = -np.sum(inward[:, :2] * start, axis=-1)
         self._offsets = np.concatenate([offsets, [-plan.floor_m, plan.height_m]])
+        # Compiled here, where it may take its time, and not for the first pose.
+        self.length_m(np.zeros((1, 3)), np.zeros((1, 3)))
 
-    def length_m(self, listeners: Floats, emitters: Floats) -> Floats:
+    def length_m(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
         """(n,) least length of such a path between points (n, 3) inside the room."""
-        from_listener = listeners @ self._normals + self._offsets
-        from_emitter = emitters @ self._normals + self._offsets
-        in_front = (from_listener > -TOUCH_M) & (from_emitter > -TOUCH_M)
-        # The square of the way to an image is longer by four times the product of both ends' distances from the mirror.
-        farther = 4 * np.min(np.where(in_front, from_listener * from_emitter, np.inf), axis=-1)
-        return np.asarray(np.sqrt(np.maximum(np.sum((listeners - emitters) ** 2, axis=-1) + farther, 0.0)))
+        listeners = np.ascontiguousarray(listeners, dtype=np.float64)
+        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        length_m = np.empty(len(listeners))
+        find_first_echoes(self._normals, self._offsets, listeners, emitters, length_m)
+        return length_m
 
 
 def mirror_gain_db(absorption: npt.ArrayLike, scattering: npt.ArrayLike) -> Floats:

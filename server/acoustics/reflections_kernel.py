@@ -25,6 +25,24 @@ def _aim(vector: Floats, x: float, y: float, z: float, length: float) -> None:
 
 
 @compiled
+def find_first_echoes(normals: Floats, offsets: Floats, listeners: Floats, emitters: Floats, length_m: Floats) -> None:
+    """Fills `length_m` (n,) for points (n, 3), given the inward normals (surface, 3) of planes and their offsets; see
+    FirstEcho."""
+    for row in range(len(listeners)):
+        lx, ly, lz = listeners[row, 0], listeners[row, 1], listeners[row, 2]
+        ex, ey, ez = emitters[row, 0], emitters[row, 1], emitters[row, 2]
+        least = math.inf
+        for plane in range(len(offsets)):
+            x, y, z = normals[plane, 0], normals[plane, 1], normals[plane, 2]
+            from_listener = x * lx + y * ly + z * lz + offsets[plane]
+            from_emitter = x * ex + y * ey + z * ez + offsets[plane]
+            if from_listener > -TOUCH_M and from_emitter > -TOUCH_M:
+                least = min(least, from_listener * from_emitter)
+        # The square of the way to an image is longer by four times the product of both ends' distances from the mirror.
+        length_m[row] = math.sqrt(max((ex - lx) ** 2 + (ey - ly) ** 2 + (ez - lz) ** 2 + 4 * least, 0.0))
+
+
+@compiled
 def find_reflections(
     corners: Floats,
     height_m: float,

@@ -7,6 +7,8 @@ whose `direct_sound` is the field's, responses are whole.
 Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
 """
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
@@ -200,9 +202,8 @@ class AcousticField:
         reflection takes, and what they smear before it would count, and be heard, as direct sound."""
         if self._first_echo is not None:
             echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
-            opens = np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(int) - len(self._rise)
-            for response, at in zip(responses, opens.tolist(), strict=True):
-                apply_gate(self._rise, response, at)
+            for response, opens in zip(responses, (echo_s - _EAR_AHEAD_S) * self.sample_rate, strict=True):
+                apply_gate(self._rise, response, math.floor(opens) - len(self._rise))
         return responses
 
     def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
