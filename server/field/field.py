@@ -177,9 +177,7 @@ class AcousticField:
             raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, yaws)
-            return self._after_first_echo(
-                self._finite(self._placed(coded, aligned), listeners, emitters), listeners, emitters
-            )
+            return self._finite(self._placed(coded, aligned), listeners, emitters)
         predicted = self.graph.predictions(listeners, emitters, yaws)
         if self.channels == 1:
             # Decoders have two ears; a lone microphone is the left one.

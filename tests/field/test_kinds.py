@@ -87,9 +87,10 @@ def test_energy_of_a_graphs_own_responses_is_theirs(bundle, tmp_path):
 
 
 def test_energy_predicted_is_that_of_the_responses(field):
-    """On average over distances: each meets another stretch of the frozen noise. Energy before the gate is left out."""
-    emitters = np.stack([np.linspace(3, 7, 40), np.full(40, 2.5), np.full(40, 1.5)], axis=-1)
-    poses = np.tile(LISTENER, (40, 1)), emitters, np.zeros(40)
+    """On average over distances: each meets another stretch of the frozen noise. Energy before the gate is left out; on
+    the floor it opens at once."""
+    emitters = np.stack([np.linspace(3, 7, 40), np.full(40, 2.5), np.zeros(40)], axis=-1)
+    poses = np.tile((*LISTENER[:2], 0.0), (40, 1)), emitters, np.zeros(40)
     found = np.sum(field.impulse_responses(*poses) ** 2, axis=-1)
     ratio_db = 10 * np.log10(np.mean(field.energy(*poses) / found))
     # The arithmetic graph sounds from its first frame on, of which the gate closes the lead.
