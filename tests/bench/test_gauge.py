@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -52,6 +53,19 @@ def test_a_pose_is_followed_by_the_first_block_that_is_not_older():
     waiting.leave(3, 0.040)
     waiting.leave(3, 0.050)
     assert waiting.times.count == 3
+
+
+@pytest.mark.parametrize(("measured", "is_settled"), [((), False), (("flat",), False), (("flat", "bench"), True)])
+def test_a_server_is_settled_once_the_effects_of_all_scenes_were_measured(measured, is_settled):
+    host = SimpleNamespace(scenes=dict.fromkeys(("flat", "bench")), effect_costs=dict.fromkeys(measured))
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": "http", "path": "/bench/settled", "state": {"host": host}}
+    asyncio.run(Gauge(None)(scope, None, send))
+    assert json.loads(sent[-1]["body"]) == {"is_settled": is_settled}
 
 
 def test_poses_are_timed_from_arrival_to_the_socket_and_messages_pass_unchanged():

@@ -51,20 +51,16 @@ class Simulated:
         return measure(response, RATE, onset=self.onset).direct_to_reverberant_db
 
 
-@pytest.fixture(scope="module")
-def pairs(apartment):
-    """Fresh ones in the bundled apartment, at places where no probe stood, from 0.7 to 4.5 m apart: of an emitter in
-    either room, since what one draws, in two takes, all its listeners have in common."""
-    away = np.array(
+@pytest.fixture(scope="module", params=["one room", "other room"])
+def pairs(apartment, request):
+    """Fresh ones in the bundled apartment, at places where no probe stood, from 0.7 to 4.5 m apart, of one emitter."""
+    emitter, mirror = {
+        "one room": (np.array([6.0, 2.2, 1.5]), np.ones(3)),
+        "other room": (np.array([2.0, 2.8, 1.5]), np.array([-1.0, 0.7, 1.0])),
+    }[request.param]
+    away = mirror * np.array(
         [(0.7, 0.0, 0.0), (-0.6, 0.9, 0.1), (1.2, 1.3, -0.2), (-1.1, -1.4, 0.1), (0.9, -1.6, 0.2), (-4.4, 0.3, 0.1)]
     )
-    return [
-        *_pairs(apartment, np.array([6.0, 2.2, 1.5]), away),
-        *_pairs(apartment, np.array([2.0, 2.8, 1.5]), away * [-1.0, 0.7, 1.0]),
-    ]
-
-
-def _pairs(apartment, emitter, away):
     listeners = emitter + away
     settings = apartment.simulation
     directions = sphere_directions(settings.arrival_directions)

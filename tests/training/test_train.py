@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -23,6 +24,7 @@ from training.models.stored_targets import load_targets
 from training.models.targets import codec_of
 from training.responses import SimulatedResponses
 from training.runs import (
+    CHECKPOINT,
     Configuration,
     FactorisedRecipe,
     NafRecipe,
@@ -140,6 +142,16 @@ def test_a_run_says_how_long_it_took_with_its_targets(dataset, run, tmp_path):
 def test_a_run_keeps_to_its_configuration(dataset, run, configuration, change):
     with pytest.raises(RunError, match="another configuration"):
         train(SimulatedResponses(dataset), run, dataclasses.replace(configuration, **change), Progress(disable=True))
+
+
+def test_a_run_of_another_network_is_refused_with_a_message(dataset, run, tmp_path):
+    other = shutil.copytree(run, tmp_path / "run")
+    checkpoint = other / CHECKPOINT
+    state = torch.load(checkpoint, weights_only=False)
+    state["field"]["level_correction"] = state["field"]["level_correction"][0]
+    torch.save(state, checkpoint)
+    with pytest.raises(RunError, match="another version of this program; train again"):
+        load_learner(SimulatedResponses(dataset), other)
 
 
 def test_a_run_keeps_to_its_data(dataset, run, configuration):

@@ -18,10 +18,9 @@ def test_what_all_predictions_lack_is_missing():
 def test_a_logarithm_of_noise_lacks_half_of_eulers_constant():
     """ln |S| of a Rayleigh-distributed magnitude lies so far, on average, below that of its mean power."""
     torch.manual_seed(0)
-    magnitude = torch.randn(200_000, 2).square().sum(dim=1, keepdim=True).sqrt().expand(-1, 2)
-    levels = torch.log(magnitude * torch.tensor([1.0, 0.0]) + torch.tensor([0.0, 1.0]))
+    magnitude = torch.randn(200_000, 2).square().sum(dim=1).sqrt()
     # The second level is the same everywhere, and most of a pair's power: shares are then those of powers.
-    levels[:, 1] = 5.0
+    levels = torch.stack([torch.log(magnitude), torch.full_like(magnitude, 5.0)], dim=1)
     predicted = levels.mean(dim=0).expand_as(levels)
     balance = PowerBalance(torch.ones(2))
     balance.add(levels, predicted, torch.ones(len(levels), 1))
