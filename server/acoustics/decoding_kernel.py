@@ -358,15 +358,22 @@ def _clear(values) -> None:
 @compiled
 def silence(signals, begin, end) -> None:
     # A slice set to zero would do the same, and take seconds to compile.
-    for ear in range(2):
+    for channel in range(signals.shape[0]):
         for n in range(begin, end):
-            signals[ear, n] = 0
+            signals[channel, n] = 0
 
 
 @compiled
 def open_gate(gate, start, response) -> None:
     """Silence before sample `start`, and the gate's rise from there on."""
     silence(response, 0, min(max(0, start), response.shape[1]))
-    for ear in range(2):
+    for channel in range(response.shape[0]):
         for n in range(max(0, start), min(response.shape[1], start + gate.size)):
-            response[ear, n] *= gate[n - start]
+            response[channel, n] *= gate[n - start]
+
+
+@compiled
+def open_gates(gate: Float32, starts: npt.NDArray[np.int64], responses: Float32) -> None:
+    """`open_gate` of each (B, ear, sample) at its own start (B,)."""
+    for row in range(len(starts)):
+        open_gate(gate, starts[row], responses[row])

@@ -23,6 +23,7 @@ if HAS_NUMBA:
         Shape,
         Workspace,
         decode,
+        open_gates,
     )
     from server.acoustics.griffin_lim_kernel import iterate
     from server.acoustics.simd import LANES
@@ -190,6 +191,15 @@ def add_from(part: Float32, response: Float32, at: int) -> None:
     first, last = max(0, at), min(response.shape[-1], at + part.shape[-1])
     if last > first:
         response[:, first:last] += part[:, first - at : last - at]
+
+
+def apply_gates(gate: Float32, responses: Float32, at: npt.NDArray[np.int64]) -> None:
+    """Multiplies (B, ear, sample) responses by a gate that begins at sample `at` (B,) of each, silent before it."""
+    if HAS_NUMBA:
+        open_gates(gate, at, responses)
+        return
+    for response, begin in zip(responses, at.tolist(), strict=True):
+        apply_gate(gate, response, begin)
 
 
 def apply_gate(gate: Float32, response: Float32, at: int) -> None:

@@ -7,8 +7,6 @@ whose `direct_sound` is the field's, responses are whole.
 Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
 """
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
@@ -19,7 +17,7 @@ from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
 from server.bounded_cache import BoundedCache
 from server.errors import BundleError, FieldError
-from server.field.decoder import Decoder, add_from, apply_gate, onset_gate, resized
+from server.field.decoder import Decoder, add_from, apply_gate, apply_gates, onset_gate, resized
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.lattice import Node, Snapped
 from server.field.phase_cache import PhaseCache
@@ -167,8 +165,8 @@ class AcousticField:
     def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
         """(B,) time at which sound can first arrive, round corners where it must."""
         pairs = zip(np.asarray(listeners), np.asarray(emitters)[:, None], strict=True)
-        length_m = np.concatenate([self._paths.find(*pair).length_m for pair in pairs])
-        return np.asarray(length_m / self.bundle.manifest.speed_of_sound)
+        length_m = [self._paths.find(*pair).length_m for pair in pairs]
+        return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
 
     def _compute(self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None) -> Float32:
         parameters = self.graph.parameters
@@ -200,8 +198,8 @@ class AcousticField:
         reflection takes, and what they smear before it would count, and be heard, as direct sound."""
         if self._first_echo is not None:
             echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
-            for response, opens in zip(responses, (echo_s - _EAR_AHEAD_S) * self.sample_rate, strict=True):
-                apply_gate(self._rise, response, math.floor(opens) - len(self._rise))
+            opens = np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(np.int64)
+            apply_gates(self._rise, responses, opens - len(self._rise))
         return responses
 
     def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:

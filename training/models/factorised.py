@@ -30,6 +30,8 @@ _AFTER_SIGHT = 2 + 2 + 2 * _YAW_HARMONICS
 _POSITION_OCTAVES = 3
 _MOST_LOG_PRECISION = 14.0
 """A bandwidth of a millimetre."""
+_NO_LENGTH = 1e-12
+"""Of a phasor: nothing is divided by less."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class FeatureGrid(nn.Module):
         squared = torch.sum(offset * offset, dim=-2)
         # An infinite precision would be 0 times infinity on a node.
         precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
-        return torch.softmax(-squared * precision, dim=-1) @ self._features
+        return torch.softmax(squared * -precision, dim=-1) @ self._features
 
 
 class PoseEncoder(nn.Module):
@@ -90,12 +92,16 @@ class PoseEncoder(nn.Module):
         self.register_buffer("_half_size", torch.tensor((box[1] - box[0]) / 2), persistent=False)
         quarter = np.pi / 2
         octaves = quarter * 2.0 ** np.arange(_POSITION_OCTAVES)
+        turns = np.array([[1, 0, 0, 1], [0, 1, -1, 0]])
+        turns_back = np.zeros((2 * _YAW_HARMONICS, 4))
+        turns_back[[0, _YAW_HARMONICS]] = turns * [[1], [-1]]
         for name, values in (
             ("octaves", np.hstack([np.tile(octave * np.eye(3), 2) for octave in octaves])),
             ("octave_phases", np.tile(np.repeat([0.0, quarter], 3), _POSITION_OCTAVES)),
             ("yaw_multiples", np.tile(np.arange(1, _YAW_HARMONICS + 1), 2)),
             ("yaw_phases", np.repeat([quarter, 0.0], _YAW_HARMONICS)),
-            ("turns", [[1, 0, 0, 1], [0, 1, -1, 0]]),
+            ("turns", turns),
+            ("turns_back", turns_back),
         ):
             self.register_buffer(f"_{name}", torch.tensor(np.array(values), dtype=torch.float32), persistent=False)
         poses = torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1)
@@ -105,12 +111,11 @@ class PoseEncoder(nn.Module):
         path = self._propagation(listener, emitter)
         # Sines alone, cosines being those of angles a quarter turn ahead: fewer nodes.
         heading = torch.sin(yaw[:, None] * self._yaw_multiples + self._yaw_phases)
-        distance = torch.clamp(path.length[:, None], min=self._nearest_m)
-        rise = (emitter[:, 2:] - listener[:, 2:]) / distance
-        visible = path.visible[:, None]
-        azimuth = self._azimuth(path.from_listener, heading)
+        distance = torch.clamp(path.length, min=self._nearest_m)
+        visible = path.visible
+        azimuth = self._azimuth(path.directions[:, :1], heading)
         ends = torch.minimum(torch.maximum(torch.stack([listener, emitter], dim=1), self._low), self._high)
-        scalars = torch.cat([torch.log(distance), 1 / (1 + distance), rise], dim=-1)
+        scalars = torch.cat([torch.log(distance), 1 / (1 + distance), path.rise / distance], dim=-1)
         return torch.cat(
             [
                 self._grid(ends).flatten(1),
@@ -120,8 +125,7 @@ class PoseEncoder(nn.Module):
                 scalars,
                 scalars * visible,
                 visible,
-                path.from_listener,
-                path.from_emitter,
+                path.directions.flatten(1),
                 heading,
             ],
             dim=-1,
@@ -136,19 +140,14 @@ class PoseEncoder(nn.Module):
         return torch.cat([scaled, torch.sin(scaled @ self._octaves + self._octave_phases)], dim=-1)
 
     def _azimuth(self, direction: Tensor, heading: Tensor) -> Tensor:
-        """cos and sin of the first multiples of the angle of a direction in plan (B, 2) as the head sees it, by
+        """cos and sin of the first multiples of the angle of a direction in plan (B, 1, 2) as the head sees it, by
         recurrence (no branch cut)."""
-        cos, sin = heading[:, :1], heading[:, _YAW_HARMONICS : _YAW_HARMONICS + 1]
-        towards = torch.cat([cos, -sin], dim=-1)[:, None] @ self._turning(direction)
+        towards = direction @ (heading @ self._turns_back).reshape(-1, 2, 2)
         harmonics = [towards]
-        turning = self._turning(towards[:, 0])
+        turning = (towards @ self._turns).reshape(-1, 2, 2)
         for _ in range(_AZIMUTH_HARMONICS - 1):
             harmonics.append(harmonics[-1] @ turning)
         return torch.cat(harmonics, dim=1).transpose(1, 2).flatten(1)
-
-    def _turning(self, unit: Tensor) -> Tensor:
-        """(B, 2, 2) that turn rows by the angle of unit vectors (B, 2)."""
-        return (unit @ self._turns).reshape(-1, 2, 2)
 
 
 class Heads(nn.Module):
@@ -259,47 +258,46 @@ class ExportedField(nn.Module):
         self._field = field
         heads = field.heads
         self._pooled = [name for name in ("late", "interaural") if name in heads.shapes]
-        order = self._order(heads)
-        # Units and level correction cost nothing where the basis and one offset have them; sight is a row of its own.
-        out_of_sight, in_sight = field.level_correction
-        basis = torch.cat([field.basis.detach() * field.spread, (out_of_sight - in_sight)[None]])
-        if field.encoder.sees_all:
-            basis = basis[:-1]
-        self.register_buffer("_basis", basis[:, order], persistent=False)
-        self.register_buffer("_offset", (field.mean + in_sight)[order], persistent=False)
         # The first bands are bins; the others need the last of these to be spread.
         self._narrow = int(np.argmax(np.append(cells.bands.widths, 2) > 1))
         wide = cells.bands.spread()[self._narrow - 1 :, self._narrow :]
         self.register_buffer("_bands", torch.tensor(np.ascontiguousarray(wide.T)), persistent=False)
+        order = self._order(heads)
+        # Units and level correction cost nothing where the basis and one offset have them; sight is a row of its own.
+        out_of_sight, in_sight = field.level_correction
+        basis, offset = field.basis.detach() * field.spread, field.mean + in_sight
+        if not field.encoder.sees_all:
+            basis, offset = torch.cat([basis, (in_sight - out_of_sight)[None]]), field.mean + out_of_sight
+        self.register_buffer("_basis", basis[:, order], persistent=False)
+        self.register_buffer("_offset", offset[order], persistent=False)
         nominal = torch.tensor(cells.codec.nominal_advance, dtype=torch.float32)
         self.register_buffer("_nominal_advance", nominal, persistent=False)
         self._silence = float(np.log(cells.codec.log_floor))
         self._to_frames = torch.from_numpy(cells.all_frames.spread())
 
     def _order(self, heads: Heads) -> Tensor:
-        """Of the flat output: pooled cells of all heads (channel or part, band, frames of one head after another), then
-        the fine frames and the phasors as they were."""
+        """Of the flat output: pooled cells of all heads (channel or part, band, frames of one head after another), of
+        the bands that are bins first and then of those to be spread; the fine frames and phasors as they were."""
         numbers = {name: torch.arange(part.start, part.stop) for name, part in heads.slices.items()}
         pooled = torch.cat([numbers[name].reshape(heads.shapes[name]) for name in self._pooled], dim=-1)
-        self._pooled_shape = tuple(pooled.shape)
-        return torch.cat([pooled.flatten(), numbers["fine"], numbers["phasor"]])
+        bins, bands = pooled[:, : self._narrow], pooled[:, self._narrow - 1 :]
+        _, *phasor = heads.shapes["phasor"]
+        self._shapes = [tuple(bins.shape), tuple(bands.shape), heads.shapes["fine"], tuple(phasor), tuple(phasor)]
+        return torch.cat([bins.flatten(), bands.flatten(), numbers["fine"], numbers["phasor"]])
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
-        shapes = self._field.heads.shapes
         features = self._field.encoder(listener, emitter, yaw)
         coefficients = self._field.coefficients_of(features)
         if not self._field.encoder.sees_all:
-            coefficients = torch.cat([coefficients, 1 - self._field.encoder.sight(features)], dim=1)
+            coefficients = torch.cat([coefficients, self._field.encoder.sight(features)], dim=1)
         flat = torch.addmm(self._offset, coefficients, self._basis)
-        _, *phasor = shapes["phasor"]
-        sizes = [int(np.prod(shape)) for shape in (self._pooled_shape, shapes["fine"], phasor, phasor)]
-        pooled, fine, real, imaginary = torch.split(flat, sizes, dim=1)
-        pooled = pooled.reshape(-1, *self._pooled_shape)
-        spread = torch.cat([pooled[:, :, : self._narrow], self._bands @ pooled[:, :, self._narrow - 1 :]], dim=2)
+        parts = torch.split(flat, [int(np.prod(shape)) for shape in self._shapes], dim=1)
+        bins, bands, fine, *phasor = (part.reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True))
+        spread = torch.cat([bins, self._bands @ bands], dim=2)
+        shapes = self._field.heads.shapes
         late, *interaural = torch.split(spread, [shapes[name][-1] for name in self._pooled], dim=-1)
-        log_magnitude = torch.clamp(torch.cat([fine.reshape(-1, *shapes["fine"]), late], dim=-1), min=self._silence)
-        frequency, certainty = self._phase(real.reshape(-1, *phasor), imaginary.reshape(-1, *phasor))
-        return log_magnitude, frequency, certainty, *interaural
+        log_magnitude = torch.clamp(torch.cat([fine, late], dim=-1), min=self._silence)
+        return log_magnitude, *self._phase(*phasor), *interaural
 
     def of_frames(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
         """The same of every frame."""
@@ -308,8 +306,13 @@ class ExportedField(nn.Module):
 
     def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
         """Instantaneous frequency and certainty of mean phasors (B, ear, frequency, frame)."""
-        certainty = torch.sqrt(real * real + imaginary * imaginary + 1e-12)
-        phase = torch.atan2(imaginary, real)
+        certainty = torch.sqrt(real * real + imaginary * imaginary)
+        # From half the angle's tangent, or its inverse: fewer nodes than the quadrants of an arc tangent.
+        slope = imaginary / torch.clamp(certainty + real.abs(), min=_NO_LENGTH)
+        phase = 2 * torch.atan(torch.where(real < 0, 1 / slope, slope))
+        certainty = torch.clamp(certainty, max=1.0)
+        if phase.shape[-1] == 1:
+            return phase, certainty
         advance = phase[..., 1:] - phase[..., :-1] - self._nominal_advance
         wrapped = advance - 2 * np.pi * torch.floor((advance + np.pi) / (2 * np.pi))
-        return torch.cat([phase[..., :1], wrapped], dim=-1), torch.clamp(certainty, max=1.0)
+        return torch.cat([phase[..., :1], wrapped], dim=-1), certainty

@@ -13,44 +13,58 @@ from torch import Tensor, nn
 
 from server.acoustics.geometry import FloorPlan
 
-_TOUCH = 1e-6
+_Floats = npt.NDArray[np.float64]
+
+_TOUCH = 1e-5
+"""Square metres: no more than single precision makes of a line that grazes a corner."""
 _FAR = 1e4
 
 
 @dataclass(frozen=True)
 class Path:
-    """Shortest path from emitter to listener: `length` (B,), unit directions in plan (B, 2) in which it leaves each
-    end, sight (B,)."""
+    """Shortest path from emitter to listener: `length`, by how much the emitter is higher, and sight (B, 1); unit
+    directions in plan in which it leaves the listener and the emitter (B, 2, 2)."""
 
     length: Tensor
-    from_listener: Tensor
-    from_emitter: Tensor
+    rise: Tensor
+    directions: Tensor
     visible: Tensor
+
+    @property
+    def from_listener(self) -> Tensor:
+        """(B, 2)"""
+        return self.directions[:, 0]
+
+    @property
+    def from_emitter(self) -> Tensor:
+        """(B, 2)"""
+        return self.directions[:, 1]
 
 
 class Propagation(nn.Module):
     """Shortest paths through a floor plan, round its reflex corners.
 
-    A graph of many small nodes takes longer than what they compute, so all lines are looked along at once, by products
-    and sums over whole vectors, whose last axis is the longest; where there is nothing to see round, there is nothing
-    to compute.
+    A graph of many small nodes takes longer than what they compute, so both ends are worked on together, by products
+    and sums over whole vectors, and what is known of corners and walls is worked out beforehand; where there is nothing
+    to see round, there is nothing to compute.
     """
 
     def __init__(self, plan: FloorPlan) -> None:
         super().__init__()
-        self._bend_count = len(plan.bend_corners)
-        walls = plan.walls
-        edges = walls[:, 1] - walls[:, 0]
+        walls = np.asarray(plan.walls, dtype=np.float64)
+        self._wall_count, self._bend_count = len(walls), len(plan.bend_corners)
+        bends = np.reshape(plan.bend_corners, (self._bend_count, 2))
         between = np.minimum(plan.bend_lengths_m, _FAR) if self._bend_count else ()
         for name, values in (
-            ("start", walls[:, 0].T[:, None]),
-            ("end", walls[:, 1].T[:, None]),
-            ("normals", _turned_left(edges).T[:, None]),
-            ("bends", np.reshape(plan.bend_corners, (self._bend_count, 2))),
+            ("apart", [[-1, 1]]),
+            ("turn_left", _turned_left(np.eye(2))),
+            ("corners", np.concatenate([walls[:, 0], walls[:, 1]]).T),
+            ("bends", bends),
+            ("bends_across", bends.T),
             ("between", np.reshape(between, (self._bend_count, self._bend_count))),
-            ("turn_left", _turned_left(np.eye(2)).T),
+            *zip(("of_place", "of_all_places"), _crossings(walls, bends), strict=True),
         ):
-            self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.float32), persistent=False)
+            self.register_buffer(f"_{name}", torch.tensor(np.asarray(values), dtype=torch.float32), persistent=False)
 
     @property
     def sees_all(self) -> bool:
@@ -58,65 +72,73 @@ class Propagation(nn.Module):
         return self._bend_count == 0
 
     def forward(self, listener: Tensor, emitter: Tensor) -> Path:
-        p, q = listener[:, :2], emitter[:, :2]
-        rise = listener[:, 2:] - emitter[:, 2:]
-        if self.sees_all:
-            plan_length, visible = _norm(p - q), torch.ones_like(rise)
-            towards, back = q, p
-        else:
-            plan_length, visible, towards, back = self._shortest(p, q)
-        return Path(
-            torch.sqrt(plan_length**2 + rise**2 + 1e-9)[:, 0],
-            _direction(towards - p),
-            _direction(back - q),
-            visible[:, 0],
-        )
+        ends = torch.stack([listener, emitter], dim=1)
+        places = ends[..., :2]
+        offset = (self._apart @ ends)[:, 0]
+        across, rise = torch.split(offset, [2, 1], dim=-1)
+        plan_length, visible = _norm(across), torch.ones_like(rise)
+        towards = places.flip(1)
+        if not self.sees_all:
+            plan_length, visible, towards = self._shortest(places, across, plan_length, towards)
+        out = towards - places
+        directions = out / (_norm(out) + 1e-4)
+        length = torch.sqrt(plan_length * plan_length + rise * rise + 1e-9)
+        return Path(length, rise, directions, visible)
 
-    def _shortest(self, p: Tensor, q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Length in plan and sight (B, 1); where the path goes from p, and from q, first (B, 2)."""
-        count = self._bend_count
-        bends = self._bends.T.expand(p.shape[0], -1, -1)
-        here, there = p[..., None], q[..., None]
-        froms = torch.cat([here, here.expand(-1, -1, count), there.expand(-1, -1, count)], dim=2)
-        tos = torch.cat([there, bends, bends], dim=2)
-        sees = self._visible(froms, tos)
-        reach = torch.where(sees, _norm(froms - tos, dim=1)[:, 0], _FAR)
-        via = reach[:, 1 : 1 + count, None] + self._between + reach[:, None, 1 + count :]
-        by_first, by_last = via.amin(dim=2), via.amin(dim=1)
-        sight = sees[:, :1]
+    def _shortest(
+        self, places: Tensor, across: Tensor, straight: Tensor, other: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Length in plan and sight (B, 1), and where the path goes from either end first (B, end, 2), of places in plan
+        (B, end, 2), which are `across` (B, 2) from each other, and `straight` (B, 1); `other` are the ends
+        exchanged."""
+        corners = self._bend_count * self._wall_count
+        crossings = places @ self._of_place + self._of_all_places
+        sides, starts, stops, of_walls = torch.split(crossings, [corners, corners, corners, self._wall_count], dim=-1)
+        crossed = torch.maximum(sides, starts * stops).reshape(-1, 2, self._bend_count, self._wall_count)
+        columns = places[..., None]
+        to_bends = columns - self._bends_across
+        far = torch.sqrt(torch.sum(to_bends * to_bends, dim=2) + 1e-12)
+        reach = torch.where(crossed.amin(dim=-1) < -_TOUCH, _FAR, far)
+        via = (reach[..., None] + self._between + reach.flip(1)[:, :, None]).amin(dim=-1)
+        sight = ~self._is_crossed(columns[:, 0], across, of_walls)
         return (
-            torch.where(sight, reach[:, :1], by_first.amin(dim=1, keepdim=True)),
-            sight.to(p.dtype),
-            torch.where(sight, q, self._bends[by_first.argmin(dim=1)]),
-            torch.where(sight, p, self._bends[by_last.argmin(dim=1)]),
+            torch.where(sight, straight, via.amin(dim=(1, 2))[:, None]),
+            sight.to(places.dtype),
+            torch.where(sight[..., None], other, self._bends[via.argmin(dim=-1)]),
         )
 
-    def _visible(self, froms: Tensor, tos: Tensor) -> Tensor:
-        """(B, N) sight between (B, 2, N) points; a line that grazes a corner is free."""
-        p, q = froms[..., None], tos[..., None]
-        across = (self._turn_left @ (tos - froms))[..., None]
-        after_start = p - self._start
-        crosses = (_dot(after_start, self._normals) * _dot(q - self._start, self._normals) < -_TOUCH) & (
-            _dot(after_start, across) * _dot(p - self._end, across) < -_TOUCH
-        )
-        return ~crosses.any(dim=-1)
+    def _is_crossed(self, start: Tensor, across: Tensor, sides: Tensor) -> Tensor:
+        """(B, 1) whether a wall crosses the line that leads `across` (B, 2) from `start` (B, 2, 1), whose ends are on
+        these `sides` (B, end, wall) of walls; one that grazes a corner does not."""
+        of_line = (across @ self._turn_left)[:, None]
+        starts, stops = torch.split(of_line @ (self._corners - start), self._wall_count, dim=-1)
+        crossed = torch.maximum(sides.prod(dim=1, keepdim=True), starts * stops)
+        return crossed.amin(dim=-1) < -_TOUCH
 
 
-def _turned_left(offsets: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """(n, 2) by a quarter of a turn: their scalar products are what others' cross products with them would be."""
-    x, y = np.asarray(offsets, dtype=np.float64).T
+def _crossings(walls: _Floats, bends: _Floats) -> tuple[_Floats, _Floats]:
+    """(2, n) and (n,): a place times the one and with the other added has first, for each bend and wall, the product of
+    the two's sides of the wall, then of which side of the line to the bend the wall's start is and its end; then of
+    which side of each wall the place is. Where either of a wall's ends is a bend, that is exactly none."""
+    starts, stops = walls[:, 0], walls[:, 1]
+    normals = _turned_left(stops - starts)
+    of_start = np.sum(normals * starts, axis=-1)
+    of_bends = np.sum(bends[:, None] * normals, axis=-1) - of_start
+    of_bends[np.all(bends[:, None, None] == walls, axis=-1).any(axis=-1)] = 0
+    factors, offsets = [of_bends[..., None] * normals], [-of_bends * of_start]
+    for ends in (starts, stops):
+        factors.append(-_turned_left(bends[:, None] - ends))
+        offsets.append(np.sum(factors[-1] * -ends, axis=-1))
+    flat = [part.reshape(-1, 2) for part in (*factors, normals)]
+    return np.concatenate(flat).T, np.concatenate([*(part.ravel() for part in offsets), -of_start])
+
+
+def _turned_left(offsets: npt.ArrayLike) -> _Floats:
+    """(..., 2) by a quarter of a turn: their scalar products are what others' cross products with them would be."""
+    x, y = np.moveaxis(np.asarray(offsets, dtype=np.float64), -1, 0)
     return np.stack([-y, x], axis=-1)
 
 
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Scalar products (B, N, wall) over axis 1."""
-    return torch.sum(a * b, dim=1)
-
-
-def _norm(offset: Tensor, dim: int = -1) -> Tensor:
-    """With an axis of one in place of `dim`."""
-    return torch.sqrt(torch.sum(offset * offset, dim=dim, keepdim=True) + 1e-12)
-
-
-def _direction(offset: Tensor) -> Tensor:
-    return offset / (_norm(offset) + 1e-4)
+def _norm(offset: Tensor) -> Tensor:
+    """(..., 1) of (..., 2)."""
+    return torch.sqrt(torch.sum(offset * offset, dim=-1, keepdim=True) + 1e-12)

@@ -37,14 +37,14 @@ def case(request):
 def test_lengths_are_those_of_the_floor_plan(case):
     plan, listeners, emitters, path = case
     assert len(listeners) > PAIRS / 2
-    np.testing.assert_allclose(path.length.numpy(), plan.path_length_m(emitters, listeners), atol=2e-4)
+    np.testing.assert_allclose(path.length.numpy()[:, 0], plan.path_length_m(emitters, listeners), atol=2e-4)
 
 
 def test_sight_is_that_of_the_floor_plan(case):
     plan, listeners, emitters, path = case
     expected = plan.is_visible(listeners, emitters)
     # Single precision may differ where a corner is grazed.
-    assert np.mean((path.visible.numpy() > 0.5) != expected) < 1e-3
+    assert np.mean((path.visible.numpy()[:, 0] > 0.5) != expected) < 1e-3
     assert expected.all() == (plan is PLANS["shoebox"])
 
 
@@ -56,7 +56,7 @@ def test_directions_are_unit_vectors(case):
 
 def test_in_sight_they_point_at_each_other(case):
     _, listeners, emitters, path = case
-    seen = path.visible.numpy() > 0.5
+    seen = path.visible.numpy()[:, 0] > 0.5
     offset = (emitters - listeners)[seen, :2]
     straight = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
     far = np.linalg.norm(offset, axis=-1) > 0.1
@@ -67,7 +67,7 @@ def test_in_sight_they_point_at_each_other(case):
 def test_out_of_sight_they_set_out_on_a_shortest_path(case):
     """A small step in the direction given makes what remains shorter by the step."""
     plan, listeners, emitters, path = case
-    hidden = ~plan.is_visible(listeners, emitters) & (path.visible.numpy() < 0.5)
+    hidden = ~plan.is_visible(listeners, emitters) & (path.visible.numpy()[:, 0] < 0.5)
     step_m = 0.02
     for here, there, direction in (
         (listeners[hidden], emitters[hidden], path.from_listener.numpy()[hidden]),
