@@ -173,7 +173,10 @@ def export(
     for talkative in (None, "torch.onnx"):
         logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or (runs[0] if (runs[0] / FILE).is_file() else dataset_folder(runs[0])))
-    bundle = export_bundle(responses, runs, output, precisions=chosen, ranks=lower, exact_tables=exact_tables)
+    with _progress() as progress:
+        bundle = export_bundle(
+            responses, runs, output, precisions=chosen, ranks=lower, exact_tables=exact_tables, progress=progress
+        )
     size = sum(path.stat().st_size for path in output.iterdir())
     fields = ", ".join(bundle.manifest.fields)
     typer.echo(f"{output}: scene {bundle.id}, {fields}, {size / 1e6:.1f} MB, digest {bundle.digest[:12]}")

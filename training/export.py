@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 import torch
+from rich.progress import Progress
 from torch import nn
 
 from server.acoustics.cells import Axis
@@ -34,6 +35,7 @@ from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
 from training.models.shaped_graph import ShapedNearestGraph
 from training.models.targets import LEAD_SAMPLES, codec_of
+from training.noise import choose_noise
 from training.responses import FILE, ImportedDataset, ResponseSet, SimulatedResponses
 from training.runs import Configuration
 from training.train import load_learner
@@ -81,13 +83,15 @@ def export(
     precisions: Sequence[Precision] = ("float32",),
     ranks: Sequence[int] = (),
     exact_tables: bool = False,
+    progress: Progress | None = None,
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision; the first field is the
     default. Factorised fields are also written at every lower one of `ranks`, with the least loss. With `exact_tables`
     a `naf` is also written with less arithmetic for the same numbers. The folder of measured responses in place of a
     run stands for the field that needs no training, `ShapedNearest`, in one precision.
 
-    Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it.
+    Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it. The frozen
+    noise behind a factorised field of a simulated scene is chosen (`training.noise`), all others' is the first drawn.
 
     Raises RunError for an unfinished run, ExportError for a graph that disagrees and for a dataset folder that is not
     of `responses` or not measured, and HealthError for fields that break a law of `nafir check`: nothing is written.
@@ -105,9 +109,6 @@ def export(
     _require_different(names)  # of lower ranks, too
     codec = exported[0].codec
     seed = 0 if exported[0].architecture == SHAPED_NEAREST else Configuration.read(runs[0]).seed
-    noise = even_noise(codec.codec, np.random.default_rng([seed, 6]))
-    arrays = io.BytesIO()
-    np.savez(arrays, frozen_noise=noise)
     # The default field is called by its kind alone, whatever its rank, unless it is less than exact.
     titles = [exported[0].architecture if precisions[0] == "float32" else names[0], *names[1:]]
     files = {f"{title}.onnx": each.model.SerializeToString() for title, each in zip(titles, exported, strict=True)}
@@ -123,12 +124,24 @@ def export(
     levels = tuple(
         QualityLevel(name=title if number else DEFAULT_LEVEL, field=title) for number, title in enumerate(titles)
     )
-    files[ARRAYS_FILE] = arrays.getvalue()
+    files[ARRAYS_FILE] = _arrays(even_noise(codec.codec, np.random.default_rng([seed, 6])))
     described = Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
     if isinstance(responses, SimulatedResponses):
-        return _write_healthy(folder, simulated_manifest(responses, described), files)
+        manifest = simulated_manifest(responses, described)
+        if exported[0].architecture == "factorised":
+            with tempfile.TemporaryDirectory() as trial:
+                bundle = write_bundle(Path(trial), manifest, files)
+                files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
+        return _write_healthy(folder, manifest, files)
     assert isinstance(responses, ImportedDataset)
     return _write_healthy(folder, measured_manifest(responses, described), files)
+
+
+def _arrays(noise: npt.NDArray[np.float32]) -> bytes:
+    """The bundle's file of arrays."""
+    arrays = io.BytesIO()
+    np.savez(arrays, frozen_noise=noise)
+    return arrays.getvalue()
 
 
 def _write_healthy(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> Bundle:

@@ -12,6 +12,7 @@ from server import whole_field
 from server.health.check import Effort
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
+from training import noise
 from training.dataset import Dataset
 from training.export import export
 from training.models.factorised import FieldShape
@@ -64,6 +65,14 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _few_draws() -> Iterator[None]:
+    """Of noise, for bundles that nobody listens to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(noise, "DRAWS", 2)
+        yield
 
 
 @pytest.fixture(scope="session")

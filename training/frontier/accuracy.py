@@ -1,4 +1,4 @@
-"""Errors of a quality level on a sample of the held-out pairs.
+"""Errors of a quality level on a sample of a dataset's pairs, held out unless others are asked for.
 
 Axes: entries are (pair, yaw); responses (yaw, ear, sample).
 """
@@ -26,7 +26,7 @@ _Responses = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Entry:
-    """One held-out pair and the head orientations it is heard at."""
+    """One pair and the head orientations it is heard at."""
 
     emitter: npt.NDArray[np.float64]
     listener: npt.NDArray[np.float64]
@@ -35,7 +35,8 @@ class Entry:
     reference: _Responses
     reflected: _Responses
     """What a field is asked for: the reference without its direct sound and its first reflections."""
-    repeat: _Responses
+    repeat: _Responses | None
+    """Of a pair that is held out."""
     parameters: RoomParameters
 
 
@@ -69,15 +70,17 @@ class Errors:
         )
 
 
-class HeldOutSample:
-    """`pairs` held-out pairs at `yaws` orientations each, spread evenly; all where there are no more."""
+class SampledPairs:
+    """`pairs` pairs at `yaws` orientations each, spread evenly; all where there are no more."""
 
-    def __init__(self, dataset: Dataset, codec: Codec, *, pairs: int, yaws: int, seed: int) -> None:
+    def __init__(
+        self, dataset: Dataset, codec: Codec, *, pairs: int, yaws: int, seed: int, held_out: bool = True
+    ) -> None:
         self._codec = codec
         self._sample_rate = dataset.sample_rate
         rng = np.random.default_rng([seed, 7])
-        held_out = dataset.pairs(held_out=True)
-        chosen = held_out[np.sort(rng.choice(len(held_out), min(pairs, len(held_out)), replace=False))]
+        all_pairs = dataset.pairs(held_out=held_out)
+        chosen = all_pairs[np.sort(rng.choice(len(all_pairs), min(pairs, len(all_pairs)), replace=False))]
         turns = np.unique(np.linspace(0, len(dataset.yaws), yaws, endpoint=False).astype(int))
         with h5py.File(Path(dataset.folder) / "pairs.h5", "r") as file:
             first, second = References(dataset, file), References(dataset, file, "repeats")
@@ -93,7 +96,7 @@ class HeldOutSample:
                     visible=bool(dataset.plan.is_visible(*ends)),
                     reference=reference,
                     reflected=reflected[emitter, listener][turns],
-                    repeat=second[pair][turns],
+                    repeat=second[pair][turns] if held_out else None,
                     parameters=measure(reference, self._sample_rate),
                 )
                 self.entries.append(entry)
@@ -115,19 +118,33 @@ class HeldOutSample:
         missing = float(np.mean(np.isnan(everything)))
         return Errors(_means(by_entry), _means(audible_by_entry), _pair_means(audible_by_entry), missing)
 
+    def audible_of(self, estimate: Callable[[Entry], _Responses]) -> dict[str, float]:
+        """Mean errors in JND by metric alone, in a third of the time."""
+        return _means([in_jnd(self._differences(entry, estimate(entry)), entry.parameters) for entry in self.entries])
+
     def floor(self) -> Errors:
-        """What a second simulation of the same pairs differs by."""
-        return self.errors_of(lambda entry: entry.repeat)
+        """What a second simulation of the same pairs, held out, differs by."""
+
+        def second(entry: Entry) -> _Responses:
+            assert entry.repeat is not None
+            return entry.repeat
+
+        return self.errors_of(second)
 
     def _compare(self, entry: Entry, estimate: _Responses) -> tuple[dict[str, _Floats], dict[str, _Floats]]:
+        errors = self._differences(entry, estimate)
+        spectrograms = (self._codec.log_magnitude(self._codec.transform(ir)) for ir in (entry.reference, estimate))
+        errors[SPECTRAL_LOSS.name] = spectral_loss(*spectrograms)
+        return errors, in_jnd(errors, entry.parameters)
+
+    def _differences(self, entry: Entry, estimate: _Responses) -> dict[str, _Floats]:
+        """Errors of room parameters."""
         onset = np.round(np.nan_to_num(entry.parameters.onset_s) * self._sample_rate).astype(np.int64)
         errors = parameter_errors(entry.parameters, measure(estimate, self._sample_rate, onset=onset))
         if not entry.visible:
             errors["drr"] = np.full_like(errors["drr"], np.nan)
             errors["itd"] = np.full_like(errors["itd"], np.nan)
-        spectrograms = (self._codec.log_magnitude(self._codec.transform(ir)) for ir in (entry.reference, estimate))
-        errors[SPECTRAL_LOSS.name] = spectral_loss(*spectrograms)
-        return errors, in_jnd(errors, entry.parameters)
+        return errors
 
 
 def _means(entries: list[dict[str, _Floats]]) -> dict[str, float]:

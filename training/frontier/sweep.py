@@ -26,7 +26,7 @@ from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, Qu
 from server.whole_field import WholeField
 from training.dataset import Dataset
 from training.evaluation.held_out import require_same_scene
-from training.frontier.accuracy import Entry, Errors, HeldOutSample
+from training.frontier.accuracy import Entry, Errors, SampledPairs
 from training.frontier.bound import TruePhase
 from training.frontier.cost import STRETCH_S, cost_of, measure, memory_mb, one_core
 from training.frontier.points import Point, default_point, offered_points, pareto
@@ -109,7 +109,7 @@ def sweep(
     require_same_scene(bundle, dataset)
     folder.mkdir(parents=True, exist_ok=True)
     trial = with_levels(bundle, levels, folder / "trial")
-    sample = HeldOutSample(dataset, trial.manifest.codec.codec, pairs=effort.pairs, yaws=effort.yaws, seed=effort.seed)
+    sample = SampledPairs(dataset, trial.manifest.codec.codec, pairs=effort.pairs, yaws=effort.yaws, seed=effort.seed)
     floor = sample.floor()
     errors = _accuracies(trial, sample, levels, folder / "accuracy.json", effort, progress)
     task = progress.add_task("timing", total=math.ceil(effort.walk_s / STRETCH_S))
@@ -171,14 +171,14 @@ def record(bundle: Bundle, frontier: Frontier, folder: Path) -> Bundle:
     return with_levels(dataclasses.replace(bundle, manifest=measured), offered, folder)
 
 
-def _point(level: QualityLevel, cost: Cost, errors: Errors, floor: Errors, sample: HeldOutSample) -> Point:
+def _point(level: QualityLevel, cost: Cost, errors: Errors, floor: Errors, sample: SampledPairs) -> Point:
     pairs, yaws = sample.size
     accuracy = Accuracy(pairs=pairs, yaws=yaws, errors=errors.errors, floor=floor.errors, steps=errors.steps)
     measured = level.model_copy(update={"accuracy": accuracy, "cost": cost})
     return Point(measured, errors.audible, errors.by_pair, errors.missing)
 
 
-def _true_phase(trial: Bundle, like: Point, sample: HeldOutSample, floor: Errors) -> Point:
+def _true_phase(trial: Bundle, like: Point, sample: SampledPairs, floor: Errors) -> Point:
     """What the first level would be if it knew the phase of every bin: drawn at its cost."""
     errors = sample.errors_of(TruePhase(AcousticField.load(trial, level=like.level.name)))
     level = like.level.model_copy(update={"name": f"{like.level.name}-true-phase"})
@@ -186,7 +186,7 @@ def _true_phase(trial: Bundle, like: Point, sample: HeldOutSample, floor: Errors
 
 
 def _accuracies(
-    trial: Bundle, sample: HeldOutSample, levels: Sequence[QualityLevel], path: Path, effort: Effort, progress: Progress
+    trial: Bundle, sample: SampledPairs, levels: Sequence[QualityLevel], path: Path, effort: Effort, progress: Progress
 ) -> dict[str, Errors]:
     """By level; those that `path` holds already, of the same graph and sample, are not measured again."""
     kept: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
@@ -204,7 +204,7 @@ def _accuracies(
     return errors
 
 
-def _errors(field: AcousticField, sample: HeldOutSample, seed: int) -> Errors:
+def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:
     """Held-out poses are where a simulation has them and look where it did, and might be nodes: of a level with a
     lattice, the mean over several places and headings of it."""
     steps = largest_steps(field, count=_STEPS, seed=seed)

@@ -16,7 +16,7 @@ from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Phase, QualityLevel, Reuse
 from server.whole_field import kemar
 from training.frontier import sweep as sweep_module
-from training.frontier.accuracy import HeldOutSample
+from training.frontier.accuracy import SampledPairs
 from training.frontier.candidates import candidates
 from training.frontier.figure import draw_frontier
 from training.frontier.sweep import Effort, record, sweep, with_levels
@@ -40,8 +40,8 @@ def frontier(tiny_bundle, dataset, chosen, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def sample(tiny_bundle, dataset) -> HeldOutSample:
-    return HeldOutSample(dataset, tiny_bundle.manifest.codec.codec, pairs=3, yaws=2, seed=0)
+def sample(tiny_bundle, dataset) -> SampledPairs:
+    return SampledPairs(dataset, tiny_bundle.manifest.codec.codec, pairs=3, yaws=2, seed=0)
 
 
 def test_candidates_differ_in_what_they_are_and_not_only_in_name(tiny_bundle) -> None:
