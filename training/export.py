@@ -30,7 +30,7 @@ from training.learning.factorised import FactorisedLearner
 from training.learning.learner import Learner
 from training.learning.naf import NafLearner
 from training.manifests import Fields, measured_manifest, simulated_manifest
-from training.models.factorised import ExportedField
+from training.models.factorised import GEOMETRY, ExportedField
 from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
 from training.models.shaped_graph import ShapedNearestGraph
@@ -91,7 +91,7 @@ def export(
     run stands for the field that needs no training, `ShapedNearest`, in one precision.
 
     Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it. The frozen
-    noise behind a factorised field of a simulated scene is chosen (`training.noise`), all others' is the first drawn.
+    noise of a simulated scene whose first field is factorised is chosen (`training.noise`), all others' is drawn.
 
     Raises RunError for an unfinished run, ExportError for a graph that disagrees and for a dataset folder that is not
     of `responses` or not measured, and HealthError for fields that break a law of `nafir check`: nothing is written.
@@ -211,7 +211,8 @@ def _factorised(
         graph = traced if field is whole else with_weights(traced, module)
         for precision in precisions:
             least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
-            model = halve_weights(to_int8(graph, least_weights=least_weights) if precision == "int8" else graph)
+            small = to_int8(graph, least_weights=least_weights, exact=GEOMETRY) if precision == "int8" else graph
+            model = halve_weights(small, exact=GEOMETRY)
             _check(model, module, poses, outputs, precision)
             name = f"{_factorised_name(rank)}{_suffix(precision)}"
             exported.append(_Exported(name, model, "factorised", rank, codec))

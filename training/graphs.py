@@ -91,16 +91,16 @@ def pose_by_pose(model: onnx.ModelProto) -> onnx.ModelProto:
     return wrapped
 
 
-def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
+def halve_weights(model: onnx.ModelProto, *, exact: str | None = None) -> onnx.ModelProto:
     """Stores large float32 constants as float16, cast back as the graph is loaded: half the bundle, the same
-    arithmetic."""
+    arithmetic. Those of the module called `exact` stay as they are."""
     halved = onnx.ModelProto()
     halved.CopyFrom(model)
     graph = halved.graph
     casts = []
     for tensor in graph.initializer:
         values = numpy_helper.to_array(tensor)
-        if values.dtype != np.float32 or values.nbytes < _HALVE_ABOVE_BYTES:
+        if values.dtype != np.float32 or values.nbytes < _HALVE_ABOVE_BYTES or _has_part(tensor.name, exact):
             continue
         name = tensor.name
         tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
@@ -111,9 +111,10 @@ def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
     return halved
 
 
-def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
+def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = None) -> onnx.ModelProto:
     """Products with at least so many constant weights in 8-bit integers: weights per column, the other factor as it
-    comes, per call. Smaller ones take no time, and what they compute is needed exactly."""
+    comes, per call. Smaller ones take no time, and what they compute is needed exactly, as is what
+    the module called `exact` computes."""
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     constants = {tensor.name: int(np.prod(tensor.dims)) for tensor in model.graph.initializer}
@@ -122,7 +123,8 @@ def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
         name
         for node in model.graph.node
         for name in (node.name, f"{node.name}_MatMul")
-        if node.op_type in {"MatMul", "Gemm"} and constants.get(node.input[1], 0) < least_weights
+        if node.op_type in {"MatMul", "Gemm"}
+        and (constants.get(node.input[1], 0) < least_weights or _has_part(node.input[1], exact))
     ]
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
@@ -140,3 +142,7 @@ def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
             op_types_to_quantize=["MatMul", "Gemm"],
         )
         return onnx.load(target)
+
+
+def _has_part(name: str, part: str | None) -> bool:
+    return part is not None and part in name.split(".")

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from rich.progress import Progress
 
 from server.acoustics.phase import FrozenNoise
+from server.errors import FieldError
 from server.field.field import AcousticField
 from server.field.graph import FieldGraph, open_graph
 from server.scene.bundle import Bundle
@@ -29,7 +30,8 @@ def choose_noise(
     bundle: Bundle, dataset: Dataset, *, seed: int, progress: Progress | None = None
 ) -> npt.NDArray[np.float32]:
     """(2, sample) of DRAWS: that with the least mean audible error of the bundle's first level over pairs that training
-    saw."""
+    saw; of those with which more could not be measured, none. A field without finite responses is nobody's to choose
+    for: it is given any."""
     progress = progress or Progress(disable=True)
     manifest = bundle.manifest
     codec = manifest.codec.codec
@@ -37,7 +39,7 @@ def choose_noise(
     graph = FieldGraph(bundle, level.field, open_graph(bundle, manifest.fields[level.field].file))
     sample = SampledPairs(dataset, codec, pairs=_PAIRS, yaws=_YAWS, seed=seed, held_out=False)
 
-    def error(noise: npt.NDArray[np.float32]) -> float:
+    def error(noise: npt.NDArray[np.float32]) -> tuple[float, float]:
         frozen = FrozenNoise.from_signal(codec, noise)
         field = WholeField.through_kemar(AcousticField(bundle, level, graph, frozen))
 
@@ -45,7 +47,10 @@ def choose_noise(
             listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
             return field.impulse_responses(listeners, emitters, entry.yaws)
 
-        return math.fsum(sample.audible_of(answer).values())
+        try:
+            return sample.audible_of(answer)
+        except FieldError:
+            return 1.0, math.inf
 
-    draws = progress.track(np.random.default_rng([seed, 6]).spawn(DRAWS), description="choosing its noise")
+    draws = progress.track(np.random.default_rng([seed, 6]).spawn(DRAWS), description="choosing the noise")
     return min((even_noise(codec, draw) for draw in draws), key=error)

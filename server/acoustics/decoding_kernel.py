@@ -374,6 +374,6 @@ def open_gate(gate, start, response) -> None:
 
 @compiled
 def open_gates(gate: Float32, starts: npt.NDArray[np.int64], responses: Float32) -> None:
-    """`open_gate` of each (B, ear, sample) at its own start (B,)."""
+    """`open_gate` of each of (B, channel, sample) at its own start (B,)."""
     for row in range(len(starts)):
         open_gate(gate, starts[row], responses[row])

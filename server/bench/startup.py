@@ -34,17 +34,21 @@ def cold_start_s() -> float:
 def _first_block_s(environment: "os._Environ[str] | dict[str, str]") -> float:
     """From the process' start until it tells of the block; what its end takes does not count."""
     started_s = time.perf_counter()
-    with subprocess.Popen(
-        [sys.executable, "-c", _FIRST_BLOCK],
-        env=dict(environment),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
+    with (
+        tempfile.TemporaryFile("w+") as complaint,
+        subprocess.Popen(
+            [sys.executable, "-c", _FIRST_BLOCK],
+            env=dict(environment),
+            stdout=subprocess.PIPE,
+            stderr=complaint,
+            text=True,
+        ) as process,
+    ):
         assert process.stdout is not None
         line = process.stdout.readline()
         taken_s = time.perf_counter() - started_s
-        _, complaint = process.communicate()
-    if line != "heard\n":
-        raise NafirError(f"a fresh process could not convolve a block: {complaint.strip()}")
+        if line != "heard\n":
+            process.wait()
+            complaint.seek(0)
+            raise NafirError(f"a fresh process could not convolve a block: {complaint.read().strip()}")
     return taken_s

@@ -194,7 +194,7 @@ def add_from(part: Float32, response: Float32, at: int) -> None:
 
 
 def apply_gates(gate: Float32, responses: Float32, at: npt.NDArray[np.int64]) -> None:
-    """Multiplies (B, ear, sample) responses by a gate that begins at sample `at` (B,) of each, silent before it."""
+    """Multiplies (B, channel, sample) responses by a gate that begins at sample `at` (B,) of each, silent before it."""
     if HAS_NUMBA:
         open_gates(gate, at, responses)
         return

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from server.acoustics.codec import Codec
 from server.acoustics.phase import FrozenNoise, griffin_lim
-from server.field.decoder import Decoder
+from server.field.decoder import Decoder, apply_gate, apply_gates
 from server.field.graph import Spectrograms
 from server.scene.manifest import CodecParameters, Phase
 
@@ -116,6 +116,19 @@ def test_a_window_that_is_no_power_of_two_is_decoded_all_the_same():
     expected = decoder.decode_with_numpy(predicted, np.array([50.5]), [None])
     assert_array_equal(decoder.decode(predicted, np.array([50.5])), expected)
     assert np.abs(expected).max() > 1e-3
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_gates_open_each_at_its_own_sample(channels):
+    starts = np.array([-100, -3, 0, 7, 95, 100, 2**40])
+    gate = np.array([0.25, 0.5, 0.75], dtype=np.float32)
+    responses = np.random.default_rng(0).standard_normal((len(starts), channels, 100)).astype(np.float32)
+    expected = responses.copy()
+    for response, start in zip(expected, starts.tolist(), strict=True):
+        apply_gate(gate, response, start)
+    apply_gates(gate, responses, starts)
+    assert_array_equal(responses, expected)
+    assert_array_equal(responses[3, :, :7], 0)
 
 
 def test_rows_of_a_batch_do_not_mix():

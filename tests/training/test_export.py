@@ -107,6 +107,15 @@ def test_small_weights_stay_as_they_are():
     np.testing.assert_array_equal(small, np.full(128, 1 / 3, np.float32))
 
 
+def test_what_has_to_be_exact_is_not_halved():
+    large = np.random.default_rng(0).standard_normal((128, 128)).astype(np.float32)
+    model = two_weights(large)
+    model.graph.initializer[0].name = model.graph.node[0].input[1] = "field._geometry.large"
+    session = open_session(halve_weights(model, exact="_geometry").SerializeToString())
+    (read,) = session.run(["y"], {"x": np.eye(128, dtype=np.float32)})
+    np.testing.assert_array_equal(read, large + np.float32(1 / 3))
+
+
 def scaled_up(data, name):
     """The graph with its largest weight, the basis, damaged."""
     model = onnx.load_from_string(data)

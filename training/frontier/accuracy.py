@@ -114,13 +114,16 @@ class SampledPairs:
             errors, audible = self._compare(entry, estimate(entry))
             by_entry.append(errors)
             audible_by_entry.append(audible)
-        everything = np.concatenate([values.ravel() for entry in audible_by_entry for values in entry.values()])
-        missing = float(np.mean(np.isnan(everything)))
-        return Errors(_means(by_entry), _means(audible_by_entry), _pair_means(audible_by_entry), missing)
+        return Errors(
+            _means(by_entry), _means(audible_by_entry), _pair_means(audible_by_entry), _missing(audible_by_entry)
+        )
 
-    def audible_of(self, estimate: Callable[[Entry], _Responses]) -> dict[str, float]:
-        """Mean errors in JND by metric alone, in a third of the time."""
-        return _means([in_jnd(self._differences(entry, estimate(entry)), entry.parameters) for entry in self.entries])
+    def audible_of(self, estimate: Callable[[Entry], _Responses]) -> tuple[float, float]:
+        """Of the errors in JND, the share that could not be measured, and the mean over metrics of the others' means:
+        in a third of the time."""
+        audible = [in_jnd(self._differences(entry, estimate(entry)), entry.parameters) for entry in self.entries]
+        means = _means(audible)
+        return _missing(audible), math.fsum(means.values()) / len(means)
 
     def floor(self) -> Errors:
         """What a second simulation of the same pairs, held out, differs by."""
@@ -151,6 +154,11 @@ def _means(entries: list[dict[str, _Floats]]) -> dict[str, float]:
     """Means over all that could be measured; a metric that never could is left out."""
     stacked = {name: np.concatenate([entry[name].ravel() for entry in entries]) for name in entries[0]}
     return {name: float(np.nanmean(values)) for name, values in stacked.items() if np.isfinite(values).any()}
+
+
+def _missing(entries: list[dict[str, _Floats]]) -> float:
+    """The share of them that could not be measured."""
+    return float(np.mean(np.isnan(np.concatenate([values.ravel() for entry in entries for values in entry.values()]))))
 
 
 def _pair_means(entries: list[dict[str, _Floats]]) -> _Floats:

@@ -23,6 +23,8 @@ from training.models.level_correction import PowerBalance
 from training.models.propagation import Propagation
 from training.models.site import Reach
 
+GEOMETRY = "_propagation"
+"""The name of the module whose constants are places and not weights: rounded, they would let sound through walls."""
 _AZIMUTH_HARMONICS = 5
 _YAW_HARMONICS = 3
 _AFTER_SIGHT = 2 + 2 + 2 * _YAW_HARMONICS
@@ -31,7 +33,7 @@ _POSITION_OCTAVES = 3
 _MOST_LOG_PRECISION = 14.0
 """A bandwidth of a millimetre."""
 _NO_LENGTH = 1e-12
-"""Of a phasor: nothing is divided by less."""
+"""Of a phasor: its imaginary part is divided by no less."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,10 @@ class FactorisedField(nn.Module):
 
     def coefficients(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
         """(B, rank), of the basis."""
-        return self.coefficients_of(self.encoder(listener, emitter, yaw))
+        # In few digits a path goes through walls.
+        with torch.autocast(listener.device.type, enabled=False):
+            features = self.encoder(listener, emitter, yaw)
+        return self.coefficients_of(features)
 
     def coefficients_of(self, features: Tensor) -> Tensor:
         """`coefficients`, of what the encoder makes of poses."""

@@ -15,8 +15,8 @@ from server.acoustics.geometry import FloorPlan
 
 _Floats = npt.NDArray[np.float64]
 
-_TOUCH = 1e-5
-"""Square metres: no more than single precision makes of a line that grazes a corner."""
+_TOUCH = 1e-6
+"""Metres to the fourth power, of two products of sides: less is a line that grazes a corner, or rounding."""
 _FAR = 1e4
 
 
@@ -119,7 +119,7 @@ class Propagation(nn.Module):
 def _crossings(walls: _Floats, bends: _Floats) -> tuple[_Floats, _Floats]:
     """(2, n) and (n,): a place times the one and with the other added has first, for each bend and wall, the product of
     the two's sides of the wall, then of which side of the line to the bend the wall's start is and its end; then of
-    which side of each wall the place is. Where either of a wall's ends is a bend, that is exactly none."""
+    which side of each wall the place is. Where the bend is an end of the wall, their product is exactly 0."""
     starts, stops = walls[:, 0], walls[:, 1]
     normals = _turned_left(stops - starts)
     of_start = np.sum(normals * starts, axis=-1)

@@ -113,6 +113,34 @@ def test_phase_is_coded_as_the_codec_does(field):
     np.testing.assert_allclose(certainty, np.minimum(length, 1), atol=1e-5)
 
 
+def test_the_first_frames_phase_is_the_angle_in_every_quadrant_and_on_the_axes(field):
+    around = torch.arange(-12, 13) * torch.pi / 12
+    angles = torch.cat([around, around + 1e-5, torch.tensor([torch.pi - 1e-7, 1e-30])])
+    real, imaginary = torch.cos(angles), torch.sin(angles)
+    real, imaginary = torch.cat([real, -torch.ones(2)]), torch.cat([imaginary, torch.tensor([0.0, -0.0])])
+    frequency, _ = ExportedField(field, CELLS)._phase(real[:, None], imaginary[:, None])
+    difference = frequency[:, 0] - torch.atan2(imaginary, real)
+    assert (difference - 2 * torch.pi * torch.round(difference / (2 * torch.pi))).abs().max() < 2e-6
+
+
+def test_of_nothing_the_phase_is_finite(field):
+    frequency, certainty = ExportedField(field, CELLS)._phase(torch.zeros(1, 1), torch.zeros(1, 1))
+    assert frequency.isfinite().all()
+    assert certainty.max() == 0
+
+
+def test_geometry_is_exact_where_training_is_not(field):
+    """Few digits for products of weights are enough; a path's length and whether a wall is in its way are not."""
+    listener, emitter, yaw = poses(200)
+    plain = field.encoder(listener, emitter, yaw)
+    seen = []
+    handle = field.encoder.register_forward_hook(lambda _, __, features: seen.append(features))
+    with torch.autocast("cpu", torch.bfloat16):
+        field.coefficients(listener, emitter, yaw)
+    handle.remove()
+    torch.testing.assert_close(seen[0], plain)
+
+
 def test_a_flat_prediction_comes_out_where_it_belongs(field):
     """With constant heads, every output of the contract is that constant, in cells of frames and bins of the codec."""
     heads = field.heads
