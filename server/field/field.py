@@ -63,6 +63,8 @@ class AcousticField:
             self._first_echo = FirstEcho(bundle.floor_plan)
         self._gate = onset_gate(opening)
         self._rise = self._gate[opening.lead_samples :]
+        # Compiled here, where it may take its time, and not for the first pose.
+        apply_gates(self._rise, np.zeros((1, self.channels, 1), np.float32), np.zeros(1, np.int64))
         self._decoder: Decoder | None = None
         if graph.gives_responses:
             if level.frames is not None or level.phase != Phase():
