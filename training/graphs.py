@@ -113,8 +113,8 @@ def halve_weights(model: onnx.ModelProto, *, exact: str | None = None) -> onnx.M
 
 def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = None) -> onnx.ModelProto:
     """Products with at least so many constant weights in 8-bit integers: weights per column, the other factor as it
-    comes, per call. Smaller ones take no time, and what they compute is needed exactly, as is what
-    the module called `exact` computes."""
+    comes, per call. Smaller ones take no time, and what they compute is needed exactly, as is what the
+    module called `exact` computes."""
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     constants = {tensor.name: int(np.prod(tensor.dims)) for tensor in model.graph.initializer}

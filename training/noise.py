@@ -17,9 +17,8 @@ from server.errors import FieldError
 from server.field.field import AcousticField
 from server.field.graph import FieldGraph, open_graph
 from server.scene.bundle import Bundle
-from server.whole_field import WholeField
 from training.dataset import Dataset
-from training.frontier.accuracy import Entry, SampledPairs
+from training.frontier.accuracy import Estimate, SampledPairs
 from training.models.frozen_noise import even_noise
 
 DRAWS = 16
@@ -30,8 +29,7 @@ def choose_noise(
     bundle: Bundle, dataset: Dataset, *, seed: int, progress: Progress | None = None
 ) -> npt.NDArray[np.float32]:
     """(2, sample) of DRAWS: that with the least mean audible error of the bundle's first level over pairs that training
-    saw; of those with which more could not be measured, none. A field without finite responses is nobody's to choose
-    for: it is given any."""
+    saw; of those with which more could not be measured, none. The first, where responses are finite with none."""
     progress = progress or Progress(disable=True)
     manifest = bundle.manifest
     codec = manifest.codec.codec
@@ -40,15 +38,9 @@ def choose_noise(
     sample = SampledPairs(dataset, codec, pairs=_PAIRS, yaws=_YAWS, seed=seed, held_out=False)
 
     def error(noise: npt.NDArray[np.float32]) -> tuple[float, float]:
-        frozen = FrozenNoise.from_signal(codec, noise)
-        field = WholeField.through_kemar(AcousticField(bundle, level, graph, frozen))
-
-        def answer(entry: Entry) -> npt.NDArray[np.float32]:
-            listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
-            return field.impulse_responses(listeners, emitters, entry.yaws)
-
+        field = AcousticField(bundle, level, graph, FrozenNoise.from_signal(codec, noise))
         try:
-            return sample.audible_of(answer)
+            return sample.audible_of(Estimate(field))
         except FieldError:
             return 1.0, math.inf
 

@@ -17,8 +17,12 @@ from server.acoustics.audibility import in_jnd
 from server.acoustics.codec import Codec
 from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_loss
 from server.acoustics.room_parameters import RoomParameters, measure
+from server.field.field import AcousticField
+from server.whole_field import WholeField
 from training.dataset import Dataset, StoredResponses
 from training.simulation.references import References
+
+_STEP_M = 0.05
 
 _Floats = npt.NDArray[np.float64]
 _Responses = npt.NDArray[np.float32]
@@ -68,6 +72,20 @@ class Errors:
             math.fsum(each.missing for each in of) / len(of),
             of[0].steps,
         )
+
+
+class Estimate:
+    """Whole responses of a field. Where it starts warm, each is asked for a step after its neighbour, as on a walk."""
+
+    def __init__(self, field: AcousticField) -> None:
+        self._whole = WholeField.through_kemar(field)
+        self._walks = field.level.phase.warm
+
+    def __call__(self, entry: Entry) -> _Responses:
+        listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
+        if self._walks:
+            self._whole.impulse_responses(listeners + np.array([_STEP_M, 0.0, 0.0]), emitters, entry.yaws)
+        return self._whole.impulse_responses(listeners, emitters, entry.yaws)
 
 
 class SampledPairs:

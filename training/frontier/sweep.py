@@ -5,7 +5,6 @@ Cost is measured at the end, of all levels in one run.
 """
 
 import dataclasses
-import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rich.progress import Progress
 
 from server.acoustics.sound_path import SoundPathFinder
@@ -23,16 +21,14 @@ from server.field.lattice import Lattice
 from server.field.levels import Levels
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, QualityLevel
-from server.whole_field import WholeField
 from training.dataset import Dataset
 from training.evaluation.held_out import require_same_scene
-from training.frontier.accuracy import Entry, Errors, SampledPairs
+from training.frontier.accuracy import Errors, Estimate, SampledPairs
 from training.frontier.bound import TruePhase
 from training.frontier.cost import STRETCH_S, cost_of, measure, memory_mb, one_core
 from training.frontier.points import Point, default_point, offered_points, pareto
 from training.frontier.steps import largest_steps
 
-_STEP_M = 0.05
 _OFFSETS = 4
 _MOST_OFFSET_M = 0.25
 _STEPS = 60
@@ -188,7 +184,7 @@ def _true_phase(trial: Bundle, like: Point, sample: SampledPairs, floor: Errors)
 def _accuracies(
     trial: Bundle, sample: SampledPairs, levels: Sequence[QualityLevel], path: Path, effort: Effort, progress: Progress
 ) -> dict[str, Errors]:
-    """By level; those that `path` holds already, of the same graph and sample, are not measured again."""
+    """By level; those that `path` holds already, of the same graph, noise and sample, are not measured again."""
     kept: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     task = progress.add_task("accuracy", total=len(levels))
     errors = {}
@@ -210,7 +206,7 @@ def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:
     steps = largest_steps(field, count=_STEPS, seed=seed)
     reuse, nodes = field.level.reuse, field.nodes
     if reuse is None or nodes is None:
-        return dataclasses.replace(sample.errors_of(_Estimate(field)), steps=steps)
+        return dataclasses.replace(sample.errors_of(Estimate(field)), steps=steps)
     paths = SoundPathFinder(field.bundle.floor_plan, field.bundle.manifest.speed_of_sound)
     most = min(_MOST_OFFSET_M, reuse.spacing_m / 2)
     measured = []
@@ -218,24 +214,11 @@ def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:
     for _ in range(_OFFSETS):
         x, y, z, turned = (*rng.uniform(-most, most, 3).tolist(), rng.uniform(-math.pi, math.pi))
         nodes.lattice = Lattice(field.bundle, reuse, paths, (x, y, z), turned)
-        measured.append(sample.errors_of(_Estimate(field)))
+        measured.append(sample.errors_of(Estimate(field)))
     return dataclasses.replace(Errors.mean(measured), steps=steps)
 
 
 def _key(trial: Bundle, level: QualityLevel, effort: Effort) -> str:
-    graph = hashlib.sha256(trial.models[trial.manifest.fields[level.field].file]).hexdigest()
-    return json.dumps([level.model_dump(mode="json"), graph, effort.pairs, effort.yaws, effort.seed])
-
-
-class _Estimate:
-    """Whole responses of a field. Where it starts warm, each is asked for a step after its neighbour, as on a walk."""
-
-    def __init__(self, field: AcousticField) -> None:
-        self._whole = WholeField.through_kemar(field)
-        self._walks = field.level.phase.warm
-
-    def __call__(self, entry: Entry) -> npt.NDArray[np.float32]:
-        listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
-        if self._walks:
-            self._whole.impulse_responses(listeners + np.array([_STEP_M, 0.0, 0.0]), emitters, entry.yaws)
-        return self._whole.impulse_responses(listeners, emitters, entry.yaws)
+    manifest = trial.manifest
+    made_of = [manifest.files[name] for name in (manifest.fields[level.field].file, ARRAYS_FILE)]
+    return json.dumps([level.model_dump(mode="json"), made_of, effort.pairs, effort.yaws, effort.seed])

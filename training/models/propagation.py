@@ -30,16 +30,6 @@ class Path:
     directions: Tensor
     visible: Tensor
 
-    @property
-    def from_listener(self) -> Tensor:
-        """(B, 2)"""
-        return self.directions[:, 0]
-
-    @property
-    def from_emitter(self) -> Tensor:
-        """(B, 2)"""
-        return self.directions[:, 1]
-
 
 class Propagation(nn.Module):
     """Shortest paths through a floor plan, round its reflex corners.

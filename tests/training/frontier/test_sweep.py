@@ -1,3 +1,4 @@
+import io
 import itertools
 import json
 import math
@@ -13,10 +14,9 @@ from server.field.field import AcousticField
 from server.field.levels import Levels
 from server.field.reuse import KEPT_BYTES
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import Phase, QualityLevel, Reuse
+from server.scene.manifest import ARRAYS_FILE, Phase, QualityLevel, Reuse
 from server.whole_field import kemar
-from training.frontier import sweep as sweep_module
-from training.frontier.accuracy import SampledPairs
+from training.frontier.accuracy import Estimate, SampledPairs
 from training.frontier.candidates import candidates
 from training.frontier.figure import draw_frontier
 from training.frontier.sweep import Effort, record, sweep, with_levels
@@ -85,10 +85,20 @@ def test_costs_are_measured_in_one_run(frontier) -> None:
 def test_what_was_measured_is_not_measured_again(tiny_bundle, dataset, chosen, tmp_path, monkeypatch) -> None:
     first = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, EFFORT, Progress(disable=True))
     kept = json.loads((tmp_path / "accuracy.json").read_text())
-    monkeypatch.setattr(sweep_module._Estimate, "__call__", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(Estimate, "__call__", lambda *_: pytest.fail("measured again"))
     again = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, EFFORT, Progress(disable=True))
     assert again.best[0].accuracy == first.best[0].accuracy
     assert json.loads((tmp_path / "accuracy.json").read_text()) == kept
+
+
+def test_with_another_noise_it_is_measured_again(tiny_bundle, dataset, chosen, tmp_path) -> None:
+    first = sweep(tiny_bundle, dataset, chosen[:1], tmp_path / "frontier", EFFORT, Progress(disable=True))
+    arrays = io.BytesIO()
+    np.savez(arrays, frozen_noise=0.5 * tiny_bundle.frozen_noise)
+    files = {name: (tiny_bundle.folder / name).read_bytes() for name in tiny_bundle.manifest.files}
+    other = write_bundle(tmp_path / "bundle", tiny_bundle.manifest, {**files, ARRAYS_FILE: arrays.getvalue()})
+    again = sweep(other, dataset, chosen[:1], tmp_path / "frontier", EFFORT, Progress(disable=True))
+    assert again.best[0].accuracy.errors["level"] != first.best[0].accuracy.errors["level"]
 
 
 def test_a_bundle_offers_the_optimal_levels_and_keeps_what_was_measured(frontier, tiny_bundle, tmp_path) -> None:

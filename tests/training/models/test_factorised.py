@@ -5,7 +5,15 @@ import torch
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from training.models.cells import Cells
-from training.models.factorised import ExportedField, FactorisedField, FeatureGrid, FieldShape, Heads, PoseEncoder
+from training.models.factorised import (
+    GEOMETRY,
+    ExportedField,
+    FactorisedField,
+    FeatureGrid,
+    FieldShape,
+    Heads,
+    PoseEncoder,
+)
 from training.models.site import Reach
 
 PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
@@ -127,6 +135,13 @@ def test_of_nothing_the_phase_is_finite(field):
     frequency, certainty = ExportedField(field, CELLS)._phase(torch.zeros(1, 1), torch.zeros(1, 1))
     assert frequency.isfinite().all()
     assert certainty.max() == 0
+
+
+def test_what_is_kept_exact_by_name_is_there(field):
+    kept = {
+        name.split(".")[-1] for name, _ in ExportedField(field, CELLS).named_buffers() if GEOMETRY in name.split(".")
+    }
+    assert {"_of_place", "_bends", "_corners"} <= kept
 
 
 def test_geometry_is_exact_where_training_is_not(field):
