@@ -26,8 +26,9 @@ class LevelPoint(_Document):
     where the bundle was made; `ms_here` is a response's on this host, when the server started. `errors` are means over
     `pairs` held-out pairs at `yaws` head orientations, by metric, and `floor` is the repeatability floor: what two
     references of the same pair differ by. `audible` and `audible_floor` say the same as one number each: the mean over
-    those metrics that have a just-noticeable difference, in just-noticeable differences. `steps` are the largest
-    changes seen between poses a centimetre apart, by metric, in just-noticeable differences.
+    those metrics that have a just-noticeable difference, in just-noticeable differences, but for EDT, whose is a share
+    of what there is. `steps` are the largest changes seen between poses a centimetre apart, by metric, in
+    just-noticeable differences.
 
     An emitter gets `ir_rate_hz` responses a second at most, or one with every pose; of each, the first `frames` frames
     are computed, or all; with `reuse`, poses near each other share them.
