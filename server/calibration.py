@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from server.field.field import AcousticField
 from server.field.levels import Levels
 from server.field.reuse import KEPT_BYTES, Kept
 from server.ir_request import EmitterSnapshot, IrRequest, compute_irs
-from server.kept_irs import response_identity
+from server.kept_irs import Shared, shared_response
 from server.rendering.hrtf import HeadFilters
 
 POSES = 5
@@ -46,7 +46,7 @@ class Listener:
             block_size=_BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
         )
         self._emitter = EmitterSnapshot(0, Pose(field.bundle.manifest.start.emitter), OMNIDIRECTIONAL)
-        self._heard: Hashable | None = None
+        self._heard: Shared | None = None
 
     @property
     def kept_bytes(self) -> int:
@@ -55,11 +55,12 @@ class Listener:
     def time_ms(self, listener: Pose) -> float:
         """Milliseconds that a pose takes: next to nothing where its response is heard already."""
         started_s = self._time_s()
-        identity = response_identity(self._field, self._direct_sound.early_reflections, listener, self._emitter)
-        if identity is None or identity != self._heard:
-            request = IrRequest(0, self._field.level.name, listener, (self._emitter,), self._direct_sound)
-            compute_irs(self._levels, request, self._renderer)
-            self._heard = identity
+        if self._heard is None or not self._heard.around.holds(listener):
+            shared = shared_response(self._field, self._direct_sound.early_reflections, listener, self._emitter)
+            if shared is None or self._heard is None or shared.identity != self._heard.identity:
+                request = IrRequest(0, self._field.level.name, listener, (self._emitter,), self._direct_sound)
+                compute_irs(self._levels, request, self._renderer)
+            self._heard = shared
         return 1000 * (self._time_s() - started_s)
 
     def forget(self) -> None:

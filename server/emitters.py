@@ -7,6 +7,7 @@ from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose, Vector3
 from server.blocks import DryBlock
 from server.errors import RequestError
+from server.field.lattice import Neighbourhood
 from server.protocol import AddEmitter, MoveEmitter
 from server.rendered_effects import ALL_ON, EmitterEffects
 from server.rendering.convolver import PartitionedIr
@@ -38,6 +39,9 @@ class Emitter:
     """Whether its direct path is of another pose."""
     identity: Hashable | None = None
     """Of its impulse response, where poses share responses."""
+    found_for: Hashable | None = None
+    around: Neighbourhood | None = None
+    """Listeners who hear that response for certain, as long as everything else is as it was `found_for`."""
     unfolded: PartitionedIr | None = None
     """The newest impulse response in effect that leaves the direct sound to the renderer."""
     is_folded: bool = False

@@ -14,7 +14,7 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.early_reflections import EarlyReflections
 from server.field.field import AcousticField
-from server.field.lattice import moved
+from server.field.lattice import Neighbourhood, moved
 from server.field.reuse import Kept, NodeResponses
 from server.node_reflections import Snapping, add_first_reflections
 from server.radiation import Placed
@@ -37,17 +37,24 @@ class _Late(NamedTuple):
     prepared: PartitionedIr
 
 
-def response_identity(
-    field: Snapping, early: EarlyReflections | None, listener: Pose, emitter: Placed
-) -> Hashable | None:
-    """What is equal where poses have the same response at a field's level, whole; None where each has its own."""
+class Shared(NamedTuple):
+    """What is equal where poses have the same response, whole, and which listeners are sure to have that one too as
+    long as nothing else changes."""
+
+    identity: Hashable
+    around: Neighbourhood
+
+
+def shared_response(field: Snapping, early: EarlyReflections | None, listener: Pose, emitter: Placed) -> Shared | None:
+    """At a field's level; None where each pose has a response of its own."""
     reuse = field.level.reuse
     if reuse is None or (early is not None and reuse.first_reflections == "pose"):
         return None
     beam = None
     if early is not None and emitter.directivity != OMNIDIRECTIONAL:
         beam = emitter.directivity, emitter.pose.orientation
-    return field.level.name, field.snap(listener.position, emitter.pose.position, listener.yaw), beam
+    snapped, around = field.find(listener.position, emitter.pose.position, listener.yaw)
+    return Shared((field.level.name, snapped, beam), around)
 
 
 def prepared_irs(
@@ -73,10 +80,10 @@ def _prepared(
     listener: Pose,
     emitter: Placed,
 ) -> PartitionedIr:
-    identity = response_identity(field, early, listener, emitter)
-    if identity is None and early is not None:
+    shared = shared_response(field, early, listener, emitter)
+    if shared is None and early is not None:
         return _with_first_reflections(field, nodes, kept, early, preparer, listener, emitter)
-    key = identity, None if early is None else early.filters, preparer.preparation
+    key = shared and shared.identity, None if early is None else early.filters, preparer.preparation
     ir = kept.get(key)
     if not isinstance(ir, PartitionedIr):
         node, later = field.snap(listener.position, emitter.pose.position, listener.yaw)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose, Vector3
 from server.early_reflections import EarlyReflections
-from server.field.lattice import Snapped, moved
+from server.field.lattice import Neighbourhood, Snapped, moved
 from server.radiation import Placed
 from server.scene.manifest import QualityLevel
 
@@ -24,6 +24,8 @@ class Snapping(Protocol):
     def level(self) -> QualityLevel: ...
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped: ...
+
+    def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]: ...
 
 
 class _AtNode(NamedTuple):

@@ -15,7 +15,7 @@ from server.emitters import Emitter
 from server.errors import RequestError
 from server.field.levels import Levels
 from server.ir_request import EmitterSnapshot, IrRequest, IrResponse
-from server.kept_irs import response_identity
+from server.kept_irs import Shared, shared_response
 from server.load import Reason, Rung
 from server.rendering.renderer import Renderer
 from server.replies import EmitterAdded, Error, LevelChanged, ServerMessage
@@ -190,15 +190,33 @@ class ResponsesInForce:
         if not (emitter.is_decided and emitter.effects.has_response):
             return False
         if emitter.is_outdated and emitter.identity is not None:
-            emitter.is_outdated = self._identity(emitter, listener) != emitter.identity
+            emitter.is_outdated = not self._still_hears(emitter, listener)
         return emitter.is_outdated or emitter.wants_folding
 
+    def _still_hears(self, emitter: Emitter, listener: Pose) -> bool:
+        """Whether what is heard of an emitter is its response at the pose, too: at once where that has hardly changed
+        since it was found to be."""
+        found_for = emitter.identity, self._wanted.level, emitter.pose, emitter.effects, self._effects.channels
+        if emitter.found_for == found_for and emitter.around is not None and emitter.around.holds(listener):
+            return True
+        shared = self._shared(emitter, listener)
+        if shared is None or shared.identity != emitter.identity:
+            return False
+        emitter.found_for, emitter.around = found_for, shared.around
+        return True
+
     def _identity(self, emitter: Emitter, listener: Pose) -> Hashable | None:
-        field = self._levels[self._wanted.level]
+        shared = self._shared(emitter, listener)
+        return shared and shared.identity
+
+    def _shared(self, emitter: Emitter, listener: Pose) -> Shared | None:
         if emitter.effects.folds:
             return None
-        shared = response_identity(field, self._direct_sound.early_reflections, listener, emitter)
-        return None if shared is None else (shared, emitter.effects, self._effects.channels)
+        field = self._levels[self._wanted.level]
+        shared = shared_response(field, self._direct_sound.early_reflections, listener, emitter)
+        if shared is None:
+            return None
+        return Shared((shared.identity, emitter.effects, self._effects.channels), shared.around)
 
     def _announce(self, identifiers: Iterable[str]) -> list[ServerMessage]:
         """That emitters sound from the next block on, of those of whom it has not been said."""

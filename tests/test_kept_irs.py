@@ -67,6 +67,34 @@ def test_a_session_asks_for_nothing_while_its_response_stays_the_same(whole_at_n
     assert (again, len(calls)) == (requests, len({snapped.node for snapped in nodes}))
 
 
+def test_a_session_looks_up_no_node_as_long_as_its_listener_hardly_moves(whole_at_nodes, filters, monkeypatch):
+    levels, session = Levels([whole_at_nodes]), open_session(whole_at_nodes, filters)
+    finds, find = [], whole_at_nodes.find
+    monkeypatch.setattr(whole_at_nodes, "find", lambda *poses: finds.append(poses) or find(*poses))
+    around = find(START, EMITTER, 0.0)[1]
+    answer(session, levels)
+    for number in range(20):
+        shifted = (START[0] + 0.04 * around.radius_m * number, *START[1:])
+        session.receive(ListenerPose(pose_id=number + 2, position=shifted))
+        assert answer(session, levels) is None
+    assert len(finds) <= 4
+    session.receive(MoveEmitter(pose_id=100, id="talker", position=EMITTER, yaw=1.0))
+    session.receive(ListenerPose(pose_id=101, position=START))
+    assert answer(session, levels) is None
+
+
+def test_who_returns_to_where_a_response_was_heard_asks_for_it_again(whole_at_nodes, filters):
+    levels, session = Levels([whole_at_nodes]), open_session(whole_at_nodes, filters)
+    answer(session, levels)
+    nearby, far = (START[0] + 1e-4, *START[1:]), (5.0, 1.0, 1.5)
+    assert whole_at_nodes.find(START, EMITTER, 0.0)[1].holds(Pose(nearby))
+    session.receive(ListenerPose(pose_id=2, position=nearby))
+    assert answer(session, levels) is None
+    for number, place in enumerate((far, START, far, START)):
+        session.receive(ListenerPose(pose_id=number + 3, position=place))
+        assert answer(session, levels) is not None
+
+
 def test_first_reflections_of_the_pose_are_asked_for_at_every_pose_and_the_field_at_nodes(
     field_at_nodes, filters, monkeypatch
 ):

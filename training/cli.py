@@ -67,6 +67,9 @@ def train(
     rank: Annotated[
         int | None, typer.Option(min=16, max=256, help="Size of a factorised field's basis; 128 if not given.")
     ] = None,
+    width: Annotated[
+        int | None, typer.Option(min=32, max=4096, help="Of a factorised field's network; 256 if not given.")
+    ] = None,
     seed: Seed = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the training set.")] = None,
     minutes: Annotated[float | None, typer.Option(min=0.001, help="Time to train for, in place of epochs.")] = None,
@@ -101,6 +104,7 @@ def train(
     configuration = configure(
         field,
         rank=rank,
+        width=width,
         points=points,
         teacher=teacher,
         seed=seed,

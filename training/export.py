@@ -99,12 +99,17 @@ def export(
     exported: list[_Exported] = []
     # All are opened, and told apart, before the first graph is made, which takes a while.
     opened = [(_opened(responses, place), place) for place in runs]
-    _require_different([_name_of(field, place) for field, place in opened])
+    usual_width = next((field.field.width for field, _ in opened if isinstance(field, FactorisedLearner)), 0)
+    _require_different([_name_of(field, place, usual_width) for field, place in opened])
     for field, place in opened:
         if isinstance(field, ImportedDataset):
             exported.append(_shaped(field))
+        elif isinstance(field, FactorisedLearner):
+            exported += _factorised(field, Configuration.read(place), precisions, ranks, usual_width=usual_width)
+        elif isinstance(field, NafLearner):
+            exported += _naf(field, Configuration.read(place), precisions, exact_tables=exact_tables)
         else:
-            exported += _graphs(field, Configuration.read(place), precisions, ranks, exact_tables=exact_tables)
+            raise TypeError(f"{type(field)} has no graph")
     names = [each.name for each in exported]
     _require_different(names)  # of lower ranks, too
     codec = exported[0].codec
@@ -161,16 +166,17 @@ def _opened(responses: ResponseSet, place: Path) -> Learner | ImportedDataset:
     return responses
 
 
-def _name_of(field: Learner | ImportedDataset, place: Path) -> str:
+def _name_of(field: Learner | ImportedDataset, place: Path, usual_width: int) -> str:
     if isinstance(field, ImportedDataset):
         return SHAPED_NEAREST
     if isinstance(field, FactorisedLearner):
-        return _factorised_name(len(field.field.basis))
+        return _factorised_name(len(field.field.basis), field.field.width, usual_width)
     return Configuration.read(place).name
 
 
-def _factorised_name(rank: int) -> str:
-    return f"factorised-r{rank}"
+def _factorised_name(rank: int, width: int, usual_width: int) -> str:
+    """With the width, where it is another than that of the bundle's first factorised field."""
+    return f"factorised-r{rank}" if width == usual_width else f"factorised-w{width}-r{rank}"
 
 
 def _require_different(names: list[str]) -> None:
@@ -178,25 +184,15 @@ def _require_different(names: list[str]) -> None:
         raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
 
 
-def _graphs(
-    learner: Learner,
+def _factorised(
+    learner: FactorisedLearner,
     configuration: Configuration,
     precisions: Sequence[Precision],
     ranks: Sequence[int],
     *,
-    exact_tables: bool,
+    usual_width: int,
 ) -> list[_Exported]:
     """All graphs of a run, each checked."""
-    if isinstance(learner, FactorisedLearner):
-        return _factorised(learner, configuration, precisions, ranks)
-    if isinstance(learner, NafLearner):
-        return _naf(learner, configuration, precisions, exact_tables=exact_tables)
-    raise TypeError(f"{type(learner)} has no graph")
-
-
-def _factorised(
-    learner: FactorisedLearner, configuration: Configuration, precisions: Sequence[Precision], ranks: Sequence[int]
-) -> list[_Exported]:
     cells, whole = learner.cells, learner.field
     trained_at = _tensors(_poses(learner.responses, _TRUNCATION_POSES, configuration.seed), _TRUNCATION_POSES)
     lower = sorted({rank for rank in ranks if rank < len(whole.basis)}, reverse=True)
@@ -214,7 +210,7 @@ def _factorised(
             small = to_int8(graph, least_weights=least_weights, exact=GEOMETRY) if precision == "int8" else graph
             model = halve_weights(small, exact=GEOMETRY)
             _check(model, module, poses, outputs, precision)
-            name = f"{_factorised_name(rank)}{_suffix(precision)}"
+            name = f"{_factorised_name(rank, field.width, usual_width)}{_suffix(precision)}"
             exported.append(_Exported(name, model, "factorised", rank, codec))
     return exported
 
@@ -222,6 +218,7 @@ def _factorised(
 def _naf(
     learner: NafLearner, configuration: Configuration, precisions: Sequence[Precision], *, exact_tables: bool
 ) -> list[_Exported]:
+    """All graphs of a run, each checked."""
     field = learner.field
     time_domain = field.shape.domain == "time"
     outputs = (RESPONSE,) if time_domain else _outputs(learner)

@@ -122,7 +122,13 @@ FIELDS = ("factorised", *_NAF_SHAPES)
 
 
 def configure(
-    field: str, *, rank: int | None = None, points: int | None = None, teacher: Path | None = None, **changes: Any
+    field: str,
+    *,
+    rank: int | None = None,
+    width: int | None = None,
+    points: int | None = None,
+    teacher: Path | None = None,
+    **changes: Any,
 ) -> Configuration:
     """The usual configuration of a field by its name on the command line, changed as said.
 
@@ -133,10 +139,11 @@ def configure(
     if field == "factorised":
         if points is not None:
             raise RunError("points: a factorised field is trained on whole responses; leave it out")
-        shape = FieldShape() if rank is None else FieldShape(rank=rank)
+        chosen = {"rank": rank, "width": width}
+        shape = FieldShape(**{option: value for option, value in chosen.items() if value is not None})
         recipe = FactorisedRecipe(teacher=None if teacher is None else str(teacher.resolve()))
         return Configuration(shape=shape, recipe=recipe, **changes)
-    for option, value in (("rank", rank), ("teacher", teacher)):
+    for option, value in (("rank", rank), ("width", width), ("teacher", teacher)):
         if value is not None:
             raise RunError(f"{option}: only a factorised field has one; leave it out for {field}")
     return Configuration.naf(_NAF_SHAPES[field], NafRecipe() if points is None else NafRecipe(points=points), **changes)

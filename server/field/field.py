@@ -19,7 +19,7 @@ from server.bounded_cache import BoundedCache
 from server.errors import BundleError, FieldError
 from server.field.decoder import Decoder, add_from, apply_gate, apply_gates, onset_gate, resized
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
-from server.field.lattice import Node, Snapped
+from server.field.lattice import Neighbourhood, Node, Snapped
 from server.field.phase_cache import PhaseCache
 from server.field.reuse import KEPT_BYTES, Kept, NodeResponses
 from server.scene.bundle import Bundle
@@ -133,6 +133,12 @@ class AcousticField:
         if self.nodes is None:
             return Snapped(Node(listener, emitter, yaw), 0)
         return self.nodes.lattice.snap(listener, emitter, yaw)
+
+    def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
+        """As `snap`, and for which listeners else: none for certain, unless the level reuses responses."""
+        if self.nodes is None:
+            return self.snap(listener, emitter, yaw), Neighbourhood(listener, 0.0, emitter, 0.0, 0.0, yaw, 0.0)
+        return self.nodes.lattice.find(listener, emitter, yaw)
 
     def _compute_all(
         self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None = None

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.geometry import Vector3
+from server.acoustics.geometry import Pose, Vector3
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.lattice_kernel import find_node
 from server.scene.bundle import Bundle
@@ -24,6 +24,8 @@ _LEAST_STEP_M = 0.25
 """Responses are moved in time by no less than what sound takes for this: 0.4 ms off at most is less than anybody hears
 of reflected sound, and every step is an exchange."""
 _ARRIVALS = 4096
+_LEAST_M, _LEAST_RAD = 1e-6, 1e-9
+"""Nearer to where a number is rounded to another, nothing is certain."""
 
 
 class Node(NamedTuple):
@@ -40,6 +42,28 @@ class Snapped(NamedTuple):
 
     node: Node
     later_samples: int
+
+
+class Neighbourhood(NamedTuple):
+    """Poses of a listener that are sure to be given what the one in their middle was, of an emitter that stays where it
+    is: places within a ball and between two distances from the emitter, headings within an arc."""
+
+    listener: Vector3
+    radius_m: float
+    emitter: Vector3
+    nearest_m: float
+    farthest_m: float
+    yaw: float
+    arc_rad: float
+    """To either side."""
+
+    def holds(self, pose: Pose) -> bool:
+        """In less than a microsecond, where finding out takes several."""
+        if math.dist(pose.position, self.listener) >= self.radius_m:
+            return False
+        if not self.nearest_m < math.dist(pose.position, self.emitter) < self.farthest_m:
+            return False
+        return self.arc_rad == math.inf or abs(math.remainder(pose.yaw - self.yaw, math.tau)) < self.arc_rad
 
 
 class Lattice:
@@ -61,6 +85,7 @@ class Lattice:
         self._paths = paths
         self._spacing_m = reuse.spacing_m
         self._turns = math.ceil(360 / reuse.turn_deg - 1e-9)
+        self._turn_rad = math.tau / self._turns
         self._corners = np.ascontiguousarray(bundle.floor_plan.walls[:, 0])
         self._low, self._high = np.array(manifest.bounds.minimum), np.array(manifest.bounds.maximum)
         self._offset = np.array(offset)
@@ -71,20 +96,32 @@ class Lattice:
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
         """What stands for poses within the bounds; a function of them alone, in a few microseconds."""
-        in_sight, (*place, ex, ey, ez) = find_node(
+        return self.find(listener, emitter, yaw)[0]
+
+    def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
+        """As `snap`, and for which listeners else."""
+        in_sight, (*place, ex, ey, ez), radius_m = find_node(
             self._corners, self._low, self._high, self._offset, self._spacing_m, *listener, *emitter
         )
         there: Vector3 = (place[0], place[1], place[2])
-        node = Node(there, (ex, ey, ez), self._heading(yaw))
+        turns = (yaw - self._turned) / self._turn_rad
+        heading = round(turns)
+        node = Node(there, (ex, ey, ez), heading % self._turns * self._turn_rad + self._turned)
+        reach_m = self._step_m / 2 - _LEAST_M
+        nearest_m, farthest_m = -math.inf, math.inf
         if in_sight:
-            farther_m = math.dist(listener, emitter) - math.dist(there, node.emitter)
+            way_m, there_m = math.dist(listener, emitter), math.dist(there, node.emitter)
+            steps = round((way_m - there_m) / self._step_m)
+            nearest_m = there_m + steps * self._step_m - reach_m
+            farthest_m = there_m + steps * self._step_m + reach_m
         else:
-            farther_m = self._length_m(listener, emitter) - self._bent_m(there, node.emitter)
-        return Snapped(node, round(round(farther_m / self._step_m) * self._samples_per_step))
-
-    def _heading(self, yaw: float) -> float:
-        turn = math.tau / self._turns
-        return (round((yaw - self._turned) / turn) % self._turns) * turn + self._turned
+            way_m, there_m = self._length_m(listener, emitter), self._bent_m(there, node.emitter)
+            steps = round((way_m - there_m) / self._step_m)
+            # A way round corners is longer by no more than the listener moves.
+            radius_m = min(radius_m, reach_m - abs(way_m - there_m - steps * self._step_m))
+        arc_rad = math.inf if self._turns == 1 else (0.5 - abs(turns - heading)) * self._turn_rad - _LEAST_RAD
+        around = Neighbourhood(listener, radius_m, emitter, nearest_m, farthest_m, yaw, arc_rad)
+        return Snapped(node, round(steps * self._samples_per_step)), around
 
     def _length_m(self, listener: Vector3, emitter: Vector3) -> float:
         return float(self._paths.find(np.array(listener), np.array([emitter])).length_m[0])

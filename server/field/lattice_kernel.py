@@ -15,19 +15,62 @@ Floats = npt.NDArray[np.float64]
 Coordinates = tuple[float, float, float, float, float, float]
 
 _HALVINGS = 5
+_SLACK_M = 1e-3
+"""By which what is said to be certain keeps away from where rounding decides."""
+_ON_A_WALL_M = 1e-5
+"""From a wall so near, what one sees through it is for rounding to decide."""
 
 
 @compiled
-def _nearest(at: float, low: float, high: float, offset: float, spacing: float) -> float:
-    """Along one axis: the middle of the cell that `at` is in, or, where that is out of bounds, of the next one."""
+def _nearest(at: float, low: float, high: float, offset: float, spacing: float) -> tuple[float, float]:
+    """Along one axis: the middle of the cell that `at` is in, or, where that is out of bounds, of the next one; and how
+    far it is to the end of the cell."""
     step = (high - low) / max(1, math.ceil((high - low) / spacing - 1e-9))
     origin = low + offset
-    middle = origin + (math.floor((at - origin) / step) + 0.5) * step
+    cell = math.floor((at - origin) / step)
+    into = at - origin - cell * step
+    middle = origin + (cell + 0.5) * step
     if middle < low:
         middle += step
     elif middle > high:
         middle -= step
-    return middle
+    return middle, min(into, step - into)
+
+
+@compiled
+def _distance(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
+    """Of a point from the line between two others."""
+    along_x, along_y = bx - ax, by - ay
+    squared = along_x**2 + along_y**2
+    share = 0.0
+    if squared > 0:
+        share = min(1.0, max(0.0, ((px - ax) * along_x + (py - ay) * along_y) / squared))
+    return math.hypot(px - ax - share * along_x, py - ay - share * along_y)
+
+
+@compiled
+def _from_walls(corners: Floats, px: float, py: float) -> float:
+    least = math.inf
+    x0, y0 = corners[-1]
+    for x1, y1 in corners:
+        least = min(least, _distance(px, py, x0, y0, x1, y1))
+        x0, y0 = x1, y1
+    return least
+
+
+@compiled
+def _clearance(corners: Floats, px: float, py: float, qx: float, qy: float) -> float:
+    """How far p may move, and no wall's end comes to lie between it and q: what q sees of it stays as it is as long as
+    p goes through no wall. Wall's ends throw shadows, straight away from q; that is how far their edges are."""
+    least = math.inf
+    for x, y in corners:
+        away_x, away_y = x - qx, y - qy
+        squared = away_x**2 + away_y**2
+        along = 0.0
+        if squared > 0:
+            along = max(0.0, ((px - x) * away_x + (py - y) * away_y) / squared)
+        least = min(least, math.hypot(px - x - along * away_x, py - y - along * away_y))
+    return least if _from_walls(corners, qx, qy) > _ON_A_WALL_M else 0.0
 
 
 @compiled
@@ -43,27 +86,30 @@ def find_node(
     ex: float,
     ey: float,
     ez: float,
-) -> tuple[bool, Coordinates]:
-    """Whether listener and emitter see each other, and the places of listener and emitter in the node for them.
+) -> tuple[bool, Coordinates, float]:
+    """Whether listener and emitter see each other, the places of listener and emitter in the node for them, and how far
+    the listener may move for certain without either being another.
 
     Each sees its place in the node, and those see each other if and only if these do. Where the cells of the lattice
     hold no such node, those of half the size are asked, and so on; in the end, they are their own node.
     """
     in_sight = is_visible(corners, lx, ly, ex, ey)
+    certain = min(_from_walls(corners, lx, ly), _clearance(corners, lx, ly, ex, ey))
     for _ in range(_HALVINGS + 1):
-        nlx = _nearest(lx, low[0], high[0], offset[0], spacing)
-        nly = _nearest(ly, low[1], high[1], offset[1], spacing)
-        nex = _nearest(ex, low[0], high[0], offset[0], spacing)
-        ney = _nearest(ey, low[1], high[1], offset[1], spacing)
-        if (
-            contains(corners, nlx, nly)
-            and contains(corners, nex, ney)
-            and is_visible(corners, lx, ly, nlx, nly)
-            and is_visible(corners, ex, ey, nex, ney)
-            and is_visible(corners, nlx, nly, nex, ney) == in_sight
-        ):
-            nlz = _nearest(lz, low[2], high[2], offset[2], spacing)
-            nez = _nearest(ez, low[2], high[2], offset[2], spacing)
-            return in_sight, (nlx, nly, nlz, nex, ney, nez)
+        nlx, end_x = _nearest(lx, low[0], high[0], offset[0], spacing)
+        nly, end_y = _nearest(ly, low[1], high[1], offset[1], spacing)
+        nex, _ = _nearest(ex, low[0], high[0], offset[0], spacing)
+        ney, _ = _nearest(ey, low[1], high[1], offset[1], spacing)
+        certain = min(certain, end_x, end_y)
+        if contains(corners, nlx, nly) and contains(corners, nex, ney):
+            certain = min(certain, _clearance(corners, lx, ly, nlx, nly))
+            if (
+                is_visible(corners, lx, ly, nlx, nly)
+                and is_visible(corners, ex, ey, nex, ney)
+                and is_visible(corners, nlx, nly, nex, ney) == in_sight
+            ):
+                nlz, end_z = _nearest(lz, low[2], high[2], offset[2], spacing)
+                nez, _ = _nearest(ez, low[2], high[2], offset[2], spacing)
+                return in_sight, (nlx, nly, nlz, nex, ney, nez), max(0.0, min(certain, end_z) - _SLACK_M)
         spacing /= 2
-    return in_sight, (lx, ly, lz, ex, ey, ez)
+    return in_sight, (lx, ly, lz, ex, ey, ez), 0.0

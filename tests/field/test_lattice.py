@@ -8,6 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.lattice import Lattice, moved
 from server.scene.bundle import Bundle, find_bundle
@@ -88,3 +89,48 @@ def test_a_response_moves_by_whole_samples(later):
     response = np.arange(1, 19, dtype=np.float32).reshape(2, 9)
     expected = [[ear[at - later] if 0 <= at - later < 9 else 0 for at in range(9)] for ear in response.tolist()]
     assert moved(response, later).tolist() == expected
+
+
+headings = st.floats(-7, 7)
+turns = st.sampled_from([15.0, 120.0, 360.0])
+directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda direction: math.hypot(*direction) > 1e-3)
+
+
+@settings(deadline=None, max_examples=400)
+@given(places, places, headings, st.sampled_from(SPACINGS_M), turns, directions, st.floats(0, 1), st.floats(-1, 1))
+def test_all_listeners_of_a_neighbourhood_are_given_what_its_middle_was(
+    listener, emitter, yaw, spacing_m, turn_deg, direction, share, turned
+):
+    assume(inside(listener, emitter))
+    nodes = lattice(spacing_m, turn_deg)
+    snapped, around = nodes.find(listener, emitter, yaw)
+    assert nodes.snap(listener, emitter, yaw) == snapped
+    step_m = 0.999 * share * max(0.0, around.radius_m) / math.hypot(*direction)
+    other = tuple(at + step_m * along for at, along in zip(listener, direction, strict=True))
+    turn = 0.999 * turned * min(around.arc_rad, math.pi)
+    if around.holds(Pose.from_yaw(other, yaw + turn)):
+        assert nodes.snap(other, emitter, yaw + turn) == snapped
+    else:
+        way_m = math.dist(other, emitter)
+        is_near_enough = step_m < around.radius_m and around.nearest_m < way_m < around.farthest_m
+        assert not (is_near_enough and abs(turn) < around.arc_rad)
+    assert not around.holds(Pose.from_yaw((listener[0] + around.radius_m + 1e-6, *listener[1:]), yaw))
+
+
+def test_neighbourhoods_are_wide_enough_to_be_of_use():
+    """Of a listener who walks: of most poses, one found before is known to be as good."""
+    nodes, around, known = lattice(5.0, 360.0), None, 0
+    poses = [Pose((0.4 + 0.07 * step, 1.7, 1.5)) for step in range(40)]
+    for pose in poses:
+        if around is not None and around.holds(pose):
+            known += 1
+        else:
+            around = nodes.find(pose.position, (2.0, 2.6, 1.5), 0.0)[1]
+    assert known > len(poses) / 2
+
+
+def test_a_neighbourhood_of_some_headings_ends_with_them():
+    around = lattice(1.0, 120.0).find((1.2, 1.3, 1.5), (2.0, 2.0, 1.5), math.radians(50))[1]
+    assert around.arc_rad == pytest.approx(math.radians(10), abs=1e-6)
+    assert around.holds(Pose.from_yaw((1.2, 1.3, 1.5), math.radians(59) - math.tau))
+    assert not around.holds(Pose.from_yaw((1.2, 1.3, 1.5), math.radians(61)))

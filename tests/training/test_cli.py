@@ -115,6 +115,7 @@ def test_evaluating_needs_one_bundle_to_record_into(nafir_train, dataset):
     [
         (("train", "{data}", "-o", "{tmp}/run", "--field", "nerf"), "there is no 'nerf'"),
         (("train", "{data}", "-o", "{tmp}/run", "--field", "naf", "--rank", "64"), "leave it out for naf"),
+        (("train", "{data}", "-o", "{tmp}/run", "--field", "naf", "--width", "64"), "leave it out for naf"),
         (("train", "{data}", "-o", "{tmp}/run", "--teacher", "{run}", "--epochs", "1"), "a naf with spectrograms"),
         (("export", "{run}", "{tmp}", "-o", "{tmp}/bundle"), "not a run folder"),
     ],
@@ -133,12 +134,13 @@ def test_an_unknown_precision_is_refused(nafir_train, run, tmp_path):
 
 
 def test_a_part_of_the_pairs_is_trained_for_a_part_of_a_minute(nafir_train, dataset, tmp_path):
-    options = ("--share", "0.5", "--minutes", "0.01", "--rank", "16", "--learning-rate", "0.001")
+    options = ("--share", "0.5", "--minutes", "0.01", "--rank", "16", "--width", "32", "--learning-rate", "0.001")
     code, out, _ = nafir_train("train", dataset.folder, "-o", tmp_path / "run", *options)
     assert code == 0
     assert "factorised is trained" in out
     written = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert (written["share"], written["minutes"], written["shape"]["rank"]) == (0.5, 0.01, 16)
+    assert (written["share"], written["minutes"]) == (0.5, 0.01)
+    assert (written["shape"]["rank"], written["shape"]["width"]) == (16, 32)
     assert written["learning_rate"] == 0.001
 
 

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -280,3 +281,13 @@ def test_lower_ranks_become_fields_that_cost_less(dataset, run, tmp_path):
     sizes = [len(bundle.models[field.file]) for field in fields.values()]
     assert sizes == sorted(sizes, reverse=True)
     assert list(Levels.load(bundle)) == ["standard", "factorised-r8", "factorised-r4"]
+
+
+def test_a_field_of_another_width_says_so_and_shares_a_bundle_with_the_first(dataset, run, tmp_path):
+    usual = Configuration.read(run)
+    wide = replace(usual, epochs=1, shape=replace(usual.shape, width=48))
+    responses = SimulatedResponses(dataset)
+    train(responses, tmp_path / "wide", wide, Progress(disable=True))
+    bundle = export(responses, [run, tmp_path / "wide"], tmp_path / "bundle", ranks=(8,))
+    named = {name: field.rank for name, field in bundle.manifest.fields.items()}
+    assert named == {"factorised": 16, "factorised-r8": 8, "factorised-w48-r16": 16, "factorised-w48-r8": 8}

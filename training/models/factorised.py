@@ -199,6 +199,11 @@ class FactorisedField(nn.Module):
         self.register_buffer("spread", torch.ones(self.heads.size))
         self.register_buffer("level_correction", torch.zeros(2, self.heads.size))
 
+    @property
+    def width(self) -> int:
+        """Of the network's layers."""
+        return self._inputs.out_features
+
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
         return self.coefficients(listener, emitter, yaw) @ self.basis
 
