@@ -16,14 +16,8 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.compiled import HAS_NUMBA
-from server.rendering.direct_path_kernel import (
-    SLOT,
-    TILE,
-    DirectPathState,
-    FloatArray,
-    render_direct_paths,
-    transform_tables,
-)
+from server.rendering.direct_path_kernel import TILE, render_direct_paths, transform_tables
+from server.rendering.direct_path_records import SLOT, DirectPathState, FloatArray
 from server.rendering.fade import raised_cosine
 from server.rendering.fractional_delay import AFTER, TAPS, sinc_table
 from server.rendering.hrtf import HeadFilters, NoHead
