@@ -3,11 +3,20 @@ from functools import cache
 import numpy as np
 import pytest
 
+from server.compiled import HAS_NUMBA
 from server.rendering.direct_path import DirectPath
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 from server.rendering.sphere import triangulate
 
 SPEED_OF_SOUND = 343.0
+
+
+@pytest.fixture(autouse=True)
+def _numba_is_there(request):
+    """Where a test says that it measures compiled code."""
+    asked = getattr(request.node, "callspec", None)
+    if asked is not None and asked.params.get("is_compiled") is True:
+        assert HAS_NUMBA, "the tests measure the compiled convolver: install numba"
 
 
 @pytest.fixture(scope="session")
