@@ -13,6 +13,8 @@ PAIRS ?= 48
 # How long the paper's network is trained for the table.
 NAF ?= --as-long-as $(RUNS)/run
 RANKS ?= 32,16,8,4,2
+# How the field is trained, where not as usual: "--epochs 24", say.
+TRAINING ?=
 # How much of the frontier is measured: all ranks with frozen phase, and one of them with responses reused.
 SWEEP ?= --phases-of none --reuse-of factorised-r16
 # Which of the held-out pairs a bundle's own errors are of: by default all.
@@ -95,7 +97,7 @@ $(RUNS)/simulated: | $(VENV)/installed-training
 	@touch $@
 
 $(RUNS)/trained: $(RUNS)/simulated
-	$(STEP) train $(TRAIN) train $(RUNS)/data -o $(RUNS)/run
+	$(STEP) train $(TRAIN) train $(RUNS)/data -o $(RUNS)/run $(TRAINING)
 	@touch $@
 
 $(RUNS)/measured: $(RUNS)/trained
