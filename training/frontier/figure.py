@@ -11,13 +11,14 @@ from training.frontier.points import Point
 from training.frontier.sweep import Frontier
 
 _PARETO, _OTHER, _FLOOR, _DEADLINE, _BOUND, _TEXT = "#0b6e99", "#aeb9c1", "#8d6a9f", "#d1495b", "#66a182", "#2b3a42"
+_SPREAD = "#bfdbe6"
 _LABEL_HEIGHT = 0.042
 """Of the axes' height: labels are no closer."""
 
 
 def draw_frontier(frontier: Frontier, path: Path) -> None:
-    """Writes a PNG: all points, the line of those worth their time, the repeatability floor, the block deadline. Named
-    are the levels that are offered."""
+    """Writes a PNG: all points at their mean time, the line of those worth it and how far from it poses are, the
+    repeatability floor, the block deadline. Named are the levels that are offered."""
     figure = Figure(figsize=(11.5, 6.6), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -26,6 +27,15 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
     bounds = [point for point in frontier.points if point.bound]
     axes.scatter(*_coordinates(others), s=20, color=_OTHER, label="measured, not worth its time", zorder=2)
     axes.scatter(*_coordinates(bounds), s=48, marker="x", color=_BOUND, label="if the phase were known", zorder=3)
+    axes.hlines(
+        [point.audible_error for point in best],
+        [point.cost.ms_p50 for point in best],
+        [point.cost.ms_p99 for point in best],
+        color=_SPREAD,
+        linewidth=3,
+        label="from the median pose to the slowest of a hundred",
+        zorder=1,
+    )
     axes.step(*_coordinates(best), where="post", color=_PARETO, linewidth=1.4, zorder=3)
     axes.scatter(
         *_coordinates(best),
@@ -44,7 +54,7 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
     axes.axhline(floor, color=_FLOOR, linestyle="--", linewidth=1.2, label="the same simulated twice (floor)")
     axes.axvline(frontier.block_ms, color=_DEADLINE, linestyle=":", linewidth=1.4, label="one block of 256 samples")
     axes.set_xscale("log")
-    costs = [point.cost.ms_mean for point in frontier.points]
+    costs = [time_ms for point in frontier.points for time_ms in (point.cost.ms_p50, point.cost.ms_mean)]
     axes.set_xlim(min(costs) / 2, max([*costs, frontier.block_ms]) * 2)
     axes.set_ylim(0, 1.12 * max(point.audible_error for point in best))
     _name(axes, offered, frontier.default)
