@@ -13,7 +13,7 @@ PAIRS ?= 48
 # How long the paper's network is trained for the table.
 NAF ?= --as-long-as $(RUNS)/run
 RANKS ?= 32,16,8,4,2
-# How the field is trained, where not as usual: "--epochs 24", say.
+# How the field is trained, where not as usual: "--epochs 24", say; of a run that is finished, remove $(RUNS)/trained.
 TRAINING ?=
 # How much of the frontier is measured: all ranks with frozen phase, and one of them with responses reused.
 SWEEP ?= --phases-of none --reuse-of factorised-r16

@@ -8,11 +8,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from server.acoustics.geometry import Pose
 from server.early_reflections import EarlyReflections
+from server.field.field import AcousticField
 from server.field.levels import Levels
 from server.ir_request import compute_irs
 from server.load import Rung
-from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, MoveEmitter
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, MoveEmitter, RemoveEmitter
 from server.rendering.renderer import Renderer
+from server.scene.manifest import Reuse
 from server.session import Session
 from server.whole_field import WholeField, _AllRound
 
@@ -21,9 +23,9 @@ EMITTER, START = (6.0, 3.0, 1.5), (2.0, 2.0, 1.5)
 CLIP = np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
 
 
-def open_session(field, filters, clip=CLIP):
-    hello = Hello(protocol=PROTOCOL, scene="flat")
-    session = Session(hello, Levels([field]), filters, lambda _: clip, rung=Rung.full(field.level, 1.0), window=10_000)
+def open_session(field, filters, clip=CLIP, levels=None):
+    hello, levels = Hello(protocol=PROTOCOL, scene="flat"), levels or Levels([field])
+    session = Session(hello, levels, filters, lambda _: clip, rung=Rung.full(field.level, 1.0), window=10_000)
     session.receive(ListenerPose(pose_id=1, position=START))
     session.receive(AddEmitter(id="talker", clip="noise", position=EMITTER))
     return session
@@ -78,9 +80,45 @@ def test_a_session_looks_up_no_node_as_long_as_its_listener_hardly_moves(whole_a
         session.receive(ListenerPose(pose_id=number + 2, position=shifted))
         assert answer(session, levels) is None
     assert len(finds) <= 4
-    session.receive(MoveEmitter(pose_id=100, id="talker", position=EMITTER, yaw=1.0))
-    session.receive(ListenerPose(pose_id=101, position=START))
-    assert answer(session, levels) is None
+
+
+def settled(session, levels, pose_id):
+    """The session has found that its listener, who has hardly moved, hears the same."""
+    for step in (1, 2):
+        session.receive(ListenerPose(pose_id=pose_id + step, position=(START[0] + 1e-4 * step, *START[1:])))
+        assert answer(session, levels) is None
+
+
+def test_an_emitter_that_moves_is_asked_for_anew_however_little_its_listener_does(whole_at_nodes, filters):
+    levels, session = Levels([whole_at_nodes]), open_session(whole_at_nodes, filters)
+    answer(session, levels)
+    settled(session, levels, 10)
+    session.receive(MoveEmitter(pose_id=20, id="talker", position=(3.0, 4.0, 1.5)))
+    assert answer(session, levels) is not None
+
+
+def test_an_emitter_that_turns_its_beam_is_asked_for_anew_however_little_its_listener_moves(whole_at_nodes, filters):
+    levels, session = Levels([whole_at_nodes]), open_session(whole_at_nodes, filters)
+    session.receive(RemoveEmitter(id="talker"))
+    session.receive(AddEmitter(id="horn", clip="noise", position=EMITTER, directivity={"pattern": "cardioid"}))
+    answer(session, levels)
+    settled(session, levels, 10)
+    session.receive(MoveEmitter(pose_id=20, id="horn", position=EMITTER, yaw=1.0))
+    assert answer(session, levels) is not None
+
+
+def test_another_level_is_asked_for_however_little_a_listener_moves(whole_at_nodes, mirrored_bundle, filters):
+    coarse = whole_at_nodes.level.model_copy(
+        update={"name": "coarse", "reuse": Reuse(spacing_m=20, turn_deg=360, first_reflections="node")}
+    )
+    levels = Levels([whole_at_nodes, AcousticField(mirrored_bundle, coarse, whole_at_nodes.graph)])
+    session = open_session(whole_at_nodes, filters, levels=levels)
+    answer(session, levels)
+    settled(session, levels, 10)
+    for number, level in enumerate((coarse, whole_at_nodes.level, coarse)):
+        session.hear(Rung.full(level, 1.0), "chosen")
+        session.receive(ListenerPose(pose_id=20 + number, position=START))
+        assert answer(session, levels).level == level.name
 
 
 def test_who_returns_to_where_a_response_was_heard_asks_for_it_again(whole_at_nodes, filters):

@@ -93,6 +93,8 @@ def export(
     Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it. The frozen
     noise of a simulated scene whose first field is factorised is chosen (`training.noise`), all others' is drawn.
 
+    Factorised fields of another width than the first one's have it in their names.
+
     Raises RunError for an unfinished run, ExportError for a graph that disagrees and for a dataset folder that is not
     of `responses` or not measured, and HealthError for fields that break a law of `nafir check`: nothing is written.
     """

@@ -96,12 +96,17 @@ class Lattice:
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
         """What stands for poses within the bounds; a function of them alone, in a few microseconds."""
-        return self.find(listener, emitter, yaw)[0]
+        return self._find(listener, emitter, yaw, looks_about=False)[0]
 
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
         """As `snap`, and for which listeners else."""
+        return self._find(listener, emitter, yaw, looks_about=True)
+
+    def _find(
+        self, listener: Vector3, emitter: Vector3, yaw: float, *, looks_about: bool
+    ) -> tuple[Snapped, Neighbourhood]:
         in_sight, (*place, ex, ey, ez), radius_m = find_node(
-            self._corners, self._low, self._high, self._offset, self._spacing_m, *listener, *emitter
+            self._corners, self._low, self._high, self._offset, self._spacing_m, *listener, *emitter, looks_about
         )
         there: Vector3 = (place[0], place[1], place[2])
         turns = (yaw - self._turned) / self._turn_rad

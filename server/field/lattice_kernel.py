@@ -39,7 +39,7 @@ def _nearest(at: float, low: float, high: float, offset: float, spacing: float) 
 
 @compiled
 def _distance(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
-    """Of a point from the line between two others."""
+    """Of a point from the line that ends at two others."""
     along_x, along_y = bx - ax, by - ay
     squared = along_x**2 + along_y**2
     share = 0.0
@@ -86,15 +86,18 @@ def find_node(
     ex: float,
     ey: float,
     ez: float,
+    looks_about: bool,
 ) -> tuple[bool, Coordinates, float]:
     """Whether listener and emitter see each other, the places of listener and emitter in the node for them, and how far
-    the listener may move for certain without either being another.
+    the listener may move for certain without either being another: 0 unless it `looks_about`.
 
     Each sees its place in the node, and those see each other if and only if these do. Where the cells of the lattice
     hold no such node, those of half the size are asked, and so on; in the end, they are their own node.
     """
     in_sight = is_visible(corners, lx, ly, ex, ey)
-    certain = min(_from_walls(corners, lx, ly), _clearance(corners, lx, ly, ex, ey))
+    certain = 0.0
+    if looks_about:
+        certain = min(_from_walls(corners, lx, ly), _clearance(corners, lx, ly, ex, ey))
     for _ in range(_HALVINGS + 1):
         nlx, end_x = _nearest(lx, low[0], high[0], offset[0], spacing)
         nly, end_y = _nearest(ly, low[1], high[1], offset[1], spacing)
@@ -102,7 +105,8 @@ def find_node(
         ney, _ = _nearest(ey, low[1], high[1], offset[1], spacing)
         certain = min(certain, end_x, end_y)
         if contains(corners, nlx, nly) and contains(corners, nex, ney):
-            certain = min(certain, _clearance(corners, lx, ly, nlx, nly))
+            if certain > _SLACK_M:
+                certain = min(certain, _clearance(corners, lx, ly, nlx, nly))
             if (
                 is_visible(corners, lx, ly, nlx, nly)
                 and is_visible(corners, ex, ey, nex, ney)

@@ -11,12 +11,9 @@ from server.rendering.sphere import triangulate
 SPEED_OF_SOUND = 343.0
 
 
-@pytest.fixture(autouse=True)
-def _numba_is_there(request):
-    """Where a test says that it measures compiled code."""
-    asked = getattr(request.node, "callspec", None)
-    if asked is not None and asked.params.get("is_compiled") is True:
-        assert HAS_NUMBA, "the tests measure the compiled convolver: install numba"
+@pytest.fixture
+def numba_is_there(is_compiled):
+    assert HAS_NUMBA or not is_compiled, "the tests measure the compiled convolver: install numba"
 
 
 @pytest.fixture(scope="session")

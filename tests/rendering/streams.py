@@ -7,9 +7,10 @@ from scipy.signal import fftconvolve
 SAMPLE_RATE = 24_000
 BLOCK_SIZES = (64, 128, 256)
 
-BOTH_KINDS = pytest.mark.parametrize(
-    "is_compiled", [pytest.param(True, id="compiled"), pytest.param(False, id="numpy")]
-)
+BOTH_KINDS = [
+    pytest.mark.parametrize("is_compiled", [pytest.param(True, id="compiled"), pytest.param(False, id="numpy")]),
+    pytest.mark.usefixtures("numba_is_there"),
+]
 """Of convolver: a test takes `is_compiled`."""
 
 
