@@ -14,11 +14,12 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.early_reflections import EarlyReflections
 from server.field.field import AcousticField
-from server.field.lattice import Neighbourhood, moved
+from server.field.lattice import Neighbourhood, Snapped, moved
 from server.field.reuse import Kept, NodeResponses
 from server.node_reflections import Snapping, add_first_reflections
 from server.radiation import Placed
 from server.rendering.convolver import PartitionedIr
+from server.scene.manifest import QualityLevel
 
 
 class Preparer(Protocol):
@@ -47,14 +48,22 @@ class Shared(NamedTuple):
 
 def shared_response(field: Snapping, early: EarlyReflections | None, listener: Pose, emitter: Placed) -> Shared | None:
     """At a field's level; None where each pose has a response of its own."""
-    reuse = field.level.reuse
-    if reuse is None or (early is not None and reuse.first_reflections == "pose"):
+    if field.level.reuse is None or _has_own_reflections(field.level, early):
         return None
+    snapped, around = field.find(listener.position, emitter.pose.position, listener.yaw)
+    return Shared(_identity(field.level, early, snapped, emitter), around)
+
+
+def _has_own_reflections(level: QualityLevel, early: EarlyReflections | None) -> bool:
+    """Of each pose, at a level that reuses responses."""
+    return early is not None and level.reuse is not None and level.reuse.first_reflections == "pose"
+
+
+def _identity(level: QualityLevel, early: EarlyReflections | None, snapped: Snapped, emitter: Placed) -> Hashable:
     beam = None
     if early is not None and emitter.directivity != OMNIDIRECTIONAL:
         beam = emitter.directivity, emitter.pose.orientation
-    snapped, around = field.find(listener.position, emitter.pose.position, listener.yaw)
-    return Shared((field.level.name, snapped, beam), around)
+    return level.name, snapped, beam
 
 
 def prepared_irs(
@@ -80,13 +89,14 @@ def _prepared(
     listener: Pose,
     emitter: Placed,
 ) -> PartitionedIr:
-    shared = shared_response(field, early, listener, emitter)
-    if shared is None and early is not None:
+    if early is not None and _has_own_reflections(field.level, early):
         return _with_first_reflections(field, nodes, kept, early, preparer, listener, emitter)
-    key = shared and shared.identity, None if early is None else early.filters, preparer.preparation
+    snapped = field.snap(listener.position, emitter.pose.position, listener.yaw)
+    identity = _identity(field.level, early, snapped, emitter)
+    key = identity, None if early is None else early.filters, preparer.preparation
     ir = kept.get(key)
     if not isinstance(ir, PartitionedIr):
-        node, later = field.snap(listener.position, emitter.pose.position, listener.yaw)
+        node, later = snapped
         samples = moved(nodes.at(node), later)
         if early is not None:
             add_first_reflections(field, early, samples[np.newaxis], listener, [emitter])
