@@ -32,7 +32,7 @@ if HAS_NUMBA:
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-_RISE_S = 0.0003
+RISE_S = 0.0003
 _SPARES = Spares(16 * 1024 * 1024)
 """A request's responses wait for those of the next."""
 
@@ -41,7 +41,7 @@ class Decoder:
     """Thread-safe: every call works in arrays of its own, kept for later ones.
 
     `ir_samples` are what a response has whatever the codec's length; of a prediction the first `frames` count, by
-    default all, and what follows them is silent.
+    default all, and what follows them is silent. `rise_s` is that of the onset's gate.
     """
 
     def __init__(
@@ -52,6 +52,7 @@ class Decoder:
         ir_samples: int,
         phase: Phase,
         frames: int | None = None,
+        rise_s: float = RISE_S,
         is_compiled: bool = HAS_NUMBA,
     ) -> None:
         self.ir_samples = ir_samples
@@ -60,7 +61,7 @@ class Decoder:
         self._noise = noise
         self._used = self._codec.frames if frames is None else min(frames, self._codec.frames)
         self._known = min(parameters.known_frames, self._used)
-        self._gate = onset_gate(parameters)
+        self._gate = onset_gate(parameters, rise_s)
         n_fft = self._codec.n_fft
         self._axis = parameters.frame_axis
         self._is_compiled = is_compiled and n_fft & (n_fft - 1) == 0 and self._codec.frames >= LANES
@@ -178,10 +179,10 @@ class Decoder:
         )
 
 
-def onset_gate(parameters: CodecParameters) -> Float32:
-    """Silence until the direct sound passes the head, for windows smear energy to where it cannot be. What reaches
-    the nearer ear sooner is the direct sound alone."""
-    rise = round(_RISE_S * parameters.sample_rate)
+def onset_gate(parameters: CodecParameters, rise_s: float = RISE_S) -> Float32:
+    """Silence until the direct sound passes the head, for windows smear energy to where it cannot be, and the rise that
+    follows. What reaches the nearer ear sooner is the direct sound alone."""
+    rise = round(rise_s * parameters.sample_rate)
     opens = np.sin(np.pi / 2 * (np.arange(rise) + 0.5) / rise)
     return np.concatenate([np.zeros(parameters.lead_samples), opens]).astype(np.float32)
 

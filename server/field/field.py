@@ -17,7 +17,7 @@ from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
 from server.bounded_cache import BoundedCache
 from server.errors import BundleError, FieldError
-from server.field.decoder import Decoder, add_from, apply_gate, apply_gates, onset_gate, resized
+from server.field.decoder import RISE_S, Decoder, add_from, apply_gate, apply_gates, onset_gate, resized
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.lattice import Neighbourhood, Node, Snapped
 from server.field.phase_cache import PhaseCache
@@ -33,6 +33,9 @@ _NEVER = 2.0**31
 """Samples: no index reaches as far."""
 _EAR_AHEAD_S = 0.00026
 """Sound reaches the nearer ear at most so much sooner than the middle of the head, 87.5 mm away."""
+_DECODED_RISE_S = 0.003
+"""Reflections set in one by one, and a codec's windows, three times as long, smear all of them to where they begin:
+heard at once, that would be taken for direct sound. Of 1 to 5 ms, this errs least."""
 
 
 class AcousticField:
@@ -54,15 +57,16 @@ class AcousticField:
         self.level = level
         self.graph = graph
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
-        opening = graph.parameters
+        opening, rise_s = graph.parameters, RISE_S
         self._first_echo: FirstEcho | None = None
         if bundle.manifest.direct_sound == "field":
             # Measured sound may arrive before geometry has it: the gate opens with the first sample that is coded.
             opening = opening.model_copy(update={"lead_samples": 0})
         else:
             self._first_echo = FirstEcho(bundle.floor_plan)
-        self._gate = onset_gate(opening)
-        self._rise = self._gate[opening.lead_samples :]
+            rise_s = RISE_S if graph.gives_responses else _DECODED_RISE_S
+        self._gate = onset_gate(opening, rise_s)
+        self._rise = onset_gate(opening)[opening.lead_samples :]
         # Compiled here, where it may take its time, and not for the first pose.
         apply_gates(self._rise, np.zeros((1, self.channels, 1), np.float32), np.zeros(1, np.int64))
         self._decoder: Decoder | None = None
@@ -78,6 +82,7 @@ class AcousticField:
                 ir_samples=self.ir_samples,
                 phase=level.phase,
                 frames=level.frames,
+                rise_s=rise_s,
             )
         self._cache = PhaseCache() if level.phase.warm else None
         self.nodes: NodeResponses | None = None

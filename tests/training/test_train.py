@@ -19,6 +19,7 @@ from training.learning.naf import NafLearner
 from training.learning.pairs import split
 from training.learning.precision import bfloat16_gains
 from training.models.cells import Cells
+from training.models.level_correction import LevelsInterpolated
 from training.models.naf import NafShape
 from training.models.stored_targets import load_targets
 from training.models.targets import codec_of
@@ -100,8 +101,8 @@ def test_learning_beats_the_mean_of_all_poses(dataset, run, tmp_path):
 
 
 def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configuration, tmp_path):
-    """Pooled over the whole set, predicted power is the targets' where the field's log would be too low: of responses
-    as they were drawn, with no error of energies to lift it."""
+    """Pooled over the whole set, what is heard has the targets' power where the field's log would be too low: of
+    responses as they were drawn, with no error of energies to lift it."""
     recipe = FactorisedRecipe(expected=False, energy_weight=0.0)
     train(
         SimulatedResponses(dataset),
@@ -117,9 +118,11 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configura
         features = field.encoder(*map(torch.from_numpy, (targets.listener, targets.emitter, targets.yaw)))
         predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
         correction = field.level_correction[field.encoder.sight(features)[:, 0].long()]
-    part = field.heads.slices["late"]
+    levels, part = field.heads.levels, field.heads.slices["late"]
+    heard = LevelsInterpolated(learner.cells, responses.channels)
     raw, corrected, true = (
-        level[:, part].double().mul(2).exp().sum() for level in (predicted, predicted + correction, flat)
+        level[:, part].double().mul(2).exp().sum()
+        for level in (heard(predicted[:, levels]), heard((predicted + correction)[:, levels]), flat)
     )
     assert abs(torch.log(corrected / true)) < abs(torch.log(raw / true))
     assert torch.log(corrected / true).abs() < 0.1

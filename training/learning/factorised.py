@@ -17,7 +17,7 @@ from training.learning.naf import NafLearner
 from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
-from training.models.level_correction import PowerBalance
+from training.models.level_correction import LevelsInterpolated, PowerBalance
 from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
@@ -160,18 +160,19 @@ class FactorisedLearner:
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> None:
-        """Correct levels by what they lack on average over the training set."""
+        """Correct levels by what is heard of them too little, or too much, on average over the training set."""
         if not self.recipe.level_correction:
             return
         field, levels = self.field, self.field.heads.levels
         balance = PowerBalance(field.heads.areas)
+        heard = LevelsInterpolated(self.cells, self.responses.channels).to(field.mean.device)
         sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
         for start in range(0, len(sample), 256):
             poses, (flat, _) = self.batch(sample[start : start + 256], None)
             features = field.encoder(*(pose.to(field.mean.device) for pose in poses))
             predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
             true = flat[:, levels].to(field.mean.device).float()
-            balance.add(true, predicted[:, levels], field.encoder.sight(features))
+            balance.add(true, heard(predicted[:, levels]), field.encoder.sight(features))
         field.level_correction[:, levels] = balance.missing()
 
 

@@ -4,8 +4,40 @@ logarithms, 2.5 dB below the logarithm of the mean power for noise, and less or 
 Axes: B pairs, n levels (natural logarithms of magnitude).
 """
 
+import math
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from training.models.cells import Cells
+
+
+class LevelsInterpolated(nn.Module):
+    """What is heard of predicted levels, in the layout that they are predicted in.
+
+    A cell's level is the mean power of its frames and bins, and whoever decodes it draws straight lines from the centre
+    of one cell to that of the next. Of sound that decays by x nepers of amplitude in half a cell, the mean power lies
+    by the factor sinh(2x) / 2x above that of its centre: read as it is, late sound decays too slowly where cells widen.
+    """
+
+    def __init__(self, cells: Cells, channels: int) -> None:
+        super().__init__()
+        self._fine = (channels, cells.codec.bins, cells.fine_frames)
+        self._late = (channels, cells.bands.cells, cells.late_frames.cells)
+        for name, matrix in (
+            ("to_bins", cells.bands.spread().T),
+            ("of_bins", cells.bands.pool().T),
+            ("to_frames", cells.all_frames.spread()[:, cells.fine_frames :]),
+            ("of_frames", cells.late_frames.pool()),
+        ):
+            self.register_buffer(f"_{name}", torch.tensor(matrix.copy()), persistent=False)
+
+    def forward(self, levels: Tensor) -> Tensor:
+        """(B, n) levels of fine frames and of late cells, to as many."""
+        fine, late = torch.split(levels, [math.prod(self._fine), math.prod(self._late)], dim=1)
+        columns = torch.cat([fine.unflatten(1, self._fine), self._to_bins @ late.unflatten(1, self._late)], dim=-1)
+        power = self._of_bins @ torch.exp(2 * (columns @ self._to_frames)) @ self._of_frames
+        return torch.cat([fine, 0.5 * torch.log(power).flatten(1)], dim=1)
 
 
 class PowerBalance:

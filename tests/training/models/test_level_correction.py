@@ -1,9 +1,12 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from training.models.level_correction import PowerBalance
+from server.acoustics.codec import Codec
+from training.models.cells import Cells
+from training.models.level_correction import LevelsInterpolated, PowerBalance
 
 IN_SIGHT, OUT_OF_SIGHT = torch.ones(4, 1), torch.zeros(4, 1)
 LOUD = torch.tensor([[0.0, -1.0], [0.5, -0.5], [-0.3, -0.7], [0.1, -1.2]])
@@ -55,3 +58,53 @@ def test_where_no_pair_is_out_of_sight_both_kinds_are_corrected_alike():
     balance = PowerBalance(torch.ones(2))
     balance.add(LOUD, LOUD - 0.2, IN_SIGHT)
     torch.testing.assert_close(balance.missing(), torch.full((2, 2), 0.2))
+
+
+CELLS = Cells(Codec(sample_rate=24_000, n_fft=256, hop=64, samples=19_200, log_floor=1e-5))
+
+
+def levels_of_decay(t60_s: float) -> torch.Tensor:
+    """(1, n) levels of one channel whose power falls by 60 dB in `t60_s`, in every bin alike."""
+    codec = CELLS.codec
+    power = np.broadcast_to(10 ** (-6 * codec.frame_times_s / t60_s), (codec.bins, codec.frames))
+    late = CELLS.bands.pool().T @ power[:, CELLS.fine_frames :] @ CELLS.late_frames.pool()
+    flat = np.concatenate([power[:, : CELLS.fine_frames].ravel(), late.ravel()])
+    return torch.tensor(0.5 * np.log(flat)[None], dtype=torch.float32)
+
+
+def reverberation_time_s(levels: torch.Tensor) -> float:
+    """Of late cells' levels of one band as they are interpolated, by a straight line through what is to come of power
+    between 10 and 30 dB below all of it."""
+    late_cells = CELLS.late_frames.cells
+    first = CELLS.codec.bins * CELLS.fine_frames
+    columns = np.concatenate([levels[0, : CELLS.fine_frames], levels[0, first : first + late_cells]])
+    power = np.exp(2 * columns.astype(np.float64) @ CELLS.all_frames.spread())
+    to_come_db = 10 * np.log10(np.cumsum(power[::-1])[::-1] / power.sum())
+    fitted = (to_come_db < -10) & (to_come_db > -30)
+    return -60 / float(np.polyfit(CELLS.codec.frame_times_s[fitted], to_come_db[fitted], 1)[0])
+
+
+def test_sound_that_does_not_decay_is_heard_as_it_is_predicted():
+    levels = torch.full_like(levels_of_decay(1.0), -1.5)
+    torch.testing.assert_close(LevelsInterpolated(CELLS, 1)(levels), levels)
+
+
+def test_more_is_heard_of_a_cell_than_its_level_says_where_sound_decays():
+    """By the factor sinh(2x) / 2x of power, x nepers being what amplitude loses in half a cell; here of eight frames,
+    between others of eight, whose sum is not quite that integral."""
+    levels = levels_of_decay(0.4)
+    excess = (LevelsInterpolated(CELLS, 1)(levels) - levels)[0, CELLS.codec.bins * CELLS.fine_frames :]
+    x = 8 / 2 * 64 / 24_000 * 3 * math.log(10) / 0.4
+    assert float(excess[25]) == pytest.approx(0.5 * math.log(math.sinh(2 * x) / (2 * x)), rel=0.03)
+    single = levels[:, : CELLS.codec.bins * CELLS.fine_frames]
+    torch.testing.assert_close(LevelsInterpolated(CELLS, 1)(levels)[:, : single.shape[1]], single)
+
+
+@pytest.mark.parametrize("t60_s", [0.3, 0.4, 0.5])
+def test_sound_decays_as_fast_as_it_should_once_corrected(t60_s):
+    levels = levels_of_decay(t60_s)
+    balance = PowerBalance(torch.ones(levels.shape[1]))
+    balance.add(levels, LevelsInterpolated(CELLS, 1)(levels), torch.ones(1, 1))
+    before, after = (reverberation_time_s(each) / t60_s - 1 for each in (levels, levels + balance.missing()[1]))
+    assert before > 0.001
+    assert abs(after) < 0.2 * before
