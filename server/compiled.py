@@ -7,7 +7,9 @@ holds compiled code has changed. A folder that cannot be written, as in a contai
 """
 
 import hashlib
+import importlib
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -34,6 +36,18 @@ def compiled(function: Function) -> Function:
     return dispatcher  # type: ignore[no-any-return]
 
 
+def _look_for_no_blas() -> None:
+    """Numba looks for SciPy's linear algebra before it reads or compiles anything, which takes a quarter of a fresh
+    process' time to its first block, for products of matrices that nothing here compiles. Others find it still, but for
+    `np.convolve` and `np.correlate`, which then do their own sums."""
+    if not {"scipy.linalg", "numba.np.arraymath"} & sys.modules.keys():
+        sys.modules["scipy.linalg"] = None  # type: ignore[assignment]  # to an import, what is not installed
+        try:
+            importlib.import_module("numba.np.arraymath")
+        finally:
+            del sys.modules["scipy.linalg"]
+
+
 @cache
 def _digest_of_sources() -> str:
     """Of every module beside this one that says "compiled"."""
@@ -56,6 +70,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 if numba is not None:
+    _look_for_no_blas()
 
     class _Locator(_CacheLocator):  # type: ignore[misc]
         def __init__(self, function: Callable[..., Any], file: str) -> None:

@@ -79,3 +79,21 @@ def test_where_nothing_can_be_written_what_is_there_is_read(package):
         )
         assert output.stdout.strip() == expected
     assert not list(package.glob("**/*.nbc"))
+
+
+def test_scipys_linear_algebra_is_not_imported_and_can_be(tmp_path):
+    """It takes as long as a third of all else before the first block. Whoever multiplies matrices finds it."""
+    (tmp_path / "product.py").write_text("import numba\n\n@numba.njit\ndef square(a):\n    return a @ a\n")
+    check = (
+        "import sys\nimport numpy as np\nfrom server.rendering.convolver import Convolver\n"
+        "convolver = Convolver(sources=1, channels=2, block_size=128, ir_samples=1_000)\n"
+        "convolver.process(np.zeros((1, 128), np.float32))\n"
+        "print('scipy.linalg' in sys.modules)\n"
+        "from product import square\nprint(square(np.full((2, 2), 3.0))[0, 0])\n"
+        "import scipy.linalg\nprint(scipy.linalg.det(np.eye(2)))"
+    )
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(server.__file__).parent.parent)])
+    }
+    output = subprocess.run([sys.executable, "-c", check], env=environment, check=True, capture_output=True, text=True)
+    assert output.stdout.split() == ["False", "18.0", "1.0"]
