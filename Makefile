@@ -9,7 +9,7 @@ RUNS ?= runs/$(SCENE)
 OFFICE ?= runs/office
 # What the paper's table compares with, and on how many held-out pairs: naf takes seconds for each of their responses.
 METHODS ?= nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear,image-sources,helmholtz
-PAIRS ?= 48
+PAIRS ?= 160
 # How long the paper's network is trained for the table.
 NAF ?= --as-long-as $(RUNS)/run
 RANKS ?= 32,16,8,4,2

@@ -6,6 +6,7 @@ for fresh as long as the one file is unchanged that a function is written in; he
 holds compiled code has changed. A folder that cannot be written, as in a container, is read all the same.
 """
 
+import contextlib
 import hashlib
 import importlib
 import os
@@ -37,15 +38,24 @@ def compiled(function: Function) -> Function:
 
 
 def _look_for_no_blas() -> None:
-    """Numba looks for SciPy's linear algebra before it reads or compiles anything, which takes a quarter of a fresh
-    process' time to its first block, for products of matrices that nothing here compiles. Others find it still, but for
-    `np.convolve` and `np.correlate`, which then do their own sums."""
-    if not {"scipy.linalg", "numba.np.arraymath"} & sys.modules.keys():
-        sys.modules["scipy.linalg"] = None  # type: ignore[assignment]  # to an import, what is not installed
+    """Numba imports SciPy's linear algebra before it reads or compiles anything, for products of matrices that nothing
+    here compiles: a quarter of what a process that convolves, and needs no SciPy besides, takes to its first block.
+    Others find it still, but for `np.convolve` and `np.correlate`, which then do their own sums."""
+    if {"scipy.linalg", "numba.np.arraymath"} & sys.modules.keys():
+        return
+    # Of numba's inner parts; where a later one has others, it takes its time.
+    with contextlib.suppress(ImportError, AttributeError):
+        linalg: Any = importlib.import_module("numba.np.linalg")
+        ensure_blas = linalg.ensure_blas
+        linalg.ensure_blas = _there_is_no_blas
         try:
             importlib.import_module("numba.np.arraymath")
         finally:
-            del sys.modules["scipy.linalg"]
+            linalg.ensure_blas = ensure_blas
+
+
+def _there_is_no_blas() -> None:
+    raise ImportError("not needed yet")
 
 
 @cache

@@ -33,9 +33,9 @@ _NEVER = 2.0**31
 """Samples: no index reaches as far."""
 _EAR_AHEAD_S = 0.00026
 """Sound reaches the nearer ear at most so much sooner than the middle of the head, 87.5 mm away."""
-_DECODED_RISE_S = 0.003
-"""Reflections set in one by one, and a codec's windows, three times as long, smear all of them to where they begin:
-heard at once, that would be taken for direct sound. Of 1 to 5 ms, this errs least."""
+_RISE_AFTER_FIRST_S = 0.003
+"""Of what follows the first reflections, where geometry computes those: it sets in bit by bit, and what windows of a
+codec smear to its beginning would be taken for direct sound. Of 1 to 5 ms, this errs least."""
 
 
 class AcousticField:
@@ -64,7 +64,8 @@ class AcousticField:
             opening = opening.model_copy(update={"lead_samples": 0})
         else:
             self._first_echo = FirstEcho(bundle.floor_plan)
-            rise_s = RISE_S if graph.gives_responses else _DECODED_RISE_S
+            if bundle.manifest.image_order and not graph.gives_responses:
+                rise_s = _RISE_AFTER_FIRST_S
         self._gate = onset_gate(opening, rise_s)
         self._rise = onset_gate(opening)[opening.lead_samples :]
         # Compiled here, where it may take its time, and not for the first pose.

@@ -19,7 +19,7 @@ from training.learning.naf import NafLearner
 from training.learning.pairs import split
 from training.learning.precision import bfloat16_gains
 from training.models.cells import Cells
-from training.models.level_correction import LevelsInterpolated
+from training.models.level_correction import LevelsInterpolated, PowerBalance
 from training.models.naf import NafShape
 from training.models.stored_targets import load_targets
 from training.models.targets import codec_of
@@ -126,6 +126,17 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configura
     )
     assert abs(torch.log(corrected / true)) < abs(torch.log(raw / true))
     assert torch.log(corrected / true).abs() < 0.1
+    # To cells themselves as much is not missing: sound decays within them.
+    of_cells = PowerBalance(field.heads.areas)
+    sight = field.encoder.sight(features)
+    of_cells.add(flat[:, levels], predicted[:, levels], sight)
+    uncorrected = predicted[:, levels] + of_cells.missing()[sight[:, 0].long()]
+    errors = []
+    for corrected in (uncorrected, (predicted + correction)[:, levels]):
+        balance = PowerBalance(field.heads.areas)
+        balance.add(flat[:, levels], heard(corrected), sight)
+        errors.append(float(balance.missing()[:, part].square().mean()))
+    assert errors[1] < 0.5 * errors[0]
     for name in ("phasor", "interaural"):
         assert not field.level_correction[:, field.heads.slices[name]].any()
 
