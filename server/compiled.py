@@ -39,7 +39,7 @@ def compiled(function: Function) -> Function:
 
 def _look_for_no_blas() -> None:
     """Numba imports SciPy's linear algebra before it reads or compiles anything, for products of matrices that nothing
-    here compiles: a quarter of what a process that convolves, and needs no SciPy besides, takes to its first block.
+    here compiles: a fifth of what a process that convolves, and needs no SciPy besides, takes to its first block.
     Others find it still, but for `np.convolve` and `np.correlate`, which then do their own sums."""
     if {"scipy.linalg", "numba.np.arraymath"} & sys.modules.keys():
         return
