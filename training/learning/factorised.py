@@ -1,5 +1,6 @@
 """The factorised field and its loss."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from training.learning.naf import NafLearner
 from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
-from training.models.level_correction import LevelsInterpolated, PowerBalance
+from training.models.level_correction import LevelsInterpolated, level_correction
 from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
@@ -164,16 +165,18 @@ class FactorisedLearner:
         if not self.recipe.level_correction:
             return
         field, levels = self.field, self.field.heads.levels
-        balance = PowerBalance(field.heads.areas)
-        heard = LevelsInterpolated(self.cells, self.responses.channels).to(field.mean.device)
+        device = field.mean.device
         sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
-        for start in range(0, len(sample), 256):
-            poses, (flat, _) = self.batch(sample[start : start + 256], None)
-            features = field.encoder(*(pose.to(field.mean.device) for pose in poses))
-            predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
-            true = flat[:, levels].to(field.mean.device).float()
-            balance.add(true, heard(predicted[:, levels]), field.encoder.sight(features))
-        field.level_correction[:, levels] = balance.missing()
+
+        def examples() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+            for start in range(0, len(sample), 256):
+                poses, (flat, _) = self.batch(sample[start : start + 256], None)
+                features = field.encoder(*(pose.to(device) for pose in poses))
+                predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
+                yield flat[:, levels].to(device).float(), predicted[:, levels], field.encoder.sight(features)
+
+        heard = LevelsInterpolated(self.cells, self.responses.channels).to(device)
+        field.level_correction[:, levels] = level_correction(examples, heard, field.heads.areas)
 
 
 def _rows_of(source: Targets | Lessons, rows: Rows) -> tuple[npt.NDArray[np.floating], ...]:

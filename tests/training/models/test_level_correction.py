@@ -6,7 +6,7 @@ import torch
 
 from server.acoustics.codec import Codec
 from training.models.cells import Cells
-from training.models.level_correction import LevelsInterpolated, PowerBalance
+from training.models.level_correction import LevelsInterpolated, PowerBalance, level_correction
 
 IN_SIGHT, OUT_OF_SIGHT = torch.ones(4, 1), torch.zeros(4, 1)
 LOUD = torch.tensor([[0.0, -1.0], [0.5, -0.5], [-0.3, -0.7], [0.1, -1.2]])
@@ -103,8 +103,22 @@ def test_more_is_heard_of_a_cell_than_its_level_says_where_sound_decays():
 @pytest.mark.parametrize("t60_s", [0.3, 0.4, 0.5])
 def test_sound_decays_as_fast_as_it_should_once_corrected(t60_s):
     levels = levels_of_decay(t60_s)
-    balance = PowerBalance(torch.ones(levels.shape[1]))
-    balance.add(levels, LevelsInterpolated(CELLS, 1)(levels), torch.ones(1, 1))
-    before, after = (reverberation_time_s(each) / t60_s - 1 for each in (levels, levels + balance.missing()[1]))
+    heard = LevelsInterpolated(CELLS, 1)
+    correction = level_correction(lambda: [(levels, levels, torch.ones(1, 1))], heard, torch.ones(levels.shape[1]))
+    before, after = (reverberation_time_s(each) / t60_s - 1 for each in (levels, levels + correction[1]))
     assert before > 0.001
-    assert abs(after) < 0.2 * before
+    assert abs(after) < 0.02 * before
+
+
+def test_each_kind_of_pairs_is_corrected_by_its_own_predictions():
+    examples = [(LOUD, LOUD - 0.1, IN_SIGHT), (LOUD, LOUD - 0.4, OUT_OF_SIGHT)]
+    correction = level_correction(lambda: examples, torch.nn.Identity(), torch.ones(2))
+    torch.testing.assert_close(correction, torch.tensor([[0.4, 0.4], [0.1, 0.1]]))
+
+
+def test_what_is_heard_of_a_correction_is_corrected_too():
+    """As where half of what a level is raised by is heard."""
+    correction = level_correction(
+        lambda: [(LOUD, LOUD - 0.4, IN_SIGHT)], lambda heard: LOUD + (heard - LOUD) / 2, torch.ones(2)
+    )
+    torch.testing.assert_close(correction[1], torch.full((2,), 0.2 + 0.1 + 0.05))
