@@ -199,6 +199,7 @@ def evaluate(
     ] = "nearest,linear,linear-aligned",
     pairs: Annotated[int | None, typer.Option(min=1, help="Held-out pairs to draw; all if not given.")] = None,
     yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
+    draws: Annotated[int, typer.Option(min=1, help="Simulations whose medians are the reference.")] = 1,
     figure: Annotated[Path | None, typer.Option(help="Draw decays and errors to this PNG.")] = None,
     record: Annotated[bool, typer.Option(help="Write the measured errors of every level into the bundle.")] = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the results as JSON, too.")] = None,
@@ -217,8 +218,9 @@ def evaluate(
 
     runs = [place for place in places[:-1] if (place / "run.json").is_file()]
     bundles = [Bundle.load(place) for place in places[:-1] if place not in runs]
-    if record and (len(bundles) != 1 or runs):
-        raise typer.BadParameter("takes one bundle", param_hint="--record")
+    if record and (len(bundles) != 1 or runs or draws > 1):
+        problem = "takes one bundle, and errors from one simulation, as a frontier's are"
+        raise typer.BadParameter(problem, param_hint="--record")
     console = Console(stderr=True)
     evaluation, published = evaluate_bundles(
         bundles,
@@ -227,6 +229,7 @@ def evaluate(
         methods=[name.strip() for name in methods.split(",") if name.strip()],
         pairs=pairs,
         yaws=yaws,
+        draws=draws,
         seed=seed,
         figure=figure,
         track=lambda steps, doing: track(steps, doing, console=console),

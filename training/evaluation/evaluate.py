@@ -24,10 +24,11 @@ from server.acoustics.metrics import (
     spectral_loss,
     summarise,
 )
-from server.acoustics.room_parameters import measure
+from server.acoustics.room_parameters import RoomParameters, measure
 from training.evaluation.held_out import EvaluationError, HeldOut, Responses
 
 FLOOR = "floor"
+ONE_SIMULATION = "one simulation"
 METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS)
 # Means that are nearer to each other are taken for luck of the draw.
 _STANDARD_ERRORS = 2.0
@@ -38,7 +39,9 @@ _TIMED_S = 5.0
 _SPECTRAL_WINDOW_S = 0.0107
 _SPECTRAL_FLOOR = 1e-5
 
-Kind = Literal["field", "baseline", "floor"]
+Kind = Literal["field", "baseline", "simulation", "floor"]
+RATED = frozenset({"field", "baseline"})
+"""What is told from what, and how long it takes: simulations are there to compare with."""
 Source = Callable[[int, npt.NDArray[np.integer]], Responses | None]
 """Held-out index and orientations (n,), indices into the yaws of the data, to (n, channel, sample); None where the
 method has no answer. Called from several threads."""
@@ -48,7 +51,9 @@ _Errors = npt.NDArray[np.float64]
 @dataclass(frozen=True)
 class Column:
     """One method. storage_bytes: what it has to keep of the scene; method: its name in published tables;
-    extra_ms: time per response that `source` does not spend because it was spent beforehand."""
+    extra_ms: time per response that `source` does not spend because it was spent beforehand. Of kind "floor" it is a
+    second simulation, compared with the first whatever the others are compared with, and of kind "simulation" one that
+    is compared as they are."""
 
     name: str
     source: Source
@@ -77,7 +82,8 @@ class Result:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What `nafir-train evaluate` reports; `held_out` is how many pairs there are, `pairs` how many were measured."""
+    """What `nafir-train evaluate` reports; `held_out` is how many pairs there are, `pairs` how many were measured,
+    `draws` of how many simulations parameters were compared with the medians."""
 
     data: str
     pairs: int
@@ -86,6 +92,7 @@ class Evaluation:
     yaws: int
     channels: int
     left_out: int
+    draws: int
     results: tuple[Result, ...]
 
     def of(self, name: str) -> Result:
@@ -127,6 +134,7 @@ class Evaluation:
             "left_out_pairs": self.left_out,
             "yaws": self.yaws,
             "channels": self.channels,
+            "draws": self.draws,
             "metrics": [{"name": metric.name, "label": metric.label, "unit": metric.unit} for metric in METRICS],
             "columns": columns,
         }
@@ -137,6 +145,8 @@ def evaluate(
     columns: Sequence[Column],
     *,
     of: int | None = None,
+    truth: Sequence[RoomParameters] = (),
+    draws: int = 1,
     decay_db: float = 30.0,
     threads: int = 2,
     track: Callable[[range], Iterable[int]] = iter,
@@ -145,8 +155,10 @@ def evaluate(
 
     Where the emitter is not in sight there is no direct sound, and metrics that need one are missing; what a method
     does not answer is missing in all of them. The direct sound is sought within 3 ms of where the reference has it.
-    `of`: the held-out pairs that these were drawn from. Sources are called from several `threads` for errors, and one
-    at a time for what they take. `track` may wrap the loop over pairs in a progress bar.
+    `of`: the held-out pairs that these were drawn from. `truth`: what parameters are compared with, pair by pair,
+    medians of so many `draws`; where there is none, with the reference's own. Spectra are always compared with the
+    reference. Sources are called from several `threads` for errors, and one at a time for what they take. `track` may
+    wrap the loop over pairs in a progress bar.
     """
     codec = spectral_codec(held_out.sample_rate, held_out.samples)
     names = [column.name for column in columns]
@@ -155,7 +167,8 @@ def evaluate(
 
     def pair_errors(pair: int) -> list[dict[str, _Errors]]:
         reference = np.asarray(held_out.reference(pair), dtype=np.float32)
-        parameters = measure(reference, held_out.sample_rate, decay_db=decay_db)
+        simulated = measure(reference, held_out.sample_rate, decay_db=decay_db)
+        parameters = truth[pair] if truth else simulated
         onset = np.round(np.nan_to_num(parameters.onset_s, nan=0.0) * held_out.sample_rate).astype(np.int64)
         spectrogram = codec.log_magnitude(codec.transform(reference))
 
@@ -169,7 +182,7 @@ def evaluate(
                     f"{column.name}: responses of {estimate.shape} where the data have {reference.shape}"
                 )
             estimated = measure(estimate, held_out.sample_rate, decay_db=decay_db, onset=onset)
-            errors = parameter_errors(parameters, estimated)
+            errors = parameter_errors(simulated if column.kind == "floor" else parameters, estimated)
             errors[SPECTRAL_LOSS.name] = spectral_loss(spectrogram, codec.log_magnitude(codec.transform(estimate)))
             for metric in METRICS:
                 if metric.needs_direct_sound and not held_out.visible[pair]:
@@ -196,6 +209,7 @@ def evaluate(
         yaws=len(held_out.heard),
         channels=held_out.channels,
         left_out=held_out.left_out,
+        draws=draws,
         results=tuple(_result(column, held_out, errors, columns) for column in columns),
     )
 
@@ -229,14 +243,14 @@ def _result(
     column: Column, held_out: HeldOut, errors: Mapping[str, Mapping[str, _Errors]], columns: Sequence[Column]
 ) -> Result:
     ours = errors[column.name]
-    rivals = [other.name for other in columns if other.kind != "floor" and other is not column]
+    rivals = [other.name for other in columns if other.kind in RATED and other is not column]
     baselines = [other.name for other in columns if other.kind == "baseline" and other is not column]
     return Result(
         name=column.name,
         kind=column.kind,
         method=column.method,
         storage_bytes=column.storage_bytes,
-        ms=None if column.kind == "floor" else milliseconds_per_response(column, held_out),
+        ms=milliseconds_per_response(column, held_out) if column.kind in RATED else None,
         summaries={metric.name: summarise(ours[metric.name]) for metric in METRICS},
         beats={
             metric.name: tuple(name for name in baselines if _beats(ours[metric.name], errors[name][metric.name]))

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from server.acoustics.room_parameters import energy_decay_db
-from training.evaluation.evaluate import METRICS, Evaluation, Source
+from training.evaluation.evaluate import METRICS, RATED, Evaluation, Source
 from training.evaluation.held_out import Responses
 
 _COLOURS = (
@@ -48,7 +48,7 @@ def draw_figure(
     reference in those panels, named as in the evaluation; first channel, at the orientation `turn` (1,), an index into
     the yaws of the data.
     """
-    judged = [result.name for result in evaluation.results if result.kind != "floor"]
+    judged = [result.name for result in evaluation.results if result.kind in RATED]
     colour = dict(zip(judged, cycle(_COLOURS), strict=False))
     across = max(len(examples), 5)
     figure = Figure(figsize=(3.1 * across, 9.6), layout="constrained", facecolor="white")

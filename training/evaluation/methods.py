@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from training.evaluation.baselines import linear, linear_aligned, nearest
 from training.evaluation.coded import AAC, AudioCodec, CodedResponses, Track, opus
-from training.evaluation.evaluate import FLOOR, Column, Source
+from training.evaluation.evaluate import FLOOR, ONE_SIMULATION, Column, Source
 from training.evaluation.held_out import EvaluationError, HeldOut, Responses
 from training.evaluation.helmholtz import HelmholtzInterpolation
 from training.evaluation.image_sources import ImageSources
@@ -34,12 +34,19 @@ def method_columns(names: Sequence[str], held_out: HeldOut, track: Track = lambd
     return [METHODS[name](name, prepared) for name in names]
 
 
-def floor_column(held_out: HeldOut) -> Column | None:
-    """What a second take of the same pairs differs by; None where there is none."""
+def floor_columns(held_out: HeldOut) -> list[Column]:
+    """What a second take of the same pairs differs from the first by; none where there is none."""
     repeats = held_out.repeats
     if repeats is None:
-        return None
-    return Column(FLOOR, lambda index, turns: repeats[int(held_out.held_out[index])][turns], "floor")
+        return []
+    return [Column(FLOOR, lambda index, turns: repeats[int(held_out.held_out[index])][turns], "floor")]
+
+
+def simulation_column(held_out: HeldOut) -> Column:
+    """What one simulation is off by, as fields are."""
+    return Column(
+        ONE_SIMULATION, at_pairs(held_out, lambda pair, turns: held_out.pairs.response(pair)[turns]), "simulation"
+    )
 
 
 class _Prepared:

@@ -6,7 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from server.acoustics.metrics import Metric
-from training.evaluation.evaluate import METRICS, Evaluation, Result
+from training.evaluation.evaluate import METRICS, RATED, Evaluation, Result
 from training.evaluation.published import PublishedTable
 
 _PUBLISHED_OTHERS = ("inras", "neraf", "minaf", "avr")
@@ -74,6 +74,8 @@ def _sentences(evaluation: Evaluation, published: PublishedTable) -> Iterator[st
     yield "DRR and ITD are of pairs in sight."
     if evaluation.channels == 1:
         yield "One microphone: nothing to compare between ears."
+    if evaluation.draws > 1:
+        yield f"Parameters are compared with medians of {evaluation.draws} more simulations, spectra with one."
     if evaluation.floor is not None:
         yield "Floor: the same pairs simulated twice."
     else:
@@ -92,7 +94,7 @@ def _best(evaluation: Evaluation, metric: Metric) -> set[str]:
     means = {
         result.name: mean
         for result in evaluation.results
-        if result.kind != "floor" and (mean := result.summaries[metric.name].mean) is not None
+        if result.kind in RATED and (mean := result.summaries[metric.name].mean) is not None
     }
     least = min(means, key=means.__getitem__, default=None)
     return {name for name in means if least not in evaluation.of(name).surpassed_by[metric.name]}

@@ -7,11 +7,12 @@ import numpy as np
 
 from server.scene.bundle import Bundle
 from training.evaluation.coded import Track
+from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import Column, Evaluation, evaluate
 from training.evaluation.fields import field_columns
 from training.evaluation.figure import draw_figure
 from training.evaluation.held_out import HeldOut, open_held_out
-from training.evaluation.methods import DEFAULT_METHODS, floor_column, method_columns
+from training.evaluation.methods import DEFAULT_METHODS, floor_columns, method_columns, simulation_column
 from training.evaluation.published import PublishedTable, published_table
 from training.responses import open_responses
 
@@ -26,13 +27,14 @@ def evaluate_bundles(
     methods: Sequence[str] = DEFAULT_METHODS,
     pairs: int | None = None,
     yaws: int | None = None,
+    draws: int = 1,
     seed: int = 0,
     figure: Path | None = None,
     track: Track = lambda steps, _: steps,
 ) -> tuple[Evaluation, PublishedTable]:
     """Every quality level of every bundle, and the field of every run folder on measured data, beside `methods` and the
-    floor, on the same pairs and orientations: all that are held out, or as many as asked for. Optionally with a figure
-    (PNG).
+    floor, on the same pairs and orientations: all that are held out, or as many as asked for. Parameters are compared
+    with the medians of so many `draws` of the simulation, or of one with its own. Optionally with a figure (PNG).
 
     Raises EvaluationError, DatasetError if the dataset is of another scene than a bundle, and RunError for a run of
     other data.
@@ -47,11 +49,14 @@ def evaluate_bundles(
             responses = open_responses(data)
             columns += [run_column(run, responses, held_out) for run in runs]
         columns += method_columns(methods, held_out, track)
-        floor = floor_column(held_out)
+        truth = median_parameters(held_out, draws, track=track) if draws > 1 else []
+        measured = [*columns, *([simulation_column(held_out)] if truth else []), *floor_columns(held_out)]
         evaluation = evaluate(
             held_out,
-            columns if floor is None else [*columns, floor],
+            measured,
             of=len(everything),
+            truth=truth,
+            draws=draws,
             track=lambda steps: track(steps, "evaluating"),
         )
         if figure is not None:

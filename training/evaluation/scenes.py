@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from server.errors import NafirError
-from training.evaluation.evaluate import FLOOR, METRICS
+from training.evaluation.evaluate import FLOOR, METRICS, ONE_SIMULATION
 from training.evaluation.report import short
 
 TIMES = "times.jsonl"
@@ -116,7 +116,11 @@ def markdown(results: Sequence[SceneResult]) -> str:
         "| --- | --- |" + " ---: |" * (len(heads) + 1),
     ]
     for result in results:
-        shown = {name: result.methods[name] for name in (result.level, _NAF, _NEAREST, FLOOR) if name in result.methods}
+        shown = {
+            name: result.methods[name]
+            for name in (result.level, _NAF, _NEAREST, ONE_SIMULATION, FLOOR)
+            if name in result.methods
+        }
         lost = {name: result.worse_than(name) for name in shown}
         for name, method in shown.items():
             cells = []

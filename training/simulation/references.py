@@ -54,6 +54,10 @@ class GeometricSound:
         """(yaw, ear, sample)"""
         return self._synthesis.specular(*self._images[emitter][listener], self.dataset.probes[listener])
 
+    def complete(self, emitter: int, listener: int, reflected: _Responses) -> _Responses:
+        """(yaw, ear, sample) the whole of what is stored `reflected` of."""
+        return reflected + self.direct(emitter, listener) + self.first_reflections(emitter, listener)
+
 
 class References:
     """Whole responses of an open dataset by flat pair index, emitter-major; `take` is one of the TAKES."""
@@ -66,5 +70,4 @@ class References:
     def __getitem__(self, pair: int) -> _Responses:
         """(yaw, ear, sample)"""
         emitter, listener = divmod(int(pair), self._probes)
-        direct, first = self._geometric.direct, self._geometric.first_reflections
-        return self._reflected[emitter, listener] + direct(emitter, listener) + first(emitter, listener)
+        return self._geometric.complete(emitter, listener, self._reflected[emitter, listener])

@@ -1,0 +1,123 @@
+"""What held-out pairs of a simulated scene are like in the median of many simulations.
+
+A simulation draws: its rays, and the noise that diffuse sound is made of. Two fields that are both nearer to what is
+expected than one simulation is cannot be told apart by it. Medians of parameters over many draws can tell them, and one
+draw whose direct sound happens to be mistaken for a reflection does not move them.
+
+Draws are simulations of the seeds that follow the dataset's, by the dataset's own plan. Their parameters are kept
+beside the dataset, a file per draw and emitter, so that what is interrupted goes on and nothing is drawn twice.
+"""
+
+import hashlib
+import json
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.room_parameters import RoomParameters, measure
+from training.dataset import TAKES, Dataset
+from training.evaluation.coded import Track
+from training.evaluation.held_out import EvaluationError, HeldOut
+from training.simulation.pairs import PairSimulation
+from training.simulation.references import GeometricSound
+
+_FOLDER = "draws"
+_FORMAT = 1
+_WORKERS = 2
+_NAMES = tuple(field.name for field in fields(RoomParameters))
+_Floats = npt.NDArray[np.float64]
+
+
+def median_parameters(
+    held_out: HeldOut, draws: int, *, decay_db: float = 30.0, track: Track = lambda steps, _: steps
+) -> list[RoomParameters]:
+    """Of each held-out pair at the orientations that are heard, over so many draws, of which none is one of the
+    dataset's own takes. What cannot be measured of more than half of them is missing.
+
+    Raises EvaluationError for measured data.
+    """
+    dataset = held_out.simulated
+    if dataset is None:
+        raise EvaluationError("--draws: what was measured cannot be drawn again; leave it out")
+    ends = [divmod(int(pair), len(dataset.probes)) for pair in held_out.held_out]
+    medians = _Draws(dataset, decay_db).medians(sorted({emitter for emitter, _ in ends}), draws, track)
+    return [
+        RoomParameters(**{name: values[held_out.heard] for name, values in medians[emitter, listener].items()})
+        for emitter, listener in ends
+    ]
+
+
+class _Draws:
+    """Of one dataset; responses are whole, and measured with decays of `decay_db`."""
+
+    def __init__(self, dataset: Dataset, decay_db: float) -> None:
+        self._dataset = dataset
+        self._decay_db = decay_db
+        self._geometric = GeometricSound(dataset)
+        self._simulations: dict[int, PairSimulation] = {}
+        simulated = hashlib.sha256((dataset.folder / "scene.toml").read_bytes())
+        simulated.update(json.dumps([_FORMAT, dataset.seed, dataset.effects.to_json(), decay_db, _NAMES]).encode())
+        self._folder = dataset.folder / _FOLDER / simulated.hexdigest()[:12]
+
+    def medians(self, emitters: list[int], draws: int, track: Track) -> dict[tuple[int, int], dict[str, _Floats]]:
+        """Parameters (yaw,) or (yaw, ear) by name, of every held-out pair of these emitters by its ends."""
+        steps = [(draw, emitter) for draw in range(draws) for emitter in emitters]
+        missing = [step for step in steps if not self._file(*step).exists()]
+        if missing:
+            self._simulate(missing, track)
+        of_pairs = {}
+        for emitter in emitters:
+            drawn = [np.load(self._file(draw, emitter)) for draw in range(draws)]
+            medians = {name: _median(np.stack([parameters[name] for parameters in drawn])) for name in _NAMES}
+            for row, listener in enumerate(self._listeners(emitter)):
+                of_pairs[emitter, listener] = {name: values[row] for name, values in medians.items()}
+        return of_pairs
+
+    def _listeners(self, emitter: int) -> list[int]:
+        """All that are held out, whichever of them are asked for."""
+        return [int(listener) for listener in np.flatnonzero(self._dataset.held_out[emitter])]
+
+    def _file(self, draw: int, emitter: int) -> Path:
+        return self._folder / f"{draw}-{emitter}.npz"
+
+    def _simulate(self, steps: list[tuple[int, int]], track: Track) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        dataset = self._dataset
+        for number in sorted({draw // len(TAKES) for draw, _ in steps}):
+            self._simulations[number] = PairSimulation.prepare(
+                dataset.scene, dataset.probes, dataset.yaws, seed=dataset.seed + 1 + number, plan=dataset.effects
+            )
+        # What takes long is compiled, and leaves the interpreter to others.
+        pool = ThreadPoolExecutor(_WORKERS, "draw")
+        try:
+            results = pool.map(self._draw, steps)
+            for _ in zip(track(range(len(steps)), "drawing references"), results, strict=True):
+                pass
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _draw(self, step: tuple[int, int]) -> None:
+        draw, emitter = step
+        number, take = divmod(draw, len(TAKES))
+        simulation = self._simulations[number]
+        measured = []
+        for listener, _, own in simulation.own(emitter, np.array(self._listeners(emitter)), take):
+            response = self._geometric.complete(emitter, listener, simulation.whole(take, own))
+            measured.append(vars(measure(response, self._dataset.sample_rate, decay_db=self._decay_db)))
+        path = self._file(draw, emitter)
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.savez(file, **{name: np.stack([of_pair[name] for of_pair in measured]) for name in _NAMES})
+        partial.replace(path)
+
+
+def _median(values: _Floats) -> _Floats:
+    """Over the first axis, of what is there in at least half of it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # where nothing is
+        median = np.nanmedian(values, axis=0)
+    return np.where(np.isnan(values).mean(axis=0) > 0.5, np.nan, median)
