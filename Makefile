@@ -9,9 +9,9 @@ RUNS ?= runs/$(SCENE)
 OFFICE ?= runs/office
 # What the paper's table compares with, and on how many held-out pairs: naf takes seconds for each of their responses.
 METHODS ?= nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear,image-sources,helmholtz
-PAIRS ?= 160
+PAIRS ?= 120
 # Of how many simulations of each pair the medians are what its parameters are compared with.
-DRAWS ?= 8
+DRAWS ?= 9
 # How long the paper's network is trained for the table.
 NAF ?= --as-long-as $(RUNS)/run
 RANKS ?= 32,16,8,4,2

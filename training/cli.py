@@ -199,7 +199,7 @@ def evaluate(
     ] = "nearest,linear,linear-aligned",
     pairs: Annotated[int | None, typer.Option(min=1, help="Held-out pairs to draw; all if not given.")] = None,
     yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
-    draws: Annotated[int, typer.Option(min=1, help="Simulations whose medians are the reference.")] = 1,
+    draws: Annotated[int, typer.Option(min=1, help="Compare with medians of so many more simulations.")] = 1,
     figure: Annotated[Path | None, typer.Option(help="Draw decays and errors to this PNG.")] = None,
     record: Annotated[bool, typer.Option(help="Write the measured errors of every level into the bundle.")] = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the results as JSON, too.")] = None,

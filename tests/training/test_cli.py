@@ -110,6 +110,12 @@ def test_evaluating_needs_one_bundle_to_record_into(nafir_train, dataset):
     assert "--record" in err
 
 
+def test_a_bundle_records_errors_from_one_simulation(nafir_train, dataset, tiny_bundle):
+    code, _, err = nafir_train("evaluate", tiny_bundle.folder, dataset.folder, "--record", "--draws", "3")
+    assert code == 2
+    assert "errors from one simulation" in " ".join(err.replace("│", " ").split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

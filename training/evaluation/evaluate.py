@@ -83,7 +83,8 @@ class Result:
 @dataclass(frozen=True)
 class Evaluation:
     """What `nafir-train evaluate` reports; `held_out` is how many pairs there are, `pairs` how many were measured,
-    `draws` of how many simulations parameters were compared with the medians."""
+    `draws` of how many simulations parameters were compared with the medians. The floor is what two simulations differ
+    by, so where there are several nothing is told in its multiples."""
 
     data: str
     pairs: int
@@ -119,7 +120,7 @@ class Evaluation:
                 "metrics": {
                     metric.name: {
                         **asdict(result.summaries[metric.name]),
-                        "times_floor": _ratio(result.summaries[metric.name], floor, metric),
+                        "times_floor": None if self.draws > 1 else _ratio(result.summaries[metric.name], floor, metric),
                         "beats": list(result.beats[metric.name]),
                         "surpassed_by": list(result.surpassed_by[metric.name]),
                     }
@@ -169,7 +170,6 @@ def evaluate(
         reference = np.asarray(held_out.reference(pair), dtype=np.float32)
         simulated = measure(reference, held_out.sample_rate, decay_db=decay_db)
         parameters = truth[pair] if truth else simulated
-        onset = np.round(np.nan_to_num(parameters.onset_s, nan=0.0) * held_out.sample_rate).astype(np.int64)
         spectrogram = codec.log_magnitude(codec.transform(reference))
 
         def errors_of(column: Column) -> dict[str, _Errors]:
@@ -181,9 +181,13 @@ def evaluate(
                 raise EvaluationError(
                     f"{column.name}: responses of {estimate.shape} where the data have {reference.shape}"
                 )
+            true = simulated if column.kind == "floor" else parameters
+            onset = np.round(np.nan_to_num(true.onset_s, nan=0.0) * held_out.sample_rate).astype(np.int64)
             estimated = measure(estimate, held_out.sample_rate, decay_db=decay_db, onset=onset)
-            errors = parameter_errors(simulated if column.kind == "floor" else parameters, estimated)
+            errors = parameter_errors(true, estimated)
             errors[SPECTRAL_LOSS.name] = spectral_loss(spectrogram, codec.log_magnitude(codec.transform(estimate)))
+            if column.kind == "simulation":  # the reference itself
+                errors[SPECTRAL_LOSS.name][:] = np.nan
             for metric in METRICS:
                 if metric.needs_direct_sound and not held_out.visible[pair]:
                     errors[metric.name] = np.full(len(reference), np.nan)

@@ -6,7 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from server.acoustics.metrics import Metric
-from training.evaluation.evaluate import METRICS, RATED, Evaluation, Result
+from training.evaluation.evaluate import METRICS, ONE_SIMULATION, RATED, Evaluation, Result
 from training.evaluation.published import PublishedTable
 
 _PUBLISHED_OTHERS = ("inras", "neraf", "minaf", "avr")
@@ -76,8 +76,9 @@ def _sentences(evaluation: Evaluation, published: PublishedTable) -> Iterator[st
         yield "One microphone: nothing to compare between ears."
     if evaluation.draws > 1:
         yield f"Parameters are compared with medians of {evaluation.draws} more simulations, spectra with one."
+        yield f"{ONE_SIMULATION.capitalize()}: that one, compared with those medians."
     if evaluation.floor is not None:
-        yield "Floor: the same pairs simulated twice."
+        yield "Floor: what two simulations of the same pairs differ by."
     else:
         yield "No pair was measured twice, so the floor is unknown."
     if evaluation.left_out:

@@ -41,6 +41,7 @@ def evaluate_bundles(
     """
     with open_held_out(data) as everything:
         held_out = everything.sample(pairs=pairs, yaws=yaws, seed=seed)
+        truth = median_parameters(held_out, draws, track=track) if draws > 1 else []
         columns = field_columns(bundles, held_out)
         if runs:
             # Torch takes seconds to load, and bundles do without.
@@ -49,7 +50,6 @@ def evaluate_bundles(
             responses = open_responses(data)
             columns += [run_column(run, responses, held_out) for run in runs]
         columns += method_columns(methods, held_out, track)
-        truth = median_parameters(held_out, draws, track=track) if draws > 1 else []
         measured = [*columns, *([simulation_column(held_out)] if truth else []), *floor_columns(held_out)]
         evaluation = evaluate(
             held_out,

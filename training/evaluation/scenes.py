@@ -44,6 +44,7 @@ class SceneResult:
     pairs: int
     visible_pairs: int
     yaws: int
+    draws: int
     level: str
     methods: Mapping[str, Method]
 
@@ -61,7 +62,8 @@ class SceneResult:
             names = {ours: level, naf: _NAF}
             methods = {names.get(name, name): _method(column, names) for name, column in columns.items()}
             scene = str(values["data"]).removesuffix(" (simulated)")
-            return cls(scene, values["pairs"], values["visible_pairs"], values["yaws"], level, methods)
+            drawn = values["pairs"], values["visible_pairs"], values["yaws"], values.get("draws", 1)
+            return cls(scene, *drawn, level, methods)
         except OSError as exc:
             raise ResultError(f"{path}: cannot be read: {exc.strerror}") from exc
         except StopIteration as exc:
@@ -80,6 +82,7 @@ class SceneResult:
             "pairs": self.pairs,
             "visible_pairs": self.visible_pairs,
             "yaws": self.yaws,
+            "draws": self.draws,
             "level": self.level,
             "worse_than_naf": [] if naf is None else self.worse_than(_NAF),
             "methods": {
@@ -109,7 +112,13 @@ def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
 
 def markdown(results: Sequence[SceneResult]) -> str:
     """A row per scene and method; bold is the default level where neither naf nor nearest errs less by more than two
-    standard errors of the difference over pairs. Below it, scene by scene, what the paper's network does better."""
+    standard errors of the difference over pairs. Below it, scene by scene, what the paper's network does better.
+
+    Raises ResultError for scenes that are compared with medians of different numbers of draws.
+    """
+    if len(drawn := sorted({result.draws for result in results})) > 1:
+        numbers = " and ".join(map(str, drawn))
+        raise ResultError(f"some scenes are compared with {numbers} draws: evaluate all with the same --draws")
     heads = [f"{metric.label} ({metric.unit})" if metric.unit else metric.label for metric in METRICS]
     lines = [
         "| scene | method | " + " | ".join([*heads, "ms"]) + " |",
@@ -147,6 +156,8 @@ def _remarks(results: Sequence[SceneResult]) -> list[str]:
         faster = "" if naf.ms is None or result.ours.ms is None else f", {short(naf.ms / result.ours.ms)} times as fast"
         said = f"errs more than naf in {', '.join(worse)}" if worse else "errs no more than naf in any metric"
         drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {result.yaws} orientations"
+        if result.draws > 1:
+            drawn += f", medians of {result.draws} draws"
         remarks.append(f"- {result.scene} ({drawn}): {said}{faster}.")
     return remarks
 

@@ -59,6 +59,21 @@ def test_the_record_says_what_naf_does_better(result):
     assert "t60" not in record["methods"]["nearest"]["errors"]
 
 
+def test_scenes_of_different_draws_are_not_put_into_one_table(result):
+    one, many = SceneResult.read(result()), SceneResult.read(result(draws=9))
+    assert (one.to_json()["draws"], many.to_json()["draws"]) == (1, 9)
+    assert "medians of 9 draws" in markdown([many])
+    with pytest.raises(ResultError, match="1 and 9 draws"):
+        markdown([one, many])
+
+
+def test_one_simulation_stands_beside_the_floor(result):
+    columns = {"standard": column("field", "", 1.0), "floor": column("floor", "", 0.5)}
+    columns["one simulation"] = column("simulation", "", 0.7)
+    rows = markdown([SceneResult.read(result(columns=columns))]).splitlines()[2:]
+    assert [row.split("|")[2].strip() for row in rows if row.startswith("|")] == ["standard", "one simulation", "floor"]
+
+
 def test_without_naf_there_is_no_remark(result):
     read = SceneResult.read(result(columns={"standard": column("field", "", 1.0), "floor": column("floor", "", 0.5)}))
     assert read.level == "standard"
