@@ -25,8 +25,9 @@ from training.evaluation.shaped import (
 class ShapedNearestGraph(nn.Module):
     """One pose at a time; sample `lead` of the answer (1, channel, sample) is when geometry has the sound arrive.
 
-    Responses are kept in half precision, each at a peak of one, in bands: what rounding adds is 66 dB below each
-    sample, and no band has to be filtered again.
+    What is expected at a pose is a sum of weights that all but cancel, so arithmetic is of double precision until
+    samples are made. Responses are kept in half precision, each at a peak of one, in bands: what rounding adds is 66 dB
+    below each sample, and no band has to be filtered again.
     """
 
     def __init__(self, shaped: ShapedNearest, yaws: npt.NDArray[np.floating], *, lead: int) -> None:
@@ -57,7 +58,8 @@ class ShapedNearestGraph(nn.Module):
             "kaiser": np.kaiser(2 * KERNEL_REACH + 1, KERNEL_BETA),
         }
         for name, values in constants.items():
-            self.register_buffer(f"_{name}", torch.tensor(np.asarray(values, dtype=np.float32)))
+            kept = np.float32 if name in {"peaks", "kaiser"} else np.float64
+            self.register_buffer(f"_{name}", torch.tensor(np.asarray(values, dtype=kept)))
         split = bands(responses / peaks[..., np.newaxis], shaped.sample_rate)
         self.register_buffer("_bands", torch.tensor(split.astype(np.float16)))
         self._spread = expected.shares.spread
@@ -65,12 +67,13 @@ class ShapedNearestGraph(nn.Module):
         self._rate, self._lead = float(shaped.sample_rate), lead
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
+        listener, emitter, yaw = listener.double(), emitter.double(), yaw.double()
         to_emitters, to_listeners = (
             torch.linalg.vector_norm(known - end, dim=-1)
             for known, end in ((self._emitters, emitter), (self._listeners, listener))
         )
         near = torch.argmin(to_emitters**2 + to_listeners**2, dim=0, keepdim=True)
-        turn = torch.argmax(torch.cos(self._yaws - yaw), dim=0, keepdim=True)
+        turn = torch.argmax(torch.cos((self._yaws - yaw).float()), dim=0, keepdim=True)
 
         def of_near(constant: Tensor) -> Tensor:
             return constant[near, turn][0]
@@ -79,7 +82,7 @@ class ShapedNearestGraph(nn.Module):
         distance = torch.linalg.vector_norm(listener - emitter, dim=-1)
         near_delay_s, near_lateness_s = self._delays_s[near], of_near(self._lateness_s)
         change = energy + self._spreading(distance) - of_near(self._energies)
-        gain = torch.clamp(torch.exp(0.5 * change), 1.0 / LARGEST_GAIN, LARGEST_GAIN)
+        gain = torch.clamp(torch.exp(0.5 * change), 1.0 / LARGEST_GAIN, LARGEST_GAIN).float()
         weights = self._stretches(near_delay_s + near_lateness_s)
         shaped = torch.sum(of_near(self._bands).float() * (gain @ weights), dim=-2)
         later = self._lead + (lateness_s - near_lateness_s - near_delay_s) * self._rate
@@ -103,7 +106,7 @@ class ShapedNearestGraph(nn.Module):
         )
         emitters = torch.linalg.vector_norm(self._known_emitters - emitter, dim=-1)
         listeners = torch.linalg.vector_norm(self._known_listeners - listener, dim=-1)
-        same_emitter, same_listener = (emitters < SAME_M).float(), (listeners < SAME_M).float()
+        same_emitter, same_listener = (emitters < SAME_M).double(), (listeners < SAME_M).double()
         emitters, listeners = emitters / self._spread[0], listeners / self._spread[1]
 
         def near(distance: Tensor, length: Tensor) -> Tensor:
@@ -119,11 +122,11 @@ class ShapedNearestGraph(nn.Module):
     def _spreading(self, distance_m: Tensor) -> Tensor:
         """(stretch,) of a distance (1,)."""
         direct = -2.0 * torch.log(torch.clamp(distance_m, min=NEAREST_M))
-        return torch.cat([direct, torch.zeros(self._shape[-1] - 1)])
+        return torch.cat([direct, torch.zeros(self._shape[-1] - 1, dtype=torch.float64)])
 
     def _stretches(self, arrival_s: Tensor) -> Tensor:
         """(channel, stretch, sample)"""
-        after_s = torch.arange(self._bands.shape[-1]) / self._rate - arrival_s[:, None]
+        after_s = (torch.arange(self._bands.shape[-1]) / self._rate - arrival_s[:, None]).float()
         count = self._shape[-1]
         later = [_rise((after_s / edge - 1 + FADE) / (2 * FADE)) for edge in EDGES_S[: count - 1]]
         bounds = [torch.ones_like(after_s), *later, torch.zeros_like(after_s)]
@@ -134,7 +137,7 @@ class ShapedNearestGraph(nn.Module):
         channels, samples = responses.shape
         whole = torch.round(later)
         taps = torch.arange(-KERNEL_REACH, KERNEL_REACH + 1)
-        angle = torch.pi * (taps - (later - whole)[:, None])
+        angle = torch.pi * (taps - (later - whole).float()[:, None])
         is_centre = angle.abs() < 1e-6
         kernel = torch.where(is_centre, 1.0, torch.sin(angle) / torch.where(is_centre, 1.0, angle)) * self._kaiser
         at = torch.arange(-KERNEL_REACH, samples + KERNEL_REACH) - whole.to(torch.int64)[:, None]

@@ -66,6 +66,18 @@ def test_it_answers_as_the_method_does_at_the_nearest_orientation(room, shaped, 
     assert compared > 3
 
 
+def test_what_it_expects_has_the_digits_of_double_precision(room, shaped, graph):
+    """Weights of a regression all but cancel: in single precision, how they are summed is heard."""
+    for pair in room.held_out:
+        ends = room.emitters[room.emitter[pair]], room.listeners[room.listener[pair]]
+        lateness_s, energy = shaped.expected(ends[0][None], ends[1][None])
+        with torch.no_grad():
+            emitter, listener = (torch.tensor(end, dtype=torch.float64)[None] for end in ends)
+            found = graph._expected(listener, emitter, torch.tensor([1]))
+        np.testing.assert_allclose(RATE * found[0].numpy(), RATE * lateness_s[1], atol=1e-6)
+        np.testing.assert_allclose(found[1].numpy(), energy[1], atol=1e-8)
+
+
 def test_any_place_is_answered(graph):
     """Far from what was measured too, and where emitter and listener are one."""
     rng = np.random.default_rng(2)
