@@ -62,7 +62,7 @@ def train(
     data: Annotated[Path, typer.Argument(help="Dataset folder from simulate or import.")],
     output: Folder,
     field: Annotated[
-        str, typer.Option(help="factorised, naf, naf-dual, naf-no-grid or naf-time-domain.")
+        str, typer.Option(help="factorised, naf, naf-whole, naf-dual, naf-no-grid or naf-time-domain.")
     ] = "factorised",
     rank: Annotated[
         int | None, typer.Option(min=16, max=256, help="Size of a factorised field's basis; 128 if not given.")

@@ -90,19 +90,22 @@ def export(
     a `naf` is also written with less arithmetic for the same numbers. The folder of measured responses in place of a
     run stands for the field that needs no training, `ShapedNearest`, in one precision.
 
-    Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it. The frozen
-    noise of a simulated scene whose first field is factorised is chosen (`training.noise`), all others' is drawn.
+    Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it, and so does
+    `naf-whole`. The frozen noise of a simulated scene whose first field is factorised is chosen (`training.noise`), all
+    others' is drawn.
 
     Factorised fields of another width than the first one's have it in their names.
 
-    Raises RunError for an unfinished run, ExportError for a graph that disagrees and for a dataset folder that is not
-    of `responses` or not measured, and HealthError for fields that break a law of `nafir check`: nothing is written.
+    Raises RunError for an unfinished run, ExportError for a graph that disagrees, for a dataset folder that is not of
+    `responses` or not measured and for fields of which only some hold the direct sound, and HealthError for fields that
+    break a law of `nafir check`: nothing is written.
     """
     exported: list[_Exported] = []
     # All are opened, and told apart, before the first graph is made, which takes a while.
     opened = [(_opened(responses, place), place) for place in runs]
     usual_width = next((field.field.width for field, _ in opened if isinstance(field, FactorisedLearner)), 0)
     _require_different([_name_of(field, place, usual_width) for field, place in opened])
+    whole = _hold_direct_sound([field for field, _ in opened])
     for field, place in opened:
         if isinstance(field, ImportedDataset):
             exported.append(_shaped(field))
@@ -134,7 +137,7 @@ def export(
     files[ARRAYS_FILE] = _arrays(even_noise(codec.codec, np.random.default_rng([seed, 6])))
     described = Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
     if isinstance(responses, SimulatedResponses):
-        manifest = simulated_manifest(responses, described)
+        manifest = simulated_manifest(responses, described, whole=whole)
         if exported[0].architecture == "factorised":
             with tempfile.TemporaryDirectory() as trial:
                 bundle = write_bundle(Path(trial), manifest, files)
@@ -179,6 +182,14 @@ def _name_of(field: Learner | ImportedDataset, place: Path, usual_width: int) ->
 def _factorised_name(rank: int, width: int, usual_width: int) -> str:
     """With the width, where it is another than that of the bundle's first factorised field."""
     return f"factorised-r{rank}" if width == usual_width else f"factorised-w{width}-r{rank}"
+
+
+def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
+    """Whether these fields of a simulated scene do. Raises ExportError where only some of them do."""
+    holding = [isinstance(field, NafLearner) and field.recipe.whole for field in fields]
+    if any(holding) and not all(holding):
+        raise ExportError("naf-whole holds the direct sound, other fields leave it out: export it to its own bundle")
+    return all(holding)
 
 
 def _require_different(names: list[str]) -> None:

@@ -28,7 +28,8 @@ class Fields:
     files: dict[str, str]
 
 
-def simulated_manifest(responses: SimulatedResponses, fields: Fields) -> Manifest:
+def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: bool = False) -> Manifest:
+    """`whole` where the fields hold the direct sound and the first reflections."""
     scene = responses.dataset.scene
     low, high = np.min(scene.geometry.corners, axis=0), np.max(scene.geometry.corners, axis=0)
     return Manifest(
@@ -42,7 +43,8 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields) -> Manifes
         ),
         speed_of_sound=SPEED_OF_SOUND,
         air=scene.air,
-        image_order=GEOMETRIC_ORDER,
+        image_order=0 if whole else GEOMETRIC_ORDER,
+        direct_sound="field" if whole else "geometry",
         transmission=responses.dataset.effects.transmission,
         start=scene.start,
         effects={name: scene.effects[name] for name in EffectName if name in scene.effects},

@@ -50,12 +50,14 @@ class FactorisedRecipe:
 class NafRecipe:
     """How the paper's network is trained: `points` of each response per step, positions shaken by `noise_m` (standard
     deviation), silence after a response's end shown with probability `padding`, and `phase_weight` (the paper's alpha,
-    which it does not state) of the error in instantaneous frequency."""
+    which it does not state) of the error in instantaneous frequency. `whole` are, as in the
+    paper, responses of simulated scenes with the direct sound and the first reflections, else left to geometry."""
 
     points: int = 2000
     noise_m: float = 0.1
     padding: float = 0.1
     phase_weight: float = 0.1
+    whole: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,8 @@ class Configuration:
             return self.kind
         if self.shape.domain == "time":
             return "naf-time-domain"
+        if isinstance(self.recipe, NafRecipe) and self.recipe.whole:
+            return "naf-whole"
         return {"shared": "naf", "dual": "naf-dual", "none": "naf-no-grid"}[self.shape.grid]
 
     @classmethod
@@ -112,13 +116,14 @@ class Configuration:
         _write_whole(run / "run.json", {"kind": self.kind, **asdict(self)})
 
 
-_NAF_SHAPES = {
-    "naf": NafShape(),
-    "naf-dual": NafShape(grid="dual"),
-    "naf-no-grid": NafShape(grid="none"),
-    "naf-time-domain": NafShape(domain="time"),
+_NAFS = {
+    "naf": (NafShape(), NafRecipe()),
+    "naf-whole": (NafShape(), NafRecipe(whole=True)),
+    "naf-dual": (NafShape(grid="dual"), NafRecipe()),
+    "naf-no-grid": (NafShape(grid="none"), NafRecipe()),
+    "naf-time-domain": (NafShape(domain="time"), NafRecipe()),
 }
-FIELDS = ("factorised", *_NAF_SHAPES)
+FIELDS = ("factorised", *_NAFS)
 
 
 def configure(
@@ -146,7 +151,10 @@ def configure(
     for option, value in (("rank", rank), ("width", width), ("teacher", teacher)):
         if value is not None:
             raise RunError(f"{option}: only a factorised field has one; leave it out for {field}")
-    return Configuration.naf(_NAF_SHAPES[field], NafRecipe() if points is None else NafRecipe(points=points), **changes)
+    naf_shape, naf_recipe = _NAFS[field]
+    if points is not None:
+        naf_recipe = dataclasses.replace(naf_recipe, points=points)
+    return Configuration.naf(naf_shape, naf_recipe, **changes)
 
 
 def dataset_folder(run: Path) -> Path:

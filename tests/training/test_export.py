@@ -235,6 +235,35 @@ def test_a_field_in_the_time_domain_gives_responses(dataset, time_domain_run, tm
     assert np.sum(response**2) > 0
 
 
+def test_naf_of_whole_responses_holds_the_direct_sound(dataset, naf_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(export_module, "check", lambda *_: SimpleNamespace(require=lambda: None))
+    responses = SimulatedResponses(dataset)
+    configuration = Configuration.read(naf_run)
+    whole = replace(configuration, recipe=replace(configuration.recipe, whole=True))
+    train(responses, tmp_path / "whole", whole, Progress(disable=True))
+    ends = np.array([(1.0, 1.0, 1.5)]), np.array([(3.0, 2.0, 1.5)])
+    direct, orders = {}, {}
+    for name, run in (("whole", tmp_path / "whole"), ("reflected", naf_run)):
+        bundle = export(responses, [run], tmp_path / f"{name}-bundle")
+        field = Levels.load(bundle).default
+        response = field.impulse_responses(*ends, [0.3])[0]
+        first = round(float(field.onset_s(*ends)[0]) * dataset.sample_rate)
+        direct[name] = np.sum(response[:, first - 20 : first + 60] ** 2)
+        orders[name] = bundle.manifest.direct_sound, bundle.manifest.image_order
+    assert orders == {"whole": ("field", 0), "reflected": ("geometry", 1)}
+    assert direct["whole"] > 3 * direct["reflected"]
+
+
+def test_fields_with_and_without_the_direct_sound_share_no_bundle(dataset, run, naf_run, tmp_path, monkeypatch):
+    naf = load_learner(SimulatedResponses(dataset), naf_run)
+    naf.recipe = replace(naf.recipe, whole=True)
+    opened = {naf_run: naf, run: load_learner(SimulatedResponses(dataset), run)}
+    monkeypatch.setattr(export_module, "_opened", lambda _, place: opened[place])
+    with pytest.raises(ExportError, match="naf-whole holds the direct sound"):
+        export(SimulatedResponses(dataset), [run, naf_run], tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()
+
+
 def test_a_graph_of_naf_computes_what_torch_does_pose_by_pose(family, dataset, naf_run):
     learner = load_learner(SimulatedResponses(dataset), naf_run)
     arrays = poses(3)

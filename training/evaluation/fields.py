@@ -33,10 +33,17 @@ def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
                     field_source(field, held_out),
                     "field",
                     storage_bytes=len(bundle.models[file.file]) + bundle.frozen_noise.nbytes,
-                    method="naf" if file.architecture.startswith("naf") else "",
+                    method=_method(file.architecture),
                 )
             )
     return columns
+
+
+def _method(architecture: str) -> str:
+    """What others published of it is looked up by."""
+    if architecture == "naf-whole":
+        return architecture
+    return "naf" if architecture.startswith("naf") else ""
 
 
 def field_source(field: AcousticField, held_out: HeldOut) -> Source:

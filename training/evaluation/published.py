@@ -31,6 +31,7 @@ SOUNDSPACES = PublishedTable(
         "aac-nearest": _t60_c50_edt(9.35, 1.67, 59.0),
         "aac-linear": _t60_c50_edt(7.88, 1.68, 57.0),
         "naf": _t60_c50_edt(3.18, 1.06, 31.0),
+        "naf-whole": _t60_c50_edt(3.18, 1.06, 31.0),
         "inras": _t60_c50_edt(3.14, 0.60, 19.0),
         "neraf": _t60_c50_edt(2.04, 0.39, 11.0),
         "minaf": _t60_c50_edt(1.59, 0.41, 2.2),

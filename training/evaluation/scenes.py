@@ -1,5 +1,5 @@
-"""One table over scenes: what the default level of each bundle gets wrong, beside the paper's network, the nearest
-response and the repeatability floor, and what they take.
+"""One table over scenes: what the default level of each bundle gets wrong, beside the paper's network, of reflected
+sound and of whole responses, the nearest response and the repeatability floor, and what they take.
 
 Reads what `nafir-train evaluate --json` wrote for each scene.
 """
@@ -17,7 +17,7 @@ from training.evaluation.report import short
 TIMES = "times.jsonl"
 """What each step took, beside the results of a scene."""
 
-_NAF = "naf"
+_NAF, _NAF_WHOLE = "naf", "naf-whole"
 _NEAREST = "nearest"
 
 
@@ -55,11 +55,14 @@ class SceneResult:
             values = json.loads(path.read_text())
             columns: dict[str, dict[str, Any]] = values["columns"]
             fields = [name for name, column in columns.items() if column["kind"] == "field"]
-            ours = next(name for name in fields if not _is_naf(columns[name]))
+            nafs = {name: columns[name]["method"] for name in fields if columns[name]["method"] in {_NAF, _NAF_WHOLE}}
+            ours = next(name for name in fields if name not in nafs)
             # Of several bundles, columns are named by folder and level.
             level = ours.split()[-1]
-            naf = next((name for name in fields if _is_naf(columns[name])), None)
-            names = {ours: level, naf: _NAF}
+            names = {ours: level}
+            for name, method in nafs.items():
+                if method not in names.values():  # the first of several
+                    names[name] = method
             methods = {names.get(name, name): _method(column, names) for name, column in columns.items()}
             scene = str(values["data"]).removesuffix(" (simulated)")
             drawn = values["pairs"], values["visible_pairs"], values["yaws"], values.get("draws", 1)
@@ -76,7 +79,6 @@ class SceneResult:
         return self.methods[self.level]
 
     def to_json(self) -> dict[str, Any]:
-        naf = self.methods.get(_NAF)
         return {
             "scene": self.scene,
             "pairs": self.pairs,
@@ -84,7 +86,7 @@ class SceneResult:
             "yaws": self.yaws,
             "draws": self.draws,
             "level": self.level,
-            "worse_than_naf": [] if naf is None else self.worse_than(_NAF),
+            "worse_than": {naf: self.worse_than(naf) for naf in (_NAF, _NAF_WHOLE) if naf in self.methods},
             "methods": {
                 name: {"errors": dict(method.errors), "ms": method.ms, "storage_bytes": method.storage_bytes}
                 for name, method in self.methods.items()
@@ -94,10 +96,6 @@ class SceneResult:
     def worse_than(self, other: str) -> list[str]:
         """Metrics in which the default level errs more, and not by chance."""
         return [name for name, surpassing in self.ours.surpassed_by.items() if other in surpassing]
-
-
-def _is_naf(column: Mapping[str, Any]) -> bool:
-    return str(column["method"]).startswith(_NAF)
 
 
 def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
@@ -127,7 +125,7 @@ def markdown(results: Sequence[SceneResult]) -> str:
     for result in results:
         shown = {
             name: result.methods[name]
-            for name in (result.level, _NAF, _NEAREST, ONE_SIMULATION, FLOOR)
+            for name in (result.level, _NAF, _NAF_WHOLE, _NEAREST, ONE_SIMULATION, FLOOR)
             if name in result.methods
         }
         lost = {name: result.worse_than(name) for name in shown}
@@ -149,17 +147,21 @@ def markdown(results: Sequence[SceneResult]) -> str:
 def _remarks(results: Sequence[SceneResult]) -> list[str]:
     remarks = []
     for result in results:
-        naf = result.methods.get(_NAF)
-        if naf is None:
+        said = "; ".join(_beside(result, naf) for naf in (_NAF, _NAF_WHOLE) if naf in result.methods)
+        if not said:
             continue
-        worse = [metric.label for metric in METRICS if metric.name in result.worse_than(_NAF)]
-        faster = "" if naf.ms is None or result.ours.ms is None else f", {short(naf.ms / result.ours.ms)} times as fast"
-        said = f"errs more than naf in {', '.join(worse)}" if worse else "errs no more than naf in any metric"
         drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {result.yaws} orientations"
         if result.draws > 1:
             drawn += f", medians of {result.draws} draws"
-        remarks.append(f"- {result.scene} ({drawn}): {said}{faster}.")
+        remarks.append(f"- {result.scene} ({drawn}): {said}.")
     return remarks
+
+
+def _beside(result: SceneResult, naf: str) -> str:
+    worse = [metric.label for metric in METRICS if metric.name in result.worse_than(naf)]
+    said = f"errs more than {naf} in {', '.join(worse)}" if worse else f"errs no more than {naf} in any metric"
+    naf_ms, ms = result.methods[naf].ms, result.ours.ms
+    return said if naf_ms is None or ms is None else f"{said}, {short(naf_ms / ms)} times as fast"
 
 
 @dataclass(frozen=True)

@@ -152,8 +152,9 @@ class FactorisedLearner:
         """Raises RunError if the folder holds no finished run on these data, and RecipeError if it is of another
         kind."""
         configuration = Configuration.read(run)
-        if configuration.kind != "naf" or configuration.name == "naf-time-domain":
-            raise RecipeError(f"teacher: {run} holds {configuration.name}; a naf with spectrograms can teach")
+        if configuration.kind != "naf" or configuration.name in {"naf-time-domain", "naf-whole"}:
+            problem = "a naf with spectrograms of what is learned here can teach"
+            raise RecipeError(f"teacher: {run} holds {configuration.name}; {problem}")
         require_same_data(self.responses, run)
         teacher = NafLearner(self.responses, configuration)
         restore(teacher.field, run, configuration)

@@ -14,8 +14,9 @@ from training.learning.schedule import decay_to_a_tenth
 from training.models.naf import Naf, NafShape
 from training.models.site import Site
 from training.models.targets import align, codec_of, delay_samples
-from training.responses import ResponseSet
+from training.responses import ResponseSet, SimulatedResponses
 from training.runs import Configuration, NafRecipe
+from training.simulation.references import WholeResponses
 
 N_FFT = 512
 _GRID_DECAY = 1e-2
@@ -33,7 +34,7 @@ class NafLearner:
         shape, recipe = configuration.shape, configuration.recipe
         if not isinstance(shape, NafShape) or not isinstance(recipe, NafRecipe):
             raise TypeError(f"{configuration.kind} is no naf")
-        self.responses = responses
+        self.responses = _whole(responses) if recipe.whole else responses
         self.recipe = recipe
         self.codec = codec_of(responses, N_FFT)
         self.site = Site.of(responses)
@@ -146,3 +147,8 @@ class NafLearner:
         if self.field.shape.domain == "time":
             return max(1, int(left))
         return max(1, int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left)))
+
+
+def _whole(responses: ResponseSet) -> ResponseSet:
+    """Measured ones are whole."""
+    return WholeResponses(responses.dataset) if isinstance(responses, SimulatedResponses) else responses

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from server.whole_field import kemar
 from training.dataset import GEOMETRIC_ORDER, Dataset, StoredResponses
+from training.responses import SimulatedResponses
 from training.simulation.direct_paths import DirectPaths
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
@@ -71,3 +72,21 @@ class References:
         """(yaw, ear, sample)"""
         emitter, listener = divmod(int(pair), self._probes)
         return self._geometric.complete(emitter, listener, self._reflected[emitter, listener])
+
+
+class WholeResponses(SimulatedResponses):
+    """A simulated dataset's responses with the direct sound and the first reflections, as measured ones have them."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        super().__init__(dataset)
+        self._geometric = GeometricSound(dataset)
+
+    def read(self, rows: npt.ArrayLike) -> _Responses:
+        """(n, ear, sample)"""
+        responses = super().read(rows)
+        for response, row in zip(responses, np.asarray(rows, dtype=np.int64), strict=True):
+            emitter, listener = self.ends(row)
+            yaw = row % len(self.dataset.yaws)
+            response += self._geometric.direct(emitter, listener)[yaw]
+            response += self._geometric.first_reflections(emitter, listener)[yaw]
+        return responses

@@ -18,6 +18,7 @@ def result(tmp_path):
         "bundle factorised-r16": column("field", "", 1.0, ms=2.0),
         "bundle factorised-r8": column("field", "", 1.5, ms=1.0),
         "naf": column("field", "naf", 2.0, ms=3000.0),
+        "naf-whole": column("field", "naf-whole", 2.5, ms=4000.0),
         "nearest": column("baseline", "nearest", 3.0, ms=0.1),
         "floor": column("floor", "", 0.5),
     }
@@ -38,10 +39,11 @@ def result(tmp_path):
 def test_the_default_level_stands_first_and_is_bold_where_nobody_errs_less(result):
     lines = markdown([SceneResult.read(result())]).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    heads, _, ours, naf, nearest, floor = cells
-    assert [row[:2] for row in (ours, naf, nearest, floor)] == [
+    heads, _, ours, naf, whole, nearest, floor = cells
+    assert [row[:2] for row in (ours, naf, whole, nearest, floor)] == [
         ["flat", "factorised-r16"],
         ["", "naf"],
+        ["", "naf-whole"],
         ["", "nearest"],
         ["", "floor"],
     ]
@@ -49,12 +51,15 @@ def test_the_default_level_stands_first_and_is_bold_where_nobody_errs_less(resul
     assert (ours[c50], naf[c50]) == ("**1.00**", "0.950")
     assert (ours[t60], nearest[t60]) == ("**1.00**", "")
     assert (ours[edt], naf[edt]) == ("1.00", "0.750")
-    assert lines[-1] == ("- flat (2 pairs, 1 in sight, 2 orientations): errs more than naf in EDT, 1500 times as fast.")
+    assert lines[-1] == (
+        "- flat (2 pairs, 1 in sight, 2 orientations): errs more than naf in EDT, 1500 times as fast; errs no more "
+        "than naf-whole in any metric, 2000 times as fast."
+    )
 
 
 def test_the_record_says_what_naf_does_better(result):
     record = SceneResult.read(result()).to_json()
-    assert record["worse_than_naf"] == ["edt"]
+    assert record["worse_than"] == {"naf": ["edt"], "naf-whole": []}
     assert record["methods"]["naf"]["ms"] == 3000.0
     assert "t60" not in record["methods"]["nearest"]["errors"]
 

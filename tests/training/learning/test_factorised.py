@@ -13,7 +13,7 @@ from training.models.factorised import ExportedField, FieldShape
 from training.models.naf import NafShape
 from training.models.targets import LEAD_SAMPLES, align, delay_samples, flat_targets
 from training.responses import ImportedDataset, Measurement, SimulatedResponses
-from training.runs import Configuration, FactorisedRecipe, NafRecipe
+from training.runs import Configuration, FactorisedRecipe, NafRecipe, configure
 from training.train import load_learner, train
 
 SILENT = Progress(disable=True)
@@ -144,9 +144,14 @@ def test_lessons_teach_levels_only(dataset, configuration, teacher):
 
 
 def test_only_a_spectrogram_of_the_paper_teaches(dataset, run, configuration, tmp_path):
-    recipe = FactorisedRecipe(teacher=str(run))
-    with pytest.raises(RecipeError, match="teacher"):
-        train(SimulatedResponses(dataset), tmp_path, dataclasses.replace(configuration, recipe=recipe), SILENT)
+    """And none of what geometry adds, the direct sound."""
+    for field in ("naf-time-domain", "naf-whole"):
+        (tmp_path / field).mkdir()
+        configure(field).write(tmp_path / field)
+    for teacher in (run, tmp_path / "naf-time-domain", tmp_path / "naf-whole"):
+        taught = dataclasses.replace(configuration, recipe=FactorisedRecipe(teacher=str(teacher)))
+        with pytest.raises(RecipeError, match=f"teacher: {teacher} holds"):
+            train(SimulatedResponses(dataset), tmp_path / "taught" / teacher.name, taught, SILENT)
 
 
 def test_measured_responses_are_learned_as_they_are(measured, mono_run):

@@ -10,8 +10,9 @@ import pytest
 from server.acoustics.decibels import power_to_db
 from server.rendering.hrtf import KEMAR, Hrtf
 from server.whole_field import kemar
+from training.responses import SimulatedResponses
 from training.simulation.rays import sphere_directions
-from training.simulation.references import GeometricSound, References
+from training.simulation.references import GeometricSound, References, WholeResponses
 from training.simulation.synthesis import BinauralSynthesis
 
 
@@ -66,6 +67,19 @@ def test_a_reference_is_the_stored_sound_and_what_geometry_knows(dataset, geomet
             known = geometric.direct(emitter, listener) + geometric.first_reflections(emitter, listener)
             np.testing.assert_allclose(found, reflected + known, atol=1e-6)
             assert reflected.any()
+
+
+def test_whole_responses_are_references_row_by_row(dataset):
+    whole, reflected = WholeResponses(dataset), SimulatedResponses(dataset)
+    yaws = len(dataset.yaws)
+    rows = np.array([5 * yaws + 1, 0, 7 * yaws, 5 * yaws])
+    with h5py.File(dataset.folder / "pairs.h5", "r") as file:
+        references = References(dataset, file)
+        for row, found in zip(rows, whole.read(rows), strict=True):
+            emitter, listener = whole.ends(row)
+            expected = references[emitter * len(dataset.probes) + listener][row % yaws]
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert np.abs(whole.read(rows) - reflected.read(rows)).max() > 0.01
 
 
 def test_first_reflections_in_a_shoebox_are_direct_sounds_of_six_mirrored_emitters(dataset, geometric):
