@@ -110,12 +110,12 @@ $(RUNS)/measured: $(RUNS)/trained
 	@touch $@
 
 # The paper's network, `naf` of the sound that our field learns too and `naf-whole` of whole responses, as in the paper.
-$(RUNS)/%-bundle: $(RUNS)/trained
+$(RUNS)/%-exported: $(RUNS)/trained
 	$(STEP) $* $(TRAIN) train $(RUNS)/data -o $(RUNS)/$* --field $* $(NAF) --points 100
-	$(STEP) export-$* $(TRAIN) export $(RUNS)/$* -o $@
+	$(STEP) export-$* $(TRAIN) export $(RUNS)/$* -o $(RUNS)/$*-bundle
 	@touch $@
 
-$(RUNS)/table.md: $(RUNS)/measured $(RUNS)/naf-bundle $(RUNS)/naf-whole-bundle
+$(RUNS)/table.md: $(RUNS)/measured $(RUNS)/naf-exported $(RUNS)/naf-whole-exported
 	$(STEP) table $(TRAIN) evaluate $(RUNS)/bundle $(RUNS)/naf-bundle $(RUNS)/naf-whole-bundle $(RUNS)/data \
 		--methods $(METHODS) \
 		--pairs $(PAIRS) --yaws 1 --draws $(DRAWS) --output $(RUNS)/table.json --markdown > $@

@@ -335,7 +335,7 @@ class Session:
     def _add_emitter(self, message: AddEmitter) -> None:
         self._bundle.require_inside(message.position, "position")
         if self._bundle.manifest.direct_sound == "field" and message.directivity is not None:
-            problem = f"scene {self._bundle.id} was measured: its emitters beam as the loudspeakers did; leave it out"
+            problem = f"scene {self._bundle.id} holds the direct sound, with how its emitters beamed; leave it out"
             raise RequestError("fixed_directivity", problem, field="directivity")
         live, source = self._open_source(message)
         try:

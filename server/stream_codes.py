@@ -32,7 +32,7 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "unknown_emitter": "no emitter has this id",
     "duplicate_emitter": "an emitter has this id",
     "too_many_emitters": "the stream has as many emitters as it may have",
-    "fixed_directivity": "the scene was measured, and its emitters radiate as they did then",
+    "fixed_directivity": "the scene's responses hold the direct sound, and its emitters radiate as they did then",
     "not_live": "a dry block came for an emitter that plays a clip",
     "bad_samples": "live samples that were no audio are silence",
     "field_failure": "no impulse response could be computed; the last ones stay in effect",

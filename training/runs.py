@@ -25,6 +25,10 @@ class RunError(NafirError):
     """A run folder that holds another configuration, or no trained field."""
 
 
+class RecipeError(NafirError):
+    """A way of training that does not fit the data."""
+
+
 @dataclass(frozen=True)
 class FactorisedRecipe:
     """How a factorised field is trained. Those that are off did not pay where they were measured.

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from training import train as train_module
-from training.learning.factorised import FactorisedLearner, RecipeError
+from training.learning.factorised import FactorisedLearner
 from training.learning.kinds import learner_of
 from training.learning.naf import NafLearner
 from training.learning.pairs import split
@@ -29,6 +29,7 @@ from training.runs import (
     Configuration,
     FactorisedRecipe,
     NafRecipe,
+    RecipeError,
     RunError,
     configure,
     dataset_folder,

@@ -9,12 +9,13 @@ from training.models.targets import align
 
 
 class TruePhase:
-    """Whole responses (yaw, ear, sample): predicted magnitudes, the reference's phase, and what geometry adds to it."""
+    """Whole responses (yaw, ear, sample): predicted magnitudes, the phase of the reference, and what geometry adds."""
 
     def __init__(self, field: AcousticField) -> None:
         manifest = field.bundle.manifest
         parameters = manifest.fields[field.level.field].codec or manifest.codec
         self._field = field
+        self._is_whole = manifest.direct_sound == "field"
         self._codec = parameters.codec
         self._lead = parameters.lead_samples
 
@@ -22,7 +23,8 @@ class TruePhase:
         listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
         codec = self._codec
         delay = float(self._field.onset_s(listeners[:1], emitters[:1])[0]) * codec.sample_rate - self._lead
-        phase = np.angle(codec.transform(align(entry.reflected, delay)))
+        sound = entry.reference if self._is_whole else entry.reflected
+        phase = np.angle(codec.transform(align(sound, delay)))
         predicted = self._field.spectrograms(listeners, emitters, entry.yaws)
         aligned = codec.synthesise(codec.magnitude(predicted.log_magnitude) * np.exp(1j * phase))
-        return np.asarray(align(aligned, -delay) + entry.reference - entry.reflected, dtype=np.float32)
+        return np.asarray(align(aligned, -delay) + entry.reference - sound, dtype=np.float32)

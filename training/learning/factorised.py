@@ -10,7 +10,6 @@ import torch
 from rich.progress import Progress
 from torch import Tensor
 
-from server.errors import NafirError
 from training.learning.energies import RAYLEIGH_DEFICIT, EnergyError
 from training.learning.learner import Losses, Rows
 from training.learning.lessons import Lessons, lessons_of
@@ -23,7 +22,7 @@ from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
 from training.responses import ResponseSet, SimulatedResponses
-from training.runs import Configuration, FactorisedRecipe, require_same_data, restore
+from training.runs import Configuration, FactorisedRecipe, RecipeError, require_same_data, restore
 
 # What a target differs by from the best possible prediction (ln magnitude of one noisy bin, of a pooled cell; unit
 # phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its
@@ -39,10 +38,6 @@ _WEIGHT_DECAY = 1e-2
 _SAMPLE_ROWS = 3000
 # A measured response starts with the direct sound, whose phase can be learned; reflections have hardly one.
 _KNOWN_FRAMES_OF_WHOLE_RESPONSES = 12
-
-
-class RecipeError(NafirError):
-    """A way of training that does not fit the data."""
 
 
 class FactorisedLearner:

@@ -15,7 +15,7 @@ from training.models.naf import Naf, NafShape
 from training.models.site import Site
 from training.models.targets import align, codec_of, delay_samples
 from training.responses import ResponseSet, SimulatedResponses
-from training.runs import Configuration, NafRecipe
+from training.runs import Configuration, NafRecipe, RecipeError
 from training.simulation.references import WholeResponses
 
 N_FFT = 512
@@ -149,6 +149,8 @@ class NafLearner:
         return max(1, int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left)))
 
 
-def _whole(responses: ResponseSet) -> ResponseSet:
-    """Measured ones are whole."""
-    return WholeResponses(responses.dataset) if isinstance(responses, SimulatedResponses) else responses
+def _whole(responses: ResponseSet) -> WholeResponses:
+    """Raises RecipeError for measured ones."""
+    if not isinstance(responses, SimulatedResponses):
+        raise RecipeError("field: measured responses are whole as they are; train naf in place of naf-whole")
+    return WholeResponses(responses.dataset)

@@ -6,14 +6,14 @@ import torch
 from rich.progress import Progress
 
 from training.importers.report import ImportReport
-from training.learning.factorised import FactorisedLearner, RecipeError
+from training.learning.factorised import FactorisedLearner
 from training.learning.lessons import lessons_of
 from training.learning.pairs import split
 from training.models.factorised import ExportedField, FieldShape
 from training.models.naf import NafShape
 from training.models.targets import LEAD_SAMPLES, align, delay_samples, flat_targets
 from training.responses import ImportedDataset, Measurement, SimulatedResponses
-from training.runs import Configuration, FactorisedRecipe, NafRecipe, configure
+from training.runs import Configuration, FactorisedRecipe, NafRecipe, RecipeError, configure
 from training.train import load_learner, train
 
 SILENT = Progress(disable=True)
@@ -152,6 +152,11 @@ def test_only_a_spectrogram_of_the_paper_teaches(dataset, run, configuration, tm
         taught = dataclasses.replace(configuration, recipe=FactorisedRecipe(teacher=str(teacher)))
         with pytest.raises(RecipeError, match=f"teacher: {teacher} holds"):
             train(SimulatedResponses(dataset), tmp_path / "taught" / teacher.name, taught, SILENT)
+
+
+def test_measured_responses_are_whole_as_they_are(measured, tmp_path):
+    with pytest.raises(RecipeError, match="train naf in place of naf-whole"):
+        train(measured, tmp_path, configure("naf-whole"), SILENT)
 
 
 def test_measured_responses_are_learned_as_they_are(measured, mono_run):
