@@ -114,7 +114,6 @@ def decode(
     shape: Shape,
     windows: Windows,
     noise: Float32,
-    gate: Float32,
     purpose: int,
     work: Workspace,
     output: Float32,
@@ -140,8 +139,6 @@ def decode(
         )
         if purpose != TARGETS:
             _add_known(log_magnitude[row], interaural[row], start, columns, shape, windows, work, output[row])
-        if purpose == WHOLE:
-            open_gate(gate, start, output[row])
 
 
 @compiled
@@ -361,19 +358,3 @@ def silence(signals, begin, end) -> None:
     for channel in range(signals.shape[0]):
         for n in range(begin, end):
             signals[channel, n] = 0
-
-
-@compiled
-def open_gate(gate, start, response) -> None:
-    """Silence before sample `start`, and the gate's rise from there on."""
-    silence(response, 0, min(max(0, start), response.shape[1]))
-    for channel in range(response.shape[0]):
-        for n in range(max(0, start), min(response.shape[1], start + gate.size)):
-            response[channel, n] *= gate[n - start]
-
-
-@compiled
-def open_gates(gate: Float32, starts: npt.NDArray[np.int64], responses: Float32) -> None:
-    """`open_gate` of each of (B, channel, sample) at its own start (B,)."""
-    for row in range(len(starts)):
-        open_gate(gate, starts[row], responses[row])

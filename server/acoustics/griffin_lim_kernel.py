@@ -1,12 +1,10 @@
 """Iterations of Griffin and Lim, compiled: from the targets that `server.acoustics.decoding_kernel` leaves in its
 workspace to responses."""
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.decoding_kernel import Shape, Workspace, delay_of, open_gate, silence
+from server.acoustics.decoding_kernel import Shape, Workspace, delay_of, silence
 from server.acoustics.simd import LANES, broadcast, load, multiply
 from server.acoustics.stft_kernel import Windows, analyse, impose_magnitudes, place_bin, synthesise
 from server.compiled import compiled
@@ -21,7 +19,6 @@ def iterate(
     aligned: float,
     shape: Shape,
     windows: Windows,
-    gate: Float32,
     work: Workspace,
     response: Float32,
 ) -> None:
@@ -32,7 +29,6 @@ def iterate(
         _synthesise_targets(first, stop, windows, work)
         _take(work.total, shape, response)
     _griffin_lim(iterations, first, stop, shape, windows, work, response)
-    open_gate(gate, math.floor(aligned), response)
 
 
 @compiled

@@ -23,7 +23,6 @@ if HAS_NUMBA:
         Shape,
         Workspace,
         decode,
-        open_gates,
     )
     from server.acoustics.griffin_lim_kernel import iterate
     from server.acoustics.simd import LANES
@@ -32,7 +31,6 @@ if HAS_NUMBA:
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-RISE_S = 0.0003
 _SPARES = Spares(16 * 1024 * 1024)
 """A request's responses wait for those of the next."""
 
@@ -41,7 +39,7 @@ class Decoder:
     """Thread-safe: every call works in arrays of its own, kept for later ones.
 
     `ir_samples` are what a response has whatever the codec's length; of a prediction the first `frames` count, by
-    default all, and what follows them is silent. `rise_s` is that of the onset's gate.
+    default all, and what follows them is silent.
     """
 
     def __init__(
@@ -52,7 +50,6 @@ class Decoder:
         ir_samples: int,
         phase: Phase,
         frames: int | None = None,
-        rise_s: float = RISE_S,
         is_compiled: bool = HAS_NUMBA,
     ) -> None:
         self.ir_samples = ir_samples
@@ -61,7 +58,6 @@ class Decoder:
         self._noise = noise
         self._used = self._codec.frames if frames is None else min(frames, self._codec.frames)
         self._known = min(parameters.known_frames, self._used)
-        self._gate = onset_gate(parameters, rise_s)
         n_fft = self._codec.n_fft
         self._axis = parameters.frame_axis
         self._is_compiled = is_compiled and n_fft & (n_fft - 1) == 0 and self._codec.frames >= LANES
@@ -116,7 +112,6 @@ class Decoder:
             float(aligned[0]),
             self._shape,
             self._windows,
-            self._gate,
             work,
             response,
         )
@@ -134,7 +129,6 @@ class Decoder:
             self._shape,
             self._windows,
             self._noise.parts,
-            self._gate,
             purpose,
             work,
             responses,
@@ -166,8 +160,6 @@ class Decoder:
                 if response is not None:
                     signals[row] = resized(response, codec.samples)
             responses = resized(griffin_lim(codec, targets, signals, phase.iterations), self.ir_samples)
-        for response, at in zip(responses, start, strict=True):
-            apply_gate(self._gate, response, at)
         return responses
 
     def _first_frames(self, predicted: Spectrograms) -> Spectrograms:
@@ -179,36 +171,11 @@ class Decoder:
         )
 
 
-def onset_gate(parameters: CodecParameters, rise_s: float = RISE_S) -> Float32:
-    """Silence until the direct sound passes the head, for windows smear energy to where it cannot be, and the rise that
-    follows. What reaches the nearer ear sooner is the direct sound alone."""
-    rise = round(rise_s * parameters.sample_rate)
-    opens = np.sin(np.pi / 2 * (np.arange(rise) + 0.5) / rise)
-    return np.concatenate([np.zeros(parameters.lead_samples), opens]).astype(np.float32)
-
-
 def add_from(part: Float32, response: Float32, at: int) -> None:
     """Adds (ear, sample) `part` to the response from sample `at` on, as far as both reach."""
     first, last = max(0, at), min(response.shape[-1], at + part.shape[-1])
     if last > first:
         response[:, first:last] += part[:, first - at : last - at]
-
-
-def apply_gates(gate: Float32, responses: Float32, at: npt.NDArray[np.int64]) -> None:
-    """Multiplies (B, channel, sample) responses by a gate that begins at sample `at` (B,) of each, silent before it."""
-    if HAS_NUMBA:
-        open_gates(gate, at, responses)
-        return
-    for response, begin in zip(responses, at.tolist(), strict=True):
-        apply_gate(gate, response, begin)
-
-
-def apply_gate(gate: Float32, response: Float32, at: int) -> None:
-    """Multiplies the response by a gate that begins at sample `at`, silent before it."""
-    response[:, : max(0, at)] = 0
-    first, last = max(0, at), min(response.shape[-1], at + len(gate))
-    if last > first:
-        response[:, first:last] *= gate[first - at : last - at]
 
 
 def resized(signals: npt.NDArray[np.floating], samples: int) -> Float32:

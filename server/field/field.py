@@ -17,7 +17,8 @@ from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
 from server.bounded_cache import BoundedCache
 from server.errors import BundleError, FieldError
-from server.field.decoder import RISE_S, Decoder, add_from, apply_gate, apply_gates, onset_gate, resized
+from server.field.decoder import Decoder, add_from, resized
+from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.lattice import Neighbourhood, Node, Snapped
 from server.field.phase_cache import PhaseCache
@@ -33,9 +34,9 @@ _NEVER = 2.0**31
 """Samples: no index reaches as far."""
 _EAR_AHEAD_S = 0.00026
 """Sound reaches the nearer ear at most so much sooner than the middle of the head, 87.5 mm away."""
-_RISE_AFTER_FIRST_S = 0.003
-"""Of what follows the first reflections, where geometry computes those: it sets in bit by bit, and what windows of a
-codec smear to its beginning would be taken for direct sound. Of 1 to 5 ms, this errs least."""
+_RISE_AFTER_FIRST_S = 0.004
+"""Of what follows the first reflections, where geometry computes those: it sets in bit by bit. Of 3 to 6 ms, this
+errs least."""
 
 
 class AcousticField:
@@ -57,19 +58,17 @@ class AcousticField:
         self.level = level
         self.graph = graph
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
-        opening, rise_s = graph.parameters, RISE_S
+        is_whole = bundle.manifest.direct_sound == "field"
+        # Measured sound may arrive before geometry has it: the gate opens with the first sample that is coded.
+        self._lead = 0 if is_whole else graph.parameters.lead_samples
         self._first_echo: FirstEcho | None = None
-        if bundle.manifest.direct_sound == "field":
-            # Measured sound may arrive before geometry has it: the gate opens with the first sample that is coded.
-            opening = opening.model_copy(update={"lead_samples": 0})
-        else:
+        if not is_whole and not graph.gives_responses:
             self._first_echo = FirstEcho(bundle.floor_plan)
-            if bundle.manifest.image_order and not graph.gives_responses:
-                rise_s = _RISE_AFTER_FIRST_S
-        self._gate = onset_gate(opening, rise_s)
-        self._rise = onset_gate(opening)[opening.lead_samples :]
-        # Compiled here, where it may take its time, and not for the first pose.
-        apply_gates(self._rise, np.zeros((1, self.channels, 1), np.float32), np.zeros(1, np.int64))
+        self._gate = Gate(
+            graph.parameters,
+            rise_s=_RISE_AFTER_FIRST_S if self._first_echo and bundle.manifest.image_order else RISE_S,
+            gives_back=self._first_echo is not None,
+        )
         self._decoder: Decoder | None = None
         if graph.gives_responses:
             if level.frames is not None or level.phase != Phase():
@@ -78,12 +77,11 @@ class AcousticField:
                 )
         else:
             self._decoder = Decoder(
-                opening,
+                graph.parameters,
                 noise or frozen_noise(bundle, graph),
                 ir_samples=self.ir_samples,
                 phase=level.phase,
                 frames=level.frames,
-                rise_s=rise_s,
             )
         self._cache = PhaseCache() if level.phase.warm else None
         self.nodes: NodeResponses | None = None
@@ -189,32 +187,41 @@ class AcousticField:
             raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, yaws)
-            return self._finite(self._placed(coded, aligned), listeners, emitters)
+            responses = self._finite(self._placed(coded, aligned), listeners, emitters)
+        else:
+            responses = self._decoded(self._decoder, listeners, emitters, yaws, aligned, cache)
+        onsets, echoes = np.floor(aligned).astype(np.int64) + self._lead, None
+        if self._first_echo is not None:
+            echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
+            echoes = np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(np.int64)
+        self._gate.open(responses, onsets, echoes)
+        return responses
+
+    def _decoded(
+        self,
+        decoder: Decoder,
+        listeners: Floats,
+        emitters: Floats,
+        yaws: Floats,
+        aligned: Floats,
+        cache: PhaseCache | None,
+    ) -> Float32:
+        """(B, channel, ir_samples) with what windows smear to before the onset."""
         predicted = self.graph.predictions(listeners, emitters, yaws)
         if self.channels == 1:
             # Decoders have two ears; a lone microphone is the left one.
             predicted = predicted.twice()
         if cache is None:
-            responses = self._decoder.decode(predicted, aligned)
-            self._finite(responses, listeners, emitters)
-            return self._after_first_echo(np.ascontiguousarray(responses[:, : self.channels]), listeners, emitters)
+            responses = self._finite(decoder.decode(predicted, aligned), listeners, emitters)
+            return np.ascontiguousarray(responses[:, : self.channels])
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
         # One after the other: each may start from the one before it.
         for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
             rows = slice(row, row + 1)
-            responses[rows] = self._decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
+            responses[rows] = decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
             self._finite(responses[rows], listeners[rows], emitters[rows])  # before others start from it
             cache.keep(*pose, responses[row])
-        return self._after_first_echo(np.ascontiguousarray(responses[:, : self.channels]), listeners, emitters)
-
-    def _after_first_echo(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
-        """The responses, silent until a surface can have answered: windows of a codec are longer than a first
-        reflection takes, and what they smear before it would count, and be heard, as direct sound."""
-        if self._first_echo is not None:
-            echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
-            opens = np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(np.int64)
-            apply_gates(self._rise, responses, opens - len(self._rise))
-        return responses
+        return np.ascontiguousarray(responses[:, : self.channels])
 
     def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
         """The responses. Raises FieldError naming the first that is not finite."""
@@ -238,7 +245,6 @@ class AcousticField:
         responses = np.zeros((len(coded), self.channels, self.ir_samples), dtype=np.float32)
         for response, part, at in zip(responses, shifted, start, strict=True):
             add_from(part, response, at)
-            apply_gate(self._gate, response, at)
         return responses
 
 

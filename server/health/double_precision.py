@@ -3,7 +3,8 @@
 The network's outputs are read as it gives them, float32; so are the tables of heads and of the windowed sinc. All that
 is done with them is done anew here, in float64 and by other algorithms where there are any: NumPy's transforms in place
 of compiled ones, the recursion of a power series in place of an unrolled kernel, all triangles of a head in place of a
-walk across them. Responses are rounded to float32 once, when all is done, which is 150 dB below them.
+walk across them. Responses are rounded to float32 when they are decoded and when the gate has opened, 150 dB below
+them.
 
 Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample).
 """
@@ -20,6 +21,7 @@ from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
 from server.early_reflections import EarlyReflections
 from server.field.decoder import Decoder
 from server.field.field import AcousticField, Silence
+from server.field.gate import Gate
 from server.field.graph import Spectrograms
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.hrtf import HeadFilters
@@ -35,12 +37,11 @@ _Number = TypeVar("_Number", np.float64, np.complex128)
 class DoubleDecoder(Decoder):
     """A field's decoder, in float64 between the network's outputs and the response."""
 
-    def __init__(self, field: AcousticField, gate: _Float32) -> None:
+    def __init__(self, field: AcousticField) -> None:
         parameters = field.graph.parameters
         self.ir_samples = field.ir_samples
         self._codec = parameters.codec
         self._frame_axis = parameters.frame_axis
-        self._gate = gate
         self._phase = field.level.phase
         self._used = field.level.frames or self._codec.frames
         self._known = min(parameters.known_frames, self._used)
@@ -75,7 +76,6 @@ class DoubleDecoder(Decoder):
             response[:, first:last] += early[:, first - start : last - start]
         if self._phase.iterations:
             response = self._griffin_lim(_later(magnitude, delay), response if near is None else _double(near), near)
-        _open(self._gate, response, start)
         return response
 
     def _separate(self, predicted: Spectrograms, magnitude: _Floats) -> tuple[_Complex, _Floats, _Complex]:
@@ -113,11 +113,20 @@ class DoubleDecoder(Decoder):
         return _fitted(signal, self.ir_samples)
 
 
+class _DoubleGate(Gate):
+    """The same, in float64 and without a compiler."""
+
+    def __init__(self, gate: Gate) -> None:
+        self._rise, self._answer, self._given = gate._rise, gate._answer, gate._given
+        self._is_compiled = False
+
+
 class _DoubleField(AcousticField):
     def __init__(self, field: AcousticField) -> None:
         super().__init__(field.bundle, field.level, field.graph)
         if self._decoder is not None:
-            self._decoder = DoubleDecoder(field, self._gate)
+            self._decoder = DoubleDecoder(field)
+        self._gate = _DoubleGate(self._gate)
 
     def _placed(self, coded: _Float32, aligned: _Floats) -> _Float32:
         start = np.floor(aligned).astype(int)
@@ -129,7 +138,6 @@ class _DoubleField(AcousticField):
             first, last = max(0, at), min(self.ir_samples, at + part.shape[-1])
             if last > first:
                 response[:, first:last] += part[:, first - at : last - at]
-            _open(self._gate, response, at)
         return responses.astype(np.float32)
 
 
@@ -202,14 +210,6 @@ def _fitted(signal: npt.NDArray[np.floating], samples: int) -> _Floats:
     count = min(samples, signal.shape[-1])
     fitted[..., :count] = signal[..., :count]
     return fitted
-
-
-def _open(gate: _Float32, response: _Floats, at: int) -> None:
-    """Silence before sample `at`, and the gate's rise from there on."""
-    response[:, : max(0, at)] = 0
-    first, last = max(0, at), min(response.shape[-1], at + len(gate))
-    if last > first:
-        response[:, first:last] *= gate[first - at : last - at]
 
 
 def _later(values: npt.NDArray[_Number], frames: float) -> npt.NDArray[_Number]:

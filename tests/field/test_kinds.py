@@ -86,24 +86,16 @@ def test_energy_of_a_graphs_own_responses_is_theirs(bundle, tmp_path):
     assert_allclose(field.energy([LISTENER], [(4.0, 4.0, 1.5)], [YAW]), [[1.0, 0.25]])
 
 
-@pytest.mark.parametrize(("scene", "rise_s"), [("bundle", 0.0003), ("mirrored_bundle", 0.003)])
-def test_energy_predicted_is_that_of_the_responses(request, scene, rise_s):
-    """But for what comes before the gate has risen, on the floor where it opens at once, and slowly where first
-    reflections are left to geometry: of power that decays as the graph's does, from half a hop before its first frame
-    on. On average over distances, for each meets another stretch of the frozen noise."""
+@pytest.mark.parametrize("scene", ["bundle", "mirrored_bundle"])
+def test_energy_predicted_is_that_of_the_responses(request, scene):
+    """Whether the gate opens at once or slowly, where first reflections are left to geometry: what it takes follows.
+    On average over distances, for each meets another stretch of the frozen noise; of some metres, for what windows
+    smear to before the emission is nowhere."""
     field = AcousticField.load(request.getfixturevalue(scene))
-    emitters = np.stack([np.linspace(3, 7, 40), np.full(40, 2.5), np.zeros(40)], axis=-1)
-    poses = np.tile((*LISTENER[:2], 0.0), (40, 1)), emitters, np.zeros(40)
+    emitters = np.stack([np.linspace(5, 7.5, 40), np.full(40, 2.5), np.zeros(40)], axis=-1)
+    poses = np.tile((1.0, 2.5, 0.0), (40, 1)), emitters, np.zeros(40)
     found = np.sum(field.impulse_responses(*poses) ** 2, axis=-1)
-    ratio_db = 10 * np.log10(np.mean(field.energy(*poses) / found))
-    parameters = field.graph.parameters
-    codec = parameters.codec
-    first = round(codec.frame_times_s[0] * codec.sample_rate) - codec.hop // 2
-    power = np.exp(-2 * 7.0 / (codec.frames * codec.hop) * np.arange(first, codec.samples))
-    heard = power[parameters.lead_samples - first :].copy()
-    rise = round(rise_s * codec.sample_rate)
-    heard[:rise] *= np.sin(np.pi / 2 * (np.arange(rise) + 0.5) / rise) ** 2
-    assert_allclose(ratio_db, 10 * np.log10(power.sum() / heard.sum()), atol=0.2)
+    assert_allclose(10 * np.log10(np.mean(field.energy(*poses) / found)), 0, atol=0.2)
 
 
 @pytest.mark.parametrize("options", [{"frames": 20}, {"phase": Phase(kind="integrated")}])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.phase import FrozenNoise
-from server.field.decoder import Decoder, onset_gate
+from server.field.decoder import Decoder
 from server.field.graph import Spectrograms
 from server.health.double_precision import DoubleDecoder
 from server.scene.manifest import CodecParameters, Phase, QualityLevel
@@ -56,7 +56,7 @@ def exact_of(parameters, phase=FROZEN, frames=None):
         level=QualityLevel(name="level", field="field", phase=phase, frames=frames),
         bundle=SimpleNamespace(frozen_noise=noise_of(parameters)),
     )
-    return DoubleDecoder(field, onset_gate(parameters))
+    return DoubleDecoder(field)
 
 
 def predicted(parameters, count=1, *, seed=0, decay=7.0):

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from server.field.gate import MOST_GIVEN, Gate
 from tests.hard_cases.predictions import (
     AT,
     COLD,
@@ -182,11 +183,27 @@ def test_what_is_no_number_does_not_outlive_its_response(phase, field, value, is
 def test_a_response_that_begins_anywhere_is_finite_and_silent_before(phase, at, is_compiled):
     some = parameters()
     response = decoder_of(some, phase, is_compiled=is_compiled).decode(predicted(some), np.array([at]))
+    onset = np.array([np.floor(at)], dtype=np.int64)
+    Gate(some, gives_back=True, is_compiled=is_compiled).open(response, onset)
     assert np.isfinite(response).all()
     silent = int(np.clip(np.floor(at), 0, SAMPLES))
     assert not np.any(response[..., :silent])
     if at <= -SAMPLES - some.n_fft:
         assert np.abs(response).max() < 1e-6  # all of it was before emission
+
+
+@COMPILED
+@pytest.mark.parametrize("before", [0.0, 1e-42, 1e-20, 1.0, 1e18])
+@pytest.mark.parametrize("after", [0.0, 1e-42, 1e-20, 1.0, 1e18])
+def test_what_a_gate_gives_back_makes_nothing_much_louder(before, after, is_compiled):
+    some, onset = parameters(), 1_000
+    response = np.full((1, 2, SAMPLES), after, np.float32)
+    response[..., :onset] = before
+    expected = response.copy()
+    Gate(some, gives_back=True, is_compiled=is_compiled).open(response, np.array([onset]))
+    assert not response[..., :onset].any()
+    assert np.isfinite(response).all()
+    assert np.all(response[..., onset:] <= 1.0001 * np.sqrt(1 + MOST_GIVEN) * expected[..., onset:])
 
 
 @settings(settings.get_profile("hard_cases"), max_examples=40)

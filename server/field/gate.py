@@ -1,0 +1,81 @@
+"""The gate that a decoded response begins with.
+
+A codec's windows are longer than the first reflections take, and smear energy to where there cannot be any: before
+sound arrives, and before a surface can have answered. It would count, and be heard, as direct sound. The gate takes it,
+and gives it back to what follows, where it belongs; else early energy would be half a decibel to one too low.
+
+Axes: B poses; responses (B, channel, sample).
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from server.compiled import HAS_NUMBA
+from server.scene.manifest import CodecParameters
+
+if HAS_NUMBA:
+    from server.field.gate_kernel import open_gates
+
+Float32 = npt.NDArray[np.float32]
+Indices = npt.NDArray[np.int64]
+
+RISE_S = 0.0003
+MOST_GIVEN = 15.0
+"""Times the energy that is there. A response that begins late, after what was taken, is not made up of it."""
+
+
+class Gate:
+    """Thread-safe. Silence until sound can arrive, and a rise of `rise_s` from there on.
+
+    Of a gate that `gives_back`, the energy it took at an ear is in what follows within one window of the codec, most of
+    it at once and less and less of it then: of each sample's square, one plus a share of a falling raised cosine.
+    """
+
+    def __init__(
+        self,
+        parameters: CodecParameters,
+        *,
+        rise_s: float = RISE_S,
+        gives_back: bool = False,
+        is_compiled: bool = HAS_NUMBA,
+    ) -> None:
+        self._rise = _rise(round(rise_s * parameters.sample_rate))
+        self._answer = _rise(round(RISE_S * parameters.sample_rate))
+        fall = np.arange(parameters.n_fft if gives_back else 0) / parameters.n_fft
+        self._given = (0.5 + 0.5 * np.cos(np.pi * fall)).astype(np.float32)
+        self._is_compiled = is_compiled
+        # Compiled here, where it may take its time, and not for the first pose.
+        self.open(np.zeros((1, 1, 1), np.float32), np.zeros(1, np.int64))
+
+    def open(self, responses: Float32, onsets: Indices, echoes: Indices | None = None) -> None:
+        """Changes responses in place. Sound arrives with sample `onsets` (B,); until sample `echoes` (B,), where there
+        are any, no surface has answered."""
+        begins = onsets if echoes is None else echoes
+        begins = begins - len(self._answer)
+        if self._is_compiled:
+            open_gates(self._rise, self._answer, self._given, MOST_GIVEN, onsets, begins, responses)
+        else:
+            self._open(responses, onsets, begins)
+
+    def _open(self, responses: Float32, onsets: Indices, begins: Indices) -> None:
+        samples = np.arange(responses.shape[-1])
+        for response, onset, begin in zip(responses, onsets.tolist(), begins.tolist(), strict=True):
+            opens = max(0, onset, begin)
+            gain = np.where(
+                samples < opens, 0.0, _at(self._rise, samples - onset, 1) * _at(self._answer, samples - begin, 1)
+            )
+            given = _at(self._given, samples - opens, 0)
+            squares = response.astype(np.float64) ** 2
+            taken, held = (squares * (1 - gain**2)).sum(axis=-1), (squares * gain**2 * given).sum(axis=-1)
+            share = np.divide(taken, held, out=np.full_like(held, MOST_GIVEN), where=taken < MOST_GIVEN * held)
+            response *= gain * np.sqrt(1 + share[:, None] * given)
+
+
+def _rise(samples: int) -> Float32:
+    return np.sin(np.pi / 2 * (np.arange(samples) + 0.5) / samples).astype(np.float32)
+
+
+def _at(curve: Float32, index: Indices, after: float) -> npt.NDArray[np.float64]:
+    """The curve's values, its first before it and `after` behind it."""
+    values = np.append(curve.astype(np.float64), after)
+    return np.asarray(values[np.clip(index, 0, len(curve))])

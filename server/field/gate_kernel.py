@@ -1,0 +1,43 @@
+"""The compiled counterpart of `server.field.gate`'s NumPy path."""
+
+import numpy as np
+import numpy.typing as npt
+
+from server.compiled import compiled
+
+Float32 = npt.NDArray[np.float32]
+Indices = npt.NDArray[np.int64]
+
+
+@compiled
+def open_gates(
+    rise: Float32, answer: Float32, given: Float32, most: float, onsets: Indices, echoes: Indices, responses: Float32
+) -> None:
+    """Of each of (B, channel, sample): silence before the later of `onsets` and `echoes` (B,), where `rise` and
+    `answer` begin; energy taken is given back by the weights `given` from there on, `most` times what is there at
+    most."""
+    for row in range(len(onsets)):
+        onset, echo = onsets[row], echoes[row]
+        opens, size = max(0, onset, echo), responses.shape[2]
+        risen = max(onset + rise.size, echo + answer.size)
+        for channel in range(responses.shape[1]):
+            response = responses[row, channel]
+            taken = 0.0
+            for n in range(min(opens, size)):
+                taken += float(response[n]) ** 2
+                response[n] = 0
+            for n in range(opens, min(risen, size)):
+                gain = 1.0
+                if n - onset < rise.size:
+                    gain *= rise[n - onset]
+                if n - echo < answer.size:
+                    gain *= answer[n - echo]
+                taken += float(response[n]) ** 2 * (1.0 - gain * gain)
+                response[n] *= gain
+            until = min(opens + given.size, size)
+            held = 0.0
+            for n in range(opens, until):
+                held += given[n - opens] * float(response[n]) ** 2
+            share = taken / held if taken < most * held else most
+            for n in range(opens, until):
+                response[n] *= np.sqrt(1.0 + share * given[n - opens])

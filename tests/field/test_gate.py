@@ -1,0 +1,98 @@
+"""The gate that responses begin with: silence, a rise, and what it took given back to what follows."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from server.compiled import HAS_NUMBA
+from server.field.gate import MOST_GIVEN, Gate
+from server.scene.manifest import CodecParameters
+
+RATE, N_FFT, SAMPLES = 24_000, 256, 2_000
+PARAMETERS = CodecParameters(
+    sample_rate=RATE, n_fft=N_FFT, hop=64, samples=SAMPLES, lead_samples=40, known_frames=5, log_floor=1e-5
+)
+ONSETS = np.array([-100, -3, 0, 700, 700, 700, SAMPLES - 30, SAMPLES, 2**40])
+ECHOES = np.array([-90, 4, 0, 690, 704, 900, SAMPLES - 20, 12, 2**40])
+
+
+def _noise(count=1, channels=2, seed=0):
+    return np.random.default_rng(seed).standard_normal((count, channels, SAMPLES)).astype(np.float32)
+
+
+def _energy(responses):
+    return np.sum(responses.astype(np.float64) ** 2, axis=-1)
+
+
+@pytest.mark.skipif(not HAS_NUMBA, reason="compares what is compiled")
+@pytest.mark.parametrize("gives_back", [False, True])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_compiled_and_numpy_agree(channels, gives_back):
+    compiled = _noise(len(ONSETS), channels)
+    reference = compiled.copy()
+    for responses, is_compiled in ((compiled, True), (reference, False)):
+        gate = Gate(PARAMETERS, rise_s=0.004, gives_back=gives_back, is_compiled=is_compiled)
+        gate.open(responses, ONSETS, ECHOES)
+    assert_allclose(compiled, reference, rtol=1e-5)
+    assert np.all(_energy(compiled)[:-2] > 1)
+
+
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_it_is_silent_until_sound_arrives_and_open_after_its_rise(is_compiled):
+    responses = _noise(3)
+    expected = responses.copy()
+    Gate(PARAMETERS, rise_s=0.004, is_compiled=is_compiled).open(responses, np.array([-200, 300, 700]))
+    assert_array_equal(responses[0], expected[0])
+    for response, whole, onset in zip(responses[1:], expected[1:], (300, 700), strict=True):
+        assert not response[:, :onset].any()
+        assert_array_equal(response[:, onset + 96 :], whole[:, onset + 96 :])
+        # A sine, half of the energy in the middle.
+        assert_allclose(response[:, onset + 48], whole[:, onset + 48] * np.sin(np.pi / 2 * 48.5 / 96), rtol=1e-6)
+
+
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_it_is_silent_until_a_surface_has_answered(is_compiled):
+    responses = _noise()
+    expected = responses.copy()
+    Gate(PARAMETERS, is_compiled=is_compiled).open(responses, np.array([300]), np.array([400]))
+    assert not responses[..., : 400 - 7].any()
+    assert responses[..., 400 - 7 : 400].all()
+    assert_array_equal(responses[..., 400:], expected[..., 400:])
+
+
+@pytest.mark.parametrize("echo", [None, 330])
+def test_what_it_takes_follows_within_a_window(echo):
+    """At each ear what that ear lost, and nothing of it later."""
+    responses = _noise() * np.array([[[1.0], [0.1]]], np.float32)
+    responses[..., :200] = 0
+    expected = responses.copy()
+    Gate(PARAMETERS, rise_s=0.004, gives_back=True).open(
+        responses, np.array([300]), None if echo is None else np.array([echo])
+    )
+    opens = 300 if echo is None else echo - 7
+    assert not responses[..., :opens].any()
+    assert_array_equal(responses[..., opens + N_FFT :], expected[..., opens + N_FFT :])
+    assert_allclose(_energy(responses), _energy(expected), rtol=1e-5)
+    # Most of it at once: the first half of the window has far more of it than the second.
+    more = responses.astype(np.float64) ** 2 - expected.astype(np.float64) ** 2
+    middle = opens + N_FFT // 2
+    first, second = more[..., opens + 96 : middle].sum() / (N_FFT // 2 - 96), more[..., middle:].sum() / (N_FFT // 2)
+    assert first > 2.5 * second > 0
+
+
+def test_what_little_there_is_is_not_made_up_of_what_was_taken():
+    responses = _noise()
+    responses[..., 300:] *= 1e-3
+    expected = responses.copy()
+    Gate(PARAMETERS, gives_back=True).open(responses, np.array([300]))
+    most = np.abs(responses[..., 307:]) / np.abs(expected[..., 307:])
+    assert most.max() <= np.sqrt(1 + MOST_GIVEN)
+    assert most.max() > 0.9 * np.sqrt(1 + MOST_GIVEN)
+
+
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_of_silence_nothing_is_given_back(is_compiled):
+    responses = _noise()
+    responses[..., 300:] = 0
+    Gate(PARAMETERS, gives_back=True, is_compiled=is_compiled).open(responses, np.array([300]))
+    assert not responses.any()
