@@ -31,6 +31,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office container-test clean hard-cases fuzz mutants
+.PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -56,11 +57,9 @@ bundle: $(RUNS)/measured ## simulate, train, export and measure a scene (SCENE=a
 table: $(RUNS)/table.md ## the paper's table of a scene (SCENE=): its bundle beside naf, trained for as long, codecs and more
 	@cat $<
 
-scenes: ## bundles of the six scenes after the paper (SCENES=)
-	for scene in $(SCENES); do $(MAKE) bundle SCENE=$$scene || exit 1; done
+scenes: $(SCENES:%=bundle-%) ## bundles of the six scenes after the paper (SCENES=); -j2: two at a time
 
-tables: ## the paper's tables of all six, and one over them; goes on where it stopped
-	for scene in $(SCENES); do $(MAKE) table SCENE=$$scene || exit 1; done
+tables: $(SCENES:%=table-%) ## the paper's tables of all six, and one over them; goes on where it stopped; -j2: two at a time
 	$(BIN)/nafir-train tabulate --json $(SCENES:%=runs/%/table.json) > runs/tables.json
 	$(BIN)/nafir-train tabulate $(SCENES:%=runs/%/table.json) | tee runs/tables.md
 
@@ -88,6 +87,17 @@ container-test: ## build the container image and try it read-only (needs buildah
 clean: ## remove .venv and caches; keeps runs/
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(SCENES:%=bundle-%): bundle-%: | $(VENV)/installed-training
+	$(MAKE) bundle SCENE=$*
+
+$(SCENES:%=table-%): table-%: | $(VENV)/installed-training
+	$(MAKE) table SCENE=$*
+
+# Of one scene one step at a time: trainings that are compared have as much of the machine.
+ifneq ($(filter bundle table,$(MAKECMDGOALS)),)
+.NOTPARALLEL:
+endif
 
 # Steps of one scene, a stamp for each that is finished; what an interrupted one has done is kept and gone on with. What
 # each takes is written to times.jsonl.
