@@ -61,7 +61,7 @@ scenes: $(SCENES:%=bundle-%) ## bundles of the six scenes after the paper (SCENE
 
 tables: $(SCENES:%=table-%) ## the paper's tables of all six, and one over them; goes on where it stopped; -j2: two at a time
 	$(BIN)/nafir-train tabulate --json $(SCENES:%=runs/%/table.json) > runs/tables.json
-	$(BIN)/nafir-train tabulate $(SCENES:%=runs/%/table.json) | tee runs/tables.md
+	$(BIN)/nafir-train tabulate $(SCENES:%=runs/%/table.json) --figure runs/tables.png | tee runs/tables.md
 
 office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere (DATA=folder in MeshRIR's layout), and its table
 	@test -f "$(DATA)/pos_mic.npy" || { echo "make office: DATA= names no folder with pos_mic.npy, pos_src.npy, ir_<number>.npy"; exit 2; }

@@ -5,11 +5,13 @@ Reads what `nafir-train evaluate --json` wrote for each scene.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from server.acoustics.metrics import Metric
 from server.errors import NafirError
 from training.evaluation.evaluate import FLOOR, METRICS, ONE_SIMULATION
 from training.evaluation.report import short
@@ -17,8 +19,7 @@ from training.evaluation.report import short
 TIMES = "times.jsonl"
 """What each step took, beside the results of a scene."""
 
-_NAF, _NAF_WHOLE = "naf", "naf-whole"
-_NEAREST = "nearest"
+NAF, NAF_WHOLE, NEAREST = "naf", "naf-whole", "nearest"
 
 
 class ResultError(NafirError):
@@ -55,7 +56,7 @@ class SceneResult:
             values = json.loads(path.read_text())
             columns: dict[str, dict[str, Any]] = values["columns"]
             fields = [name for name, column in columns.items() if column["kind"] == "field"]
-            nafs = {name: columns[name]["method"] for name in fields if columns[name]["method"] in {_NAF, _NAF_WHOLE}}
+            nafs = {name: columns[name]["method"] for name in fields if columns[name]["method"] in {NAF, NAF_WHOLE}}
             ours = next(name for name in fields if name not in nafs)
             # Of several bundles, columns are named by folder and level.
             level = ours.split()[-1]
@@ -86,7 +87,7 @@ class SceneResult:
             "yaws": self.yaws,
             "draws": self.draws,
             "level": self.level,
-            "worse_than": {naf: self.worse_than(naf) for naf in (_NAF, _NAF_WHOLE) if naf in self.methods},
+            "worse_than": {naf: self.worse_than(naf) for naf in (NAF, NAF_WHOLE) if naf in self.methods},
             "methods": {
                 name: {"errors": dict(method.errors), "ms": method.ms, "storage_bytes": method.storage_bytes}
                 for name, method in self.methods.items()
@@ -110,7 +111,8 @@ def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
 
 def markdown(results: Sequence[SceneResult]) -> str:
     """A row per scene and method; bold is the default level where neither naf nor nearest errs less by more than two
-    standard errors of the difference over pairs. Below it, scene by scene, what the paper's network does better.
+    standard errors of the difference over pairs. Then means over the scenes, and scene by scene what the paper's
+    network does better.
 
     Raises ResultError for scenes that are compared with medians of different numbers of draws.
     """
@@ -123,34 +125,54 @@ def markdown(results: Sequence[SceneResult]) -> str:
         "| --- | --- |" + " ---: |" * (len(heads) + 1),
     ]
     for result in results:
-        shown = {
-            name: result.methods[name]
-            for name in (result.level, _NAF, _NAF_WHOLE, _NEAREST, ONE_SIMULATION, FLOOR)
-            if name in result.methods
-        }
-        lost = {name: result.worse_than(name) for name in shown}
-        for name, method in shown.items():
-            cells = []
-            for metric in METRICS:
-                error = method.errors.get(metric.name)
-                cell = "" if error is None else short(error)
-                if error is not None and method is result.ours:
-                    is_best = not any(metric.name in worse for worse in lost.values())
-                    cell = f"**{cell}**" if is_best else cell
-                cells.append(cell)
+        for name in _shown(result):
+            method = result.methods[name]
+            cells = [_cell(result, name, metric) for metric in METRICS]
             first = result.scene if method is result.ours else ""
             cells.append("" if method.ms is None else short(method.ms))
             lines.append(f"| {first} | {name} | " + " | ".join(cells) + " |")
+    if len(results) > 1:
+        lines += _mean_rows(results)
     return "\n".join([*lines, "", *_remarks(results)])
+
+
+def _shown(result: SceneResult) -> list[str]:
+    names = (result.level, NAF, NAF_WHOLE, NEAREST, ONE_SIMULATION, FLOOR)
+    return [name for name in names if name in result.methods]
+
+
+def _cell(result: SceneResult, name: str, metric: Metric) -> str:
+    error = result.methods[name].errors.get(metric.name)
+    if error is None:
+        return ""
+    is_bold = name == result.level and not any(metric.name in result.worse_than(other) for other in _shown(result))
+    return f"**{short(error)}**" if is_bold else short(error)
+
+
+def _mean_rows(results: Sequence[SceneResult]) -> list[str]:
+    """Means over the scenes, of the methods that all of them have."""
+    rows = []
+    for name in _shown(results[0]):
+        of_scenes = [result.ours if name == results[0].level else result.methods.get(name) for result in results]
+        methods = [method for method in of_scenes if method is not None]
+        if len(methods) < len(results):
+            continue
+        means = [[method.errors.get(metric.name, math.nan) for method in methods] for metric in METRICS]
+        means.append([math.nan if method.ms is None else method.ms for method in methods])
+        cells = [short(mean) if math.isfinite(mean := math.fsum(values) / len(values)) else "" for values in means]
+        first, shown = ("mean", "default level") if not rows else ("", name)
+        rows.append(f"| {first} | {shown} | " + " | ".join(cells) + " |")
+    return rows
 
 
 def _remarks(results: Sequence[SceneResult]) -> list[str]:
     remarks = []
     for result in results:
-        said = "; ".join(_beside(result, naf) for naf in (_NAF, _NAF_WHOLE) if naf in result.methods)
+        said = "; ".join(_beside(result, naf) for naf in (NAF, NAF_WHOLE) if naf in result.methods)
         if not said:
             continue
-        drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {result.yaws} orientations"
+        orientations = "1 orientation" if result.yaws == 1 else f"{result.yaws} orientations"
+        drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {orientations}"
         if result.draws > 1:
             drawn += f", medians of {result.draws} draws"
         remarks.append(f"- {result.scene} ({drawn}): {said}.")

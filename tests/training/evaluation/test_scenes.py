@@ -1,9 +1,13 @@
 import json
 
+import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
+from PIL import Image
 
 from training.evaluation.evaluate import METRICS
 from training.evaluation.scenes import ResultError, SceneResult, markdown, step_times, times_markdown
+from training.evaluation.scenes_figure import draw_scenes, figure_of
 
 
 def column(kind, method, error, ms=None):
@@ -77,6 +81,41 @@ def test_one_simulation_stands_beside_the_floor(result):
     columns["one simulation"] = column("simulation", "", 0.7)
     rows = markdown([SceneResult.read(result(columns=columns))]).splitlines()[2:]
     assert [row.split("|")[2].strip() for row in rows if row.startswith("|")] == ["standard", "one simulation", "floor"]
+
+
+def test_means_over_scenes_are_of_methods_that_all_have(result):
+    one = SceneResult.read(result())
+    columns = {
+        "bundle factorised-r32": column("field", "", 3.0, ms=4.0),
+        "naf": column("field", "naf", 6.0, ms=5000.0),
+        "nearest": column("baseline", "nearest", 5.0, ms=0.3),
+        "floor": column("floor", "", 1.5),
+    }
+    lines = markdown([one, SceneResult.read(result(columns=columns, data="hut (simulated)"))]).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    heads, means = cells[0], cells[-4:]
+    assert [row[:2] for row in means] == [["mean", "default level"], ["", "naf"], ["", "nearest"], ["", "floor"]]
+    edt, t60, ms = (heads.index(head) for head in ("EDT (ms)", "T60 (%)", "ms"))
+    assert [row[edt] for row in means] == ["2.00", "3.38", "4.00", "1.00"]
+    assert [row[t60] for row in means] == ["2.00", "4.00", "", "1.00"]
+    assert [row[ms] for row in means] == ["3.00", "4000", "0.200", ""]
+
+
+def test_errors_are_drawn_in_units_of_the_floor(result, tmp_path):
+    results = [SceneResult.read(result()), SceneResult.read(result(data="hut (simulated)"))]
+    panels = {axes.get_title(): axes for axes in figure_of(results).axes if axes.get_visible()}
+    assert list(panels) == ["spectral loss", "T60", "EDT", "C50", "DRR", "IACC", "level", "ITD"]
+
+    def drawn(title, label):
+        return next(line.get_ydata() for line in panels[title].lines if str(line.get_label()).startswith(label))
+
+    assert_array_equal(drawn("C50", "default level"), [2.0, 2.0])
+    assert_array_equal(drawn("EDT", "what follows"), [1.5, 1.5])
+    assert_array_equal(drawn("T60", "nearest"), [np.nan, np.nan])
+    assert [text.get_text() for text in panels["ITD"].get_xticklabels()] == ["flat", "hut"]
+    draw_scenes(results, tmp_path / "scenes.png")
+    with Image.open(tmp_path / "scenes.png") as picture:
+        assert min(picture.size) > 500
 
 
 def test_without_naf_there_is_no_remark(result):
