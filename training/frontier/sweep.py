@@ -29,7 +29,7 @@ from training.frontier.cost import STRETCH_S, cost_of, measure, memory_mb, one_c
 from training.frontier.points import Point, default_point, offered_points, pareto
 from training.frontier.steps import largest_steps
 
-_SOUND = 3
+_SOUND = 4
 """Another number wherever the same graph comes to sound otherwise: what was kept of before is measured anew."""
 _OFFSETS = 4
 _MOST_OFFSET_M = 0.25
