@@ -35,8 +35,8 @@ _NEVER = 2.0**31
 _EAR_AHEAD_S = 0.00026
 """Sound reaches the nearer ear at most so much sooner than the middle of the head, 87.5 mm away."""
 _RISE_AFTER_FIRST_S = 0.003
-"""Of what follows the first reflections, where geometry computes those: it sets in bit by bit. Sooner, it errs more of
-interaural time differences; later, of the direct-to-reverberant ratio."""
+"""From the onset on, where geometry computes the first reflections: what follows those sets in bit by bit. Sooner, it
+errs more of interaural time differences; later, of the direct-to-reverberant ratio."""
 
 
 class AcousticField:

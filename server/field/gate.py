@@ -21,7 +21,7 @@ Indices = npt.NDArray[np.int64]
 
 RISE_S = 0.0003
 MOST_GIVEN = 15.0
-"""Times the energy that is there. A response that begins late, after what was taken, is not made up of it."""
+"""Times a sample's square. A response that begins late, after what was taken, is not made up of it."""
 
 
 class Gate:
@@ -49,9 +49,12 @@ class Gate:
         self.open(np.zeros((1, 1, 1), np.float32), np.zeros(1, np.int64))
 
     def open(self, responses: Float32, onsets: Indices, echoes: Indices | None = None) -> None:
-        """Changes responses in place. Sound arrives with sample `onsets` (B,); until sample `echoes` (B,), where there
-        are any, no surface has answered."""
+        """Changes responses in place. Sound arrives with sample `onsets` (B,); a surface can have answered by sample
+        `echoes` (B,), where there are any: the last RISE_S before it rise from silence. Raises ValueError for other
+        numbers of them than of responses."""
         begins = onsets if echoes is None else echoes
+        if not len(onsets) == len(begins) == len(responses):
+            raise ValueError(f"{len(onsets)} onsets and {len(begins)} echoes of {len(responses)} responses")
         begins = begins - len(self._answer)
         if self._is_compiled:
             open_gates(self._rise, self._answer, self._given, MOST_GIVEN, onsets, begins, responses)

@@ -11,15 +11,14 @@ Indices = npt.NDArray[np.int64]
 
 @compiled
 def open_gates(
-    rise: Float32, answer: Float32, given: Float32, most: float, onsets: Indices, echoes: Indices, responses: Float32
+    rise: Float32, answer: Float32, given: Float32, most: float, onsets: Indices, begins: Indices, responses: Float32
 ) -> None:
-    """Of each of (B, channel, sample): silence before the later of `onsets` and `echoes` (B,), where `rise` and
-    `answer` begin; energy taken is given back by the weights `given` from there on, `most` times what is there at
-    most."""
-    for row in range(len(onsets)):
-        onset, echo = onsets[row], echoes[row]
-        opens, size = max(0, onset, echo), responses.shape[2]
-        risen = max(onset + rise.size, echo + answer.size)
+    """Of each of (B, channel, sample), with `onsets` and `begins` (B,): `rise` begins at the onset and `answer` at the
+    other, both silent before; energy taken is given back by the weights `given` from the later of the two on."""
+    for row in range(responses.shape[0]):
+        onset, begin = onsets[row], begins[row]
+        opens, size = max(0, onset, begin), responses.shape[2]
+        risen = max(onset + rise.size, begin + answer.size)
         for channel in range(responses.shape[1]):
             response = responses[row, channel]
             taken = 0.0
@@ -30,8 +29,8 @@ def open_gates(
                 gain = 1.0
                 if n - onset < rise.size:
                     gain *= rise[n - onset]
-                if n - echo < answer.size:
-                    gain *= answer[n - echo]
+                if n - begin < answer.size:
+                    gain *= answer[n - begin]
                 taken += float(response[n]) ** 2 * (1.0 - gain * gain)
                 response[n] *= gain
             until = min(opens + given.size, size)

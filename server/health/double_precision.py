@@ -114,7 +114,7 @@ class DoubleDecoder(Decoder):
 
 
 class _DoubleGate(Gate):
-    """The same, in float64 and without a compiler."""
+    """The same without a compiler: gains and energies in float64, of float32 samples."""
 
     def __init__(self, gate: Gate) -> None:
         self._rise, self._answer, self._given = gate._rise, gate._answer, gate._given

@@ -15,6 +15,9 @@ PARAMETERS = CodecParameters(
 ONSETS = np.array([-100, -3, 0, 700, 700, 700, SAMPLES - 30, SAMPLES, 2**40])
 ECHOES = np.array([-90, 4, 0, 690, 704, 900, SAMPLES - 20, 12, 2**40])
 
+COMPILED = pytest.mark.skipif(not HAS_NUMBA, reason="nothing is compiled")
+EITHER = pytest.mark.parametrize("is_compiled", [pytest.param(True, marks=COMPILED), False])
+
 
 def _noise(count=1, channels=2, seed=0):
     return np.random.default_rng(seed).standard_normal((count, channels, SAMPLES)).astype(np.float32)
@@ -24,7 +27,7 @@ def _energy(responses):
     return np.sum(responses.astype(np.float64) ** 2, axis=-1)
 
 
-@pytest.mark.skipif(not HAS_NUMBA, reason="compares what is compiled")
+@COMPILED
 @pytest.mark.parametrize("gives_back", [False, True])
 @pytest.mark.parametrize("channels", [1, 2])
 def test_compiled_and_numpy_agree(channels, gives_back):
@@ -37,7 +40,7 @@ def test_compiled_and_numpy_agree(channels, gives_back):
     assert np.all(_energy(compiled)[:-2] > 0.1)
 
 
-@pytest.mark.parametrize("is_compiled", [True, False])
+@EITHER
 def test_it_is_silent_until_sound_arrives_and_open_after_its_rise(is_compiled):
     responses = _noise(3)
     expected = responses.copy()
@@ -55,7 +58,7 @@ def test_it_is_silent_until_sound_arrives_and_open_after_its_rise(is_compiled):
         assert np.all(np.abs(response[:, onset + 6]) < 0.012 * np.abs(whole[:, onset + 6]))
 
 
-@pytest.mark.parametrize("is_compiled", [True, False])
+@EITHER
 def test_it_is_silent_until_a_surface_has_answered(is_compiled):
     responses = _noise()
     expected = responses.copy()
@@ -95,9 +98,18 @@ def test_what_little_there_is_is_not_made_up_of_what_was_taken():
     assert most.max() > 0.9 * np.sqrt(1 + MOST_GIVEN)
 
 
-@pytest.mark.parametrize("is_compiled", [True, False])
+@EITHER
 def test_of_silence_nothing_is_given_back(is_compiled):
     responses = _noise()
     responses[..., 300:] = 0
     Gate(PARAMETERS, gives_back=True, is_compiled=is_compiled).open(responses, np.array([300]))
     assert not responses.any()
+
+
+@EITHER
+def test_as_many_responses_as_there_are_onsets(is_compiled):
+    gate = Gate(PARAMETERS, is_compiled=is_compiled)
+    with pytest.raises(ValueError, match="3 onsets and 3 echoes of 1 responses"):
+        gate.open(_noise(), np.array([1, 2, 3]))
+    with pytest.raises(ValueError, match="1 onsets and 2 echoes"):
+        gate.open(_noise(), np.array([1]), np.array([1, 2]))

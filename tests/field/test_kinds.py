@@ -71,6 +71,17 @@ def test_a_graphs_own_responses_begin_when_sound_arrives(bundle, tmp_path, dista
     assert_allclose(_respond(field, emitter), expected, atol=1e-5)
 
 
+def test_what_a_graphs_own_responses_have_too_early_is_left_out_and_not_given_back(bundle, tmp_path, monkeypatch):
+    lead = bundle.manifest.codec.lead_samples
+    field = _pulses(bundle, tmp_path / "pulses", pulse=lead + 30)
+    coded = np.zeros((1, 2, bundle.manifest.codec.samples), np.float32)
+    coded[..., lead - 20], coded[..., lead + 30] = 3.0, 1.0
+    monkeypatch.setattr(field.graph, "impulse_responses", lambda *_: coded)
+    expected = np.zeros((2, field.ir_samples))
+    expected[:, 160 + 30] = 1.0
+    assert_allclose(_respond(field, (2.0 + 160 * 343.0 / 24_000, 2.5, 1.5)), expected, atol=1e-5)
+
+
 def test_a_fraction_of_a_sample_is_a_delay_too(bundle, tmp_path):
     """Centre of mass of the left ear's energy follows the distance to a hundredth of a sample."""
     field = _pulses(bundle, tmp_path / "pulses", pulse=bundle.manifest.codec.lead_samples + 200)
