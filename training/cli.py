@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from server.errors import NafirError
 from training.evaluation import cli as evaluation
 from training.importers.cli import importing
+from training.options import Json, Seed
 from training.simulation import cli as simulation
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -20,8 +21,6 @@ app.add_typer(importing, name="import")
 app.command()(simulation.plan)
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
-Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
 
 
 def _progress() -> Progress:

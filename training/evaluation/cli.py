@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
-Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
+from training.options import Json, Seed
 
 
 def evaluate(

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from training.importers.receivers import Receivers
+from training.options import Json
 
 if TYPE_CHECKING:
     from training.responses import Measurement
@@ -36,7 +37,6 @@ Rate = Annotated[int | None, typer.Option("--sample-rate", min=1, help="Resample
 Duration = Annotated[
     float | None, typer.Option("--duration-s", min=0.001, help="Longest response; all of it otherwise.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 
 
 @dataclass(frozen=True)

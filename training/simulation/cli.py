@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from training.options import Seed
+
 if TYPE_CHECKING:
     from training.simulation.check import PlanCheck
     from training.simulation.pairs import PairSimulation
@@ -27,7 +29,6 @@ Effects = Annotated[
         "[effects].",
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
 
 
 def wide_console(*, stderr: bool = False) -> Console:
