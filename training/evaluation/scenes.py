@@ -20,6 +20,7 @@ TIMES = "times.jsonl"
 """What each step took, beside the results of a scene."""
 
 NAF, NAF_WHOLE, NEAREST = "naf", "naf-whole", "nearest"
+_NOT_METHODS = {ONE_SIMULATION, FLOOR}
 
 
 class ResultError(NafirError):
@@ -35,6 +36,11 @@ class Method:
     surpassed_by: Mapping[str, Sequence[str]]
     ms: float | None
     storage_bytes: int | None
+
+    @property
+    def megabytes(self) -> float:
+        """Not finite where nothing is stored."""
+        return math.nan if self.storage_bytes is None else self.storage_bytes / 1e6
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,11 @@ class SceneResult:
         """Metrics in which the default level errs more, and not by chance."""
         return [name for name, surpassing in self.ours.surpassed_by.items() if other in surpassing]
 
+    def larger_than(self, other: str) -> list[str]:
+        """Metrics in which the default level errs more in the mean, by chance or not."""
+        theirs = self.methods[other].errors
+        return [name for name, error in self.ours.errors.items() if error > theirs.get(name, math.inf)]
+
 
 def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
     metrics = column["metrics"]
@@ -110,9 +121,9 @@ def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
 
 
 def markdown(results: Sequence[SceneResult]) -> str:
-    """A row per scene and method; bold is the default level where neither naf nor nearest errs less by more than two
-    standard errors of the difference over pairs. Then means over the scenes, and scene by scene what the paper's
-    network does better.
+    """A row per scene and method; bold is the best of the default level, the paper's network and nearest, and what errs
+    no more than it by two standard errors of the difference over pairs. Then means over the scenes, where bold is the
+    smallest, and scene by scene what the paper's network does better.
 
     Raises ResultError for scenes that are compared with medians of different numbers of draws.
     """
@@ -121,15 +132,15 @@ def markdown(results: Sequence[SceneResult]) -> str:
         raise ResultError(f"some scenes are compared with {numbers} draws: evaluate all with the same --draws")
     heads = [f"{metric.label} ({metric.unit})" if metric.unit else metric.label for metric in METRICS]
     lines = [
-        "| scene | method | " + " | ".join([*heads, "ms"]) + " |",
-        "| --- | --- |" + " ---: |" * (len(heads) + 1),
+        "| scene | method | " + " | ".join([*heads, "MB", "ms"]) + " |",
+        "| --- | --- |" + " ---: |" * (len(heads) + 2),
     ]
     for result in results:
         for name in _shown(result):
             method = result.methods[name]
             cells = [_cell(result, name, metric) for metric in METRICS]
             first = result.scene if method is result.ours else ""
-            cells.append("" if method.ms is None else short(method.ms))
+            cells += [_number(method.megabytes), _number(_finite(method.ms))]
             lines.append(f"| {first} | {name} | " + " | ".join(cells) + " |")
     if len(results) > 1:
         lines += _mean_rows(results)
@@ -142,24 +153,43 @@ def _shown(result: SceneResult) -> list[str]:
 
 
 def _cell(result: SceneResult, name: str, metric: Metric) -> str:
-    error = result.methods[name].errors.get(metric.name)
-    if error is None:
+    error = result.methods[name].errors.get(metric.name, math.nan)
+    compared = [other for other in _shown(result) if other not in _NOT_METHODS]
+    best = min(compared, key=lambda other: result.methods[other].errors.get(metric.name, math.inf))
+    is_bold = name in compared and best not in result.methods[name].surpassed_by.get(metric.name, ())
+    return _number(error, is_bold=is_bold)
+
+
+def _number(value: float, *, is_bold: bool = False) -> str:
+    """Empty where there is none."""
+    if not math.isfinite(value):
         return ""
-    is_bold = name == result.level and not any(metric.name in result.worse_than(other) for other in _shown(result))
-    return f"**{short(error)}**" if is_bold else short(error)
+    return f"**{short(value)}**" if is_bold else short(value)
+
+
+def _finite(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _mean_rows(results: Sequence[SceneResult]) -> list[str]:
     """Means over the scenes, of the methods that all of them have."""
-    rows = []
+    means: dict[str, list[float]] = {}
     for name in _shown(results[0]):
         of_scenes = [result.ours if name == results[0].level else result.methods.get(name) for result in results]
         methods = [method for method in of_scenes if method is not None]
         if len(methods) < len(results):
             continue
-        means = [[method.errors.get(metric.name, math.nan) for method in methods] for metric in METRICS]
-        means.append([math.nan if method.ms is None else method.ms for method in methods])
-        cells = [short(mean) if math.isfinite(mean := math.fsum(values) / len(values)) else "" for values in means]
+        values = [[method.errors.get(metric.name, math.nan) for method in methods] for metric in METRICS]
+        values += [[method.megabytes for method in methods], [_finite(method.ms) for method in methods]]
+        means[name] = [math.fsum(column) / len(column) for column in values]
+    compared = [of_name for name, of_name in means.items() if name not in _NOT_METHODS]
+    smallest = [min(filter(math.isfinite, column), default=math.nan) for column in zip(*compared, strict=True)]
+    rows = []
+    for name, of_name in means.items():
+        cells = [
+            _number(mean, is_bold=number < len(METRICS) and name not in _NOT_METHODS and mean == smallest[number])
+            for number, mean in enumerate(of_name)
+        ]
         first, shown = ("mean", "default level") if not rows else ("", name)
         rows.append(f"| {first} | {shown} | " + " | ".join(cells) + " |")
     return rows
@@ -180,8 +210,14 @@ def _remarks(results: Sequence[SceneResult]) -> list[str]:
 
 
 def _beside(result: SceneResult, naf: str) -> str:
-    worse = [metric.label for metric in METRICS if metric.name in result.worse_than(naf)]
-    said = f"errs more than {naf} in {', '.join(worse)}" if worse else f"errs no more than {naf} in any metric"
+    worse, larger = result.worse_than(naf), result.larger_than(naf)
+    told = ", ".join(metric.label for metric in METRICS if metric.name in worse)
+    untold = ", ".join(metric.label for metric in METRICS if metric.name in larger and metric.name not in worse)
+    if told:
+        said = f"errs more than {naf} in {told}" + (f", and in {untold} not by more than chance" if untold else "")
+    else:
+        said = f"errs no more than {naf} in any metric"
+        said += f" but {untold}, and there not by more than chance" if untold else ""
     naf_ms, ms = result.methods[naf].ms, result.ours.ms
     return said if naf_ms is None or ms is None else f"{said}, {short(naf_ms / ms)} times as fast"
 

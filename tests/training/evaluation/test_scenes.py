@@ -29,6 +29,9 @@ def result(tmp_path):
     columns["naf"]["metrics"]["edt"]["mean"] = 0.75
     columns["bundle factorised-r16"]["metrics"]["edt"]["surpassed_by"] = ["naf"]
     columns["naf"]["metrics"]["c50"]["mean"] = 0.95  # not told from 1.0
+    for worse in ("naf", "naf-whole", "nearest"):
+        for metric in set(columns[worse]["metrics"]) - {"c50", *({"edt"} if worse == "naf" else ())}:
+            columns[worse]["metrics"][metric]["surpassed_by"] = ["bundle factorised-r16"]
     columns["nearest"]["metrics"]["t60"]["mean"] = None
 
     def write(**changes):
@@ -40,7 +43,7 @@ def result(tmp_path):
     return write
 
 
-def test_the_default_level_stands_first_and_is_bold_where_nobody_errs_less(result):
+def test_the_default_level_stands_first_and_bold_is_the_best_and_what_is_not_told_from_it(result):
     lines = markdown([SceneResult.read(result())]).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
     heads, _, ours, naf, whole, nearest, floor = cells
@@ -51,13 +54,15 @@ def test_the_default_level_stands_first_and_is_bold_where_nobody_errs_less(resul
         ["", "nearest"],
         ["", "floor"],
     ]
-    edt, t60, c50 = (heads.index(head) for head in ("EDT (ms)", "T60 (%)", "C50 (dB)"))
-    assert (ours[c50], naf[c50]) == ("**1.00**", "0.950")
-    assert (ours[t60], nearest[t60]) == ("**1.00**", "")
-    assert (ours[edt], naf[edt]) == ("1.00", "0.750")
+    edt, t60, c50, drr = (heads.index(head) for head in ("EDT (ms)", "T60 (%)", "C50 (dB)", "DRR (dB)"))
+    assert (ours[c50], naf[c50], floor[c50]) == ("**1.00**", "**0.950**", "0.500")
+    assert (ours[t60], naf[t60], nearest[t60]) == ("**1.00**", "2.00", "")
+    assert (ours[edt], naf[edt]) == ("1.00", "**0.750**")
+    assert (ours[drr], naf[drr]) == ("**1.00**", "2.00")
+    assert (heads[-2:], ours[-2:], naf[-2:]) == (["MB", "ms"], ["0.00100", "2.00"], ["0.00100", "3000"])
     assert lines[-1] == (
-        "- flat (2 pairs, 1 in sight, 2 orientations): errs more than naf in EDT, 1500 times as fast; errs no more "
-        "than naf-whole in any metric, 2000 times as fast."
+        "- flat (2 pairs, 1 in sight, 2 orientations): errs more than naf in EDT, and in C50 not by more than "
+        "chance, 1500 times as fast; errs no more than naf-whole in any metric, 2000 times as fast."
     )
 
 
@@ -66,6 +71,14 @@ def test_the_record_says_what_naf_does_better(result):
     assert record["worse_than"] == {"naf": ["edt"], "naf-whole": []}
     assert record["methods"]["naf"]["ms"] == 3000.0
     assert "t60" not in record["methods"]["nearest"]["errors"]
+
+
+def test_what_is_larger_by_chance_alone_is_told(result):
+    columns = {"standard": column("field", "", 1.0), "naf": column("field", "naf", 2.0)}
+    columns["naf"]["metrics"]["itd"]["mean"] = 0.9
+    read = SceneResult.read(result(columns=columns))
+    assert (read.worse_than("naf"), read.larger_than("naf")) == ([], ["itd"])
+    assert "errs no more than naf in any metric but ITD, and there not by more than chance" in markdown([read])
 
 
 def test_scenes_of_different_draws_are_not_put_into_one_table(result):
@@ -96,8 +109,8 @@ def test_means_over_scenes_are_of_methods_that_all_have(result):
     heads, means = cells[0], cells[-4:]
     assert [row[:2] for row in means] == [["mean", "default level"], ["", "naf"], ["", "nearest"], ["", "floor"]]
     edt, t60, ms = (heads.index(head) for head in ("EDT (ms)", "T60 (%)", "ms"))
-    assert [row[edt] for row in means] == ["2.00", "3.38", "4.00", "1.00"]
-    assert [row[t60] for row in means] == ["2.00", "4.00", "", "1.00"]
+    assert [row[edt] for row in means] == ["**2.00**", "3.38", "4.00", "1.00"]
+    assert [row[t60] for row in means] == ["**2.00**", "4.00", "", "1.00"]
     assert [row[ms] for row in means] == ["3.00", "4000", "0.200", ""]
 
 
