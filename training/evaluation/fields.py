@@ -13,6 +13,10 @@ from server.scene.manifest import Accuracy, QualityLevel
 from server.whole_field import WholeField
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
 from training.evaluation.held_out import EvaluationError, HeldOut, Responses, require_same_scene
+from training.evaluation.moved_lattice import with_moved_lattice
+
+_PLACES = 8
+"""Of a lattice; held-out pairs take turns."""
 
 
 def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
@@ -48,7 +52,7 @@ def _method(architecture: str) -> str:
 
 def field_source(field: AcousticField, held_out: HeldOut) -> Source:
     """Whole responses as the server answers with them: the direct sound is joined to what the field says, unless it
-    holds that."""
+    holds that. A lattice on which responses are reused is moved and turned between pairs."""
     codec = field.bundle.manifest.codec.codec
     if codec.sample_rate != held_out.sample_rate:
         raise EvaluationError(
@@ -58,12 +62,14 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
         raise EvaluationError(
             f"{field.bundle.folder}: has {field.channels} channels, {held_out.name} has {held_out.channels}"
         )
-    whole = WholeField.through_kemar(field)
+    rng = np.random.default_rng(_PLACES)
+    fields = [field] if field.nodes is None else [with_moved_lattice(field, rng) for _ in range(_PLACES)]
+    wholes = [WholeField.through_kemar(moved) for moved in fields]
     listeners, emitters = held_out.listeners, held_out.emitters
 
     def source(index: int, turns: npt.NDArray[np.integer]) -> Responses:
         shape = (len(turns), 3)
-        responses = whole.impulse_responses(
+        responses = wholes[index % len(wholes)].impulse_responses(
             np.broadcast_to(listeners[index], shape), np.broadcast_to(emitters[index], shape), held_out.yaws[turns]
         )
         return _of_length(responses, held_out.samples)
@@ -72,16 +78,10 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
 
 
 def record_accuracy(bundle: Bundle, evaluation: Evaluation) -> Bundle:
-    """Writes the measured errors of every quality level into the bundle's manifest; `evaluation` is of it alone.
-
-    Levels that reuse responses keep what the frontier found: held-out poses look where the nodes of a lattice may, and
-    there is no moving them here.
-    """
+    """Writes the measured errors of every quality level into the bundle's manifest; `evaluation` is of it alone."""
     floor = {} if evaluation.floor is None else _means(evaluation, evaluation.floor.name)
 
     def measured(level: QualityLevel) -> QualityLevel:
-        if level.reuse is not None and level.accuracy is not None:
-            return level
         accuracy = Accuracy(
             pairs=evaluation.pairs,
             yaws=evaluation.yaws,

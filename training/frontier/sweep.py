@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
-from server.field.lattice import Lattice
 from server.field.levels import Levels
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, QualityLevel
 from training.dataset import Dataset
 from training.evaluation.held_out import require_same_scene
+from training.evaluation.moved_lattice import with_moved_lattice
 from training.frontier.accuracy import Errors, Estimate, SampledPairs
 from training.frontier.bound import TruePhase
 from training.frontier.cost import STRETCH_S, cost_of, measure, memory_mb, one_core
@@ -32,7 +31,6 @@ from training.frontier.steps import largest_steps
 _SOUND = 4
 """Another number wherever the same graph comes to sound otherwise: what was kept of before is measured anew."""
 _OFFSETS = 4
-_MOST_OFFSET_M = 0.25
 _STEPS = 60
 
 
@@ -203,20 +201,12 @@ def _accuracies(
 
 
 def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:
-    """Held-out poses are where a simulation has them and look where it did, and might be nodes: of a level with a
-    lattice, the mean over several places and headings of it."""
+    """Of a level with a lattice, the mean over several places and headings of it."""
     steps = largest_steps(field, count=_STEPS, seed=seed)
-    reuse, nodes = field.level.reuse, field.nodes
-    if reuse is None or nodes is None:
+    if field.nodes is None:
         return dataclasses.replace(sample.errors_of(Estimate(field)), steps=steps)
-    paths = SoundPathFinder(field.bundle.floor_plan, field.bundle.manifest.speed_of_sound)
-    most = min(_MOST_OFFSET_M, reuse.spacing_m / 2)
-    measured = []
     rng = np.random.default_rng([seed, 12])
-    for _ in range(_OFFSETS):
-        x, y, z, turned = (*rng.uniform(-most, most, 3).tolist(), rng.uniform(-math.pi, math.pi))
-        nodes.lattice = Lattice(field.bundle, reuse, paths, (x, y, z), turned)
-        measured.append(sample.errors_of(Estimate(field)))
+    measured = [sample.errors_of(Estimate(with_moved_lattice(field, rng))) for _ in range(_OFFSETS)]
     return dataclasses.replace(Errors.mean(measured), steps=steps)
 
 

@@ -143,7 +143,7 @@ def test_errors_of_every_level_are_recorded_and_the_bundle_still_loads(evaluatio
             assert level.accuracy.floor.get(name) == evaluation.floor.summaries[name].mean
 
 
-def test_what_the_frontier_found_of_lattices_and_steps_stays(evaluation, two_levels, tmp_path):
+def test_what_the_frontier_found_of_steps_stays(evaluation, two_levels, tmp_path):
     standard, short = two_levels.manifest.levels
     found = Accuracy(pairs=7, yaws=2, errors={"t60": 9.0}, floor={"t60": 1.0}, steps={"level": 0.5})
     levels = (
@@ -152,9 +152,9 @@ def test_what_the_frontier_found_of_lattices_and_steps_stays(evaluation, two_lev
     )
     files = {name: (two_levels.folder / name).read_bytes() for name in two_levels.manifest.files}
     bundle = write_bundle(tmp_path, two_levels.manifest.model_copy(update={"levels": levels}), files)
-    exact, reusing = record_accuracy(bundle, evaluation).manifest.levels
-    assert (exact.accuracy.pairs, exact.accuracy.steps) == (evaluation.pairs, {"level": 0.5})
-    assert reusing.accuracy == found
+    for level in record_accuracy(bundle, evaluation).manifest.levels:
+        assert (level.accuracy.pairs, level.accuracy.steps) == (evaluation.pairs, {"level": 0.5})
+        assert level.accuracy.errors["t60"] == evaluation.of(level.name).summaries["t60"].mean
 
 
 class TestMeasured:
