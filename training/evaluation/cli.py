@@ -26,7 +26,12 @@ def evaluate(
     draws: Annotated[int, typer.Option(min=1, help="Compare with medians of so many more simulations.")] = 1,
     figure: Annotated[Path | None, typer.Option(help="Draw decays and errors to this PNG.")] = None,
     record: Annotated[bool, typer.Option(help="Write the measured errors of every level into the bundle.")] = False,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the results as JSON, too.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Write the results as JSON, too, and until then what is measured, to go on with."
+        ),
+    ] = None,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
@@ -56,6 +61,7 @@ def evaluate(
         draws=draws,
         seed=seed,
         figure=figure,
+        keep=None if output is None else Path(f"{output}.partial"),
         track=lambda steps, doing: track(steps, doing, console=console),
     )
     if record:

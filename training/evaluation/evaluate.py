@@ -26,6 +26,7 @@ from server.acoustics.metrics import (
 )
 from server.acoustics.room_parameters import RoomParameters, measure
 from training.evaluation.held_out import EvaluationError, HeldOut, Responses
+from training.evaluation.kept_errors import Errors, KeptErrors
 
 FLOOR = "floor"
 ONE_SIMULATION = "one simulation"
@@ -150,6 +151,7 @@ def evaluate(
     draws: int = 1,
     decay_db: float = 30.0,
     threads: int = 2,
+    kept: KeptErrors | None = None,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
     """Measures every held-out pair at every orientation that is heard, in every column.
@@ -158,15 +160,17 @@ def evaluate(
     does not answer is missing in all of them. The direct sound is sought within 3 ms of where the reference has it.
     `of`: the held-out pairs that these were drawn from. `truth`: what parameters are compared with, pair by pair,
     medians of so many `draws`; where there is none, with the reference's own. Spectra are always compared with the
-    reference. Sources are called from several `threads` for errors, and one at a time for what they take. `track` may
-    wrap the loop over pairs in a progress bar.
+    reference. Sources are called from several `threads` for errors, and one at a time for what they take. Errors of
+    pairs that `kept` holds are not measured again. `track` may wrap the loop over pairs in a progress bar.
     """
     codec = spectral_codec(held_out.sample_rate, held_out.samples)
     names = [column.name for column in columns]
     if len(set(names)) < len(names):
         raise EvaluationError(f"two columns have the same name among {', '.join(names)}")
 
-    def pair_errors(pair: int) -> list[dict[str, _Errors]]:
+    def pair_errors(pair: int) -> Errors:
+        if kept is not None and (found := kept.get(pair)) is not None:
+            return found
         reference = np.asarray(held_out.reference(pair), dtype=np.float32)
         simulated = measure(reference, held_out.sample_rate, decay_db=decay_db)
         parameters = truth[pair] if truth else simulated
@@ -193,7 +197,10 @@ def evaluate(
                     errors[metric.name] = np.full(len(reference), np.nan)
             return errors
 
-        return [errors_of(column) for column in columns]
+        errors = [errors_of(column) for column in columns]
+        if kept is not None:
+            kept.put(pair, errors)
+        return errors
 
     pool = ThreadPoolExecutor(threads)
     try:

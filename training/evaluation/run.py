@@ -12,6 +12,7 @@ from training.evaluation.evaluate import Column, Evaluation, evaluate
 from training.evaluation.fields import field_columns
 from training.evaluation.figure import draw_figure
 from training.evaluation.held_out import HeldOut, open_held_out
+from training.evaluation.kept_errors import KeptErrors, signature
 from training.evaluation.methods import DEFAULT_METHODS, floor_columns, method_columns, simulation_column
 from training.evaluation.published import PublishedTable, published_table
 from training.responses import open_responses
@@ -30,11 +31,13 @@ def evaluate_bundles(
     draws: int = 1,
     seed: int = 0,
     figure: Path | None = None,
+    keep: Path | None = None,
     track: Track = lambda steps, _: steps,
 ) -> tuple[Evaluation, PublishedTable]:
     """Every quality level of every bundle, and the field of every run folder on measured data, beside `methods` and the
     floor, on the same pairs and orientations: all that are held out, or as many as asked for. Parameters are compared
-    with the medians of so many `draws` of the simulation, or of one with its own. Optionally with a figure (PNG).
+    with the medians of so many `draws` of the simulation, or of one with its own. Optionally with a figure (PNG). What
+    is measured is put into the file `keep` pair by pair, to go on with if interrupted, which in the end is removed.
 
     Raises EvaluationError, DatasetError if the dataset is of another scene than a bundle, and RunError for a run of
     other data.
@@ -51,16 +54,23 @@ def evaluate_bundles(
             columns += [run_column(run, responses, held_out) for run in runs]
         columns += method_columns(methods, held_out, track)
         measured = [*columns, *([simulation_column(held_out)] if truth else []), *floor_columns(held_out)]
+        kept = None
+        if keep is not None:
+            made_of = [[bundle.digest for bundle in bundles], [signature(folder) for folder in (*runs, data)]]
+            kept = KeptErrors(keep, [made_of, [column.name for column in measured], pairs, yaws, draws, seed])
         evaluation = evaluate(
             held_out,
             measured,
             of=len(everything),
             truth=truth,
             draws=draws,
+            kept=kept,
             track=lambda steps: track(steps, "evaluating"),
         )
         if figure is not None:
             _draw(evaluation, figure, held_out, columns)
+        if kept is not None:
+            kept.discard()
         return evaluation, published_table(simulated=held_out.simulated is not None)
 
 
