@@ -21,6 +21,8 @@ TRAINING ?=
 SWEEP ?= --phases-of none --reuse-of factorised-r16
 # Which of the held-out pairs a bundle's own errors are of: by default all.
 MEASURE ?=
+# How long either fuzzer runs, in seconds.
+FUZZ_SECONDS ?= 60
 # Tests that watch the clock, and so have the machine to themselves.
 TIMED := tests/integration tests/bench/test_sessions.py tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
 
@@ -54,12 +56,12 @@ format: $(VENV)/installed-dev ## format the code and apply safe lint fixes
 
 bundle: $(RUNS)/measured ## simulate, train, export and measure a scene (SCENE=apartment); goes on where it stopped
 
-table: $(RUNS)/table.md ## the paper's table of a scene (SCENE=): its bundle beside naf, trained for as long, codecs and more
+table: $(RUNS)/table.md ## a table like the paper's of a scene (SCENE=): its bundle beside naf, trained for as long, codecs and more
 	@cat $<
 
 scenes: $(SCENES:%=bundle-%) ## bundles of the six scenes after the paper (SCENES=); -j2: two at a time
 
-tables: $(SCENES:%=table-%) ## the paper's tables of all six, and one over them; goes on where it stopped; -j2: two at a time
+tables: $(SCENES:%=table-%) ## such tables of all six, and one over them; goes on where it stopped; -j2: two at a time
 	$(BIN)/nafir-train tabulate --json $(SCENES:%=runs/%/table.json) > runs/tables.json
 	$(BIN)/nafir-train tabulate $(SCENES:%=runs/%/table.json) --figure runs/tables.png | tee runs/tables.md
 

@@ -10,7 +10,8 @@ from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
 from server.rendering.packed_filter import PackedFilter, address, pack
-from server.rendering.partitions import Partitioning, Stage
+from server.rendering.partitions import TURNS, Partitioning, Stage
+from server.rendering.products import COLUMNS
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -49,7 +50,7 @@ class CompiledConvolver:
         self._tail_history = zeros_on_lines(1, history * block_size)
         self._tail_wanted: IntArray = np.zeros(1, np.int64)
         self._tail_silent: IntArray = np.zeros(1, np.int64)
-        self._scratch = zeros_on_lines(2, stages[-1].size)
+        self._scratch = zeros_on_lines(3, stages[-1].size)
         self._fade_in = raised_cosine(block_size)
         last = len(stages) - 1
         kinds = [(number, False) for number in range(len(stages)) if number < last or has_own_tails]
@@ -146,30 +147,34 @@ class _StageArrays:
         self.sources = sources
         self.tables = right_angle.tables(stage.size)
         self.fade_out = raised_cosine(stage.size)[::-1].copy()
-        self.spectra = zeros_on_lines(sources, stage.size // LANES, stage.partitions, 2, LANES)
-        self.mix, self.next_mix, self.surplus = (zeros_on_lines(channels, 2, stage.size) for _ in range(3))
+        tiles, self.slots = stage.size // LANES, max(TURNS, stage.partitions)
+        self.recent = zeros_on_lines(sources, TURNS, tiles, 2, LANES)
+        self.ring = zeros_on_lines(sources, tiles, self.slots, 2, LANES)
+        self.mix = zeros_on_lines(tiles, channels, COLUMNS, 2, LANES)
         self.output = zeros_on_lines(2, channels, stage.size)
         self.current, self.job_source, self.job_old, self.job_new = (np.zeros(sources, np.int64) for _ in _PER_SOURCE)
 
     def enter(self, record: npt.NDArray[np.void]) -> None:
         """Write sizes and addresses into a STAGE record (1,)."""
         record["size"], record["ticks"] = self.stage.size, self.stage.ticks
-        record["partitions"], record["sources"] = self.stage.partitions, self.sources
+        record["partitions"], record["slots"], record["sources"] = self.stage.partitions, self.slots, self.sources
         for name in ("twist", "passes", "lanes"):
             record[name] = address(getattr(self.tables, name))
-        for name in ("fade_out", "spectra", "mix", "next_mix", "surplus", "output", *_PER_SOURCE):
+        for name in ("fade_out", "recent", "ring", "mix", "output", *_PER_SOURCE):
             record[name] = address(getattr(self, name))
 
     def clear(self, source: int) -> None:
         if self.current[source]:
             self.current[source] = 0
-            self.spectra[source] = 0
+            self.recent[source] = 0
+            self.ring[source] = 0
         is_at_work = self.job_source == source
         self.job_old[is_at_work] = 0
         self.job_new[is_at_work] = 0
 
     def reset(self) -> None:
-        self.spectra.fill(0)
+        for array in (self.recent, self.ring, self.mix):
+            array.fill(0)
         self.current.fill(0)
         self.job_old.fill(0)
         self.job_new.fill(0)

@@ -6,8 +6,8 @@ frequency domain, in order of their number; one that is silent costs nothing and
 A new IR is exchanged stage by stage: at the stage's next window both IRs run over the same input spectra, and their
 outputs are crossfaded in the time domain over one partition, a raised cosine. Interpolating the spectra instead would
 wrap around in time (a click) and comb. Only partitions that differ are computed twice. The head, the first stage,
-begins with the next block; later parts of the IR follow within three partitions of their stage, and of several IRs that
-arrive meanwhile only the newest is heard there.
+begins with the next block; later stages exchange one source in TURNS per window, so later parts of the IR follow within
+TURNS + 1 partitions of their stage, and of several IRs that arrive meanwhile only the newest is heard there.
 
 Compiled where numba is installed (`server.rendering.convolver_kernel`), NumPy elsewhere
 (`server.rendering.numpy_convolver`): the same to -120 dB.
@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from server.compiled import HAS_NUMBA
 from server.rendering.ingest import LOUDEST
-from server.rendering.partitions import Partitioning
+from server.rendering.partitions import TURNS, Partitioning
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -101,8 +101,9 @@ class Convolver:
         self._irs: list[PartitionedIr | None] = [None] * sources
         self._tail_energy = np.zeros(sources)
         self._retired: deque[tuple[int, PartitionedIr]] = deque()
-        # Compiled code holds addresses: an IR that was replaced is in use until the third window after it was made.
-        self._retires_after = 4 * stages[-1].ticks
+        # Compiled code holds addresses: an IR that was replaced is in use until its source's turn, and in the
+        # window that is made of it then.
+        self._retires_after = (TURNS + 2) * stages[-1].ticks
         self._tail: PartitionedIr | None = None
 
     def prepare(

@@ -2,16 +2,20 @@
 
 A convolver is a record of numbers and addresses (`CONVOLVER`), with one record per stage (`STAGE`). Every array it
 needs is sized once, in `server.rendering.compiled_convolver`, which owns them. Bins are laid out in tiles of eight,
-complex numbers as eight real parts then eight imaginary ones:
+complex numbers as eight real parts then eight imaginary ones, and what is read together lies together:
 
-    filter of a stage   (tile, partition, channel, part, 8)   one per IR, partitions in order
-    spectra of a stage  (source, tile, slot, part, 8)          a ring of windows: slot `newest` + p is p windows old
-    mix of a stage      (channel, part, bin)                   and `surplus`: what the IRs that are faded from add to it
+    filter of a stage   near: (partition, tile, channel, part, 8), the first NEAR partitions;
+                        far: (tile, partition, channel, part, 8), the others behind them
+    recent of a stage   (source, turn, tile, part, 8)          spectra since the source's turn, which is 0
+    ring of a stage     (source, tile, slot, part, 8)          what was recent at a turn and earlier, the newest first
+    mix of a stage      (tile, channel, column, part, 8)       columns as in `server.rendering.products`
 
-so that a product runs through memory once, in order, with its sums in registers; memory is what limits it. So a later
-stage multiplies two windows at a time: reading a filter once, it adds to the mix of the window at work all partitions,
-and to that of the next one (`next_mix`) all but the first, whose input is not there yet. Sources take turns, even ones
-in one window and odd ones in the other, and exchange their IRs on theirs.
+Memory is what limits it. So sources take turns, one in TURNS windows, and on its turn a source is multiplied for all
+of them, its filter read once: the window at work gets all partitions, the next one all but the first, whose input is
+not there yet, and so on. In the windows between, only those first partitions are left to multiply.
+
+An IR is exchanged in the first stage at once, and what the one before was multiplied for in advance is taken back;
+in later stages on the source's turn, when there is nothing to take back.
 
 A stage other than the first works on a window while the next one fills: its sources' transforms, their products, and
 the inverse transforms are a list of jobs with estimated costs, of which every block does its share.
@@ -25,6 +29,7 @@ from server.acoustics.simd import add, broadcast, load, load_int, multiply_add, 
 from server.compiled import compiled
 from server.rendering import products, right_angle
 from server.rendering.convolver_records import CONVOLVER, STAGE
+from server.rendering.partitions import TURNS
 
 _CHUNK_NS = 2500
 """A list of products is cut into jobs of about this length."""
@@ -158,20 +163,16 @@ def _tick(convolver, stage) -> None:
 @compiled
 def _begin(convolver, stage, window) -> None:
     """List the jobs of a window that is full, and put into effect the filters wanted by now."""
-    is_mix_begun = stage.number > 0 and stage.first_pair < stage.jobs
-    stage.mix, stage.next_mix = stage.next_mix, stage.mix
     stage.window = window
-    stage.newest = (stage.newest if stage.newest > 0 else stage.partitions) - 1
     wanted, silent = _ints(stage.wanted, stage.sources), _ints(stage.silent, stage.sources)
     current = _ints(stage.current, stage.sources)
     job_source = _ints(stage.job_source, stage.sources)
     job_old, job_new = _ints(stage.job_old, stage.sources), _ints(stage.job_new, stage.sources)
-    stage.first_pair = stage.sources
     stage.fades, stage.cost = 0, 0
     jobs = 0
     for source in range(stage.sources):
         old, new = current[source], wanted[source]
-        if old != 0 and new != 0 and not _has_turn(stage, source):
+        if old != 0 and new != 0 and stage.number > 0 and _since_turn(stage, source) > 0:
             new = old
         current[source] = new
         if new == 0 or silent[source] >= convolver.quiet_blocks:
@@ -180,36 +181,35 @@ def _begin(convolver, stage, window) -> None:
         job_source[jobs], job_new[jobs] = source, new
         job_old[jobs] = old if is_fading else 0
         stage.fades += is_fading
-        if stage.number > 0 and _has_turn(stage, source):
-            stage.first_pair = min(stage.first_pair, jobs)
         stage.cost += _transform_ns(stage.size) + _product_ns(stage, source, is_fading) * (stage.size // 8)
         jobs += 1
-    if stage.fades > 0:
-        for n in range(0, 2 * convolver.channels * stage.size, 8):
-            store(stage.surplus, n, broadcast(np.float32(0)))
-    stage.jobs, stage.is_mix_begun = jobs, is_mix_begun
+    stage.jobs = jobs
     stage.cursor, stage.step, stage.cost_done = 0, 0, 0
     if jobs > 0:
         stage.cost += convolver.channels * (2 if stage.fades > 0 else 1) * _transform_ns(stage.size)
+    else:
+        for channel in range(convolver.channels):
+            _clear_column(convolver, stage, channel, window % TURNS)
 
 
 @compiled
-def _has_turn(stage, source) -> bool:
-    """Whether this is the window in which a source is multiplied for two, and may exchange its IR."""
-    return stage.number == 0 or (stage.window + source) % 2 == 0
+def _since_turn(stage, source) -> int:
+    """Windows since the one in which a source was multiplied for this one, too; 0 in that."""
+    return (stage.window + source) % TURNS
 
 
 @compiled
 def _transform_ns(size) -> int:
     """About what a transform takes; only proportions matter."""
-    return size + size // 4
+    return 2 * size
 
 
 @compiled
 def _product_ns(stage, source, is_fading) -> int:
     """About what the products of one tile take."""
-    partitions = stage.partitions if _has_turn(stage, source) else 1
-    return 6 * (3 * partitions if is_fading else partitions)
+    since = _since_turn(stage, source)
+    ns = 10 * (stage.partitions if since == 0 else since)
+    return ns + 20 * stage.partitions if is_fading else ns
 
 
 @compiled
@@ -246,54 +246,89 @@ def _work(convolver, stage, until) -> None:
 
 
 @compiled
+def _recent(stage, source, turn) -> int:
+    """The address of a source's spectrum (tile, part, 8) in the window that was `turn` after its turn."""
+    return stage.recent + 8 * stage.size * (TURNS * source + turn)
+
+
+@compiled
 def _transform(convolver, stage, job) -> None:
-    """The spectrum of a source's window, into its newest slot."""
+    """The spectrum of a source's window, the newest of the recent ones."""
     source = _ints(stage.job_source, stage.sources)[job]
     size, span = stage.size, convolver.history_blocks * convolver.block_size
     history = stage.history + 4 * source * span
     second = (stage.window * size) % span
     first = (second - size) % span
-    scratch = convolver.scratch
     right_angle.forward(
-        history + 4 * first, history + 4 * second, scratch, size, stage.twist, stage.passes, stage.lanes
+        history + 4 * first,
+        history + 4 * second,
+        convolver.scratch,
+        _recent(stage, source, _since_turn(stage, source)),
+        16,
+        8,
+        size,
+        stage.twist,
+        stage.passes,
+        stage.lanes,
     )
-    spectra = stage.spectra + 4 * (source * 2 * size * stage.partitions + 16 * stage.newest)
-    for tile in range(size // 8):
-        store(spectra, tile * stage.partitions * 16, load(scratch, 8 * tile))
-        store(spectra, tile * stage.partitions * 16 + 8, load(scratch, size + 8 * tile))
 
 
 @compiled
 def _multiply(convolver, stage, job, first, last) -> None:
     """Add the products of a source's spectra and filter, tiles `first` to `last`, to the mix."""
+    channels = convolver.channels
     source = _ints(stage.job_source, stage.sources)[job]
     old, new = _ints(stage.job_old, stage.sources)[job], _ints(stage.job_new, stage.sources)[job]
-    spectra = stage.spectra + 4 * source * 2 * stage.size * stage.partitions
-    header = 3 * stage.number
-    count = load_int(new, header + 1) if new != 0 else 0
-    is_first = job == 0 and not stage.is_mix_begun
-    if stage.number > 0 and _has_turn(stage, source):
-        filters = load_int(new, header) if new != 0 else 0
-        products.accumulate_pair(
-            stage, convolver.channels, filters, count, spectra, first, last, is_first, job == stage.first_pair
-        )
+    since, recent, ring = _since_turn(stage, source), _recent(stage, source, 0), _ring(stage, source)
+    filters, count = _partitions(stage, new)
+    if since == 0:
+        newest = _newest(stage, source)
+        products.add_turn(stage, channels, filters, count, recent, ring, newest, first, last)
     else:
-        end = count if stage.number == 0 else min(1, count)
-        products.accumulate(
-            stage, convolver.channels, new, spectra, stage.mix, 0, end, first, last, np.float32(1), is_first
-        )
-    if old == 0 or new == 0:
-        return
-    begin, end = _changed(old, new, header)
-    if begin < end:
-        until = min(end, load_int(old, header + 1))
-        products.accumulate(
-            stage, convolver.channels, old, spectra, stage.surplus, begin, until, first, last, np.float32(1), False
-        )
+        until, column = min(since, count), stage.window % TURNS
+        products.add_near(stage, channels, filters, recent, since, 0, until, column, first, last, np.float32(1))
+    if old != 0 and new != 0:
+        _exchange(stage, channels, source, old, new, first, last)
+
+
+@compiled
+def _exchange(stage, channels, source, old, new, first, last) -> None:
+    """Add what the filter before differs by to the surplus, and have the new one stand for it where it was multiplied
+    in advance."""
+    since, newest = _since_turn(stage, source), _newest(stage, source)
+    recent, ring = _recent(stage, source, 0), _ring(stage, source)
+    begin, end = _changed(old, new, 3 * stage.number)
+    for sign, header in ((np.float32(1), old), (np.float32(-1), new)):
+        filters, count = _partitions(stage, header)
         until = min(end, count)
-        products.accumulate(
-            stage, convolver.channels, new, spectra, stage.surplus, begin, until, first, last, np.float32(-1), False
-        )
+        near, far, column = min(until, since), max(begin, since), products.SURPLUS
+        products.add_near(stage, channels, filters, recent, since, begin, near, column, first, last, sign)
+        slot = newest + far - since
+        products.add_range(stage, channels, filters, count, ring, slot, far, until, column, first, last, sign)
+        for ahead in range(TURNS - since if since > 0 else 0):
+            known, column = max(begin, since + ahead), (stage.window + ahead) % TURNS
+            slot = newest + known - since - ahead
+            products.add_range(stage, channels, filters, count, ring, slot, known, until, column, first, last, -sign)
+
+
+@compiled
+def _ring(stage, source) -> int:
+    """The address of a source's ring of spectra (tile, slot, part, 8)."""
+    return stage.ring + 8 * stage.size * stage.slots * source
+
+
+@compiled
+def _newest(stage, source) -> int:
+    """The slot of what was newest on the source's turn."""
+    return -((stage.window + source) // TURNS * TURNS) % stage.slots
+
+
+@compiled
+def _partitions(stage, header):
+    """The address of a filter's spectra for a stage, and how many partitions they are of; of none at 0."""
+    if header == 0:
+        return 0, 0
+    return load_int(header, 3 * stage.number), load_int(header, 3 * stage.number + 1)
 
 
 @compiled
@@ -313,12 +348,27 @@ def _changed(old: int, new: int, header: int):
 @compiled
 def _synthesise(convolver, stage, channel, out) -> None:
     """The samples of a channel at `out` (size,), faded from the filters before where any were exchanged."""
-    size = stage.size
-    bins = stage.mix + 4 * channel * 2 * size
-    right_angle.inverse(bins, out, size, stage.twist, stage.passes, stage.lanes)
+    _invert_column(convolver, stage, channel, stage.window % TURNS, out)
     if stage.fades > 0:
-        surplus = stage.surplus + 4 * channel * 2 * size
-        right_angle.inverse(surplus, convolver.scratch, size, stage.twist, stage.passes, stage.lanes)
-        for n in range(0, size, 8):
-            faded = multiply_add(load(convolver.scratch, n), load(stage.fade_out, n), load(out, n))
-            store(out, n, faded)
+        faded_from = convolver.scratch + 8 * stage.size
+        _invert_column(convolver, stage, channel, products.SURPLUS, faded_from)
+        for n in range(0, stage.size, 8):
+            store(out, n, multiply_add(load(faded_from, n), load(stage.fade_out, n), load(out, n)))
+
+
+@compiled
+def _invert_column(convolver, stage, channel, column, out) -> None:
+    """The samples (size,) of what is in a column of a channel's mix; zeros are left there, for a window to come."""
+    mix = stage.mix + 4 * products.mixed(convolver.channels, 0, channel, column)
+    step = products.mixed(convolver.channels, 1, 0, 0)
+    right_angle.inverse(mix, step, 8, convolver.scratch, out, stage.size, stage.twist, stage.passes, stage.lanes)
+    _clear_column(convolver, stage, channel, column)
+
+
+@compiled
+def _clear_column(convolver, stage, channel, column) -> None:
+    zero = broadcast(np.float32(0))
+    for tile in range(stage.size // 8):
+        at = products.mixed(convolver.channels, tile, channel, column)
+        store(stage.mix, at, zero)
+        store(stage.mix, at + 8, zero)

@@ -16,8 +16,9 @@ STAGE = np.dtype(
             "passes",
             "lanes",
             "fade_out",  # (size,) float32
-            "spectra",
-            "newest",
+            "slots",
+            "recent",
+            "ring",
             "wanted",  # (source,) int64: filter a source should have
             "silent",  # (source,) int64: blocks of silence it has had
             "current",  # (source,) int64: filter in effect, 0 for none
@@ -32,10 +33,6 @@ STAGE = np.dtype(
             "cost_done",
             "fades",
             "mix",
-            "next_mix",
-            "surplus",
-            "first_pair",  # the first job that adds to `next_mix`
-            "is_mix_begun",
             "output",  # (2, channel, size) float32, heard and being made
             "heard",
             "is_heard",
@@ -44,7 +41,6 @@ STAGE = np.dtype(
     ]
 )
 PROGRESS = (
-    "newest",
     "jobs",
     "window",
     "cursor",
@@ -52,8 +48,6 @@ PROGRESS = (
     "cost",
     "cost_done",
     "fades",
-    "first_pair",
-    "is_mix_begun",
     "heard",
     "is_heard",
     "is_made",
@@ -77,7 +71,7 @@ CONVOLVER = np.dtype(
             "wanted",
             "silent",
             "exchanged",  # (source,) int64: whether its IR was exchanged in this block
-            "scratch",  # (2, size of the largest stage) float32
+            "scratch",  # (3, size of the largest stage) float32
             "has_shared_tail",
             "tail_history",
             "tail_silent",

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy.fft
 
 from server.rendering.fade import raised_cosine
-from server.rendering.partitions import Partitioning, Stage
+from server.rendering.partitions import TURNS, Partitioning, Stage
 
 FloatArray = npt.NDArray[np.float32]
 Spectra = npt.NDArray[np.complex64]
@@ -159,7 +159,7 @@ class _StageState:
         mix, surplus = np.zeros(shape, np.complex64), np.zeros(shape, np.complex64)
         for source, new in enumerate(wanted):
             old = self._current[source]
-            if old is not None and new is not None and self._number > 0 and (window + source) % 2:
+            if old is not None and new is not None and self._number > 0 and (window + source) % TURNS:
                 new = old  # not its turn
             self._current[source] = new
             self.exchanged[source] = sounds[source] and old is not None and old is not new

@@ -1,6 +1,5 @@
 """Impulse responses (IRs) in the layout that the compiled convolver multiplies."""
 
-import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -8,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.simd import LANES, load, store
 from server.acoustics.spares import Spares
 from server.compiled import compiled
 from server.rendering import right_angle
 from server.rendering.partitions import Partitioning
+from server.rendering.products import packed
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -68,8 +67,7 @@ def pack(
             digests.append(like.digests[number])
             continue
         count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
-        shape = stage.size // LANES, count, channels, 2, LANES
-        spectra.append(_SPARES.take(4 * math.prod(shape)).view(np.float32).reshape(shape))  # all of it is written below
+        spectra.append(_SPARES.floats(2 * stage.size * count * channels))  # all of it is written below
         digests.append(all_digests[taken : taken + count])
         header[at : at + _PER_STAGE] = address(spectra[-1]), count, address(digests[-1])
         made, taken = number + 1, taken + count  # those that are taken over come last
@@ -102,7 +100,7 @@ def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digest
     for number in range(len(stages)):
         start, size = stages[number, 0], stages[number, 1]
         twist, passes, lanes = stages[number, 2], stages[number, 3], stages[number, 4]
-        packed, count = header[3 * number], header[3 * number + 1]
+        spectra, count = header[3 * number], header[3 * number + 1]
         for partition in range(count):
             begin = start + partition * size
             end = min(begin + size, samples)
@@ -114,11 +112,10 @@ def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digest
                     padded[end - begin : size] = 0
                     first = padded.ctypes.data
                 digest = _digest(words[channel, begin:end], size, digest)
-                right_angle.forward(first, silence, bins, size, twist, passes, lanes)
-                for tile in range(size // 8):
-                    at = ((tile * count + partition) * channels + channel) * 16
-                    store(packed, at, load(bins, 8 * tile))
-                    store(packed, at + 8, load(bins, size + 8 * tile))
+                at = packed(channels, size // 8, count, 0, partition)
+                step = packed(channels, size // 8, count, 1, partition) - at
+                to = spectra + 4 * (at + 16 * channel)
+                right_angle.forward(first, silence, bins, to, step, 8, size, twist, passes, lanes)
             digests[done] = np.int64(digest)
             done += 1
 

@@ -13,6 +13,11 @@ from functools import cached_property
 _GROWTH = 4
 _STAGES = 3
 SMALLEST_BLOCK = 64
+TURNS = 4
+"""A source's filter is read once in so many windows, and multiplied for all of them (`server.rendering.products`);
+the source's number modulo TURNS says when."""
+NEAR = TURNS - 1
+"""First partitions of a stage, which lie by themselves: they are multiplied in the windows between, too."""
 
 
 @dataclass(frozen=True)
@@ -64,5 +69,6 @@ class Partitioning:
 
     @property
     def quiet_blocks(self) -> int:
-        """Blocks of silence after which no window of any stage holds anything else, and nothing is left to come out."""
-        return max(self.history_blocks, *((stage.partitions + 3) * stage.ticks for stage in self.stages))
+        """Blocks of silence after which no window of any stage holds anything else, turns included, and nothing is left
+        to come out."""
+        return max(self.history_blocks, *((stage.partitions + 2 * TURNS) * stage.ticks for stage in self.stages))

@@ -71,9 +71,8 @@ def transform(samples: FloatArray, twist: FloatArray, passes: FloatArray, lanes:
     size = bins.shape[1]
     first = int(samples.ctypes.data)
     second, to = first + 4 * size, int(bins.ctypes.data)
-    right_angle.forward(
-        first, second, to, size, int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data)
-    )
+    tables = int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data)
+    right_angle.forward(first, second, to, to, 8, size, size, *tables)
 
 
 @compiled
@@ -82,7 +81,8 @@ def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: Fl
     size = mix.shape[1]
     bins = int(mix.ctypes.data)
     to = int(out.ctypes.data)
-    right_angle.inverse(bins, to, size, int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data))
+    tables = int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data)
+    right_angle.inverse(bins, 8, size, bins, to, size, *tables)
 
 
 @compiled

@@ -1,170 +1,154 @@
 """The innermost loops of the compiled convolver: products of spectra and filters, summed over partitions.
 
-`stage` is a STAGE record, and layouts are as in `server.rendering.convolver_kernel`. Sums stay in registers: one pass
-over the partitions per tile of eight bins, in the order in which filter and spectra lie in memory.
+`stage` is a STAGE record, and layouts are as in `server.rendering.convolver_kernel`. Memory is what limits them: it is
+read in order, by few streams at a time, and sums stay in registers.
 """
 
 import numpy as np
 
-from server.acoustics.simd import broadcast, load, load_int, multiply, multiply_add, multiply_subtract, store
+from server.acoustics.simd import broadcast, load, multiply, multiply_add, multiply_subtract, store
 from server.compiled import compiled
+from server.rendering.partitions import NEAR, TURNS
+
+COLUMNS = TURNS + 1
+"""Of a mix: windows, by their number modulo TURNS, and what the IRs that are faded from add to the one at work."""
+SURPLUS = TURNS
 
 
 @compiled
-def accumulate(stage, channels, filters, spectra, mix, begin, end, first, last, sign, is_first) -> None:
-    """Add partitions `begin` to `end`, times `sign`, to a mix; `is_first` starts from zero, not from what is there."""
-    address = load_int(filters, 3 * stage.number) if filters != 0 else 0
-    stride = load_int(filters, 3 * stage.number + 1) if filters != 0 else 0
-    if channels == 2:
-        _accumulate_two(stage, address, stride, spectra, mix, begin, end, first, last, sign, is_first)
-    else:
-        _accumulate_one(stage, address, stride, spectra, mix, begin, end, first, last, sign, is_first)
+def mixed(channels, tile, channel, column) -> int:
+    """Where the real parts of a tile are in a mix; the imaginary ones follow."""
+    return 16 * (COLUMNS * (channels * tile + channel) + column)
 
 
 @compiled
-def _accumulate_two(stage, filters, stride, spectra, mix, begin, end, first, last, sign, is_first) -> None:
-    size, slots = stage.size, stage.partitions
-    zero, factor = broadcast(np.float32(0)), broadcast(sign)
-    start = stage.newest + begin
-    if start >= slots:
-        start -= slots
+def packed(channels, tiles, count, tile, partition) -> int:
+    """Where a tile is in a filter of `count` partitions: real and imaginary parts of the first channel, then of the
+    second."""
+    near = min(NEAR, count)
+    if partition < near:
+        return 16 * channels * (tiles * partition + tile)
+    return 16 * channels * (tiles * near + tile * (count - near) + partition - near)
+
+
+@compiled
+def _multiply_add(re, im, xr, xi, filters, h):
+    """The complex sum of `re` and `im`, and of the product of x and what is in a filter."""
+    hr, hi = load(filters, h), load(filters, h + 8)
+    re, im = multiply_add(xr, hr, re), multiply_add(xr, hi, im)
+    return multiply_subtract(xi, hi, re), multiply_add(xi, hr, im)
+
+
+@compiled
+def _step(near, tiles, channels, count, tile, partition) -> int:
+    """From a tile of a partition to that of the next one."""
+    if partition + 1 == near:
+        return packed(channels, tiles, count, tile, near) - packed(channels, tiles, count, tile, near - 1)
+    return 16 * channels * (tiles if partition + 1 < near else 1)
+
+
+@compiled
+def add_near(stage, channels, filters, recent, newest, begin, end, column, first, last, sign) -> None:
+    """Add partitions `begin` to `end` of the NEAR first ones, times `sign` and a source's `recent` spectra, of which
+    `newest` belongs to partition 0, to a column of the mix."""
+    mix, tiles, factor = stage.mix, stage.size // 8, broadcast(sign)
     for tile in range(first, last):
-        at = 8 * tile
-        lr, li, rr, ri = zero, zero, zero, zero
-        if not is_first:
-            lr, li = load(mix, at), load(mix, size + at)
-            rr, ri = load(mix, 2 * size + at), load(mix, 3 * size + at)
-        slot = start
-        h = 32 * (tile * stride + begin)
-        for _ in range(begin, end):
-            x = 16 * (tile * slots + slot)
-            xr, xi = multiply(load(spectra, x), factor), multiply(load(spectra, x + 8), factor)
-            hr, hi = load(filters, h), load(filters, h + 8)
-            gr, gi = load(filters, h + 16), load(filters, h + 24)
-            lr, li = multiply_add(xr, hr, lr), multiply_add(xr, hi, li)
-            rr, ri = multiply_add(xr, gr, rr), multiply_add(xr, gi, ri)
-            lr, li = multiply_subtract(xi, hi, lr), multiply_add(xi, hr, li)
-            rr, ri = multiply_subtract(xi, gi, rr), multiply_add(xi, gr, ri)
-            h += 32
-            slot += 1
-            if slot == slots:
-                slot = 0
-        store(mix, at, lr)
-        store(mix, size + at, li)
-        store(mix, 2 * size + at, rr)
-        store(mix, 3 * size + at, ri)
+        left, right = mixed(channels, tile, 0, column), mixed(channels, tile, channels - 1, column)
+        lr, li, rr, ri = load(mix, left), load(mix, left + 8), load(mix, right), load(mix, right + 8)
+        for partition in range(begin, end):
+            x, h = 16 * (tiles * (newest - partition) + tile), 16 * channels * (tiles * partition + tile)
+            xr, xi = multiply(load(recent, x), factor), multiply(load(recent, x + 8), factor)
+            lr, li = _multiply_add(lr, li, xr, xi, filters, h)
+            rr, ri = _multiply_add(rr, ri, xr, xi, filters, h + 16 * (channels - 1))
+        store(mix, left, lr)
+        store(mix, left + 8, li)
+        store(mix, right, rr)
+        store(mix, right + 8, ri)
 
 
 @compiled
-def _accumulate_one(stage, filters, stride, spectra, mix, begin, end, first, last, sign, is_first) -> None:
-    size, slots = stage.size, stage.partitions
-    zero, factor = broadcast(np.float32(0)), broadcast(sign)
-    start = stage.newest + begin
-    if start >= slots:
-        start -= slots
+def add_range(stage, channels, filters, count, ring, slot, begin, end, column, first, last, sign) -> None:
+    """Add partitions `begin` to `end` of a filter, times `sign`, to a column of the mix; the first of them times the
+    spectra in a slot of the ring."""
+    mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast(sign)
+    near = min(NEAR, count)
+    start = slot % slots
     for tile in range(first, last):
-        at = 8 * tile
-        re, im = zero, zero
-        if not is_first:
-            re, im = load(mix, at), load(mix, size + at)
+        left, right = mixed(channels, tile, 0, column), mixed(channels, tile, channels - 1, column)
+        lr, li, rr, ri = load(mix, left), load(mix, left + 8), load(mix, right), load(mix, right + 8)
         slot = start
-        h = 16 * (tile * stride + begin)
-        for _ in range(begin, end):
+        h = packed(channels, tiles, count, tile, begin)
+        for partition in range(begin, end):
             x = 16 * (tile * slots + slot)
-            xr, xi = multiply(load(spectra, x), factor), multiply(load(spectra, x + 8), factor)
-            hr, hi = load(filters, h), load(filters, h + 8)
-            re, im = multiply_add(xr, hr, re), multiply_add(xr, hi, im)
-            re, im = multiply_subtract(xi, hi, re), multiply_add(xi, hr, im)
-            h += 16
-            slot += 1
-            if slot == slots:
-                slot = 0
-        store(mix, at, re)
-        store(mix, size + at, im)
+            xr, xi = multiply(load(ring, x), factor), multiply(load(ring, x + 8), factor)
+            lr, li = _multiply_add(lr, li, xr, xi, filters, h)
+            rr, ri = _multiply_add(rr, ri, xr, xi, filters, h + 16 * (channels - 1))
+            h += _step(near, tiles, channels, count, tile, partition)
+            slot = slot + 1 if slot + 1 < slots else 0
+        store(mix, left, lr)
+        store(mix, left + 8, li)
+        store(mix, right, rr)
+        store(mix, right + 8, ri)
 
 
 @compiled
-def accumulate_pair(stage, channels, filters, stride, spectra, first, last, is_first, is_first_pair) -> None:
-    """All partitions into `mix`, and from the second on, with input one window older, into `next_mix`."""
-    if channels == 2:
-        _accumulate_pair_two(stage, filters, stride, spectra, first, last, is_first, is_first_pair)
-    else:
-        _accumulate_pair_one(stage, filters, stride, spectra, first, last, is_first, is_first_pair)
-
-
-@compiled
-def _accumulate_pair_two(stage, filters, stride, spectra, first, last, is_first, is_first_pair) -> None:
-    size, slots, mix, next_mix = stage.size, stage.partitions, stage.mix, stage.next_mix
+def add_turn(stage, channels, filters, count, recent, ring, newest, first, last) -> None:
+    """Put the TURNS newest spectra of a source, which are `recent`, into slots of its ring from `newest` on. Add all
+    partitions of its filter to the mix of the window at work, and to those of the three that follow it what is known of
+    them by now: from the first, second and third partition on."""
+    mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
+    near = min(NEAR, count)
+    other = 16 * COLUMNS * (channels - 1)  # from one channel to the other, which is the same if there is only one
     zero = broadcast(np.float32(0))
     for tile in range(first, last):
-        at = 8 * tile
-        lr, li, rr, ri = zero, zero, zero, zero
-        next_lr, next_li, next_rr, next_ri = zero, zero, zero, zero
-        if not is_first:
-            lr, li = load(mix, at), load(mix, size + at)
-            rr, ri = load(mix, 2 * size + at), load(mix, 3 * size + at)
-        if not is_first_pair:
-            next_lr, next_li = load(next_mix, at), load(next_mix, size + at)
-            next_rr, next_ri = load(next_mix, 2 * size + at), load(next_mix, 3 * size + at)
-        slot = stage.newest
-        h = 32 * tile * stride
-        newer_r, newer_i = zero, zero
-        for _ in range(stride):
+        slot = newest
+        for age in range(TURNS):
+            x, at = 16 * (tile * slots + slot), 16 * (tiles * ((TURNS - age) % TURNS) + tile)
+            store(ring, x, load(recent, at))
+            store(ring, x + 8, load(recent, at + 8))
+            slot = slot + 1 if slot + 1 < slots else 0
+        a = mixed(channels, tile, 0, stage.window % TURNS)
+        b = mixed(channels, tile, 0, (stage.window + 1) % TURNS)
+        c = mixed(channels, tile, 0, (stage.window + 2) % TURNS)
+        d = mixed(channels, tile, 0, (stage.window + 3) % TURNS)
+        lr_a, li_a, lr_b, li_b = load(mix, a), load(mix, a + 8), load(mix, b), load(mix, b + 8)
+        lr_c, li_c, lr_d, li_d = load(mix, c), load(mix, c + 8), load(mix, d), load(mix, d + 8)
+        a, b, c, d = a + other, b + other, c + other, d + other
+        rr_a, ri_a, rr_b, ri_b = load(mix, a), load(mix, a + 8), load(mix, b), load(mix, b + 8)
+        rr_c, ri_c, rr_d, ri_d = load(mix, c), load(mix, c + 8), load(mix, d), load(mix, d + 8)
+        xr_b, xi_b, xr_c, xi_c, xr_d, xi_d = zero, zero, zero, zero, zero, zero
+        slot = newest
+        h = 16 * channels * tile
+        for partition in range(count):
             x = 16 * (tile * slots + slot)
-            xr, xi = load(spectra, x), load(spectra, x + 8)
-            hr, hi = load(filters, h), load(filters, h + 8)
-            lr, li = multiply_add(xr, hr, lr), multiply_add(xr, hi, li)
-            next_lr, next_li = multiply_add(newer_r, hr, next_lr), multiply_add(newer_r, hi, next_li)
-            lr, li = multiply_subtract(xi, hi, lr), multiply_add(xi, hr, li)
-            next_lr, next_li = multiply_subtract(newer_i, hi, next_lr), multiply_add(newer_i, hr, next_li)
-            hr, hi = load(filters, h + 16), load(filters, h + 24)
-            rr, ri = multiply_add(xr, hr, rr), multiply_add(xr, hi, ri)
-            next_rr, next_ri = multiply_add(newer_r, hr, next_rr), multiply_add(newer_r, hi, next_ri)
-            rr, ri = multiply_subtract(xi, hi, rr), multiply_add(xi, hr, ri)
-            next_rr, next_ri = multiply_subtract(newer_i, hi, next_rr), multiply_add(newer_i, hr, next_ri)
-            newer_r, newer_i = xr, xi
-            h += 32
-            slot += 1
-            if slot == slots:
-                slot = 0
-        store(mix, at, lr)
-        store(mix, size + at, li)
-        store(mix, 2 * size + at, rr)
-        store(mix, 3 * size + at, ri)
-        store(next_mix, at, next_lr)
-        store(next_mix, size + at, next_li)
-        store(next_mix, 2 * size + at, next_rr)
-        store(next_mix, 3 * size + at, next_ri)
-
-
-@compiled
-def _accumulate_pair_one(stage, filters, stride, spectra, first, last, is_first, is_first_pair) -> None:
-    size, slots, mix, next_mix = stage.size, stage.partitions, stage.mix, stage.next_mix
-    zero = broadcast(np.float32(0))
-    for tile in range(first, last):
-        at = 8 * tile
-        re, im, next_re, next_im = zero, zero, zero, zero
-        if not is_first:
-            re, im = load(mix, at), load(mix, size + at)
-        if not is_first_pair:
-            next_re, next_im = load(next_mix, at), load(next_mix, size + at)
-        slot = stage.newest
-        h = 16 * tile * stride
-        newer_r, newer_i = zero, zero
-        for _ in range(stride):
-            x = 16 * (tile * slots + slot)
-            xr, xi = load(spectra, x), load(spectra, x + 8)
-            hr, hi = load(filters, h), load(filters, h + 8)
-            re, im = multiply_add(xr, hr, re), multiply_add(xr, hi, im)
-            next_re, next_im = multiply_add(newer_r, hr, next_re), multiply_add(newer_r, hi, next_im)
-            re, im = multiply_subtract(xi, hi, re), multiply_add(xi, hr, im)
-            next_re, next_im = multiply_subtract(newer_i, hi, next_re), multiply_add(newer_i, hr, next_im)
-            newer_r, newer_i = xr, xi
-            h += 16
-            slot += 1
-            if slot == slots:
-                slot = 0
-        store(mix, at, re)
-        store(mix, size + at, im)
-        store(next_mix, at, next_re)
-        store(next_mix, size + at, next_im)
+            xr_a, xi_a = load(ring, x), load(ring, x + 8)
+            lr_a, li_a = _multiply_add(lr_a, li_a, xr_a, xi_a, filters, h)
+            lr_b, li_b = _multiply_add(lr_b, li_b, xr_b, xi_b, filters, h)
+            lr_c, li_c = _multiply_add(lr_c, li_c, xr_c, xi_c, filters, h)
+            lr_d, li_d = _multiply_add(lr_d, li_d, xr_d, xi_d, filters, h)
+            if channels == 2:
+                rr_a, ri_a = _multiply_add(rr_a, ri_a, xr_a, xi_a, filters, h + 16)
+                rr_b, ri_b = _multiply_add(rr_b, ri_b, xr_b, xi_b, filters, h + 16)
+                rr_c, ri_c = _multiply_add(rr_c, ri_c, xr_c, xi_c, filters, h + 16)
+                rr_d, ri_d = _multiply_add(rr_d, ri_d, xr_d, xi_d, filters, h + 16)
+            xr_b, xi_b, xr_c, xi_c, xr_d, xi_d = xr_a, xi_a, xr_b, xi_b, xr_c, xi_c
+            h += _step(near, tiles, channels, count, tile, partition)
+            slot = slot + 1 if slot + 1 < slots else 0
+        if channels == 2:
+            store(mix, a, rr_a)
+            store(mix, a + 8, ri_a)
+            store(mix, b, rr_b)
+            store(mix, b + 8, ri_b)
+            store(mix, c, rr_c)
+            store(mix, c + 8, ri_c)
+            store(mix, d, rr_d)
+            store(mix, d + 8, ri_d)
+        a, b, c, d = a - other, b - other, c - other, d - other
+        store(mix, a, lr_a)
+        store(mix, a + 8, li_a)
+        store(mix, b, lr_b)
+        store(mix, b + 8, li_b)
+        store(mix, c, lr_c)
+        store(mix, c + 8, li_c)
+        store(mix, d, lr_d)
+        store(mix, d + 8, li_d)

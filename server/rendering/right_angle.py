@@ -75,8 +75,24 @@ def _parts(values: npt.NDArray[np.complex128]) -> npt.NDArray[np.float32]:
 
 
 @compiled
-def forward(first: int, second: int, bins: int, size: int, twist: int, passes: int, lanes: int) -> None:
-    """Transform the window whose halves (n,) are at addresses `first` and `second` to `bins` (2, n); all addresses."""
+def forward(
+    first: int,
+    second: int,
+    room: int,
+    to: int,
+    step: int,
+    imaginary: int,
+    size: int,
+    twist: int,
+    passes: int,
+    lanes: int,
+) -> None:
+    """Transform the window whose halves (n,) are at addresses `first` and `second`; all arrays are addresses.
+
+    Real parts go, eight at a time, to every `step`-th float32 from `to` on, and imaginary ones `imaginary` behind them.
+    `room` (2, n) may be the same place, where eight follow on eight: step 8, imaginary n.
+    """
+    bins = room
     vectors = size // 8
     if is_odd_power(vectors):
         half = size // 2
@@ -94,12 +110,12 @@ def forward(first: int, second: int, bins: int, size: int, twist: int, passes: i
             store(bins, size + n, im)
         transform_lanes(bins, vectors, passes)
     for at in range(0, size, 64):
-        re, im = _load_8(bins, at), _load_8(bins, size + at)
-        cos, sin = _load_8(lanes, at), _load_8(lanes, size + at)
+        re, im = _load_8(bins, at, 8), _load_8(bins, size + at, 8)
+        cos, sin = _load_8(lanes, at, 8), _load_8(lanes, size + at, 8)
         re, im = _multiply_8(re, im, cos, sin)
         re, im = _eight_points(transpose(re), transpose(im))
-        _store_8(bins, at, re)
-        _store_8(bins, size + at, im)
+        _store_8(to, at // 8 * step, step, re)
+        _store_8(to, imaginary + at // 8 * step, step, im)
 
 
 @compiled
@@ -110,16 +126,29 @@ def _twisted(first, second, n, size, twist):
 
 
 @compiled
-def inverse(bins: int, out: int, size: int, twist: int, passes: int, lanes: int) -> None:
-    """Write the second half (n,) of the window, the half overlap-save keeps, to `out`; the bins are used up."""
+def inverse(
+    spectrum: int,
+    step: int,
+    imaginary: int,
+    room: int,
+    out: int,
+    size: int,
+    twist: int,
+    passes: int,
+    lanes: int,
+) -> None:
+    """Write the second half (n,) of the window, the half overlap-save keeps, to `out`. A spectrum lies as `forward`
+    leaves it; in `room` (2, n), which may be the same place, bins are used up."""
     vectors = size // 8
+    bins = room
     for at in range(0, size, 64):
-        im, re = _eight_points(_load_8(bins, size + at), _load_8(bins, at))  # parts swapped: the inverse
+        im, re = _load_8(spectrum, imaginary + at // 8 * step, step), _load_8(spectrum, at // 8 * step, step)
+        im, re = _eight_points(im, re)  # parts swapped: the inverse
         re, im = transpose(re), transpose(im)
-        cos, sin = _load_8(lanes, at), _load_8(lanes, size + at)
+        cos, sin = _load_8(lanes, at, 8), _load_8(lanes, size + at, 8)
         re, im = _multiply_conjugate_8(re, im, cos, sin)
-        _store_8(bins, at, re)
-        _store_8(bins, size + at, im)
+        _store_8(bins, at, 8, re)
+        _store_8(bins, size + at, 8, im)
     largest = first_span(vectors)
     is_odd = 4 * largest != vectors
     span = 1
@@ -177,29 +206,29 @@ def _untwist(re, im, n, size, twist, scale, out) -> None:
 
 
 @compiled
-def _load_8(address: int, index: int) -> Any:
+def _load_8(address: int, index: int, step: int) -> Any:
     return (
         load(address, index),
-        load(address, index + 8),
-        load(address, index + 16),
-        load(address, index + 24),
-        load(address, index + 32),
-        load(address, index + 40),
-        load(address, index + 48),
-        load(address, index + 56),
+        load(address, index + step),
+        load(address, index + 2 * step),
+        load(address, index + 3 * step),
+        load(address, index + 4 * step),
+        load(address, index + 5 * step),
+        load(address, index + 6 * step),
+        load(address, index + 7 * step),
     )
 
 
 @compiled
-def _store_8(address: int, index: int, rows: Any) -> None:
+def _store_8(address: int, index: int, step: int, rows: Any) -> None:
     store(address, index, rows[0])
-    store(address, index + 8, rows[1])
-    store(address, index + 16, rows[2])
-    store(address, index + 24, rows[3])
-    store(address, index + 32, rows[4])
-    store(address, index + 40, rows[5])
-    store(address, index + 48, rows[6])
-    store(address, index + 56, rows[7])
+    store(address, index + step, rows[1])
+    store(address, index + 2 * step, rows[2])
+    store(address, index + 3 * step, rows[3])
+    store(address, index + 4 * step, rows[4])
+    store(address, index + 5 * step, rows[5])
+    store(address, index + 6 * step, rows[6])
+    store(address, index + 7 * step, rows[7])
 
 
 @compiled

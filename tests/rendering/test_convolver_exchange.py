@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from server.rendering.convolver import Convolver
 from server.rendering.fade import raised_cosine
-from server.rendering.partitions import Partitioning
+from server.rendering.partitions import TURNS, Partitioning
 from tests.rendering.streams import BOTH_KINDS, SAMPLE_RATE, convolve, decaying_ir, error_db, noise, stream
 
 pytestmark = BOTH_KINDS
@@ -17,7 +17,7 @@ def expected_with_exchanges(dry, schedule, partitioning):
     """Oracle of exchanges: every stage convolves by itself, and crossfades windows of its output.
 
     `schedule[source]` lists (block, ir). Window w of a stage is full after its last block; the IR wanted then is the
-    one its output is made with, but for later stages, where even and odd sources take turns to change.
+    one its output is made with, but for later stages, where sources change on their turns, one window in TURNS.
     """
     blocks = dry.shape[1] // partitioning.block_size
     expected = np.zeros((2, dry.shape[1]))
@@ -40,7 +40,7 @@ def expected_with_exchanges(dry, schedule, partitioning):
                 if expected[:, span].size == 0:
                     continue
                 fade = raised_cosine(stage.size)[: expected[:, span].shape[1]]
-                may_change = stage.start == 0 or (window + source) % 2 == 0
+                may_change = stage.start == 0 or (window + source) % TURNS == 0
                 new = wanted[-1] if current is None or may_change else current
                 old = new if current is None else current
                 expected[:, span] += (1 - fade) * heard(old)[:, span] + fade * heard(new)[:, span]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server.rendering.convolver import Convolver
-from server.rendering.partitions import Partitioning
+from server.rendering.partitions import TURNS, Partitioning
 from tests.rendering.streams import BOTH_KINDS, convolve, decaying_ir, error_db, noise, stream
 
 pytestmark = BOTH_KINDS
@@ -119,7 +119,7 @@ def test_sources_join_and_leave_without_touching_the_others(is_compiled, seed):
     assert error_db(np.concatenate(wet, axis=1), expected) < -120
 
 
-@pytest.mark.parametrize("cleared_at", range(32, 48))
+@pytest.mark.parametrize("cleared_at", range(64, 80))
 def test_a_source_cleared_while_it_fades_touches_no_other(is_compiled, cleared_at):
     """At every block of a window of the last stage in which its IR is being exchanged, and with it what that costs."""
     size, samples = 64, 12_000
@@ -136,7 +136,8 @@ def test_a_source_cleared_while_it_fades_touches_no_other(is_compiled, cleared_a
         if block == cleared_at:
             convolver.clear(1)
         wet.append(convolver.process(dry[:, block * size : (block + 1) * size]))
-    gone = (cleared_at + 48) * size  # what the source had in work by then has come out
+    # What the source had in work by then, and was multiplied in advance for, has come out.
+    gone = (cleared_at + 16 * (TURNS + 2)) * size
     expected = convolve(dry[0], irs[2])
     assert error_db(np.concatenate(wet, axis=1)[:, gone:], expected[:, gone:]) < -115
 

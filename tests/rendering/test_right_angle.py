@@ -20,6 +20,9 @@ def transform(window):
         address(window),
         address(window) + 4 * size,
         address(bins),
+        address(bins),
+        8,
+        size,
         size,
         address(tables.twist),
         address(tables.passes),
@@ -33,7 +36,15 @@ def second_half(bins):
     tables = right_angle.tables(size)
     out = np.zeros(size, np.float32)
     right_angle.inverse(
-        address(bins), address(out), size, address(tables.twist), address(tables.passes), address(tables.lanes)
+        address(bins),
+        8,
+        size,
+        address(bins),
+        address(out),
+        size,
+        address(tables.twist),
+        address(tables.passes),
+        address(tables.lanes),
     )
     return out
 

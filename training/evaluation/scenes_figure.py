@@ -17,9 +17,9 @@ from training.evaluation.scenes import NAF, NAF_WHOLE, NEAREST, SceneResult
 _DEFAULT = "default level"
 _STYLES = {
     NAF_WHOLE: ("v", "#edae49", "the paper's network, whole responses (naf-whole)"),
-    NAF: ("^", "#d1495b", "what follows geometry by the same network (naf)"),
-    NEAREST: ("s", "#66a182", "nearest training pair"),
-    ONE_SIMULATION: ("x", "#8d6a9f", "another simulation of the pair"),
+    NAF: ("^", "#d1495b", "the same network, reflected sound (naf)"),
+    NEAREST: ("s", "#66a182", "nearest pair"),
+    ONE_SIMULATION: ("x", "#8d6a9f", "one simulation"),
     _DEFAULT: ("o", "#0b6e99", "default level"),
 }
 """Marker, colour and label; the last is drawn on top."""

@@ -123,7 +123,7 @@ def test_errors_are_drawn_in_units_of_the_floor(result, tmp_path):
         return next(line.get_ydata() for line in panels[title].lines if str(line.get_label()).startswith(label))
 
     assert_array_equal(drawn("C50", "default level"), [2.0, 2.0])
-    assert_array_equal(drawn("EDT", "what follows"), [1.5, 1.5])
+    assert_array_equal(drawn("EDT", "the same network"), [1.5, 1.5])
     assert_array_equal(drawn("T60", "nearest"), [np.nan, np.nan])
     assert [text.get_text() for text in panels["ITD"].get_xticklabels()] == ["flat", "hut"]
     draw_scenes(results, tmp_path / "scenes.png")
