@@ -40,6 +40,12 @@ def _multiply_add(re, im, xr, xi, filters, h):
 
 
 @compiled
+def _keep(mix, at, re, im) -> None:
+    store(mix, at, re)
+    store(mix, at + 8, im)
+
+
+@compiled
 def _step(near, tiles, channels, count, tile, partition) -> int:
     """From a tile of a partition to that of the next one."""
     if partition + 1 == near:
@@ -60,10 +66,8 @@ def add_near(stage, channels, filters, recent, newest, begin, end, column, first
             xr, xi = multiply(load(recent, x), factor), multiply(load(recent, x + 8), factor)
             lr, li = _multiply_add(lr, li, xr, xi, filters, h)
             rr, ri = _multiply_add(rr, ri, xr, xi, filters, h + 16 * (channels - 1))
-        store(mix, left, lr)
-        store(mix, left + 8, li)
-        store(mix, right, rr)
-        store(mix, right + 8, ri)
+        _keep(mix, left, lr, li)
+        _keep(mix, right, rr, ri)
 
 
 @compiled
@@ -85,10 +89,8 @@ def add_range(stage, channels, filters, count, ring, slot, begin, end, column, f
             rr, ri = _multiply_add(rr, ri, xr, xi, filters, h + 16 * (channels - 1))
             h += _step(near, tiles, channels, count, tile, partition)
             slot = slot + 1 if slot + 1 < slots else 0
-        store(mix, left, lr)
-        store(mix, left + 8, li)
-        store(mix, right, rr)
-        store(mix, right + 8, ri)
+        _keep(mix, left, lr, li)
+        _keep(mix, right, rr, ri)
 
 
 @compiled
@@ -135,20 +137,12 @@ def add_turn(stage, channels, filters, count, recent, ring, newest, first, last)
             h += _step(near, tiles, channels, count, tile, partition)
             slot = slot + 1 if slot + 1 < slots else 0
         if channels == 2:
-            store(mix, a, rr_a)
-            store(mix, a + 8, ri_a)
-            store(mix, b, rr_b)
-            store(mix, b + 8, ri_b)
-            store(mix, c, rr_c)
-            store(mix, c + 8, ri_c)
-            store(mix, d, rr_d)
-            store(mix, d + 8, ri_d)
+            _keep(mix, a, rr_a, ri_a)
+            _keep(mix, b, rr_b, ri_b)
+            _keep(mix, c, rr_c, ri_c)
+            _keep(mix, d, rr_d, ri_d)
         a, b, c, d = a - other, b - other, c - other, d - other
-        store(mix, a, lr_a)
-        store(mix, a + 8, li_a)
-        store(mix, b, lr_b)
-        store(mix, b + 8, li_b)
-        store(mix, c, lr_c)
-        store(mix, c + 8, li_c)
-        store(mix, d, lr_d)
-        store(mix, d + 8, li_d)
+        _keep(mix, a, lr_a, li_a)
+        _keep(mix, b, lr_b, li_b)
+        _keep(mix, c, lr_c, li_c)
+        _keep(mix, d, lr_d, li_d)

@@ -78,7 +78,7 @@ def _parts(values: npt.NDArray[np.complex128]) -> npt.NDArray[np.float32]:
 def forward(
     first: int,
     second: int,
-    room: int,
+    bins: int,
     to: int,
     step: int,
     imaginary: int,
@@ -90,9 +90,8 @@ def forward(
     """Transform the window whose halves (n,) are at addresses `first` and `second`; all arrays are addresses.
 
     Real parts go, eight at a time, to every `step`-th float32 from `to` on, and imaginary ones `imaginary` behind them.
-    `room` (2, n) may be the same place, where eight follow on eight: step 8, imaginary n.
+    `bins` (2, n), room for them, may be the same place, where eight follow on eight: step 8, imaginary n.
     """
-    bins = room
     vectors = size // 8
     if is_odd_power(vectors):
         half = size // 2
@@ -130,7 +129,7 @@ def inverse(
     spectrum: int,
     step: int,
     imaginary: int,
-    room: int,
+    bins: int,
     out: int,
     size: int,
     twist: int,
@@ -138,9 +137,8 @@ def inverse(
     lanes: int,
 ) -> None:
     """Write the second half (n,) of the window, the half overlap-save keeps, to `out`. A spectrum lies as `forward`
-    leaves it; in `room` (2, n), which may be the same place, bins are used up."""
+    leaves it; `bins` (2, n), room for it, may be the same place, and are used up."""
     vectors = size // 8
-    bins = room
     for at in range(0, size, 64):
         im, re = _load_8(spectrum, imaginary + at // 8 * step, step), _load_8(spectrum, at // 8 * step, step)
         im, re = _eight_points(im, re)  # parts swapped: the inverse
