@@ -24,9 +24,8 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
-from contextlib import contextmanager
 
 from server.load import PERIOD_S, LoadControl, Reason
 from server.priority import become_real_time
@@ -42,6 +41,7 @@ _PRESUMED_LOAD = 0.02
 _SWITCH_S = 0.0005
 """How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, one that is busy
 half of the time holds audio up for longer than blocks last."""
+_FAILED = "a stream failed and is closed"
 _logger = logging.getLogger(__name__)
 
 Post = Callable[[Callable[[], None]], object]
@@ -176,12 +176,15 @@ class AudioThread:
             is_due = stream.due_s <= now_s + _EARLY_S
             if not is_due and not stream.has_news:
                 continue
-            with self._failing_alone(stream, made):
+            try:
                 made[stream] = stream.take_in(self._workers)
                 if is_due:
                     began_s = self._time_s()
                     stream.session.begin_block()
                     due[stream] = self._time_s() - began_s
+            except Exception:
+                _logger.exception(_FAILED)
+                self._fail(stream, made)
         if due:
             self._render(due, made)
             self._busy_s += self._time_s() - now_s
@@ -209,8 +212,11 @@ class AudioThread:
         now_s = self._time_s()
         share_s = (now_s - began_s) / len(due)
         for (stream, cost_s), clock, samples in zip(due.items(), clocks, blocks, strict=True):
-            with self._failing_alone(stream, made):
+            try:
                 made[stream] += stream.finish_block(clock, samples, cost_s=cost_s + share_s, now_s=now_s)
+            except Exception:
+                _logger.exception(_FAILED)
+                self._fail(stream, made)
 
     def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
         """Have streams step down or up, and IRs take no more than their share."""
@@ -225,16 +231,8 @@ class AudioThread:
         for stream in self._streams:
             stream.ration_irs(streams=len(self._streams), share=self._ir_share)
 
-    @contextmanager
-    def _failing_alone(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> Iterator[None]:
-        """The boundary between streams: one that breaks leaves the others sounding."""
-        try:
-            yield
-        except Exception:
-            _logger.exception("a stream failed and is closed")
-            self._fail(stream, made)
-
     def _fail(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> None:
+        """The boundary between streams: one that breaks leaves the others sounding."""
         del self._streams[stream]
         made.setdefault(stream, []).append(StreamFailed())
 

@@ -24,7 +24,7 @@ def _encode(samples: FloatArray, encoding: Encoding) -> bytes:
     """In C order."""
     if encoding == "s16":
         return np.rint(np.clip(samples, -1, 1) * _FULL_SCALE).astype("<i2").tobytes()
-    return samples.astype("<f4").tobytes()
+    return samples.astype("<f4", copy=False).tobytes()
 
 
 def _decode(data: bytes, encoding: Encoding, offset: int) -> FloatArray:
@@ -34,7 +34,7 @@ def _decode(data: bytes, encoding: Encoding, offset: int) -> FloatArray:
     return np.frombuffer(data, "<f4", offset=offset).astype(np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class AudioBlock:
     """One block of audio: `samples` (channel, frame).
 
@@ -73,7 +73,10 @@ class AudioBlock:
     def serialize(self, encoding: Encoding) -> bytes:
         """By LAYOUT."""
         channels, frames = self.samples.shape
-        flags = sum(bit * getattr(self, name) for name, bit in self.FLAGS.items())
+        flags = 0
+        for name, bit in self.FLAGS.items():
+            if getattr(self, name):
+                flags |= bit
         poses = self.pose_id, self.reverberation_pose_id
         header = self.LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
         return header + _encode(self.samples.T, encoding)

@@ -7,6 +7,7 @@ _SHORTEST_S = 1e-6
 _PER_OCTAVE = 16
 _OCTAVES = 26
 """Up to a minute."""
+_BINS = _OCTAVES * _PER_OCTAVE
 
 
 class DurationHistogram:
@@ -16,11 +17,11 @@ class DurationHistogram:
     def __init__(self) -> None:
         self.count = 0
         self.total_s = 0.0
-        self._bins = [0] * (_OCTAVES * _PER_OCTAVE)
+        self._bins = [0] * _BINS
 
     def add(self, duration_s: float) -> None:
-        place = int(math.log2(max(duration_s, _SHORTEST_S) / _SHORTEST_S) * _PER_OCTAVE)
-        self._bins[min(place, len(self._bins) - 1)] += 1
+        place = int(math.log2(duration_s / _SHORTEST_S) * _PER_OCTAVE) if duration_s > _SHORTEST_S else 0
+        self._bins[place if place < _BINS else _BINS - 1] += 1
         self.count += 1
         self.total_s += duration_s
 

@@ -252,9 +252,10 @@ class Session:
     def begin_block(self) -> None:
         """Have the direct paths of the next block follow the newest poses."""
         displaced = {name: emitter for name, emitter in self._emitters.items() if emitter.is_displaced}
-        self._direct_sound.aim(self.renderer, self._listener, displaced)
-        for emitter in displaced.values():
-            emitter.is_displaced = False
+        if displaced:
+            self._direct_sound.aim(self.renderer, self._listener, displaced)
+            for emitter in displaced.values():
+                emitter.is_displaced = False
         self.renderer.set_orientation(self._listener.orientation)
         self._followed_pose_id = self._responses.newest_pose_id
 
@@ -264,9 +265,9 @@ class Session:
 
         A block that is not sent was rendered all the same: clips and reverberation keep their place on the clock.
         """
-        is_exchange = self.renderer.exchanged
+        is_exchange, is_limited = self.renderer.exchanged, self.renderer.is_limited
         self.ir_exchanges += is_exchange
-        self.blocks_limited += self.renderer.is_limited
+        self.blocks_limited += is_limited
         self._responses.follow_renderer()
         if not self.window.is_open:
             self.blocks_dropped += 1
@@ -278,7 +279,7 @@ class Session:
             reverberation_pose_id=self._responses.applied_pose_id,
             samples=samples,
             is_exchange=is_exchange,
-            is_limited=self.renderer.is_limited,
+            is_limited=is_limited,
         )
 
     def render_block(self) -> AudioBlock | None:

@@ -33,7 +33,7 @@ _COST_SMOOTHING = 0.2
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class TimedBlock:
     """A block on its way out; after `deadline_s` of the audio engine's clock it is late."""
 
@@ -205,8 +205,9 @@ class Stream:
         """Pass on the block just rendered, which took `cost_s` and is ready `now_s`."""
         outgoing: list[Outgoing] = []
         block = self.session.finish_block(sample_clock, samples)
+        clock = self.clock
         if block is not None:
-            outgoing.append(TimedBlock(block, self.clock.deadline_s(self.next_block)))
+            outgoing.append(TimedBlock(block, clock.deadline_s(self.next_block)))
             self.pose_times.take_effect(block.pose_id, now_s)
             self.reverberation_times.take_effect(block.reverberation_pose_id, now_s)
         self.load += _LOAD_SMOOTHING * (cost_s / self.block_s - self.load)
@@ -216,10 +217,10 @@ class Stream:
             self.latenesses.add(lateness_s)
             if lateness_s > self._worst_lateness_s:
                 self._worst_lateness_s = lateness_s
-        if self.clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
-            self.clock.slip(self.next_block, now_s)
+        if clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
+            clock.slip(self.next_block, now_s)
         self.next_block += 1
-        self.due_s = self.clock.due_s(self.next_block)
+        self.due_s = clock.due_s(self.next_block)
         if self.next_block * self.block_s >= self._next_status_s:
             self._next_status_s += 1.0
             outgoing += self.session.complaints()

@@ -273,7 +273,7 @@ class Connection:
         block = timed.block
         if self._time_s() > timed.deadline_s:
             stream.blocks_late += 1
-            block = dataclasses.replace(block, is_late=True)
+            block.is_late = True
         await self._websocket.send_bytes(block.serialize(hello.encoding))
 
     async def _send_message(self, message: ServerMessage) -> None:

@@ -15,11 +15,15 @@ be the wrong place to find out.
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from server.compiled import HAS_NUMBA, compiled
+
+if HAS_NUMBA:
+    from server.rendering.by_reference import Reference
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
@@ -50,66 +54,78 @@ def _interpolators() -> FloatArray:
     return np.asarray(rows / rows.sum(axis=-1, keepdims=True), np.float32)
 
 
+class LimiterState(NamedTuple):
+    """Everything that `limit` reads and writes."""
+
+    signal: FloatArray  # (channel, the last of the block before, and room for a block)
+    table: FloatArray  # (phase, tap)
+    peak: FloatArray  # (sample,)
+    gain: DoubleArray  # at the ends of steps
+    held: IntArray  # (1,) steps since a peak asked for a gain
+    counts: IntArray  # (2,) whether the block last processed was changed; samples silenced so far
+    ceiling: float
+    safe: float
+    keep: float
+    hold: int
+
+
 class Limiter:
-    """Of blocks (channels, block_size), whose size is a multiple of 16."""
+    """Of blocks (channels, block_size), whose size is a multiple of 16. `state` is for compiled code to hand on."""
 
     def __init__(self, *, channels: int, block_size: int, sample_rate: int, ceiling: float = CEILING) -> None:
         if block_size % _STEP or not 0 < ceiling < math.inf:
             raise ValueError(f"blocks are multiples of {_STEP} samples, and a ceiling is above 0 and finite")
-        self._ceiling = np.float32(ceiling)
-        self._table = _interpolators()
-        # Up to here no signal reaches the ceiling between samples, whatever its phases.
-        self._safe = np.float32(ceiling / np.abs(self._table).sum(axis=-1).max())
-        self._keep = math.exp(-_STEP / (_RELEASE_S * sample_rate))
-        self._hold = round(_HOLD_S * sample_rate / _STEP)
-        self._signal = np.zeros((channels, _TAPS - 1 + block_size), np.float32)
-        self._peak = np.zeros(block_size, np.float32)
-        # In double precision: in single, the last of a slow release is lost to rounding, and it never ends.
-        self._gain = np.ones(block_size // _STEP + 1)
-        self._held = np.zeros(1, np.int64)
-        self.reset()
+        table = _interpolators()
+        state = LimiterState(
+            signal=np.zeros((channels, _TAPS - 1 + block_size), np.float32),
+            table=table,
+            peak=np.zeros(block_size, np.float32),
+            # In double precision: in single, the last of a slow release is lost to rounding, and it never ends.
+            gain=np.ones(block_size // _STEP + 1),
+            held=np.zeros(1, np.int64),
+            counts=np.zeros(2, np.int64),
+            ceiling=float(np.float32(ceiling)),
+            # Up to here no signal reaches the ceiling between samples, whatever its phases.
+            safe=float(np.float32(ceiling / np.abs(table).sum(axis=-1).max())),
+            keep=math.exp(-_STEP / (_RELEASE_S * sample_rate)),
+            hold=round(_HOLD_S * sample_rate / _STEP),
+        )
+        self._arrays = state
+        self.state: Any = Reference(state) if HAS_NUMBA else state
 
     def reset(self) -> None:
         """Forget what was heard before."""
-        self._signal.fill(0)
-        self._gain.fill(1)
-        self._held.fill(0)
-        self.acted = False
+        for array in (self._arrays.signal, self._arrays.held, self._arrays.counts):
+            array.fill(0)
+        self._arrays.gain.fill(1)
+
+    @property
+    def acted(self) -> bool:
         """Whether the block last processed was changed."""
-        self.samples_silenced = 0
+        return bool(self._arrays.counts[0])
+
+    @property
+    def samples_silenced(self) -> int:
         """Since the beginning, because they were not finite."""
+        return int(self._arrays.counts[1])
 
     def process(self, block: FloatArray) -> None:
         """Limit a block in place."""
-        is_limited, silenced = _limit(
-            block,
-            self._signal,
-            self._table,
-            self._ceiling,
-            self._safe,
-            self._keep,
-            self._hold,
-            self._peak,
-            self._gain,
-            self._held,
-        )
-        self.acted = bool(is_limited or silenced)
-        self.samples_silenced += silenced
+        limit(self.state, block)
 
 
 @compiled
-def _limit(
-    block: FloatArray,
-    signal: FloatArray,  # (channel, the last of the block before, and room for a block)
-    table: FloatArray,
-    ceiling: np.float32,
-    safe: np.float32,
-    keep: float,
-    hold: int,
-    peak: FloatArray,
-    gain: DoubleArray,  # at the ends of steps
-    held: IntArray,  # (1,) steps since a peak asked for a gain
-) -> tuple[bool, int]:
+def limit(state: LimiterState, block: FloatArray) -> None:
+    """Limit a block (channel, block_size) in place."""
+    is_changed, silenced = _limit(state, block, np.float32(state.ceiling), np.float32(state.safe))
+    state.counts[0] = is_changed or silenced > 0
+    state.counts[1] += silenced
+
+
+@compiled
+def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np.float32) -> tuple[bool, int]:
+    """Whether it would have been too loud, and how many samples were silenced."""
+    signal, peak, gain = state.signal, state.peak, state.gain
     channels, size = block.shape
     before = signal.shape[1] - size
     silenced = 0
@@ -120,7 +136,7 @@ def _limit(
     gain[0] = gain[-1]
     if is_loud:
         signal[:, before:] = block
-        _find_peaks(signal, table, peak)
+        _find_peaks(signal, state.table, peak)
         is_loud = bool(np.max(peak) > ceiling)
     for channel in range(channels):
         signal[channel, :before] = block[channel, size - before :]
@@ -128,7 +144,7 @@ def _limit(
         return False, silenced
     if not is_loud:
         peak[:] = 0
-    _follow(peak, ceiling, keep, hold, gain, held)
+    _follow(peak, ceiling, state.keep, state.hold, gain, state.held)
     rise = np.arange(1, _STEP + 1) / _STEP
     for step in range(gain.size - 1):
         at = step * _STEP

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import Quaternion
-from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
+from server.rendering.convolver import Convolver, PartitionedIr
 from server.rendering.direct_path import DirectPath
 from server.rendering.mixing import Mixer
 
@@ -138,18 +138,6 @@ class MixerSet:
         if is_hushed := (mixer, slot) in self._hushed:
             self._hushed.remove((mixer, slot))
         return is_hushed
-
-    def output(self, channels: int) -> FloatArray:
-        """The sum of the block just mixed (channels, block_size). One ear without a head is as good as either of two; a
-        head's two make one by their mean."""
-        if len(self._mixers) == 1:
-            (mixer,) = self._mixers.values()
-            if mixer.channels == channels:
-                return mixer.output.copy()
-        block = np.zeros((channels, self._block_size), np.float32)
-        for mixer in self:
-            block += mixer.output if mixer.channels <= channels else mixer.output.mean(axis=0)
-        return block
 
     def let_go(self, heard: set[Mixer], sending: set[Mixer]) -> None:
         """After a block, of slots and IRs that have rung out; of mixers but those `heard`, through which there are

@@ -1,13 +1,11 @@
-"""One block of many mixers in one call: gains, direct paths and convolution, without the interpreter's lock.
+"""One listener's sound in so many channels: gains, direct paths and convolution, mixed in compiled code
+(`server.rendering.mixing_kernel`) or, without a compiler, here.
 
-A `Mixer` holds the arrays of one listener's sound in so many channels. Slots are rows: what an emitter plays lies in
-`dry` (slot, block), is scaled by its gain for the direct path, and by its send besides for the convolver. Both reach
-what is wanted by the end of a block, along a raised cosine.
+Slots are rows: what an emitter plays lies in `dry` (slot, block), is scaled by its gain for the direct path, and by its
+send besides for the convolver. Both reach what is wanted by the end of a block, along a raised cosine.
 
 What nothing is sent to is not there: a mixer without a convolver has none and pays for none.
 """
-
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from server.rendering.sources import ClipPlayer, Source
 
 if HAS_NUMBA:
     from server.rendering.by_reference import Reference
-    from server.rendering.mixing_kernel import enter_convolver, mixing_with, record_of
+    from server.rendering.mixing_kernel import enter_convolver, record_of
 
 
 class Mixer:
@@ -129,25 +127,8 @@ class Mixer:
         self._followed.clear()
 
 
-def mix_all(mixers: Sequence[Mixer]) -> None:
-    """The next block of each, in its `output`."""
-    for mixer in mixers:
-        mixer.fill()
-    for mixer in mixers:
-        mixer.follow()
-    if HAS_NUMBA:
-        like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
-        mix = mixing_with(None if like is None else like.kind)
-        mix(np.array([mixer.address for mixer in mixers], np.int64), like)
-        for mixer in mixers:
-            if mixer.convolver is not None:
-                mixer.convolver.release()
-        return
-    for mixer in mixers:
-        _mix(mixer)
-
-
-def _mix(mixer: Mixer) -> None:
+def mix(mixer: Mixer) -> None:
+    """The next block, in its `output`, without a compiler."""
     plays = mixer.plays.astype(bool)
     mixer.dry[~plays] = 0
     mixer.dry *= _ramp(mixer.gain, mixer.fade_in)

@@ -1,19 +1,16 @@
 """The compiled part of `server.rendering.mixing`."""
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import carray, types
+from numba import carray
 
 from server.acoustics.simd import broadcast, load, multiply, multiply_add, pointer, store
 from server.compiled import compiled
-from server.rendering.by_reference import Reference, ReferenceType, reference_at
+from server.rendering.by_reference import Reference, reference_at
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
-from server.rendering.flush_to_zero import flush_to_zero, restore
 
 MIXER = np.dtype(
     [
@@ -42,34 +39,22 @@ MIXER = np.dtype(
 
 
 @compiled
-def mix_mixers(addresses: npt.NDArray[np.int64], like: Reference | None) -> None:
-    """One block of every renderer, each a MIXER record at its address. `like` refers to any direct path's state, or is
-    None where none of them has one."""
-    mode = flush_to_zero()
-    for number in range(addresses.size):
-        mixer = carray(pointer(addresses[number]), (1,), MIXER)[0]
-        _play(mixer)
-        _scale(mixer)
-        if mixer.convolver != 0:
-            process_convolver(mixer.convolver)
-            for n in range(0, mixer.channels * mixer.block_size, 8):
-                store(mixer.output, n, load(mixer.convolver_output, n))
-        else:
-            for n in range(0, mixer.channels * mixer.block_size, 8):
-                store(mixer.output, n, broadcast(np.float32(0)))
-        if like is not None and mixer.direct != 0:
-            blocks = carray(pointer(mixer.dry), (mixer.slots, mixer.block_size), np.float32)
-            output = carray(pointer(mixer.output), (mixer.channels, mixer.block_size), np.float32)
-            render_direct_paths(reference_at(mixer.direct, like), blocks, output)
-    restore(mode)
-
-
-@cache
-def mixing_with(kind: ReferenceType | None) -> Callable[[npt.NDArray[np.int64], Reference | None], None]:
-    """`mix_mixers` for references of one kind, which numba, called without, finds out in Python with every call."""
-    signature = types.Array(types.int64, 1, "C"), types.none if kind is None else kind
-    mix_mixers.compile(signature)  # type: ignore[attr-defined]
-    return mix_mixers.get_overload(signature)  # type: ignore[attr-defined]
+def mix(mixer, like: Reference | None) -> None:
+    """One block of what a MIXER record describes. `like` refers to any direct path's state, or is None where none has
+    one."""
+    _play(mixer)
+    _scale(mixer)
+    if mixer.convolver != 0:
+        process_convolver(mixer.convolver)
+        for n in range(0, mixer.channels * mixer.block_size, 8):
+            store(mixer.output, n, load(mixer.convolver_output, n))
+    else:
+        for n in range(0, mixer.channels * mixer.block_size, 8):
+            store(mixer.output, n, broadcast(np.float32(0)))
+    if like is not None and mixer.direct != 0:
+        blocks = carray(pointer(mixer.dry), (mixer.slots, mixer.block_size), np.float32)
+        output = carray(pointer(mixer.output), (mixer.channels, mixer.block_size), np.float32)
+        render_direct_paths(reference_at(mixer.direct, like), blocks, output)
 
 
 @compiled

@@ -29,9 +29,9 @@ from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
 from server.rendering.direct_path import DirectPath, PathTarget
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import require_gain
-from server.rendering.limiter import Limiter
 from server.rendering.mixer_set import MixerSet
-from server.rendering.mixing import Mixer, mix_all
+from server.rendering.mixing import Mixer
+from server.rendering.output import Output, mix_all
 from server.rendering.sources import Source
 
 
@@ -120,9 +120,7 @@ class Renderer:
         self._mixers = MixerSet(slots=slots, block_size=block_size, new_direct=direct_of, new_convolver=convolver_of)
         self._mixer = self._mixers.of(2 if has_head else 1)
         """What new emitters are heard through."""
-        self._limiter = None
-        if ceiling is not None:
-            self._limiter = Limiter(channels=outputs, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
+        self._output = Output(channels=outputs, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
         self._emitters: dict[str, _Emitter] = {}
         self._changed: list[_Emitter] = []  # since the last block
         self._has_changed = False  # before the last block
@@ -142,12 +140,14 @@ class Renderer:
     @property
     def is_limited(self) -> bool:
         """Whether the block last rendered would have been too loud, and was turned down."""
-        return self._limiter is not None and self._limiter.acted
+        limiter = self._output.limiter
+        return limiter is not None and limiter.acted
 
     @property
     def samples_silenced(self) -> int:
         """Rendered so far that were not finite, which none should be; they were made silence."""
-        return 0 if self._limiter is None else self._limiter.samples_silenced
+        limiter = self._output.limiter
+        return 0 if limiter is None else limiter.samples_silenced
 
     @property
     def convolvers(self) -> int:
@@ -321,14 +321,14 @@ class Renderer:
     def reset(self) -> None:
         """Drop every emitter and its reverberation, and start the clock again."""
         self._mixers.clear()
-        if self._limiter is not None:
-            self._limiter.reset()
+        if self._output.limiter is not None:
+            self._output.limiter.reset()
         self._mixer = self._mixers.of(self._mixer.channels)
         self._emitters.clear()
         self._changed.clear()
         self._blocks_rendered = 0
 
-    def _begin(self) -> list[Mixer]:
+    def _begin(self) -> tuple[Output, list[Mixer]]:
         """Put into effect what was handed in since the last block."""
         for emitter in self._changed:
             has_response = emitter.has_ir or not emitter.awaits_ir
@@ -339,20 +339,16 @@ class Renderer:
                     emitter.mixer.play(emitter.slot, emitter.source)
         self._has_changed = bool(self._changed)
         self._changed.clear()
-        return list(self._mixers)
+        return self._output, list(self._mixers)
 
-    def _finish(self) -> FloatArray:
-        """The block just mixed; lets go of what has rung out."""
+    def _finish(self) -> None:
+        """After a block, let go of what has rung out."""
         self._blocks_rendered += 1
-        block = self._mixers.output(self.outputs)
-        if self._limiter is not None:
-            self._limiter.process(block)
         if self._mixers.rests:
-            return block
+            return
         emitters = self._emitters.values()
         sending = {emitter.mixer for emitter in emitters if emitter.has_ir or emitter.awaits_ir}
         self._mixers.let_go({self._mixer, *(emitter.mixer for emitter in emitters)}, sending)
-        return block
 
     def _hand_over(self, emitter: _Emitter, mixer: Mixer) -> None:
         """Have an emitter be heard through another mixer: over the next block its sound fades out of the one and into
@@ -379,6 +375,9 @@ class Renderer:
 
 
 def render_all(renderers: Sequence[Renderer]) -> list[FloatArray]:
-    """Render the next block (2, block_size) of each, all in one call without the interpreter's lock."""
-    mix_all([mixer for renderer in renderers for mixer in renderer._begin()])
-    return [renderer._finish() for renderer in renderers]
+    """Render the next block (channel, block_size) of each, in arrays of their own, all in one call without the
+    interpreter's lock."""
+    blocks = mix_all([renderer._begin() for renderer in renderers])
+    for renderer in renderers:
+        renderer._finish()
+    return blocks

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from server.rendering.fade import raised_cosine
-from server.rendering.mixing_kernel import mix_mixers
+from server.rendering.output_kernel import mix_listeners
 from server.rendering.partitions import Partitioning
 from server.rendering.renderer import (
     DuplicateEmitterError,
@@ -370,7 +370,9 @@ def test_rendering_leaves_the_interpreter_to_others():
         add(engine, str(number), noise(number, 500))
         engine.set_ir(str(number), room(number))
     run(engine, 2)
-    addresses = np.full(20_000, engine._mixer.address, np.int64)  # the same one, over and over: some hundred ms
+    # The same one, over and over: some hundred ms.
+    rows = np.tile(np.array([engine._output.address, engine._mixer.address, 0, 0], np.int64), (20_000, 1))
+    frames = np.zeros(engine._output.sum.size, np.float32)
     counted = []
 
     def count():
@@ -381,7 +383,7 @@ def test_rendering_leaves_the_interpreter_to_others():
     thread = threading.Thread(target=count)
     thread.start()
     before = len(counted)
-    mix_mixers(addresses, None)
+    mix_listeners(rows, frames, None, None)
     during = len(counted) - before
     counted.append(-1)
     thread.join()

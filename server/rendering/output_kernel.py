@@ -1,0 +1,96 @@
+"""The compiled part of `server.rendering.output`."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import carray, types
+
+from server.acoustics.simd import pointer
+from server.compiled import compiled
+from server.rendering.by_reference import Reference, ReferenceType, reference_at
+from server.rendering.flush_to_zero import flush_to_zero, restore
+from server.rendering.limiter import limit
+from server.rendering.mixing_kernel import MIXER, mix
+
+OUTPUT = np.dtype(
+    [
+        (name, np.int64)
+        for name in (
+            "channels",
+            "block_size",
+            "sum",  # (channel, block_size) float32
+            "limiter",  # address of a reference to a LimiterState, 0 for none
+        )
+    ]
+)
+
+
+@compiled
+def mix_listeners(
+    rows: npt.NDArray[np.int64],
+    frames: npt.NDArray[np.float32],
+    like: Reference | None,
+    like_limiter: Reference | None,
+) -> None:
+    """One block of every listener. A row has the addresses of its OUTPUT record and of two MIXER records, the second 0
+    for none, and where in `frames` its block begins. `like` and `like_limiter` refer to any direct path's state and
+    any limiter's, or are None where there is none."""
+    mode = flush_to_zero()
+    for number in range(rows.shape[0]):
+        output = carray(pointer(rows[number, 0]), (1,), OUTPUT)[0]
+        total = carray(pointer(output.sum), (output.channels, output.block_size), np.float32)
+        total[:] = 0
+        for place in range(1, 3):
+            if rows[number, place] != 0:
+                mixer = carray(pointer(rows[number, place]), (1,), MIXER)[0]
+                mix(mixer, like)
+                _add(mixer, total)
+        if like_limiter is not None and output.limiter != 0:
+            limit(reference_at(output.limiter, like_limiter), total)
+        at = rows[number, 3]
+        for n in range(output.block_size):
+            for channel in range(output.channels):
+                frames[at] = total[channel, n]
+                at += 1
+    restore(mode)
+
+
+@compiled
+def _add(mixer, total) -> None:
+    """One ear without a head is as good as either of two; a head's two make one by their mean."""
+    channels, size = total.shape
+    made = carray(pointer(mixer.output), (mixer.channels, size), np.float32)
+    for channel in range(channels):
+        if mixer.channels <= channels:
+            own = made[min(channel, mixer.channels - 1)]
+            for n in range(size):
+                total[channel, n] += own[n]
+        else:
+            for n in range(size):
+                total[channel, n] += np.float32(0.5) * (made[0, n] + made[1, n])
+
+
+@cache
+def mixing_with(kind: ReferenceType | None, limiter: ReferenceType | None) -> Callable[..., None]:
+    """`mix_listeners` for references of these kinds, which numba, called without, finds out in Python with every
+    call."""
+    signature = (
+        types.Array(types.int64, 2, "C"),
+        types.Array(types.float32, 1, "C"),
+        types.none if kind is None else kind,
+        types.none if limiter is None else limiter,
+    )
+    mix_listeners.compile(signature)  # type: ignore[attr-defined]
+    return mix_listeners.get_overload(signature)  # type: ignore[attr-defined]
+
+
+def record_of(output: Any) -> npt.NDArray[np.void]:
+    """The OUTPUT record (1,) of a `server.rendering.output.Output`, which has to outlive it."""
+    record = np.zeros(1, OUTPUT)
+    record["channels"], record["block_size"] = output.sum.shape
+    record["sum"] = output.sum.ctypes.data
+    record["limiter"] = 0 if output.limiter is None else output.limiter.state.address
+    return record
