@@ -219,7 +219,7 @@ class AudioThread:
                 self._fail(stream, made)
 
     def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
-        """Have streams step down or up, and IRs take no more than their share."""
+        """Have streams step down or up, and IRs and checks take no more than their share."""
         busy, self._busy_s = self._busy_s / (now_s - self._looked_s), 0.0
         self._looked_s = now_s
         by_ladder = {stream.ladder: stream for stream in self._streams}
@@ -229,7 +229,7 @@ class AudioThread:
             made.setdefault(stream, []).extend(stream.step(reason, now_s))
             self.steps[reason] += 1
         for stream in self._streams:
-            stream.ration_irs(streams=len(self._streams), share=self._ir_share)
+            stream.ration(streams=len(self._streams), share=self._ir_share)
 
     def _fail(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> None:
         """The boundary between streams: one that breaks leaves the others sounding."""

@@ -28,7 +28,14 @@ PERIOD_S = 10.0
 """Of sound from one check to the next, or more where checks take more than their share of time."""
 SHARE = 0.01
 """Of a core that the checks of one stream may take."""
+SHARE_OF_ALL = 0.04
+"""Of a core that those of all streams of an audio thread may take."""
 LIMIT_JND = 1.0
+
+
+def interval_s(cost_s: float, *, streams: int) -> float:
+    """Of sound until the check after one that took `cost_s` of CPU time, with so many streams that share a core."""
+    return max(PERIOD_S, cost_s / min(SHARE, SHARE_OF_ALL / streams))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from server.load import Ladder, Offer, Reason, Strain, ir_interval_s
 from server.pacing import StreamClock
 from server.planned_effects import PlanRequest
 from server.protocol import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
-from server.regret import FIRST_S, PERIOD_S, SHARE, Regret, RegretRecord
+from server.regret import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
 from server.replies import Durations, Error, ServerMessage, Status
 from server.scene.plan import Plan
 from server.session import Session
@@ -113,6 +113,8 @@ class Stream:
         self._plans: deque[Future[Plan]] = deque()
         self.regrets = RegretRecord()
         self._checks: deque[Future[Regret]] = deque()
+        self._streams = 1
+        """Of the audio thread."""
         self._next_check_s: float | None = FIRST_S
         """None while one is under way."""
         self._next_status_s = 1.0
@@ -197,8 +199,9 @@ class Stream:
         self._forget_waits(now_s)
         return [*self.session.hear(self.ladder.rung, reason)]
 
-    def ration_irs(self, *, streams: int, share: float) -> None:
-        """Leave others what `share` of a core, divided between `streams`, leaves them."""
+    def ration(self, *, streams: int, share: float) -> None:
+        """Take one of `streams` equal parts of what IRs may take of a core, `share`, and of what checks may."""
+        self._streams = streams
         self.session.space_irs(ir_interval_s(self.ladder, request_s=self._request_s, streams=streams, share=share))
 
     def finish_block(self, sample_clock: int, samples: FloatArray, *, cost_s: float, now_s: float) -> list[Outgoing]:
@@ -264,7 +267,7 @@ class Stream:
             _logger.error("a plan of effects could not be checked", exc_info=failure)
             return
         regret = answer.result()
-        self._next_check_s = clock_s + max(PERIOD_S, regret.cost_s / SHARE)
+        self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self._streams)
         self.regrets.add(regret)
         self.session.learn(regret)
 

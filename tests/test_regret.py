@@ -7,7 +7,7 @@ import pytest
 from server.acoustics.geometry import Pose
 from server.direct_sound import DirectSound
 from server.emitters import Emitter
-from server.regret import LIMIT_JND, RegretCheck, RegretRecord
+from server.regret import LIMIT_JND, PERIOD_S, SHARE_OF_ALL, RegretCheck, RegretRecord, interval_s
 from server.rendered_effects import ALL_ON, EmitterEffects
 from server.scene.effects import EffectName
 
@@ -80,3 +80,12 @@ def test_a_record_keeps_the_worst(check):
     assert (record.checks, record.failures) == (2, 1)
     for parameter, jnd in heard.by_parameter.items():
         assert record.worst_jnd[parameter] == max(jnd, unheard.by_parameter.get(parameter, 0.0))
+
+
+@pytest.mark.parametrize("streams", [1, 4, 20, 500])
+@pytest.mark.parametrize("cost_s", [0.0, 0.02, 0.2])
+def test_checks_of_all_streams_together_take_no_more_than_their_share(streams, cost_s):
+    apart_s = interval_s(cost_s, streams=streams)
+    assert apart_s >= PERIOD_S
+    assert streams * cost_s / apart_s <= SHARE_OF_ALL + 1e-12
+    assert cost_s / apart_s <= 0.01 + 1e-12
