@@ -90,6 +90,21 @@ def store(_context: Any, _address: Any, _index: Any, _value: Any) -> Any:
 
 
 @intrinsic
+def prefetch(_context: Any, _address: Any) -> Any:
+    """Have the cache line at an address be near when it is read soon."""
+
+    def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        to = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [to, _INT32, _INT32, _INT32])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        to_read_data_at_all_levels = [ir.Constant(_INT32, value) for value in (0, 3, 1)]
+        builder.call(function, [builder.inttoptr(args[0], to), *to_read_data_at_all_levels])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), generate
+
+
+@intrinsic
 def load_int(_context: Any, _address: Any, _index: Any) -> Any:
     """One int64; `index` counts int64."""
 

@@ -61,6 +61,8 @@ def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatAr
     state.is_mixed[:] = 0
     for index in range(blocks.shape[0]):
         slot = state.slots[index]
+        if index + 1 < blocks.shape[0]:
+            _fetch(state, index + 1, position, size)
         if slot.present and _take_in(slot, state.line[index], position, state.ring, state.quiet, blocks[index]):
             _render_slot(state, slot, index, size)
     state.position[0] = (position + size) % state.ring
@@ -69,6 +71,22 @@ def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatAr
             _synthesise(state, kind, out)
     if state.is_mixed[_PLAIN] != 0:
         loops.add_block(state.plain, out[0])
+
+
+@compiled
+def _fetch(state: DirectPathState, index: int, position: int, size: int) -> None:
+    """Have what a slot reads come near while the one before it is worked on. With many listeners on a core, all of it
+    lies in main memory."""
+    slot = state.slots[index]
+    if not slot.present:
+        return
+    line = state.line[index]
+    begin = (position - int(slot.delay[0]) - BEFORE) % state.ring
+    loops.fetch(line, position, position + size)
+    loops.fetch(line, begin, min(begin + size + 2 * BEFORE, line.size))
+    for ear in range(state.heard.shape[1]):
+        loops.fetch(state.heard[index, ear], 0, state.heard.shape[2])
+        loops.fetch(state.spectra[index, ear].reshape(-1), 0, 2 * state.spectra.shape[3])
 
 
 @compiled

@@ -15,6 +15,7 @@ from server.acoustics.simd import (
     multiply,
     multiply_add,
     multiply_subtract,
+    prefetch,
     store,
     subtract,
     transpose,
@@ -28,6 +29,7 @@ IntArray = npt.NDArray[np.int64]
 
 TILE = 64
 _ROW = 2 * TAPS
+_LINE_BYTES = 64
 
 
 @compiled
@@ -194,6 +196,15 @@ def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, sums: Float
             store(s, width + n + k, multiply_add(right, load(c, width + k), load(s, width + n + k)))
         for ear in range(2):
             taps[ear, n + 1] = sums[ear, n + 1] * reciprocals[n + 1]
+
+
+@compiled
+def fetch(samples: FloatArray, begin: int, end: int) -> None:
+    """Have samples be near when they are read soon: streams as short as a slot's are over before a processor sees that
+    they are streams."""
+    address = int(samples.ctypes.data)
+    for at in range(address + 4 * begin, address + 4 * end, _LINE_BYTES):
+        prefetch(at)
 
 
 @compiled

@@ -81,6 +81,10 @@ def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, _sums: Floa
     taps[:] = scipy.fft.irfft(np.exp(spectra), n_fft)[:, :count]
 
 
+def fetch(_samples: FloatArray, _begin: int, _end: int) -> None:
+    """For compiled loops."""
+
+
 def scale(samples: FloatArray, start: float, end: float, ramp: FloatArray) -> None:
     samples[: ramp.size] *= np.float32(start) + np.float32(end - start) * ramp
 
