@@ -27,7 +27,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Executor
 
-from server.load import PERIOD_S, LoadControl, Reason
+from server.load import PERIOD_S, LoadControl, Reason, ir_share
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
 from server.stream import Outgoing, Stream, StreamFailed
@@ -52,8 +52,8 @@ class AudioEngine:
     """Renders streams until stopped.
 
     `workers` computes IRs; each stream has at most one request with it, so its queue is never longer than there are
-    streams. Under load, those of one audio thread's streams take `ir_share` of a core. `is_real_time` asks the system
-    to schedule audio threads before all others.
+    streams. Under load, those of one audio thread's streams take `ir_share` of a core, or less where rendering leaves
+    less. `is_real_time` asks the system to schedule audio threads before all others.
     """
 
     def __init__(
@@ -228,8 +228,9 @@ class AudioThread:
             stream = by_ladder[ladder]
             made.setdefault(stream, []).extend(stream.step(reason, now_s))
             self.steps[reason] += 1
+        share = ir_share(self._ir_share, busy=busy)
         for stream in self._streams:
-            stream.ration(streams=len(self._streams), share=self._ir_share)
+            stream.ration(streams=len(self._streams), share=share)
 
     def _fail(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> None:
         """The boundary between streams: one that breaks leaves the others sounding."""

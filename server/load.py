@@ -32,6 +32,10 @@ _LEAST_RATE_HZ = 2.0
 _FULL = 0.85
 """Share of the time in which an audio thread renders, from which on it has none to spare."""
 _FREE = 0.6
+_SHARED = 0.85
+"""Share of a core that rendering and impulse responses may take together: the event loop needs the rest."""
+_LEAST_IR_SHARE = 1 / 3
+"""Of what impulse responses may take otherwise: reverberation keeps following."""
 _LATE, _TIGHT, _EASY = 1.0, 0.5, 0.25
 """Shares of what a client has in hand: used up, running out, hardly touched."""
 _PATIENCE_S = 0.15
@@ -219,6 +223,11 @@ def _best_off(ladders: Mapping[Ladder, Strain]) -> Sequence[Ladder]:
     able = [ladder for ladder in ladders if ladder.at + 1 < len(ladder.rungs)]
     highest = min((ladder.at for ladder in able), default=0)
     return [ladder for ladder in able if ladder.at == highest]
+
+
+def ir_share(most: float, *, busy: float) -> float:
+    """Of a core, for IRs of the streams of an audio thread that renders for a share `busy` of the time."""
+    return min(most, max(_SHARED - busy, _LEAST_IR_SHARE * most))
 
 
 def ir_interval_s(ladder: Ladder, *, request_s: float, streams: int, share: float) -> float:

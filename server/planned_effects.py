@@ -2,7 +2,8 @@
 
 A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
 One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, or to move faster than it
-did; while poses change, twice a second at most, and once a second for many emitters. Clocks are seconds of sound.
+did; while poses change, twice a second at most, once a second for many emitters, and less often where plans take more
+than their share of time. Clocks are seconds of sound.
 """
 
 import dataclasses
@@ -21,7 +22,11 @@ from server.scene.situation import Emitter, Listener, Output, Place, Situation
 
 PERIOD_S = 0.5
 _EMITTERS_PER_PERIOD, _MOST_PERIODS = 8, 2
-"""Plans of more take longer, and are made less often. All are made well within the `HORIZON_S` that they look ahead."""
+"""Plans of more take longer, and are made less often."""
+_LONGEST_S = 2.0
+"""All are made well within the `HORIZON_S` that they look ahead."""
+SHARE_OF_ALL = 0.03
+"""Of a core that plans of all streams of an audio thread may take, as long as each is made every `_LONGEST_S`."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
 
@@ -86,6 +91,7 @@ class PlannedEffects:
         self._is_stale = False
         self._in_flight = False
         self._next_look_s = 0.0
+        self._interval_s = 0.0
         self._seen: object = None
 
     @property
@@ -138,12 +144,16 @@ class PlannedEffects:
         self._emitters.pop(name, None)
         self._is_stale = True
 
+    def space(self, interval_s: float) -> None:
+        """Have at least so much time pass from one plan to the next while poses change, as far as plans last."""
+        self._interval_s = min(interval_s, _LONGEST_S)
+
     def take_request(self, listener: Pose, emitters: Mapping[str, Placed], clock_s: float) -> PlanRequest | None:
         """None where an earlier one is unanswered, or nothing has changed."""
         if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
             return None
         periods = min(max(1.0, len(emitters) / _EMITTERS_PER_PERIOD), _MOST_PERIODS)
-        self._next_look_s = clock_s + PERIOD_S * periods
+        self._next_look_s = clock_s + max(PERIOD_S * periods, self._interval_s)
         motion = self._listener
         situation = Situation(
             self.place,

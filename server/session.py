@@ -158,6 +158,11 @@ class Session:
         """Have so much time pass from one request for IRs to the next, unless an emitter waits for its first."""
         self._responses.space(interval_s)
 
+    def space_plans(self, interval_s: float) -> None:
+        """Have so much time pass from one plan of effects to the next, unless something calls for one at once."""
+        if self._effects.planned is not None:
+            self._effects.planned.space(interval_s)
+
     def receive(self, message: ClientMessage) -> list[ServerMessage]:
         """Take in one message; what is wrong with it comes back as an `Error`, and nothing has changed then."""
         try:

@@ -42,7 +42,8 @@ class Settings(BaseSettings):
     ir_workers: Annotated[int, Field(ge=1)] = max(1, _usable_cores() - 1)
     """Threads that compute impulse responses, behind all others. One core is left to the audio threads."""
     ir_share: Annotated[float, Field(gt=0)] = 0.25
-    """Cores' worth of impulse responses that streams of one audio thread may take between them under load."""
+    """Cores' worth of impulse responses that streams of one audio thread may take between them under load, or less
+    where rendering leaves less."""
     max_streams: Annotated[int, Field(ge=1)] = 64
     shared_tail: bool = False
     """Let all emitters of a stream share one late tail, each at the level of its own: many cost less, and only what

@@ -19,6 +19,7 @@ from server.field.levels import Levels
 from server.ir_request import IrRequest, IrResponse, compute_irs
 from server.load import Ladder, Offer, Reason, Strain, ir_interval_s
 from server.pacing import StreamClock
+from server.planned_effects import SHARE_OF_ALL as PLAN_SHARE
 from server.planned_effects import PlanRequest
 from server.protocol import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
 from server.regret import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
@@ -100,6 +101,8 @@ class Stream:
         self._offer = offer
         self._request_s = 0.0
         """CPU time that a request for impulse responses has taken of late."""
+        self._plan_s = 0.0
+        """And a plan of effects."""
         self._asked_s: float | None = None
         """When the request was made that is unanswered."""
         self._longest_wait_s: float | None = None
@@ -110,7 +113,7 @@ class Stream:
         self._time_s: Callable[[], float] = time.monotonic
         self._messages: deque[tuple[float, ClientMessage]] = deque()
         self._answers: deque[tuple[IrRequest, Future[_Computed]]] = deque()
-        self._plans: deque[Future[Plan]] = deque()
+        self._plans: deque[Future[tuple[Plan, float]]] = deque()
         self.regrets = RegretRecord()
         self._checks: deque[Future[Regret]] = deque()
         self._streams = 1
@@ -177,7 +180,7 @@ class Stream:
             self._take_regret(self._checks.popleft())
         self._check_plan(workers)
         if (wanted := self.session.take_plan_request()) is not None:
-            workers.submit(PlanRequest.plan, wanted).add_done_callback(self._keep_plan)
+            workers.submit(_plan_timed, wanted).add_done_callback(self._keep_plan)
         if (request := self.session.take_request()) is not None:
             self._asked_s = self._time_s()
             answer = workers.submit(_compute_timed, self._levels, request, self.session)
@@ -200,8 +203,10 @@ class Stream:
         return [*self.session.hear(self.ladder.rung, reason)]
 
     def ration(self, *, streams: int, share: float) -> None:
-        """Take one of `streams` equal parts of what IRs may take of a core, `share`, and of what checks may."""
+        """Take one of `streams` equal parts of what IRs may take of a core, `share`, and of what plans of effects and
+        checks of them may."""
         self._streams = streams
+        self.session.space_plans(self._plan_s * streams / PLAN_SHARE)
         self.session.space_irs(ir_interval_s(self.ladder, request_s=self._request_s, streams=streams, share=share))
 
     def finish_block(self, sample_clock: int, samples: FloatArray, *, cost_s: float, now_s: float) -> list[Outgoing]:
@@ -271,15 +276,17 @@ class Stream:
         self.regrets.add(regret)
         self.session.learn(regret)
 
-    def _keep_plan(self, plan: "Future[Plan]") -> None:
+    def _keep_plan(self, plan: "Future[tuple[Plan, float]]") -> None:
         self._plans.append(plan)  # on the worker's thread
         self._wake()
 
-    def _take_plan(self, plan: "Future[Plan]") -> list[ServerMessage]:
-        if (failure := plan.exception()) is not None:
+    def _take_plan(self, answer: "Future[tuple[Plan, float]]") -> list[ServerMessage]:
+        if (failure := answer.exception()) is not None:
             _logger.error("no plan of effects", exc_info=failure)
             return self.session.keep_effects()
-        return self.session.adopt(plan.result())
+        plan, cpu_s = answer.result()
+        self._plan_s = _smoothed(self._plan_s, cpu_s)
+        return self.session.adopt(plan)
 
     def _take_answer(self, request: IrRequest, answer: "Future[_Computed]") -> list[ServerMessage]:
         if self._asked_s is not None:
@@ -290,7 +297,7 @@ class Stream:
             return self.session.give_up(request)
         computed = answer.result()
         self.ir_times.add(computed.duration_s)
-        self._request_s += (_COST_SMOOTHING if self._request_s else 1.0) * (computed.cpu_s - self._request_s)
+        self._request_s = _smoothed(self._request_s, computed.cpu_s)
         return self.session.accept(computed.response)
 
     def _status(self, now_s: float) -> Status:
@@ -321,6 +328,16 @@ class _Computed:
     duration_s: float
     cpu_s: float
     """What the thread that computed it spent."""
+
+
+def _smoothed(cost_s: float, newest_s: float) -> float:
+    return cost_s + (_COST_SMOOTHING if cost_s else 1.0) * (newest_s - cost_s)
+
+
+def _plan_timed(request: PlanRequest) -> tuple[Plan, float]:
+    """With the CPU time it took."""
+    started_s = time.thread_time()
+    return request.plan(), time.thread_time() - started_s
 
 
 def _compute_timed(levels: Levels, request: IrRequest, session: Session) -> _Computed:

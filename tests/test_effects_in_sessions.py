@@ -22,6 +22,7 @@ from server.rendering.convolver import Convolver
 from server.replies import EmitterAdded, Error, PlanChanged
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import EffectName
+from server.scene.reach import HORIZON_S
 from server.session import Session
 
 SIZE = 256
@@ -215,6 +216,31 @@ def test_what_moves_faster_than_it_did_is_planned_for_at_once(mirrored_field, wh
     assert asks(0.8, 1.7)
     walks = [asks(0.8 + 0.1 * step, 1.7 + 0.03 * step) for step in range(1, 40)]
     assert 3 <= sum(walks) <= 5  # once a second, of so many
+
+
+def test_plans_are_made_less_often_under_load_but_before_they_are_outdated(mirrored_field):
+    planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE))
+    emitters = {"one": Emitter(1, Pose(THERE))}
+    planned.follow_emitter("one", emitters["one"].pose, 0.0)
+
+    def plans_of_a_walk(began_s):
+        plans = []
+        for step in range(60):
+            clock_s = began_s + 0.1 * step
+            pose = Pose((HERE[0] + 0.06 * step, *HERE[1:]))
+            planned.follow_listener(pose, clock_s)
+            if (request := planned.take_request(pose, emitters, clock_s)) is not None:
+                planned.accept(request.plan())
+                plans.append(clock_s)
+        return np.array(plans[1:])  # the first is for a motion that is new
+
+    assert np.diff(plans_of_a_walk(0.0)).max() == pytest.approx(0.6, abs=0.11)
+    planned.space(1.2)
+    assert np.diff(plans_of_a_walk(100.0)) == pytest.approx(1.2, abs=0.11)
+    planned.space(60.0)
+    assert np.diff(plans_of_a_walk(200.0)).max() < HORIZON_S - 0.8
+    planned.wish({EffectName.AIR_ABSORPTION: False}, None)
+    assert planned.take_request(Pose(HERE), emitters, 206.0) is not None  # whoever wishes does not wait
 
 
 def test_a_mono_loudspeaker_has_one_channel_and_no_head(open_stage):

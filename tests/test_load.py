@@ -2,12 +2,13 @@
 
 import itertools
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server.errors import RequestError
-from server.load import AUTO, PERIOD_S, Ladder, LoadControl, Offer, Rung, Strain, ir_interval_s
+from server.load import AUTO, PERIOD_S, Ladder, LoadControl, Offer, Rung, Strain, ir_interval_s, ir_share
 from server.scene.manifest import QualityLevel, Reuse
 
 BLOCK_S = 256 / 24_000
@@ -204,3 +205,12 @@ def test_responses_are_unbounded_at_the_top_and_take_an_equal_part_of_a_share_of
     interval_s = ir_interval_s(eased, streams=10, **budget)
     assert 10 * budget["request_s"] / interval_s == pytest.approx(budget["share"])
     assert ir_interval_s(eased, streams=1, **budget) == pytest.approx(1 / 12)  # the rung's own rate bounds it sooner
+
+
+def test_responses_leave_to_rendering_and_the_event_loop_what_these_need():
+    assert ir_share(0.25, busy=0.3) == 0.25
+    shares = [ir_share(0.25, busy=busy) for busy in np.linspace(0.5, 1.0, 11)]
+    assert shares == sorted(shares, reverse=True)
+    assert ir_share(0.25, busy=0.7) == pytest.approx(0.15)
+    assert shares[-1] == pytest.approx(0.25 / 3)  # where nothing is left, reverberation still follows
+    assert ir_share(2.0, busy=0.2) == pytest.approx(2.0 / 3)  # who allows more than a core, gets a third of it at least

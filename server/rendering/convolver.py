@@ -119,13 +119,14 @@ class Convolver:
         """
         if ir.ndim != 2 or ir.shape[0] != self.channels or not 1 <= ir.shape[1] <= self.ir_samples:
             raise ValueError(f"expected an IR ({self.channels}, 1..{self.ir_samples}), got shape {ir.shape}")
-        if not -LOUDEST <= ir.min() <= ir.max() <= LOUDEST:  # false, too, of what is no number
+        with np.errstate(over="ignore"):  # seen below
+            samples = ir.astype(np.float32, copy=False)
+        head_energy, tail_energy = _energy(samples[:, : self._tail_start]), _energy(samples[:, self._tail_start :])
+        # Energy says it at once of nearly all; neither is true of what is no number.
+        if not (head_energy + tail_energy <= LOUDEST or -LOUDEST <= ir.min() <= ir.max() <= LOUDEST):
             raise ValueError(f"impulse response has samples that are not finite, or beyond {LOUDEST:g}")
-        samples = ir.astype(np.float32, copy=False)
         if like is not None and like.layout != self._layout:
             raise ValueError("the IR that it is like was prepared for another convolver")
-        tail = samples[:, self._tail_start :].astype(np.float64)
-        tail_energy = float(np.einsum("cn,cn->", tail, tail))
         prepared = self._engine.prepare(samples, None if like is None else like.filters, same_from)
         return PartitionedIr(self._layout, prepared, tail_energy)
 
@@ -233,6 +234,11 @@ class Convolver:
         self._tail_energy.fill(0)
         self._retired.clear()
         self._tail = None
+
+
+def _energy(samples: FloatArray) -> float:
+    """Of (channel, n), without a copy of it."""
+    return float(np.einsum("cn,cn->", samples, samples))
 
 
 # Either takes a third of a second to import, and is wanted without the other.

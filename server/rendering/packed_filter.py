@@ -19,7 +19,7 @@ IntArray = npt.NDArray[np.int64]
 _PER_STAGE = 3
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _SHIFT = np.uint64(32)
-_SPARES = Spares(32 * 1024 * 1024)
+_SPARES = Spares(64 * 1024 * 1024)
 """A few dozen responses of a second: each that is exchanged leaves what the next one needs."""
 
 

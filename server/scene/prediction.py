@@ -9,6 +9,7 @@ energies are relative to the direct sound at one metre.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -71,6 +72,14 @@ class Mirrored:
     arrival: Floats
 
 
+class _Way(NamedTuple):
+    """What paths do to energy: by their length, by the air (·, band), and by the direction they leave in (·, band)."""
+
+    spread: Floats
+    air: Floats
+    departure: Floats
+
+
 @dataclass(frozen=True)
 class Change:
     """What leaving out an effect changes most, in JND."""
@@ -110,30 +119,26 @@ class Prediction:
     def energies(self, variants: Sequence[Off]) -> Energies:
         """What is heard without some effects, in each of v variants."""
         reach, place = self.reach, self.place
-        lengths_m = {False: reach.paths.length_m, True: reach.straight_m}
-        air = {way: db_to_power(-length_m[:, None] * place.air_db_per_m) for way, length_m in lengths_m.items()}
-        spread = {way: np.maximum(length_m, place.nearest_m)[:, None] ** -2.0 for way, length_m in lengths_m.items()}
-        departure = {False: db_to_power(reach.departure_db), True: db_to_power(reach.straight_departure_db)}
-        screen = db_to_power(reach.paths.screen_db)
         mirror = self.mirrored_energies(variants)
         direct = np.zeros((len(variants), len(reach.owner), len(OCTAVE_BANDS_HZ)))
         mirrored = np.zeros((len(variants), *self._held.shape))
         held = np.zeros_like(mirrored)
         for variant, off in enumerate(variants):
             straight = EffectName.OCCLUSION in off
+            way = self._straight if straight else self._bent
             if EffectName.DIRECT_PATH not in off and not place.holds_direct_sound:
                 row = direct[variant]
                 row += 1
                 if EffectName.DISTANCE_ATTENUATION not in off:
-                    row *= spread[straight]
+                    row *= way.spread
                 if EffectName.AIR_ABSORPTION not in off:
-                    row *= air[straight]
+                    row *= way.air
                 if EffectName.DIRECTIVITY not in off:
-                    row *= departure[straight]
+                    row *= way.departure
                 if EffectName.DIFFRACTION in off and not straight:
                     row *= reach.paths.in_sight[:, None]
                 elif not straight:
-                    row *= screen
+                    row *= self._screen
             if EffectName.EARLY_REFLECTIONS not in off:
                 np.add.at(mirrored[variant], self.mirrored.owner, mirror[variant])
             if EffectName.LATE_REVERBERATION not in off:
@@ -142,11 +147,32 @@ class Prediction:
 
     def mirrored_energies(self, variants: Sequence[Off]) -> Floats:
         """(v, m, band) where there are any; air is in them whether or not the direct sound is without."""
+        everywhere, beamed = self._mirrored_energies
+        return np.array([everywhere if EffectName.DIRECTIVITY in off else beamed for off in variants])
+
+    @cached_property
+    def _mirrored_energies(self) -> tuple[Floats, Floats]:
+        """(m, band) where all radiate alike everywhere, and as they do."""
         paths = self.mirrored
-        surface = db_to_power(paths.surface_db) / np.maximum(paths.length_m, self.place.nearest_m)[:, None] ** 2
-        departure = db_to_power(paths.departure_db)
-        air = db_to_power(-paths.length_m[:, None] * self.place.air_db_per_m)
-        return np.array([surface * air * (1.0 if EffectName.DIRECTIVITY in off else departure) for off in variants])
+        way = self._way(paths.length_m, paths.departure_db)
+        everywhere = db_to_power(paths.surface_db) * way.spread * way.air
+        return everywhere, everywhere * way.departure
+
+    @cached_property
+    def _bent(self) -> "_Way":
+        return self._way(self.reach.paths.length_m, self.reach.departure_db)
+
+    @cached_property
+    def _straight(self) -> "_Way":
+        return self._way(self.reach.straight_m, self.reach.straight_departure_db)
+
+    @cached_property
+    def _screen(self) -> Floats:
+        return db_to_power(self.reach.paths.screen_db)
+
+    def _way(self, length_m: Floats, departure_db: Floats) -> "_Way":
+        spread = np.maximum(length_m, self.place.nearest_m)[:, None] ** -2.0
+        return _Way(spread, db_to_power(-length_m[:, None] * self.place.air_db_per_m), db_to_power(departure_db))
 
     def changes(self, variants: Sequence[Off]) -> dict[str, Floats]:
         """(v, e) change of each parameter in each variant, in JND, the worst within reach."""
@@ -223,30 +249,26 @@ class Prediction:
         return self._thirds_db(ALL_ON)
 
     @cached_property
-    def _phases(self) -> tuple[npt.NDArray[np.int64], list[npt.NDArray[np.complex128]]]:
-        """(frequency,) the bands of frequencies in thirds of octaves; of each emitter (m, frequency) by how much its
-        mirrored paths are later than its direct sound."""
+    def _phases(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.complex128]]:
+        """(frequency,) the bands of frequencies in thirds of octaves; (m, frequency) by how much mirrored paths are
+        later than the direct sound."""
         frequency = (_THIRDS_HZ[0.45 * self.place.sample_rate > _THIRDS_HZ, None] * _PER_THIRD).ravel()
         bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
         paths, direct_m = self.mirrored, self.reach.paths.length_m
         later_s = (paths.length_m - direct_m[paths.owner]) / self.place.speed_of_sound
-        turns = np.exp(-2j * np.pi * later_s[:, None] * frequency)
-        return bands, [turns[paths.owner == number] for number in range(len(self.emitters))]
+        return bands, np.exp(-2j * np.pi * later_s[:, None] * frequency)
 
     def _thirds_db(self, off: Off) -> Floats:
         """(e, third) spectrum, as everybody is now: the direct sound and the first reflections with their phases, and
         what the field holds."""
-        energies, (bands, phases) = self.energies([off]), self._phases
-        amplitude = np.sqrt(self.mirrored_energies([off])[0])
-        if EffectName.EARLY_REFLECTIONS in off:
-            amplitude[:] = 0
-        thirds = []
-        for number, turns in enumerate(phases):
-            wave = np.sqrt(energies.direct[0, number])[bands]
-            wave = wave + np.sum(amplitude[self.mirrored.owner == number][:, bands] * turns, axis=0)
-            power = np.abs(wave) ** 2 + energies.held[0, number][bands] + _SILENCE
-            thirds.append(power.reshape(-1, len(_PER_THIRD)).mean(axis=-1))
-        return power_to_db(np.array(thirds))
+        energies, (bands, turns) = self.energies([off]), self._phases
+        count = len(self.emitters)
+        wave = np.sqrt(energies.direct[0, :count])[:, bands].astype(np.complex128)
+        if EffectName.EARLY_REFLECTIONS not in off:
+            amplitude = np.sqrt(self.mirrored_energies([off])[0])
+            wave += self._decays.whose @ (amplitude[:, bands] * turns)
+        power = np.abs(wave) ** 2 + energies.held[0][:, bands] + _SILENCE
+        return power_to_db(power.reshape(count, -1, len(_PER_THIRD)).mean(axis=-1))
 
     def _mirror(self) -> Mirrored:
         bands = len(OCTAVE_BANDS_HZ)

@@ -168,6 +168,19 @@ def test_an_ir_that_is_not_finite_is_refused_and_the_old_one_stays(is_compiled, 
     assert convolver.exchanged == ()
 
 
+@pytest.mark.parametrize("where", [0, 700, 1_199])
+def test_an_ir_is_refused_for_its_loudest_sample_and_not_for_its_energy(is_compiled, where):
+    convolver = Convolver(
+        sources=2, channels=2, block_size=64, ir_samples=4_000, shared_tail=True, is_compiled=is_compiled
+    )
+    loud = np.full((2, 1_200), 1e6)
+    assert np.isfinite(convolver.prepare(loud.astype(np.float32)).tail_energy)
+    for sample in (1.1e6, 1e30, -1e300):
+        loud[1, where] = sample
+        with pytest.raises(ValueError, match="finite, or beyond 1e\\+06"):
+            convolver.prepare(loud)
+
+
 @pytest.mark.parametrize(("samples", "channels", "block_size"), [(100, 2, 128), (100, 1, 64), (101, 2, 64)])
 def test_an_ir_prepared_for_another_convolver_is_refused(is_compiled, samples, channels, block_size):
     convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=100, is_compiled=is_compiled)
