@@ -32,8 +32,9 @@ _LEAST_RATE_HZ = 2.0
 _FULL = 0.85
 """Share of the time in which an audio thread renders, from which on it has none to spare."""
 _FREE = 0.6
-_SHARED = 0.85
-"""Share of a core that rendering and impulse responses may take together: the event loop needs the rest."""
+_SHARED = 0.75
+"""Share of a core that rendering and impulse responses may take together: the event loop, plans and checks need the
+rest."""
 _LEAST_IR_SHARE = 1 / 3
 """Of what impulse responses may take otherwise: reverberation keeps following."""
 _LATE, _TIGHT, _EASY = 1.0, 0.5, 0.25

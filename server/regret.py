@@ -28,7 +28,7 @@ PERIOD_S = 10.0
 """Of sound from one check to the next, or more where checks take more than their share of time."""
 SHARE = 0.01
 """Of a core that the checks of one stream may take."""
-SHARE_OF_ALL = 0.04
+SHARE_OF_ALL = 0.02
 """Of a core that those of all streams of an audio thread may take."""
 LIMIT_JND = 1.0
 

@@ -375,7 +375,7 @@ class Check:
 
 @pytest.mark.parametrize(("streams", "checks"), [(1, 2), (8, 1)])
 def test_the_more_streams_share_a_thread_the_less_often_each_is_checked(stage, streams, checks):
-    """Alone, every 20 s of sound from 2 s on; of eight, every 40 s."""
+    """Alone, every 20 s of sound from 2 s on; of eight, every 80 s."""
     opened = [stage.open(window=10_000)[0] for _ in range(streams)]
     for stream in opened:
         stream.session.take_check = Check

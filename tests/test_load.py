@@ -209,8 +209,8 @@ def test_responses_are_unbounded_at_the_top_and_take_an_equal_part_of_a_share_of
 
 def test_responses_leave_to_rendering_and_the_event_loop_what_these_need():
     assert ir_share(0.25, busy=0.3) == 0.25
-    shares = [ir_share(0.25, busy=busy) for busy in np.linspace(0.5, 1.0, 11)]
+    shares = [ir_share(0.25, busy=busy) for busy in np.linspace(0.4, 1.0, 13)]
     assert shares == sorted(shares, reverse=True)
-    assert ir_share(0.25, busy=0.7) == pytest.approx(0.15)
+    assert ir_share(0.25, busy=0.6) == pytest.approx(0.15)
     assert shares[-1] == pytest.approx(0.25 / 3)  # where nothing is left, reverberation still follows
     assert ir_share(2.0, busy=0.2) == pytest.approx(2.0 / 3)  # who allows more than a core, gets a third of it at least

@@ -10,7 +10,7 @@ from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
 from server.rendering.packed_filter import PackedFilter, address, pack
-from server.rendering.partitions import TURNS, Partitioning, Stage
+from server.rendering.partitions import Partitioning, Stage
 from server.rendering.products import COLUMNS
 
 FloatArray = npt.NDArray[np.float32]
@@ -147,8 +147,7 @@ class _StageArrays:
         self.sources = sources
         self.tables = right_angle.tables(stage.size)
         self.fade_out = raised_cosine(stage.size)[::-1].copy()
-        tiles, self.slots = stage.size // LANES, max(TURNS, stage.partitions)
-        self.recent = zeros_on_lines(sources, TURNS, tiles, 2, LANES)
+        tiles, self.slots = stage.size // LANES, stage.partitions
         self.ring = zeros_on_lines(sources, tiles, self.slots, 2, LANES)
         self.mix = zeros_on_lines(tiles, channels, COLUMNS, 2, LANES)
         self.output = zeros_on_lines(2, channels, stage.size)
@@ -160,20 +159,19 @@ class _StageArrays:
         record["partitions"], record["slots"], record["sources"] = self.stage.partitions, self.slots, self.sources
         for name in ("twist", "passes", "lanes"):
             record[name] = address(getattr(self.tables, name))
-        for name in ("fade_out", "recent", "ring", "mix", "output", *_PER_SOURCE):
+        for name in ("fade_out", "ring", "mix", "output", *_PER_SOURCE):
             record[name] = address(getattr(self, name))
 
     def clear(self, source: int) -> None:
         if self.current[source]:
             self.current[source] = 0
-            self.recent[source] = 0
             self.ring[source] = 0
         is_at_work = self.job_source == source
         self.job_old[is_at_work] = 0
         self.job_new[is_at_work] = 0
 
     def reset(self) -> None:
-        for array in (self.recent, self.ring, self.mix):
+        for array in (self.ring, self.mix):
             array.fill(0)
         self.current.fill(0)
         self.job_old.fill(0)

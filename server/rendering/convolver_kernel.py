@@ -6,13 +6,13 @@ complex numbers as eight real parts then eight imaginary ones, and what is read 
 
     filter of a stage   near: (partition, tile, channel, part, 8), the first NEAR partitions;
                         far: (tile, partition, channel, part, 8), the others behind them
-    recent of a stage   (source, turn, tile, part, 8)          spectra since the source's turn, which is 0
-    ring of a stage     (source, tile, slot, part, 8)          what was recent at a turn and earlier, the newest first
+    ring of a stage     (source, tile, slot, part, 8)          spectra of windows, the newest first
     mix of a stage      (tile, channel, column, part, 8)       columns as in `server.rendering.products`
 
 Memory is what limits it. So sources take turns, one in TURNS windows, and on its turn a source is multiplied for all
 of them, its filter read once: the window at work gets all partitions, the next one all but the first, whose input is
-not there yet, and so on. In the windows between, only those first partitions are left to multiply.
+not there yet, and so on. In the windows between, what is newest is all that is left to multiply: by the first
+partition for the window at work, and by the next ones for those up to the source's next turn.
 
 An IR is exchanged in the first stage at once, and what the one before was multiplied for in advance is taken back;
 in later stages on the source's turn, when there is nothing to take back.
@@ -208,7 +208,7 @@ def _transform_ns(size) -> int:
 def _product_ns(stage, source, is_fading) -> int:
     """About what the products of one tile take."""
     since = _since_turn(stage, source)
-    ns = 10 * (stage.partitions if since == 0 else since)
+    ns = 10 * (stage.partitions if since == 0 else TURNS - since)
     return ns + 20 * stage.partitions if is_fading else ns
 
 
@@ -246,14 +246,8 @@ def _work(convolver, stage, until) -> None:
 
 
 @compiled
-def _recent(stage, source, turn) -> int:
-    """The address of a source's spectrum (tile, part, 8) in the window that was `turn` after its turn."""
-    return stage.recent + 8 * stage.size * (TURNS * source + turn)
-
-
-@compiled
 def _transform(convolver, stage, job) -> None:
-    """The spectrum of a source's window, the newest of the recent ones."""
+    """The spectrum of a source's window, the newest in its ring."""
     source = _ints(stage.job_source, stage.sources)[job]
     size, span = stage.size, convolver.history_blocks * convolver.block_size
     history = stage.history + 4 * source * span
@@ -263,8 +257,8 @@ def _transform(convolver, stage, job) -> None:
         history + 4 * first,
         history + 4 * second,
         convolver.scratch,
-        _recent(stage, source, _since_turn(stage, source)),
-        16,
+        _ring(stage, source) + 64 * _newest(stage),
+        16 * stage.slots,
         8,
         size,
         stage.twist,
@@ -279,14 +273,12 @@ def _multiply(convolver, stage, job, first, last) -> None:
     channels = convolver.channels
     source = _ints(stage.job_source, stage.sources)[job]
     old, new = _ints(stage.job_old, stage.sources)[job], _ints(stage.job_new, stage.sources)[job]
-    since, recent, ring = _since_turn(stage, source), _recent(stage, source, 0), _ring(stage, source)
+    since, ring, newest = _since_turn(stage, source), _ring(stage, source), _newest(stage)
     filters, count = _partitions(stage, new)
     if since == 0:
-        newest = _newest(stage, source)
-        products.add_turn(stage, channels, filters, count, recent, ring, newest, first, last)
+        products.add_turn(stage, channels, filters, count, ring, newest, first, last)
     else:
-        until, column = min(since, count), stage.window % TURNS
-        products.add_near(stage, channels, filters, recent, since, 0, until, column, first, last, np.float32(1))
+        products.add_newest(stage, channels, filters, count, ring, newest, TURNS - since, first, last)
     if old != 0 and new != 0:
         _exchange(stage, channels, source, old, new, first, last)
 
@@ -295,20 +287,17 @@ def _multiply(convolver, stage, job, first, last) -> None:
 def _exchange(stage, channels, source, old, new, first, last) -> None:
     """Add what the filter before differs by to the surplus, and have the new one stand for it where it was multiplied
     in advance."""
-    since, newest = _since_turn(stage, source), _newest(stage, source)
-    recent, ring = _recent(stage, source, 0), _ring(stage, source)
+    since, ring, newest = _since_turn(stage, source), _ring(stage, source), _newest(stage)
     begin, end = _changed(old, new, 3 * stage.number)
     for sign, header in ((np.float32(1), old), (np.float32(-1), new)):
         filters, count = _partitions(stage, header)
-        until = min(end, count)
-        near, far, column = min(until, since), max(begin, since), products.SURPLUS
-        products.add_near(stage, channels, filters, recent, since, begin, near, column, first, last, sign)
-        slot = newest + far - since
-        products.add_range(stage, channels, filters, count, ring, slot, far, until, column, first, last, sign)
+        until, column = min(end, count), products.SURPLUS
+        products.add_range(stage, channels, filters, count, ring, newest, begin, until, 0, column, first, last, sign)
         for ahead in range(TURNS - since if since > 0 else 0):
-            known, column = max(begin, since + ahead), (stage.window + ahead) % TURNS
-            slot = newest + known - since - ahead
-            products.add_range(stage, channels, filters, count, ring, slot, known, until, column, first, last, -sign)
+            known, column = max(begin, ahead + 1), (stage.window + ahead) % TURNS
+            products.add_range(
+                stage, channels, filters, count, ring, newest, known, until, ahead, column, first, last, -sign
+            )
 
 
 @compiled
@@ -318,9 +307,9 @@ def _ring(stage, source) -> int:
 
 
 @compiled
-def _newest(stage, source) -> int:
-    """The slot of what was newest on the source's turn."""
-    return -((stage.window + source) // TURNS * TURNS) % stage.slots
+def _newest(stage) -> int:
+    """The slot of the window at work in every ring."""
+    return -stage.window % stage.slots
 
 
 @compiled

@@ -17,7 +17,6 @@ STAGE = np.dtype(
             "lanes",
             "fade_out",  # (size,) float32
             "slots",
-            "recent",
             "ring",
             "wanted",  # (source,) int64: filter a source should have
             "silent",  # (source,) int64: blocks of silence it has had

@@ -54,29 +54,28 @@ def _step(near, tiles, channels, count, tile, partition) -> int:
 
 
 @compiled
-def add_near(stage, channels, filters, recent, newest, begin, end, column, first, last, sign) -> None:
-    """Add partitions `begin` to `end` of the NEAR first ones, times `sign` and a source's `recent` spectra, of which
-    `newest` belongs to partition 0, to a column of the mix."""
-    mix, tiles, factor = stage.mix, stage.size // 8, broadcast(sign)
+def add_newest(stage, channels, filters, count, ring, slot, ahead, first, last) -> None:
+    """Add the products of a source's newest spectrum, in a slot of its ring, to the mix of the window at work, and of
+    the `ahead` - 1 that follow it: with the first partition of its filter, the second and so on."""
+    mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
     for tile in range(first, last):
-        left, right = mixed(channels, tile, 0, column), mixed(channels, tile, channels - 1, column)
-        lr, li, rr, ri = load(mix, left), load(mix, left + 8), load(mix, right), load(mix, right + 8)
-        for partition in range(begin, end):
-            x, h = 16 * (tiles * (newest - partition) + tile), 16 * channels * (tiles * partition + tile)
-            xr, xi = multiply(load(recent, x), factor), multiply(load(recent, x + 8), factor)
-            lr, li = _multiply_add(lr, li, xr, xi, filters, h)
-            rr, ri = _multiply_add(rr, ri, xr, xi, filters, h + 16 * (channels - 1))
-        _keep(mix, left, lr, li)
-        _keep(mix, right, rr, ri)
+        x = 16 * (tile * slots + slot)
+        xr, xi = load(ring, x), load(ring, x + 8)
+        for partition in range(min(ahead, count)):
+            h = 16 * channels * (tiles * partition + tile)
+            for channel in range(channels):
+                at = mixed(channels, tile, channel, (stage.window + partition) % TURNS)
+                re, im = _multiply_add(load(mix, at), load(mix, at + 8), xr, xi, filters, h + 16 * channel)
+                _keep(mix, at, re, im)
 
 
 @compiled
-def add_range(stage, channels, filters, count, ring, slot, begin, end, column, first, last, sign) -> None:
-    """Add partitions `begin` to `end` of a filter, times `sign`, to a column of the mix; the first of them times the
-    spectra in a slot of the ring."""
+def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, column, first, last, sign) -> None:
+    """Add partitions `begin` to `end` of a filter, times `sign` and the spectra in the ring, to a column of the mix,
+    which is that of a window `ahead` of the one whose spectrum is in slot `newest`."""
     mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast(sign)
     near = min(NEAR, count)
-    start = slot % slots
+    start = (newest + begin - ahead) % slots
     for tile in range(first, last):
         left, right = mixed(channels, tile, 0, column), mixed(channels, tile, channels - 1, column)
         lr, li, rr, ri = load(mix, left), load(mix, left + 8), load(mix, right), load(mix, right + 8)
@@ -94,21 +93,15 @@ def add_range(stage, channels, filters, count, ring, slot, begin, end, column, f
 
 
 @compiled
-def add_turn(stage, channels, filters, count, recent, ring, newest, first, last) -> None:
-    """Put the TURNS newest spectra of a source, which are `recent`, into slots of its ring from `newest` on. Add all
-    partitions of its filter to the mix of the window at work, and to those of the three that follow it what is known of
-    them by now: from the first, second and third partition on."""
+def add_turn(stage, channels, filters, count, ring, newest, first, last) -> None:
+    """Add all partitions of a source's filter, times its spectra in the ring from slot `newest` on, to the mix of the
+    window at work, and to those of the three that follow it what is known of them by now: from the first, second and
+    third partition on."""
     mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
     near = min(NEAR, count)
     other = 16 * COLUMNS * (channels - 1)  # from one channel to the other, which is the same if there is only one
     zero = broadcast(np.float32(0))
     for tile in range(first, last):
-        slot = newest
-        for age in range(TURNS):
-            x, at = 16 * (tile * slots + slot), 16 * (tiles * ((TURNS - age) % TURNS) + tile)
-            store(ring, x, load(recent, at))
-            store(ring, x + 8, load(recent, at + 8))
-            slot = slot + 1 if slot + 1 < slots else 0
         a = mixed(channels, tile, 0, stage.window % TURNS)
         b = mixed(channels, tile, 0, (stage.window + 1) % TURNS)
         c = mixed(channels, tile, 0, (stage.window + 2) % TURNS)
