@@ -3,7 +3,6 @@
 import os
 import sys
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -12,11 +11,8 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
-from server.planned_effects import SHARE_OF_ALL
 from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
-from server.regret import Regret
 from server.replies import EmitterAdded, Error, Status
-from server.scene.plan import Plan
 from server.stream import MAX_WAITING_MESSAGES, StreamFailed
 from tests.engine_stage import BLOCK_S, Clock, Patient, Stage, blocks, open_stream
 
@@ -362,49 +358,3 @@ def test_samples_that_are_no_audio_are_told_of_once_a_second_and_the_stream_goes
     assert (first.id, first.samples_gated, second.samples_gated) == ("voice", 1536, 1536)
     assert second.underruns == 1
     assert all(np.isfinite(item.block.samples).all() for item in blocks(delivered))
-
-
-class Check:
-    """Of a plan, which finds nothing and takes a fifth of a second of CPU time."""
-
-    level = "standard"
-
-    def run(self, _field):
-        return Regret({}, {}, cost_s=0.2)
-
-
-@pytest.mark.parametrize(("streams", "checks"), [(1, 2), (8, 1)])
-def test_the_more_streams_share_a_thread_the_less_often_each_is_checked(stage, streams, checks):
-    """Alone, every 20 s of sound from 2 s on; of eight, every 80 s."""
-    opened = [stage.open(window=10_000)[0] for _ in range(streams)]
-    for stream in opened:
-        stream.session.take_check = Check
-    for _ in range(30):
-        stage.run(1.0, step_s=BLOCK_S / 2)
-        stage.workers.run()
-    assert [stream.regrets.checks for stream in opened] == [checks] * streams
-
-
-class SlowPlan:
-    """A request for one, which takes a few milliseconds of CPU time."""
-
-    def plan(self):
-        until_s = time.thread_time() + 0.004
-        while time.thread_time() < until_s:
-            pass
-        return Plan({}, {})
-
-
-def test_the_more_streams_share_a_thread_the_less_often_plans_are_made(stage):
-    opened = [stage.open(window=10_000)[0] for _ in range(5)]
-    intervals_s = []
-    for stream in opened:
-        requests = [SlowPlan()]
-        stream.session.take_plan_request = lambda requests=requests: requests.pop() if requests else None
-        stream.session.adopt = lambda _plan: []
-    opened[-1].session.space_plans = intervals_s.append
-    stage.run(0.6)
-    stage.workers.run()
-    stage.run(1.0)
-    assert intervals_s[0] == 0.0  # nobody knows yet what they take
-    assert 0.004 * 5 / SHARE_OF_ALL <= intervals_s[-1] < 0.02 * 5 / SHARE_OF_ALL

@@ -54,12 +54,12 @@ def _step(near, tiles, channels, count, tile, partition) -> int:
 
 
 @compiled
-def add_newest(stage, channels, filters, count, ring, slot, ahead, first, last) -> None:
-    """Add the products of a source's newest spectrum, in a slot of its ring, to the mix of the window at work, and of
-    the `ahead` - 1 that follow it: with the first partition of its filter, the second and so on."""
+def add_newest(stage, channels, filters, count, ring, newest, ahead, first, last) -> None:
+    """Add the products of a source's newest spectrum, in slot `newest` of its ring, to the mix of the window at work,
+    and of the `ahead` - 1 that follow it: with the first partition of its filter, the second and so on."""
     mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
     for tile in range(first, last):
-        x = 16 * (tile * slots + slot)
+        x = 16 * (tile * slots + newest)
         xr, xi = load(ring, x), load(ring, x + 8)
         for partition in range(min(ahead, count)):
             h = 16 * channels * (tiles * partition + tile)
