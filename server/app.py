@@ -1,7 +1,6 @@
 """The ASGI application: loads scenes, starts the audio engine, warms up, serves."""
 
 import asyncio
-import gc
 import logging
 from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.ir_request import compute_irs
 from server.load import AUTO, Offer
+from server.memory import collect_as_usual, collect_rarely
 from server.places import place_of_field
 from server.priority import Breaks, become_background
 from server.problems import install_problems
@@ -77,7 +77,7 @@ def create_app(
             finally:
                 warming.cancel()
                 await asyncio.to_thread(audio.stop)
-                gc.unfreeze()
+                collect_as_usual()
 
     app = FastAPI(
         title="Nafir",
@@ -101,9 +101,7 @@ async def _become_ready(host: StreamHost) -> None:
     except Exception:  # whatever it is, the server stays up, and not ready, for an operator to look at
         _logger.exception("warm-up failed")
         return
-    # A full collection looks at all there is, for longer than a block lasts; what is here by now stays.
-    gc.collect()
-    gc.freeze()
+    collect_rarely()
     host.is_ready = True
     _logger.info("ready: %s", ", ".join(host.scenes))
     # Nothing waits for these: whoever came first is served first.
