@@ -177,7 +177,7 @@ class DirectSound:
         for number, emitter in enumerate(emitters):
             if not emitter.effects.diffraction:
                 gain_db[number] = 0.0 if paths.in_sight[number] else _SILENT_DB
-            if emitter.directivity != OMNIDIRECTIONAL:
+            if emitter.directivity is not OMNIDIRECTIONAL:
                 gain_db[number] += departure_gain_db(emitter, paths.departure[number])
         return _Paths(paths.length_m, paths.arrival, gain_db)
 

@@ -88,12 +88,12 @@ class DirectPath:
         band_gains_db: npt.NDArray[np.floating],
     ) -> None:
         """`set_target` of several slots (n,) at once: lengths (n,), arrivals (n, 3), gains (n, band)."""
-        records = self.state.slots
-        records["present"][slots] = True
-        records["asked"][slots] = True
-        records["goal_m"][slots] = lengths_m
-        records["arrival"][slots] = arrivals
-        records["band_gain_db"][slots] = band_gains_db
+        records, rows = self.state.slots, np.asarray(slots, np.intp)
+        records["present"][rows] = True
+        records["asked"][rows] = True
+        records["goal_m"][rows] = lengths_m
+        records["arrival"][rows] = arrivals
+        records["band_gain_db"][rows] = band_gains_db
 
     def set_muted(self, slot: int, is_muted: bool) -> None:
         """Have a slot fade out, and do nothing more for it than keep what it plays; or fade in, where it is by then."""
