@@ -27,7 +27,8 @@ def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own():
     assert 0 <= case["late_share"] <= 1
     for name in ("block_ms", "lateness_ms", "pose_to_audio_ms", "pose_to_reverberation_ms", "client_pose_to_audio_ms"):
         assert 0 < case[name]["p50"] <= case[name]["p99"] <= case[name]["p99_9"], name
-    assert case["pose_to_audio_ms"]["p50"] < case["client_pose_to_audio_ms"]["p50"]
+    # No client hears sooner than the server sends; histograms tell durations apart by a sixteenth of an octave.
+    assert case["pose_to_audio_ms"]["p50"] <= case["client_pose_to_audio_ms"]["p50"] * 2 ** (1 / 16)
     loads = case["server_load_by_thread"]
     assert all(load > 0 for name, load in loads.items() if name.startswith("nafir-") or name == "MainThread")
     assert any(name.startswith("nafir-audio") for name in loads)
