@@ -30,9 +30,19 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def compiled(function: Function) -> Function:
     """Compile on first call; without numba, the function as it is."""
+    return _compile(function)
+
+
+def compiled_in_place(function: Function) -> Function:
+    """As `compiled`, of what makes no array and keeps none, but works in those of others: where short loops take their
+    turns over many arrays, counting references is a tenth of all work. What would allocate does not compile."""
+    return _compile(function, _nrt=False)
+
+
+def _compile(function: Function, **options: bool) -> Function:
     if numba is None:
         return function
-    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
     dispatcher._cache = _Cache(function)
     return dispatcher  # type: ignore[no-any-return]
 

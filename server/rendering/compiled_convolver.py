@@ -11,7 +11,7 @@ from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
 from server.rendering.packed_filter import PackedFilter, address, pack
 from server.rendering.partitions import Partitioning, Stage
-from server.rendering.products import COLUMNS
+from server.rendering.products import COLUMNS, GROUP, apart
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -148,10 +148,11 @@ class _StageArrays:
         self.tables = right_angle.tables(stage.size)
         self.fade_out = raised_cosine(stage.size)[::-1].copy()
         tiles, self.slots = stage.size // LANES, stage.partitions
-        self.ring = zeros_on_lines(sources, tiles, self.slots, 2, LANES)
+        self.ring = zeros_on_lines(sources, self.slots, int(apart(stage.size)))
         self.mix = zeros_on_lines(tiles, channels, COLUMNS, 2, LANES)
         self.output = zeros_on_lines(2, channels, stage.size)
         self.current, self.job_source, self.job_old, self.job_new = (np.zeros(sources, np.int64) for _ in _PER_SOURCE)
+        self.group = np.zeros((GROUP, 3), np.int64)
 
     def enter(self, record: npt.NDArray[np.void]) -> None:
         """Write sizes and addresses into a STAGE record (1,)."""
@@ -159,7 +160,7 @@ class _StageArrays:
         record["partitions"], record["slots"], record["sources"] = self.stage.partitions, self.slots, self.sources
         for name in ("twist", "passes", "lanes"):
             record[name] = address(getattr(self.tables, name))
-        for name in ("fade_out", "ring", "mix", "output", *_PER_SOURCE):
+        for name in ("fade_out", "ring", "mix", "output", "group", *_PER_SOURCE):
             record[name] = address(getattr(self, name))
 
     def clear(self, source: int) -> None:

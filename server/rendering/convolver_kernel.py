@@ -6,7 +6,7 @@ complex numbers as eight real parts then eight imaginary ones, and what is read 
 
     filter of a stage   near: (partition, tile, channel, part, 8), the first NEAR partitions;
                         far: (tile, partition, channel, part, 8), the others behind them
-    ring of a stage     (source, tile, slot, part, 8)          spectra of windows, the newest first
+    ring of a stage     (source, slot, tile, part, 8)          spectra of windows, `products.apart`, the newest first
     mix of a stage      (tile, channel, column, part, 8)       columns as in `server.rendering.products`
 
 Memory is what limits it. So sources take turns, one in TURNS windows, and on its turn a source is multiplied for all
@@ -129,10 +129,14 @@ def _head(convolver, stage) -> None:
     exchanged = _ints(convolver.exchanged, convolver.sources)
     exchanged[:] = 0
     job_source, job_old = _ints(stage.job_source, stage.sources), _ints(stage.job_old, stage.sources)
-    for job in range(stage.jobs):
-        exchanged[job_source[job]] = job_old[job] != 0
-        _transform(convolver, stage, job)
-        _multiply(convolver, stage, job, np.int64(0), size // 8)
+    job = 0
+    while job < stage.jobs:
+        end = _group_end(stage, job)
+        for member in range(job, end):
+            exchanged[job_source[member]] = job_old[member] != 0
+            _transform(convolver, stage, member)
+        _multiply(convolver, stage, job, end, np.int64(0), size // 8)
+        job = end
     for channel in range(channels):
         if stage.jobs == 0:
             for n in range(0, size, 8):
@@ -170,19 +174,20 @@ def _begin(convolver, stage, window) -> None:
     job_old, job_new = _ints(stage.job_old, stage.sources), _ints(stage.job_new, stage.sources)
     stage.fades, stage.cost = 0, 0
     jobs = 0
-    for source in range(stage.sources):
-        old, new = current[source], wanted[source]
-        if old != 0 and new != 0 and stage.number > 0 and _since_turn(stage, source) > 0:
-            new = old
-        current[source] = new
-        if new == 0 or silent[source] >= convolver.quiet_blocks:
-            continue
-        is_fading = old != 0 and old != new
-        job_source[jobs], job_new[jobs] = source, new
-        job_old[jobs] = old if is_fading else 0
-        stage.fades += is_fading
-        stage.cost += _transform_ns(stage.size) + _product_ns(stage, source, is_fading) * (stage.size // 8)
-        jobs += 1
+    for turn in range(TURNS):
+        for source in range(turn, stage.sources, TURNS):
+            old, new = current[source], wanted[source]
+            if old != 0 and new != 0 and stage.number > 0 and _since_turn(stage, source) > 0:
+                new = old
+            current[source] = new
+            if new == 0 or silent[source] >= convolver.quiet_blocks:
+                continue
+            is_fading = old != 0 and old != new
+            job_source[jobs], job_new[jobs] = source, new
+            job_old[jobs] = old if is_fading else 0
+            stage.fades += is_fading
+            stage.cost += _transform_ns(stage.size) + _product_ns(stage, source, is_fading) * (stage.size // 8)
+            jobs += 1
     stage.jobs = jobs
     stage.cursor, stage.step, stage.cost_done = 0, 0, 0
     if jobs > 0:
@@ -222,21 +227,24 @@ def _work(convolver, stage, until) -> None:
     while stage.cost_done < until and stage.cursor < jobs_and_inverses:
         if stage.cursor < stage.jobs:
             job = stage.cursor
-            if stage.step == 0:
-                _transform(convolver, stage, job)
-                stage.step = 1
+            end = _group_end(stage, job)
+            if stage.step < end - job:
+                _transform(convolver, stage, job + stage.step)
+                stage.step += 1
                 stage.cost_done += _transform_ns(stage.size)
                 continue
-            weight = _product_ns(stage, job_source[job], job_old[job] != 0)
-            first = stage.step - 1
+            weight = 0
+            for member in range(job, end):
+                weight += _product_ns(stage, job_source[member], job_old[member] != 0)
+            first = stage.step - (end - job)
             last = min(tiles, first + max(1, _CHUNK_NS // weight))
-            _multiply(convolver, stage, job, first, last)
+            _multiply(convolver, stage, job, end, first, last)
             stage.cost_done += (last - first) * weight
             if last == tiles:
-                stage.cursor += 1
+                stage.cursor = end
                 stage.step = 0
             else:
-                stage.step = last + 1
+                stage.step = last + end - job
         else:
             channel = stage.cursor - stage.jobs
             made = stage.output + 4 * ((1 - stage.heard) * convolver.channels + channel) * stage.size
@@ -257,8 +265,8 @@ def _transform(convolver, stage, job) -> None:
         history + 4 * first,
         history + 4 * second,
         convolver.scratch,
-        _ring(stage, source) + 64 * _newest(stage),
-        16 * stage.slots,
+        _ring(stage, source) + 4 * products.apart(size) * _newest(stage),
+        16,
         8,
         size,
         stage.twist,
@@ -268,19 +276,32 @@ def _transform(convolver, stage, job) -> None:
 
 
 @compiled
-def _multiply(convolver, stage, job, first, last) -> None:
-    """Add the products of a source's spectra and filter, tiles `first` to `last`, to the mix."""
+def _group_end(stage, job) -> int:
+    """The job after those that are multiplied together with this one: sources whose turn is in the same window."""
+    job_source = _ints(stage.job_source, stage.sources)
+    end = job + 1
+    while end < min(stage.jobs, job + products.GROUP) and (job_source[end] - job_source[job]) % TURNS == 0:
+        end += 1
+    return end
+
+
+@compiled
+def _multiply(convolver, stage, job, end, first, last) -> None:
+    """Add the products of the spectra and filters of a group, tiles `first` to `last`, to the mix."""
     channels = convolver.channels
-    source = _ints(stage.job_source, stage.sources)[job]
-    old, new = _ints(stage.job_old, stage.sources)[job], _ints(stage.job_new, stage.sources)[job]
-    since, ring, newest = _since_turn(stage, source), _ring(stage, source), _newest(stage)
-    filters, count = _partitions(stage, new)
+    job_source = _ints(stage.job_source, stage.sources)
+    job_old, job_new = _ints(stage.job_old, stage.sources), _ints(stage.job_new, stage.sources)
+    since, newest = _since_turn(stage, job_source[job]), _newest(stage)
+    for member in range(job, end):
+        filters, count = _partitions(stage, job_new[member])
+        products.enter_member(stage, member - job, filters, count, _ring(stage, job_source[member]))
     if since == 0:
-        products.add_turn(stage, channels, filters, count, ring, newest, first, last)
+        products.add_turn(stage, channels, end - job, newest, first, last)
     else:
-        products.add_newest(stage, channels, filters, count, ring, newest, TURNS - since, first, last)
-    if old != 0 and new != 0:
-        _exchange(stage, channels, source, old, new, first, last)
+        products.add_newest(stage, channels, end - job, newest, TURNS - since, first, last)
+    for member in range(job, end):
+        if job_old[member] != 0 and job_new[member] != 0:
+            _exchange(stage, channels, job_source[member], job_old[member], job_new[member], first, last)
 
 
 @compiled
@@ -302,8 +323,8 @@ def _exchange(stage, channels, source, old, new, first, last) -> None:
 
 @compiled
 def _ring(stage, source) -> int:
-    """The address of a source's ring of spectra (tile, slot, part, 8)."""
-    return stage.ring + 8 * stage.size * stage.slots * source
+    """The address of a source's ring of spectra (slot, tile, part, 8), which are `products.apart`."""
+    return stage.ring + 4 * products.apart(stage.size) * stage.slots * source
 
 
 @compiled

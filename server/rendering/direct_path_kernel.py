@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from server.compiled import HAS_NUMBA, compiled
+from server.compiled import HAS_NUMBA, compiled_in_place
 from server.rendering.direct_path_records import BANDS, DirectPathState, DoubleArray, FloatArray
 from server.rendering.fractional_delay import BEFORE
 from server.rendering.sphere import find_triangle
@@ -53,7 +53,7 @@ transform_tables = loops.transform_tables
 _ANCHOR, _AT, _SPEED = 0, 1, 2
 
 
-@compiled
+@compiled_in_place
 def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatArray) -> None:
     """Add what all ears (e, b) hear of the blocks (s, b) of all slots."""
     position = state.position[0]
@@ -73,7 +73,7 @@ def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatAr
         loops.add_block(state.plain, out[0])
 
 
-@compiled
+@compiled_in_place
 def _fetch(state: DirectPathState, index: int, position: int, size: int) -> None:
     """Have what a slot reads come near while the one before it is worked on. With many listeners on a core, all of it
     lies in main memory."""
@@ -86,20 +86,18 @@ def _fetch(state: DirectPathState, index: int, position: int, size: int) -> None
     loops.fetch(line, begin, min(begin + size + 2 * BEFORE, line.size))
     for ear in range(state.heard.shape[1]):
         loops.fetch(state.heard[index, ear], 0, state.heard.shape[2])
-        loops.fetch(state.spectra[index, ear].reshape(-1), 0, 2 * state.spectra.shape[3])
+        loops.fetch(state.spectra[index, ear, 0], 0, 2 * state.spectra.shape[3])  # the imaginary parts follow
 
 
-@compiled
-def _mix_of(state: DirectPathState, kind: int) -> Any:
-    """(e, part, f) of a kind, silent before its first use in a block."""
-    mix = state.mix[kind]
+@compiled_in_place
+def _open(state: DirectPathState, kind: int) -> None:
+    """Have a mix be silent before its first use in a block."""
     if state.is_mixed[kind] == 0:
-        mix[:] = 0
+        state.mix[kind] = 0
         state.is_mixed[kind] = 1
-    return mix
 
 
-@compiled
+@compiled_in_place
 def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
     """Add one of the mixes: what the filters in effect make, or what those before add to it while they fade out."""
     block = state.filtered
@@ -114,7 +112,7 @@ def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
             loops.add_fading(newest, state.fade, out[ear])
 
 
-@compiled
+@compiled_in_place
 def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, block: FloatArray) -> bool:
     """Write a block to its line. False if the slot has rung out: its line is silent then, and need not be written."""
     size = block.size
@@ -125,14 +123,14 @@ def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, 
         if slot.silent == quiet:
             slot.started = False
             return False
-    line[position : position + size] = block
+    loops.copy(block, line[position : position + size])
     again = ring + position
     if again + size <= line.size:
-        line[again : again + size] = block
+        loops.copy(block, line[again : again + size])
     return True
 
 
-@compiled
+@compiled_in_place
 def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> None:
     """Add a slot to the mixes."""
     starts = not slot.started
@@ -180,7 +178,7 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
             # A filter has to know what came before.
             past = _delay(state, slot, ear) if at_once else slot.delay[ear]
             _read_still(state, state.line[index], past, window - size, samples[:window])
-            samples[:window] *= np.float32(gain_before)
+            loops.multiply_by(samples[:window], gain_before)
         _read(state, slot, state.line[index], ear, size, at_once, jumps, gain_before, newest)
         if was_filtered or slot.filtered:
             loops.transform(samples, state.twist, state.passes, state.lanes, state.bins)
@@ -190,17 +188,19 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
             if not slot.filtered:
                 after[:] = 0
             if starts:
-                in_effect[:] = after
+                loops.copy_spectrum(after, in_effect)
             elif change != _NONE:
-                loops.accumulate_change(state.bins, in_effect, after, _mix_of(state, change)[ear])
-                in_effect[:] = after
+                _open(state, change)
+                loops.accumulate_change(state.bins, in_effect, after, state.mix[change, ear])
+                loops.copy_spectrum(after, in_effect)
             if slot.filtered:
-                loops.accumulate(state.bins, in_effect, _mix_of(state, 0)[ear])
+                _open(state, 0)
+                loops.accumulate(state.bins, in_effect, state.mix[0, ear])
         if was_plain or is_plain:
             _add_plain(state, newest[:size], was_plain or starts, is_plain)
 
 
-@compiled
+@compiled_in_place
 def _add_plain(state: DirectPathState, block: FloatArray, before: bool, after: bool) -> None:
     """Add what is heard without a filter, fading where it was not or is not to be."""
     if state.is_mixed[_PLAIN] == 0:
@@ -213,11 +213,11 @@ def _add_plain(state: DirectPathState, block: FloatArray, before: bool, after: b
         loops.add_fading(block, state.fade, plain)
     else:
         loops.add_block(block, plain)
-        block *= np.float32(-1)
+        loops.multiply_by(block, -1.0)
         loops.add_fading(block, state.fade, plain)
 
 
-@compiled
+@compiled_in_place
 def _colours(slot: Any) -> bool:
     """Whether anything on the way has a gain in some band."""
     most = 0.0
@@ -226,7 +226,7 @@ def _colours(slot: Any) -> bool:
     return most > 0.0
 
 
-@compiled
+@compiled_in_place
 def _jumps(slot: Any, size: int, sample_rate: float, speed_of_sound: float) -> bool:
     slot.since_asked += size
     longest = max(_POSE_INTERVAL_S * sample_rate, float(size))
@@ -236,7 +236,7 @@ def _jumps(slot: Any, size: int, sample_rate: float, speed_of_sound: float) -> b
     return bool(slot.unattenuated != slot.was_unattenuated or (slot.asked and (slot.jump or too_far)))
 
 
-@compiled
+@compiled_in_place
 def _follow(spring: DoubleArray, goal: float, period_s: float, time_s: float, rest: float, at_once: bool) -> None:
     """Move by one block, exactly, a critically damped spring of time constant `time_s` whose anchor moves steadily to
     `goal`; it trails its anchor by twice the time constant. Within `rest` it stops."""
@@ -258,7 +258,7 @@ def _follow(spring: DoubleArray, goal: float, period_s: float, time_s: float, re
     spring[_SPEED] = speed
 
 
-@compiled
+@compiled_in_place
 def _change(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> int:
     """How far direction and bands are from what the filters were computed for: not worth new ones, a step of steady
     motion, or a leap."""
@@ -281,7 +281,7 @@ def _change(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> int:
     return _STEP if turned > _ANGLE_STEP**2 or difference_db > _BAND_STEP_DB else _NONE
 
 
-@compiled
+@compiled_in_place
 def _find_filters(state: DirectPathState, slot: Any) -> None:
     """The filters and the head's delays for a slot's direction and bands."""
     for axis in range(3):
@@ -304,15 +304,15 @@ def _find_filters(state: DirectPathState, slot: Any) -> None:
                 loops.add_scaled(state.cepstra[direction, ear], state.weights[corner], cepstrum)
         for band in range(BANDS):
             loops.add_scaled(state.band_cepstra[band], slot.bands_db[band], cepstrum)
-        cepstrum *= state.orders
+        loops.weight(cepstrum, state.orders)
         slot.head_goal_s[ear] = delay
     loops.series_exponential(state.cepstrum, state.reciprocals, state.sums, state.next_taps)
     for ear in range(ears):
-        state.padded[:count] = state.next_taps[ear]
+        loops.copy(state.next_taps[ear], state.padded[:count])
         loops.transform(state.padded, state.twist, state.passes, state.lanes, state.next_spectra[ear])
 
 
-@compiled
+@compiled_in_place
 def _read(
     state: DirectPathState,
     slot: Any,
@@ -353,14 +353,14 @@ def _read(
         loops.scale(heard, gain_before, gain, state.ramp)
 
 
-@compiled
+@compiled_in_place
 def _delay(state: DirectPathState, slot: Any, ear: int) -> float:
     """Where length and head are, as a delay."""
     within = min(max(slot.length[_AT], state.shortest_m), state.longest_m)
     return float((within / state.speed_of_sound + slot.head[ear, _AT]) * state.sample_rate)
 
 
-@compiled
+@compiled_in_place
 def _read_still(state: DirectPathState, line: FloatArray, delay: float, back: int, out: FloatArray) -> None:
     """What was heard from `back` samples before this block on, had the delay always been this."""
     first, row, share = state.first[:1], state.row[:1], state.share[:1]
@@ -371,7 +371,7 @@ def _read_still(state: DirectPathState, line: FloatArray, delay: float, back: in
     loops.filter_block(line[begin:], state.still_taps, out)
 
 
-@compiled
+@compiled_in_place
 def _read_moving(
     state: DirectPathState, line: FloatArray, a0: float, a1: float, a2: float, a3: float, out: FloatArray
 ) -> None:

@@ -20,7 +20,7 @@ from server.acoustics.simd import (
     subtract,
     transpose,
 )
-from server.compiled import compiled
+from server.compiled import compiled_in_place
 from server.rendering import right_angle
 from server.rendering.fractional_delay import PHASES, TAPS
 
@@ -32,7 +32,7 @@ _ROW = 2 * TAPS
 _LINE_BYTES = 64
 
 
-@compiled
+@compiled_in_place
 def filter_block(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
     """out[i] = sum over k of taps[k] samples[i + len(taps) - 1 - k]"""
     x, h, y = samples.ctypes.data, taps.ctypes.data, out.ctypes.data
@@ -67,7 +67,7 @@ def transform_tables(size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     return tables.twist, tables.passes, tables.lanes
 
 
-@compiled
+@compiled_in_place
 def transform(samples: FloatArray, twist: FloatArray, passes: FloatArray, lanes: FloatArray, bins: FloatArray) -> None:
     """The right-angle spectrum (2, f) of the first 2 f samples."""
     size = bins.shape[1]
@@ -77,7 +77,7 @@ def transform(samples: FloatArray, twist: FloatArray, passes: FloatArray, lanes:
     right_angle.forward(first, second, to, to, 8, size, size, *tables)
 
 
-@compiled
+@compiled_in_place
 def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: FloatArray, out: FloatArray) -> None:
     """The second half (f,) of a window from its spectrum (2, f), which is used up."""
     size = mix.shape[1]
@@ -87,7 +87,7 @@ def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: Fl
     right_angle.inverse(bins, 8, size, bins, to, size, *tables)
 
 
-@compiled
+@compiled_in_place
 def accumulate(bins: FloatArray, filters: FloatArray, mix: FloatArray) -> None:
     """Add the product of two spectra (2, f) to a third."""
     size = bins.shape[1]
@@ -98,7 +98,7 @@ def accumulate(bins: FloatArray, filters: FloatArray, mix: FloatArray) -> None:
         store(y, size + n, multiply_add(xi, hr, multiply_add(xr, hi, load(y, size + n))))
 
 
-@compiled
+@compiled_in_place
 def accumulate_change(bins: FloatArray, before: FloatArray, after: FloatArray, mix: FloatArray) -> None:
     """`accumulate` by the difference of two filters, the one before less the one after."""
     size = bins.shape[1]
@@ -110,7 +110,7 @@ def accumulate_change(bins: FloatArray, before: FloatArray, after: FloatArray, m
         store(y, size + n, multiply_add(xi, hr, multiply_add(xr, hi, load(y, size + n))))
 
 
-@compiled
+@compiled_in_place
 def read_at(
     line: FloatArray, first: IntArray, row: IntArray, share: FloatArray, table: FloatArray, out: FloatArray
 ) -> None:
@@ -136,7 +136,7 @@ def read_at(
         store(y, i, add(lower, upper))
 
 
-@compiled
+@compiled_in_place
 def _products(x: int, t: int, f: int, r: int, s: int, i: int):  # type: ignore[no-untyped-def]
     """What the sinc of one sample adds to, in eight lanes."""
     at, row, share = load_int(f, i), load_int(r, i) * _ROW, load_broadcast(s, i)
@@ -147,7 +147,7 @@ def _products(x: int, t: int, f: int, r: int, s: int, i: int):  # type: ignore[n
     return total
 
 
-@compiled
+@compiled_in_place
 def locate(
     start: float,
     ring: int,
@@ -176,7 +176,7 @@ def locate(
         share[i] = phase - step
 
 
-@compiled
+@compiled_in_place
 def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, sums: FloatArray, taps: FloatArray) -> None:
     """taps (2, n) of the minimum-phase filters whose folded cepstra are c: h = exp(c) as power series.
 
@@ -198,7 +198,7 @@ def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, sums: Float
             taps[ear, n + 1] = sums[ear, n + 1] * reciprocals[n + 1]
 
 
-@compiled
+@compiled_in_place
 def fetch(samples: FloatArray, begin: int, end: int) -> None:
     """Have samples be near when they are read soon: streams as short as a slot's are over before a processor sees that
     they are streams."""
@@ -207,7 +207,7 @@ def fetch(samples: FloatArray, begin: int, end: int) -> None:
         prefetch(at)
 
 
-@compiled
+@compiled_in_place
 def scale(samples: FloatArray, start: float, end: float, ramp: FloatArray) -> None:
     """Multiply by what goes from `start` to `end` along `ramp` (b,); what is beyond the ramp stays."""
     first, rise = np.float32(start), np.float32(end - start)
@@ -215,40 +215,66 @@ def scale(samples: FloatArray, start: float, end: float, ramp: FloatArray) -> No
         samples[i] *= first + rise * ramp[i]
 
 
-@compiled
+@compiled_in_place
+def copy(values: FloatArray, out: FloatArray) -> None:
+    for i in range(out.size):
+        out[i] = values[i]
+
+
+@compiled_in_place
+def copy_spectrum(values: FloatArray, out: FloatArray) -> None:
+    """(2, f)"""
+    for part in range(2):
+        copy(values[part], out[part])
+
+
+@compiled_in_place
+def multiply_by(samples: FloatArray, factor: float) -> None:
+    scalar = np.float32(factor)
+    for i in range(samples.size):
+        samples[i] *= scalar
+
+
+@compiled_in_place
+def weight(values: FloatArray, weights: FloatArray) -> None:
+    for i in range(values.size):
+        values[i] *= weights[i]
+
+
+@compiled_in_place
 def add_block(block: FloatArray, out: FloatArray) -> None:
     for i in range(out.size):
         out[i] += block[i]
 
 
-@compiled
+@compiled_in_place
 def add_scaled(values: FloatArray, factor: float, out: FloatArray) -> None:
     scalar = np.float32(factor)
     for i in range(out.size):
         out[i] += scalar * values[i]
 
 
-@compiled
+@compiled_in_place
 def add_fading(block: FloatArray, fade: FloatArray, out: FloatArray) -> None:
     """Add a block that fades out as `fade` rises."""
     for i in range(out.size):
         out[i] += (np.float32(1) - fade[i]) * block[i]
 
 
-@compiled
+@compiled_in_place
 def add_faded(before: FloatArray, after: FloatArray, fade: FloatArray, out: FloatArray) -> None:
     for i in range(out.size):
         out[i] += before[i] + fade[i] * (after[i] - before[i])
 
 
-@compiled
+@compiled_in_place
 def shift(samples: FloatArray, by: int, count: int) -> None:
     """samples[:count] = what is `by` further on; the two may overlap."""
     for i in range(count):
         samples[i] = samples[i + by]
 
 
-@compiled
+@compiled_in_place
 def interpolate_reversed(row: FloatArray, share: float, taps: FloatArray) -> None:
     """A row of the table and `share` of the way to the next, for `filter_block`, which takes the last tap first."""
     scalar = np.float32(share)
@@ -256,7 +282,7 @@ def interpolate_reversed(row: FloatArray, share: float, taps: FloatArray) -> Non
         taps[TAPS - 1 - k] = row[k] + scalar * row[TAPS + k]
 
 
-@compiled
+@compiled_in_place
 def is_silent(block: FloatArray) -> bool:
     """Whether all samples are zero, of either sign."""
     bits = block.view(np.int32)

@@ -89,6 +89,22 @@ def scale(samples: FloatArray, start: float, end: float, ramp: FloatArray) -> No
     samples[: ramp.size] *= np.float32(start) + np.float32(end - start) * ramp
 
 
+def copy(values: FloatArray, out: FloatArray) -> None:
+    out[:] = values[: out.size]
+
+
+def copy_spectrum(values: FloatArray, out: FloatArray) -> None:
+    out[:] = values
+
+
+def multiply_by(samples: FloatArray, factor: float) -> None:
+    samples *= np.float32(factor)
+
+
+def weight(values: FloatArray, weights: FloatArray) -> None:
+    values *= weights
+
+
 def add_block(block: FloatArray, out: FloatArray) -> None:
     out += block[: out.size]
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from server.compiled import compiled
+from server.compiled import compiled_in_place
 from server.errors import NafirError
 
 _Floats = npt.NDArray[np.float64]
@@ -37,7 +37,7 @@ class Triangulation(NamedTuple):
     """(t, 3, 3) from a direction to its w."""
 
 
-@compiled
+@compiled_in_place
 def find_triangle(
     across: npt.NDArray[np.int64],
     inverses: _Floats,
