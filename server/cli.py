@@ -101,7 +101,7 @@ def server_options(settings: "Settings") -> dict[str, Any]:
         "host": settings.host,
         "port": settings.port,
         "loop": "auto",  # uvloop wherever it exists
-        "ws": "websockets-sansio",
+        "ws": "server.web_socket:WebSocketProtocol",
         "ws_max_size": settings.max_frame_bytes,
         "ws_per_message_deflate": False,
         "timeout_graceful_shutdown": 5,

@@ -19,6 +19,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.answers import Answers
 from server.audio_engine import AudioEngine
+from server.blocks import Encoding
 from server.catalogue import describe_scene
 from server.clips import ClipLibrary, DecodeError
 from server.errors import RequestError
@@ -35,6 +36,7 @@ from server.session import Session
 from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
 from server.telemetry import StreamTotals
+from server.web_socket import Write
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
 MAX_WAITING_ANSWERS = 256
@@ -83,16 +85,27 @@ class StreamHost:
 
 
 class Connection:
-    """One client from its hello to its goodbye."""
+    """One client from its hello to its goodbye. `write` is the short way out, where there is one."""
 
-    def __init__(self, websocket: WebSocket, host: StreamHost, *, time_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        websocket: WebSocket,
+        host: StreamHost,
+        *,
+        write: Write | None = None,
+        time_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._websocket = websocket
+        self._write = write
         self._host = host
         self._time_s = time_s
         self._outgoing: deque[Outgoing] = deque()
         self._has_outgoing = asyncio.Event()
+        self._is_sending = False
         self._capacity = MAX_WAITING_ANSWERS
         self._is_overfull = asyncio.Event()
+        self._stream: Stream | None = None
+        self._encoding: Encoding = "f32"
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
@@ -171,7 +184,7 @@ class Connection:
             ladder=ladder,
             block_s=block_s,
             lead=hello.buffer_blocks,
-            deliver=self._enqueue,
+            deliver=self._deliver,
         )
 
     def _open_session(self, hello: Hello, levels: Levels, hrtf: str, rung: Rung, window: int) -> Session:
@@ -191,10 +204,11 @@ class Connection:
 
     async def _pump(self, stream: Stream, hello: Hello) -> None:
         """Read and send until either ends or fails, or too much waits to be sent."""
+        self._stream, self._encoding = stream, hello.encoding
         self._host.audio.open(stream)
         tasks = [
             asyncio.create_task(self._read_incoming(stream, hello)),
-            asyncio.create_task(self._send_outgoing(stream, hello)),
+            asyncio.create_task(self._send_outgoing()),
             asyncio.create_task(self._refuse_overflow()),
         ]
         try:
@@ -240,6 +254,17 @@ class Connection:
             raise RequestError("message_too_large", f"a message has at most {limit} bytes, not {size}", status=413)
         return parse_client_message(data)
 
+    def _deliver(self, outgoing: list[Outgoing]) -> None:
+        """Send blocks at once where there is a short way and nothing waits to go before them."""
+        sent = 0
+        if self._write is not None and not (self._outgoing or self._is_sending):
+            while sent < len(outgoing) and isinstance(first := outgoing[sent], TimedBlock):
+                if not self._write(self._serialize(first)):
+                    break
+                sent += 1
+        if sent < len(outgoing):
+            self._enqueue(outgoing[sent:])
+
     def _enqueue(self, outgoing: list[Outgoing]) -> None:
         """Where there is no room, what comes is lost, and the connection ends."""
         if len(self._outgoing) + len(outgoing) > self._capacity:
@@ -253,28 +278,31 @@ class Connection:
         await self._is_overfull.wait()
         raise ClosingError(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
 
-    async def _send_outgoing(self, stream: Stream, hello: Hello) -> None:
+    async def _send_outgoing(self) -> None:
         """Send until cancelled, or until the stream cannot go on and the socket was closed for it."""
         while True:
             await self._has_outgoing.wait()
             self._has_outgoing.clear()
+            self._is_sending = True
             while self._outgoing:
                 match self._outgoing.popleft():
                     case TimedBlock() as timed:
-                        await self._send_block(timed, stream, hello)
+                        await self._websocket.send_bytes(self._serialize(timed))
                     case StreamFailed():
                         await self._send_message(Error(code="internal_error", message="the stream failed"))
                         await self._websocket.close(INTERNAL_ERROR, "internal_error")
                         return
                     case message:
                         await self._send_message(message)
+            self._is_sending = False
 
-    async def _send_block(self, timed: TimedBlock, stream: Stream, hello: Hello) -> None:
+    def _serialize(self, timed: TimedBlock) -> bytes:
         block = timed.block
-        if self._time_s() > timed.deadline_s:
-            stream.blocks_late += 1
+        if not block.is_late and self._time_s() > timed.deadline_s:
+            assert self._stream is not None
+            self._stream.blocks_late += 1
             block.is_late = True
-        await self._websocket.send_bytes(block.serialize(hello.encoding))
+        return block.serialize(self._encoding)
 
     async def _send_message(self, message: ServerMessage) -> None:
         await self._websocket.send_text(message.serialize())

@@ -110,6 +110,41 @@ def test_blocks_that_leave_after_their_deadline_are_flagged_and_counted(field, h
     assert status.blocks_late == pytest.approx(len(late), abs=12)
 
 
+def test_blocks_that_go_the_short_way_and_the_long_one_stay_in_order(field, hrtfs):
+    """Where the short way has no room, what comes waits for what waits; each block is late once, whichever way."""
+    tries, written = [], []
+
+    async def scenario():
+        socket = Socket()
+
+        def write(data):
+            tries.append(len(tries))
+            if len(tries) % 5 in {0, 1}:
+                return False
+            written.append(AudioBlock.parse(data, "f32").sequence)
+            socket.sent.append(AudioBlock.parse(data, "f32"))
+            return True
+
+        async with hosting(field, hrtfs) as host:
+            connection = Connection(socket, host, write=write, time_s=lambda: time.monotonic() + 1.0)
+            running = asyncio.create_task(connection.run())
+            socket.say(HELLO)
+            while not any(isinstance(message, Status) for message in socket.sent):
+                for block in [message for message in socket.sent if isinstance(message, AudioBlock)][-1:]:
+                    socket.say(Acknowledge(sequence=block.sequence))
+                await asyncio.sleep(0.01)
+            await socket.close(1000, "")
+            await running
+        return socket.sent
+
+    sent = asyncio.run(scenario())
+    blocks = [message for message in sent if isinstance(message, AudioBlock)]
+    (status,) = [message for message in sent if isinstance(message, Status)]
+    assert [block.sequence for block in blocks] == list(range(len(blocks)))
+    assert 0 < len(written) < len(blocks)
+    assert status.blocks_late == pytest.approx(len(blocks), abs=12)
+
+
 @pytest.mark.parametrize("message", [Ping(id=1), RemoveEmitter(id="ghost")])
 def test_a_client_that_never_reads_its_answers_is_cut_off(field, hrtfs, message):
     async def scenario():

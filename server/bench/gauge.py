@@ -22,6 +22,7 @@ from server.protocol import ListenerPose
 from server.replies import Durations
 from server.stream import Stream
 from server.streaming import StreamHost
+from server.web_socket import watched
 
 POSE_ID = struct.Struct("<4xI")
 """Where it stands in a binary pose of a listener."""
@@ -111,18 +112,21 @@ class Gauge:
                 watch.reverberation.enter(pose_id, now_s)
             return message
 
-        async def send_block(message: Message) -> None:
-            await send(message)
-            data = message.get("bytes")
-            if data and data[0] == AudioBlock.KIND:
+        def see_block(data: bytes) -> None:
+            if data[0] == AudioBlock.KIND:
                 pose_id, reverberation_pose_id = POSE_IDS.unpack_from(data)
                 now_s = self._time_s()
                 watch.direct.leave(pose_id, now_s)
                 watch.reverberation.leave(reverberation_pose_id, now_s)
 
+        async def send_block(message: Message) -> None:
+            await send(message)
+            if data := message.get("bytes"):
+                see_block(data)
+
         self._watches.add(watch)
         try:
-            await self._app(scope, receive_pose, send_block)
+            await self._app(watched(scope, see_block), receive_pose, send_block)
         finally:
             self._watches.remove(watch)
 
