@@ -115,6 +115,16 @@ def load_int(_context: Any, _address: Any, _index: Any) -> Any:
 
 
 @intrinsic
+def load_short_int(_context: Any, _address: Any, _index: Any) -> Any:
+    """One int32; `index` counts int32."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.sext(builder.load(_pointer(builder, *args, _INT32, 4), align=4), _INT64)
+
+    return types.int64(types.int64, types.int64), generate
+
+
+@intrinsic
 def broadcast(_context: Any, _value: Any) -> Any:
     """One float32 in every lane."""
 

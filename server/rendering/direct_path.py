@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.cache_lines import zeros_on_lines
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.compiled import HAS_NUMBA
@@ -172,7 +173,7 @@ def _state(
     twist, passes, lanes = transform_tables(bins)
 
     def floats(*shape: int) -> FloatArray:
-        return np.zeros(shape, np.float32)
+        return zeros_on_lines(*shape)
 
     def doubles(*shape: int) -> npt.NDArray[np.float64]:
         return np.zeros(shape, np.float64)
@@ -214,8 +215,8 @@ def _state(
         bins=floats(2, bins),
         is_mixed=integers(4),
         mix=floats(3, ears, 2, bins),
-        first=integers(wide),
-        row=integers(wide),
+        first=np.zeros(wide, np.int32),
+        row=np.zeros(wide, np.int32),
         share=floats(wide),
         still_taps=floats(TAPS),
         read=floats(2, wide),

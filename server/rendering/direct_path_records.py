@@ -88,8 +88,8 @@ class DirectPathState(NamedTuple):
     bins: FloatArray  # (part, f)
     is_mixed: IntArray  # (4,) whether anything was, in this block: in each mix, and without a filter
     mix: FloatArray  # (3, e, part, f) by the filters in effect; what those before add, in a step and in a leap
-    first: IntArray  # (w,)
-    row: IntArray  # (w,)
+    first: npt.NDArray[np.int32]  # (w,)
+    row: npt.NDArray[np.int32]  # (w,)
     share: FloatArray  # (w,)
     still_taps: FloatArray  # (TAPS,)
     read: FloatArray  # (2, w)

@@ -5,8 +5,12 @@ coefficients, then their differences to the next row, between which one interpol
 the error is below -90 dB up to 0.8 and below -100 dB up to half of the Nyquist frequency.
 """
 
+from functools import cache
+
 import numpy as np
 import numpy.typing as npt
+
+from server.acoustics.cache_lines import on_lines
 
 TAPS = 32
 BEFORE = TAPS // 2 - 1
@@ -16,10 +20,11 @@ PHASES = 256
 _KAISER_BETA = 10.0
 
 
+@cache
 def sinc_table() -> npt.NDArray[np.float32]:
-    """(PHASES, 2 * TAPS)"""
+    """(PHASES, 2 * TAPS), one for all: of many listeners, each would push the others' out of the caches."""
     offset = np.arange(TAPS) - BEFORE - np.arange(PHASES + 1)[:, None] / PHASES
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1 - (offset / (TAPS / 2)) ** 2)))
     rows = np.sinc(offset) * window
     rows /= rows.sum(axis=-1, keepdims=True)
-    return np.concatenate([rows[:-1], np.diff(rows, axis=0)], axis=-1).astype(np.float32)
+    return on_lines(np.concatenate([rows[:-1], np.diff(rows, axis=0)], axis=-1))

@@ -7,25 +7,23 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.simd import (
-    add,
     broadcast,
     load,
     load_broadcast,
-    load_int,
-    multiply,
+    load_short_int,
     multiply_add,
     multiply_subtract,
     prefetch,
     store,
     subtract,
-    transpose,
 )
+from server.acoustics.wide_simd import load_16, load_broadcast_16, multiply_16, multiply_add_16, sum_each
 from server.compiled import compiled_in_place
 from server.rendering import right_angle
 from server.rendering.fractional_delay import PHASES, TAPS
 
 FloatArray = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
+IntArray = npt.NDArray[np.int32]
 
 TILE = 64
 _ROW = 2 * TAPS
@@ -119,7 +117,7 @@ def read_at(
     x, t, y = line.ctypes.data, table.ctypes.data, out.ctypes.data
     f, r, s = first.ctypes.data, row.ctypes.data, share.ctypes.data
     for i in range(0, out.size, 8):
-        lanes = transpose(
+        sums = sum_each(
             (
                 _products(x, t, f, r, s, i),
                 _products(x, t, f, r, s, i + 1),
@@ -131,19 +129,17 @@ def read_at(
                 _products(x, t, f, r, s, i + 7),
             )
         )
-        lower = add(add(lanes[0], lanes[1]), add(lanes[2], lanes[3]))
-        upper = add(add(lanes[4], lanes[5]), add(lanes[6], lanes[7]))
-        store(y, i, add(lower, upper))
+        store(y, i, sums)
 
 
 @compiled_in_place
 def _products(x: int, t: int, f: int, r: int, s: int, i: int):  # type: ignore[no-untyped-def]
-    """What the sinc of one sample adds to, in eight lanes."""
-    at, row, share = load_int(f, i), load_int(r, i) * _ROW, load_broadcast(s, i)
-    total = multiply(multiply_add(share, load(t, row + TAPS), load(t, row)), load(x, at))
-    for k in range(8, TAPS, 8):
-        tap = multiply_add(share, load(t, row + TAPS + k), load(t, row + k))
-        total = multiply_add(tap, load(x, at + k), total)
+    """What the sinc of one sample adds to, in sixteen lanes."""
+    at, row, share = load_short_int(f, i), load_short_int(r, i) * _ROW, load_broadcast_16(s, i)
+    total = multiply_16(multiply_add_16(share, load_16(t, row + TAPS), load_16(t, row)), load_16(x, at))
+    for k in range(16, TAPS, 16):
+        tap = multiply_add_16(share, load_16(t, row + TAPS + k), load_16(t, row + k))
+        total = multiply_add_16(tap, load_16(x, at + k), total)
     return total
 
 

@@ -7,7 +7,7 @@ import scipy.fft
 from server.rendering.fractional_delay import PHASES, TAPS
 
 FloatArray = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
+IntArray = npt.NDArray[np.int32]
 
 TILE = 64
 _ALIASING = 8

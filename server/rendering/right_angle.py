@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.cache_lines import on_lines
 from server.acoustics.lane_fft import (
     first_span,
     is_odd_power,
@@ -71,7 +72,7 @@ def tables(size: int) -> Tables:
 
 
 def _parts(values: npt.NDArray[np.complex128]) -> npt.NDArray[np.float32]:
-    return np.ascontiguousarray(np.stack([values.real, values.imag]).astype(np.float32))
+    return on_lines(np.stack([values.real, values.imag]))
 
 
 @compiled

@@ -24,11 +24,6 @@ def _band_cepstra(sample_rate: int, taps: int) -> FloatArray:
     return band_cepstra(sample_rate, taps).astype(np.float32)
 
 
-@cache
-def _sinc_table() -> FloatArray:
-    return sinc_table()
-
-
 class StillPaths:
     """A head and the air around it; safe to share between threads. `air_db_per_m` (band,) >= 0.
 
@@ -48,7 +43,7 @@ class StillPaths:
             band_cepstra=_band_cepstra(filters.sample_rate, filters.taps),
             orders=orders.astype(np.float32),
             reciprocals=(1 / orders).astype(np.float32),
-            sinc=_sinc_table(),
+            sinc=sinc_table(),
             air_db_per_m=np.array(air_db_per_m, np.float64).reshape(len(OCTAVE_BANDS_HZ)),
             sample_rate=float(filters.sample_rate),
             speed_of_sound=float(speed_of_sound),
