@@ -10,6 +10,11 @@ the renderer's call and the way to the event loop would cost about what renderin
 stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly apart, gives a
 new stream the one with the fewest others, and renders all that is due at an instant in one call without the lock.
 
+**Under load**, blocks are rendered in pairs (`server.load.runs_ahead`): of a pair, the second costs less rendering, for
+much of what it reads is in the caches, and hardly any of what waking, messages and the way to the event loop cost. It
+is ready a block before it is due, so poses are heard up to a block later. Half of an instant's streams have their pairs
+in every other block, half in the others.
+
 **What a stream gets.** Four times a second a thread looks at what its streams went through, and moves them to cheaper
 or better quality (`server.load`).
 
@@ -26,14 +31,16 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from typing import NamedTuple
 
-from server.load import PERIOD_S, LoadControl, Reason, ir_share
+from server.load import PERIOD_S, LoadControl, Reason, ir_share, runs_ahead
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
 from server.stream import Outgoing, Stream, StreamFailed
 
 PHASES = 2
 """Four streams of 16 emitters cost their two threads 9 % less than at four, and poses are heard 0.4 ms later."""
+_PAIR = 2
 _EARLY_S = 0.0002
 """Blocks due within that are rendered now: sooner than one could sleep and wake again."""
 _PRESUMED_LOAD = 0.02
@@ -137,7 +144,8 @@ class AudioThread:
         self._busy_s = 0.0
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
-        """With the phase of each."""
+        """With the place of each: its phase, and which of a pair of blocks it begins pairs with."""
+        self._runs_ahead = False
         self._arrivals: deque[tuple[Stream, bool]] = deque()
         self._origin_s: float | None = None
         self._wake = threading.Event()
@@ -171,7 +179,7 @@ class AudioThread:
         now_s = self._time_s()
         self._admit(now_s)
         made: dict[Stream, list[Outgoing]] = {}
-        due: dict[Stream, float] = {}  # with what its block has cost so far
+        due: list[_Due] = []
         for stream in tuple(self._streams):
             is_due = stream.due_s <= now_s + _EARLY_S
             if not is_due and not stream.has_news:
@@ -181,7 +189,7 @@ class AudioThread:
                 if is_due:
                     began_s = self._time_s()
                     stream.session.begin_block()
-                    due[stream] = self._time_s() - began_s
+                    due.append(_Due(stream, self._blocks_of(stream), self._time_s() - began_s))
             except Exception:
                 _logger.exception(_FAILED)
                 self._fail(stream, made)
@@ -196,24 +204,37 @@ class AudioThread:
             return None
         return min(stream.due_s for stream in self._streams) - self._time_s()
 
-    def _render(self, due: dict[Stream, float], made: dict[Stream, list[Outgoing]]) -> None:
+    def _blocks_of(self, stream: Stream) -> int:
+        """How many blocks of a stream that is due are rendered now."""
+        if not (self._runs_ahead and stream.session.renderer.runs_by_itself):
+            return 1
+        assert self._origin_s is not None
+        since_origin = math.floor((stream.due_s - self._origin_s) / stream.block_s + 0.5 / PHASES)
+        return _PAIR if (since_origin - self._streams[stream] // PHASES) % _PAIR == 0 else 1
+
+    def _render(self, due: list["_Due"], made: dict[Stream, list[Outgoing]]) -> None:
         began_s = self._time_s()
-        clocks = [stream.session.sample_clock for stream in due]
+        clocks = [each.stream.session.sample_clock for each in due]
+        renderers = [each.stream.session.renderer for each in due for _ in range(each.blocks)]
         try:
-            blocks = render_all([stream.session.renderer for stream in due])
+            blocks = iter(render_all(renderers))
         except Exception:  # whose block it was shows when each is rendered alone
-            _logger.exception("%d blocks rendered together failed", len(due))
-            for stream, cost_s in due.items():
-                if len(due) == 1:
-                    self._fail(stream, made)
+            _logger.exception("%d blocks rendered together failed", len(renderers))
+            for each in due:
+                if len(renderers) == 1:
+                    self._fail(each.stream, made)
                 else:
-                    self._render({stream: cost_s}, made)
+                    self._render([each._replace(blocks=1)], made)
             return
         now_s = self._time_s()
-        share_s = (now_s - began_s) / len(due)
-        for (stream, cost_s), clock, samples in zip(due.items(), clocks, blocks, strict=True):
+        share_s = (now_s - began_s) / len(renderers)
+        for (stream, count, cost_s), clock in zip(due, clocks, strict=True):
+            rendered = [next(blocks) for _ in range(count)]
+            size = stream.session.renderer.block_size
             try:
-                made[stream] += stream.finish_block(clock, samples, cost_s=cost_s + share_s, now_s=now_s)
+                for number, block in enumerate(rendered):
+                    spent_s = share_s + cost_s / count
+                    made[stream] += stream.finish_block(clock + number * size, block, cost_s=spent_s, now_s=now_s)
             except Exception:
                 _logger.exception(_FAILED)
                 self._fail(stream, made)
@@ -228,6 +249,7 @@ class AudioThread:
             stream = by_ladder[ladder]
             made.setdefault(stream, []).extend(stream.step(reason, now_s))
             self.steps[reason] += 1
+        self._runs_ahead = runs_ahead(busy, before=self._runs_ahead)
         share = ir_share(self._ir_share, busy=busy)
         for stream in self._streams:
             stream.ration(streams=len(self._streams), share=share)
@@ -241,15 +263,16 @@ class AudioThread:
         while self._arrivals:
             stream, is_opening = self._arrivals.popleft()
             if is_opening:
-                phase = self._freest_phase(stream.block_s)
-                stream.start(self._origin_of(phase, stream.block_s, now_s))
-                self._streams[stream] = phase
+                place = self._freest_place(stream.block_s)
+                stream.start(self._origin_of(place % PHASES, stream.block_s, now_s))
+                self._streams[stream] = place
             else:
                 self._streams.pop(stream, None)
 
-    def _freest_phase(self, block_s: float) -> int:
-        taken = Counter(phase for stream, phase in self._streams.items() if stream.block_s == block_s)
-        return min(range(PHASES), key=lambda phase: taken[phase])
+    def _freest_place(self, block_s: float) -> int:
+        taken = Counter(place for stream, place in self._streams.items() if stream.block_s == block_s)
+        phases = Counter(place % PHASES for place in taken.elements())
+        return min(range(PHASES * _PAIR), key=lambda place: (phases[place % PHASES], taken[place]))
 
     def _origin_of(self, phase: int, block_s: float, now_s: float) -> float:
         """The next instant of `phase` that lies a block ahead at least, so that the first has time to be rendered."""
@@ -266,6 +289,14 @@ class AudioThread:
             if wait_s is None or wait_s > 0:
                 self._wake.wait(wait_s)
             self._wake.clear()
+
+
+class _Due(NamedTuple):
+    """So many blocks of a stream, which have cost `cost_s` so far."""
+
+    stream: Stream
+    blocks: int
+    cost_s: float
 
 
 def _deliver(made: dict[Stream, list[Outgoing]]) -> None:

@@ -32,6 +32,8 @@ _LEAST_RATE_HZ = 2.0
 _FULL = 0.85
 """Share of the time in which an audio thread renders, from which on it has none to spare."""
 _FREE = 0.6
+_PAIRS_ABOVE, _ALONE_BELOW = 0.6, 0.4
+"""Shares of the time. Pairs take a tenth to a fifth less of it."""
 _SHARED = 0.75
 """Share of a core that rendering and impulse responses may take together: the event loop, plans and checks need the
 rest."""
@@ -229,6 +231,12 @@ def _best_off(ladders: Mapping[Ladder, Strain]) -> Sequence[Ladder]:
 def ir_share(most: float, *, busy: float) -> float:
     """Of a core, for IRs of the streams of an audio thread that renders for a share `busy` of the time."""
     return min(most, max(_SHARED - busy, _LEAST_IR_SHARE * most))
+
+
+def runs_ahead(busy: float, *, before: bool) -> bool:
+    """Whether an audio thread that renders for a share `busy` of the time renders blocks in pairs, the second of them
+    ahead of time, as it did `before` or not: cheaper, and poses are heard up to a block later."""
+    return busy > (_ALONE_BELOW if before else _PAIRS_ABOVE)
 
 
 def ir_interval_s(ladder: Ladder, *, request_s: float, streams: int, share: float) -> float:

@@ -9,6 +9,7 @@ definition. What a client sends is validated here, once; a `RequestError` carrie
 """
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
@@ -58,7 +59,7 @@ class _Directed(Message):
         """Whether the message says where front is."""
         return self.orientation is not None or self.yaw is not None
 
-    @property
+    @cached_property
     def pose(self) -> Pose:
         if self.orientation is not None:
             return Pose(self.position, Quaternion(*self.orientation))

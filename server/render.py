@@ -27,7 +27,6 @@ from server.places import place_of_field
 from server.planned_effects import PlannedEffects
 from server.radiation import reverberation_gain
 from server.rendering.ingest import DryAudio, require_gain
-from server.rendering.renderer import render_all
 from server.rendering.sources import ClipPlayer
 from server.scene.effects import EffectName, require_effect
 from server.scene.situation import Output
@@ -219,7 +218,7 @@ def render(
     output = np.empty((walk.renderer.outputs, blocks, block_size), np.float32)
     for block in range(blocks):
         walk.go_on(direct.get(block), reverberation.get(block))
-        (output[:, block],) = render_all([walk.renderer])
+        output[:, block] = walk.renderer.process()
         if progress:
             progress((block + 1) / blocks)
     return output.reshape(len(output), -1)[:, :length]

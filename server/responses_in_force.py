@@ -49,7 +49,7 @@ class ResponsesInForce:
         self._reason: Reason = "chosen"
         self._accepted_pose_id = 0
         self._in_flight: IrRequest | None = None
-        self._waits_for_change = False
+        self._waits_for_change = self._has_looked = False
         self._interval_s = 0.0
         self._next_request_clock = 0
         renderer.share_tail(rung.shared_tail)
@@ -65,7 +65,7 @@ class ResponsesInForce:
         if rung.level != self._wanted.level:
             for emitter in self._emitters.values():
                 emitter.is_outdated = True
-            self._waits_for_change = False
+            self._look_again()
             self._next_request_clock = 0
         self._wanted, self._reason = rung, reason
         return self.change_rung() if rung.level == self.heard.level or not self._emitters else []
@@ -95,22 +95,30 @@ class ResponsesInForce:
         if pose_id <= self.newest_pose_id:
             raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")
         self.newest_pose_id = pose_id
-        self._waits_for_change = False
+        self._look_again()
 
     def retry(self) -> None:
         """Look again at what to ask for: somebody has come, or is decided about."""
-        self._waits_for_change = False
+        self._look_again()
+
+    def _look_again(self) -> None:
+        """Something has changed that may call for an IR."""
+        self._waits_for_change = self._has_looked = False
 
     def enforce_plan(self) -> list[ServerMessage]:
         """Put the plan of effects into effect, with the block that follows."""
         events = self._announce(self._effects.enforce(self._emitters))
         self._effects.share_tail(self.heard.shared_tail, self._emitters)
-        self._waits_for_change = False
+        self._look_again()
         return events
 
     def take_request(self, listener: Pose) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, or when every IR is up to date."""
         if self._in_flight is not None or self._waits_for_change:
+            return None
+        clock = self._renderer.sample_clock
+        is_too_soon = clock < self._next_request_clock
+        if is_too_soon and self._has_looked:
             return None
         outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter, listener)]
         if not outdated and not self._effects.awaits_ears:
@@ -118,8 +126,8 @@ class ResponsesInForce:
             # Room for other ears comes by itself; whatever else calls for an IR is told.
             self._waits_for_change = not self._effects.wants_other_ears
             return None
-        clock = self._renderer.sample_clock
-        if clock < self._next_request_clock and all(emitter.token is not None for emitter in outdated):
+        if is_too_soon and all(emitter.token is not None for emitter in outdated):
+            self._has_looked = True
             return None
         self._next_request_clock = clock + round(self._interval_s * self._sample_rate)
         asked = {emitter.serial: as_asked(emitter) for emitter in outdated}
@@ -147,7 +155,7 @@ class ResponsesInForce:
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""
         self._in_flight = None
-        self._waits_for_change = False
+        self._look_again()
         if response.request.level not in {self._wanted.level, self.heard.level}:
             return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
         pose_id = response.request.pose_id

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from server.acoustics.decibels import db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
-from server.blocks import AudioBlock, DryBlock, FloatArray
+from server.blocks import AudioBlock, DryBlock
 from server.direct_sound import DirectSound
 from server.effects_in_force import EffectsInForce
 from server.emitters import Emitter, LiveInput
@@ -43,6 +43,7 @@ from server.radiation import reverberation_gain
 from server.regret import Regret, RegretCheck
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
+from server.rendering.output import Rendered
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
 from server.rendering.sources import ClipPlayer, Source
 from server.replies import EmitterRemoved, Error, LiveStatus, PlanChanged, ServerMessage
@@ -264,15 +265,14 @@ class Session:
         self.renderer.set_orientation(self._listener.orientation)
         self._followed_pose_id = self._responses.newest_pose_id
 
-    def finish_block(self, sample_clock: int, samples: FloatArray) -> AudioBlock | None:
+    def finish_block(self, sample_clock: int, rendered: Rendered) -> AudioBlock | None:
         """The block just rendered, which began at `sample_clock`; None when the window is full, so that it is not to be
         sent.
 
         A block that is not sent was rendered all the same: clips and reverberation keep their place on the clock.
         """
-        is_exchange, is_limited = self.renderer.exchanged, self.renderer.is_limited
-        self.ir_exchanges += is_exchange
-        self.blocks_limited += is_limited
+        self.ir_exchanges += rendered.is_exchange
+        self.blocks_limited += rendered.is_limited
         self._responses.follow_renderer()
         if not self.window.is_open:
             self.blocks_dropped += 1
@@ -282,17 +282,17 @@ class Session:
             sample_clock=sample_clock,
             pose_id=self._followed_pose_id,
             reverberation_pose_id=self._responses.applied_pose_id,
-            samples=samples,
-            is_exchange=is_exchange,
-            is_limited=is_limited,
+            samples=rendered.samples,
+            is_exchange=rendered.is_exchange,
+            is_limited=rendered.is_limited,
         )
 
     def render_block(self) -> AudioBlock | None:
         """All three steps for this session alone."""
         self.begin_block()
         sample_clock = self.sample_clock
-        (samples,) = render_all([self.renderer])
-        return self.finish_block(sample_clock, samples)
+        (rendered,) = render_all([self.renderer])
+        return self.finish_block(sample_clock, rendered)
 
     def live_statuses(self) -> tuple[LiveStatus, ...]:
         return tuple(emitter.live.status for emitter in self._emitters.values() if emitter.live)

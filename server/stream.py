@@ -12,7 +12,7 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from functools import partial
 
-from server.blocks import AudioBlock, FloatArray
+from server.blocks import AudioBlock
 from server.durations import DurationHistogram
 from server.errors import RequestError
 from server.field.levels import Levels
@@ -23,6 +23,7 @@ from server.planned_effects import SHARE_OF_ALL as PLAN_SHARE
 from server.planned_effects import PlanRequest
 from server.protocol import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
 from server.regret import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
+from server.rendering.output import Rendered
 from server.replies import Durations, Error, ServerMessage, Status
 from server.scene.plan import Plan
 from server.session import Session
@@ -160,7 +161,8 @@ class Stream:
 
     @property
     def has_news(self) -> bool:
-        return bool(self._messages or self._answers or self._plans or self._checks)
+        """Whether something waits that cannot wait for the next block: for an IR to be asked for, or for an answer."""
+        return bool(self._answers or self._plans or (self._messages and not self.session.awaits_irs))
 
     def take_in(self, workers: Executor) -> list[Outgoing]:
         """Heed what waits and ask for impulse responses."""
@@ -209,10 +211,10 @@ class Stream:
         self.session.space_plans(self._plan_s * streams / PLAN_SHARE)
         self.session.space_irs(ir_interval_s(self.ladder, request_s=self._request_s, streams=streams, share=share))
 
-    def finish_block(self, sample_clock: int, samples: FloatArray, *, cost_s: float, now_s: float) -> list[Outgoing]:
+    def finish_block(self, sample_clock: int, rendered: Rendered, *, cost_s: float, now_s: float) -> list[Outgoing]:
         """Pass on the block just rendered, which took `cost_s` and is ready `now_s`."""
         outgoing: list[Outgoing] = []
-        block = self.session.finish_block(sample_clock, samples)
+        block = self.session.finish_block(sample_clock, rendered)
         clock = self.clock
         if block is not None:
             outgoing.append(TimedBlock(block, clock.deadline_s(self.next_block)))

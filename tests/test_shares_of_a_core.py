@@ -23,7 +23,7 @@ def test_the_busier_a_thread_the_less_its_responses_may_take(stage, busy, share)
 
     def take_time():
         follow_poses()
-        stage.clock.now_s += busy * BLOCK_S
+        stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
 
     stream.session.begin_block = take_time
     stream.ration = lambda **budget: shares.append(budget["share"])

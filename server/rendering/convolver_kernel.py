@@ -58,6 +58,17 @@ def process_convolver(address: int) -> None:
 
 
 @compiled
+def has_exchanged(address: int) -> bool:
+    """Whether an IR was exchanged in the head, in the block last processed."""
+    convolver = carray(pointer(address), (1,), CONVOLVER)[0]
+    exchanged = _ints(convolver.exchanged, convolver.sources)
+    some = np.int64(0)
+    for source in range(convolver.sources):
+        some |= exchanged[source]
+    return some != 0
+
+
+@compiled
 def process_block(address: int, blocks: npt.NDArray[np.float32], output: npt.NDArray[np.float32]) -> bool:
     """`process_convolver` of one block (source, block_size), its mix left in `output` (channel, block_size). False, and
     nothing done, for other shapes."""

@@ -114,6 +114,11 @@ class Mixer:
         self._sources.pop(slot, None)
         self._followed.pop(slot, None)
 
+    @property
+    def plays_by_itself(self) -> bool:
+        """Whether none of its sources is one that Python has to ask."""
+        return not self._sources
+
     def fill(self) -> None:
         """Have those sources play that Python has to ask."""
         for slot, source in self._sources.items():

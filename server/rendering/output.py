@@ -5,6 +5,7 @@ costs little by itself; but where others want it, each time may mean to wait for
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,15 +32,25 @@ class Output:
             self.address = int(self._record.ctypes.data)
 
 
-def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer]]]) -> list[FloatArray]:
-    """The next block (channel, block_size) of each, in an array of its own, of its one or two mixers."""
+class Rendered(NamedTuple):
+    """A block (channel, block_size), in an array of its own."""
+
+    samples: FloatArray
+    is_exchange: bool
+    """Whether an impulse response was exchanged in it."""
+    is_limited: bool
+    """Whether it would have been too loud, and was turned down."""
+
+
+def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer]]]) -> list[Rendered]:
+    """The next block of each, of its one or two mixers. Who stands there several times, in a row, gets so many; that is
+    for mixers that play by themselves."""
     mixers = [mixer for _, mixed in listeners for mixer in mixed]
     for mixer in mixers:
         mixer.fill()
     for mixer in mixers:
         mixer.follow()
-    size = sum(output.sum.size for output, _ in listeners)
-    frames = np.empty(size, np.float32)
+    frames = np.empty(sum(output.sum.size for output, _ in listeners), np.float32)
     blocks = []
     end = 0
     rows = []
@@ -47,21 +58,24 @@ def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer]]]) -> list[FloatAr
         start, end = end, end + output.sum.size
         blocks.append(frames[start:end].reshape(-1, output.channels).T)
         if HAS_NUMBA:
-            rows.append((output.address, mixed[0].address, mixed[1].address if len(mixed) > 1 else 0, start))
-        else:
-            _mix(output, mixed, blocks[-1])
-    if HAS_NUMBA and rows:
-        like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
-        limiter = next((output.limiter.state for output, _ in listeners if output.limiter is not None), None)
-        kinds = (None if each is None else each.kind for each in (like, limiter))
-        mixing_with(*kinds)(np.array(rows, np.int64), frames, like, limiter)
-        for mixer in mixers:
-            if mixer.convolver is not None:
-                mixer.convolver.release()
-    return blocks
+            rows.append((output.address, mixed[0].address, mixed[1].address if len(mixed) > 1 else 0, start, 0, 0))
+    if not HAS_NUMBA:
+        return [_mix(output, mixed, block) for (output, mixed), block in zip(listeners, blocks, strict=True)]
+    if not rows:
+        return []
+    like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
+    limiter = next((output.limiter.state for output, _ in listeners if output.limiter is not None), None)
+    kinds = (None if each is None else each.kind for each in (like, limiter))
+    table = np.array(rows, np.int64)
+    mixing_with(*kinds)(table, frames, like, limiter)
+    for mixer in mixers:
+        if mixer.convolver is not None:
+            mixer.convolver.release()
+    flags = table[:, 4:].tolist()
+    return [Rendered(block, bool(one), bool(other)) for block, (one, other) in zip(blocks, flags, strict=True)]
 
 
-def _mix(output: Output, mixers: Sequence[Mixer], block: FloatArray) -> None:
+def _mix(output: Output, mixers: Sequence[Mixer], block: FloatArray) -> Rendered:
     output.sum.fill(0)
     for mixer in mixers:
         mix(mixer)
@@ -70,3 +84,5 @@ def _mix(output: Output, mixers: Sequence[Mixer], block: FloatArray) -> None:
     if output.limiter is not None:
         output.limiter.process(output.sum)
     block[:] = output.sum
+    is_exchange = any(mixer.convolver is not None and mixer.convolver.exchanged for mixer in mixers)
+    return Rendered(block, is_exchange, output.limiter is not None and output.limiter.acted)

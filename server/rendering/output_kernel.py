@@ -11,6 +11,7 @@ from numba import carray, types
 from server.acoustics.simd import pointer
 from server.compiled import compiled
 from server.rendering.by_reference import Reference, ReferenceType, reference_at
+from server.rendering.convolver_kernel import has_exchanged
 from server.rendering.flush_to_zero import flush_to_zero, restore
 from server.rendering.limiter import limit
 from server.rendering.mixing_kernel import MIXER, mix
@@ -35,8 +36,9 @@ def mix_listeners(
     like: Reference | None,
     like_limiter: Reference | None,
 ) -> None:
-    """One block of every listener. A row has the addresses of its OUTPUT record and of two MIXER records, the second 0
-    for none, and where in `frames` its block begins. `like` and `like_limiter` refer to any direct path's state and
+    """One block for every row, in order. A row (6,) has the addresses of an OUTPUT record and of two MIXER records,
+    the second 0 for none, and where in `frames` its block begins; it is told whether an IR was exchanged in it, and
+    whether it would have been too loud. `like` and `like_limiter` refer to any direct path's state and
     any limiter's, or are None where there is none."""
     mode = flush_to_zero()
     for number in range(rows.shape[0]):
@@ -48,8 +50,12 @@ def mix_listeners(
                 mixer = carray(pointer(rows[number, place]), (1,), MIXER)[0]
                 mix(mixer, like)
                 _add(mixer, total)
+                if mixer.convolver != 0 and has_exchanged(mixer.convolver):
+                    rows[number, 4] = 1
         if like_limiter is not None and output.limiter != 0:
-            limit(reference_at(output.limiter, like_limiter), total)
+            limiter = reference_at(output.limiter, like_limiter)
+            limit(limiter, total)
+            rows[number, 5] = limiter.counts[0]
         at = rows[number, 3]
         for n in range(output.block_size):
             for channel in range(output.channels):

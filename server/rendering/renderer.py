@@ -31,7 +31,7 @@ from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import require_gain
 from server.rendering.mixer_set import MixerSet
 from server.rendering.mixing import Mixer
-from server.rendering.output import Output, mix_all
+from server.rendering.output import Output, Rendered, mix_all
 from server.rendering.sources import Source
 
 
@@ -123,7 +123,8 @@ class Renderer:
         self._output = Output(channels=outputs, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
         self._emitters: dict[str, _Emitter] = {}
         self._changed: list[_Emitter] = []  # since the last block
-        self._has_changed = False  # before the last block
+        self.exchanged = False
+        """Whether an IR was exchanged in the block last rendered."""
         self._blocks_rendered = 0
 
     @property
@@ -132,16 +133,9 @@ class Renderer:
         return self._blocks_rendered * self.block_size
 
     @property
-    def exchanged(self) -> bool:
-        """Whether an IR was exchanged in the block last rendered."""
-        convolvers = (mixer.convolver for mixer in self._mixers)
-        return self._has_changed and any(convolver is not None and convolver.exchanged for convolver in convolvers)
-
-    @property
-    def is_limited(self) -> bool:
-        """Whether the block last rendered would have been too loud, and was turned down."""
-        limiter = self._output.limiter
-        return limiter is not None and limiter.acted
+    def runs_by_itself(self) -> bool:
+        """Whether several blocks may be rendered in one call: nothing has to be looked after between them."""
+        return self._mixers.rests and all(mixer.plays_by_itself for mixer in self._mixers)
 
     @property
     def samples_silenced(self) -> int:
@@ -316,7 +310,7 @@ class Renderer:
 
     def process(self) -> FloatArray:
         """Render the next block (channel, block_size), in an array of its own."""
-        return render_all([self])[0]
+        return render_all([self])[0].samples
 
     def reset(self) -> None:
         """Drop every emitter and its reverberation, and start the clock again."""
@@ -337,13 +331,13 @@ class Renderer:
                 if not emitter.has_played:
                     emitter.has_played = True
                     emitter.mixer.play(emitter.slot, emitter.source)
-        self._has_changed = bool(self._changed)
         self._changed.clear()
         return self._output, list(self._mixers)
 
-    def _finish(self) -> None:
+    def _finish(self, rendered: Rendered) -> None:
         """After a block, let go of what has rung out."""
         self._blocks_rendered += 1
+        self.exchanged = rendered.is_exchange
         if self._mixers.rests:
             return
         emitters = self._emitters.values()
@@ -374,10 +368,11 @@ class Renderer:
             raise UnknownEmitterError(f"no emitter {emitter_id!r}") from None
 
 
-def render_all(renderers: Sequence[Renderer]) -> list[FloatArray]:
-    """Render the next block (channel, block_size) of each, in arrays of their own, all in one call without the
-    interpreter's lock."""
+def render_all(renderers: Sequence[Renderer]) -> list[Rendered]:
+    """Render the next block of each, all in one call without the interpreter's lock. One that `runs_by_itself` may
+    stand there several times, in a row, and gets as many blocks: of all that they read, the second finds much in the
+    caches."""
     blocks = mix_all([renderer._begin() for renderer in renderers])
-    for renderer in renderers:
-        renderer._finish()
+    for renderer, rendered in zip(renderers, blocks, strict=True):
+        renderer._finish(rendered)
     return blocks

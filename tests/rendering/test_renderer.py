@@ -353,7 +353,7 @@ def test_many_rendered_in_one_call_are_each_alone_to_the_bit():
                 if block == 20:
                     engine.set_gain("a", 0.5)
             due = [engine for number, engine in enumerate(engines) if (block + number) % 3]
-            blocks = render_all(due) if together else [engine.process() for engine in due]
+            blocks = [each.samples for each in render_all(due)] if together else [engine.process() for engine in due]
             for engine, samples in zip(due, blocks, strict=True):
                 output[engines.index(engine)].append(samples)
         return [np.concatenate(blocks, axis=1) for blocks in output]

@@ -42,7 +42,7 @@ for block in range(120):
                 engine.set_gain(name, 0.1 + block / 200)
                 engine.set_reverberation_gain(name, 0.5)
         engine.set_orientation((0.0, 0.0, np.sin(block / 60), np.cos(block / 60)))
-    heard.append(np.concatenate(render_all(engines), axis=0))
+    heard.append(np.concatenate([rendered.samples for rendered in render_all(engines)], axis=0))
 np.save(sys.argv[2], np.concatenate(heard, axis=1))
 """
 

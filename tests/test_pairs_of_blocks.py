@@ -1,0 +1,104 @@
+"""Under load, blocks are rendered in pairs, of which none is later than it would be alone."""
+
+import numpy as np
+import pytest
+
+from server import audio_engine
+from server.audio_engine import PHASES
+from server.blocks import DryBlock
+from server.load import runs_ahead
+from server.protocol import AddEmitter
+from tests.engine_stage import BLOCK_S, Stage, blocks
+
+
+@pytest.fixture
+def stage(field, filters):
+    return Stage(field, filters)
+
+
+def open_sounding(stage, **emitter):
+    """A stream with one emitter that is heard."""
+    stream, delivered = stage.open(lead=8, window=10_000)
+    stream.offer(AddEmitter(id="a", position=(1.0, 2.0, 1.0), **(emitter or {"clip": "tone"})))
+    for _ in range(3):
+        stage.run(2 * BLOCK_S)
+        stage.workers.run()
+    return stream, delivered
+
+
+def batches_of(monkeypatch):
+    """The renderers of each call."""
+    batches = []
+
+    def render_all(renderers):
+        batches.append(list(renderers))
+        return rendered(renderers)
+
+    rendered = audio_engine.render_all
+    monkeypatch.setattr(audio_engine, "render_all", render_all)
+    return batches
+
+
+def test_pairs_begin_under_load_and_end_well_below_it():
+    assert [runs_ahead(busy, before=False) for busy in (0.3, 0.5, 0.7)] == [False, False, True]
+    assert [runs_ahead(busy, before=True) for busy in (0.3, 0.5, 0.7)] == [False, True, True]
+
+
+def test_a_busy_thread_renders_in_pairs_and_an_idle_one_block_by_block(stage, monkeypatch):
+    stream, _ = open_sounding(stage)
+    busy = 0.0
+    follow_poses = stream.session.begin_block
+
+    def take_time():
+        follow_poses()
+        stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
+
+    stream.session.begin_block = take_time
+    for busy, count in [(0.2, 1), (0.8, 2), (0.5, 2), (0.2, 1)]:
+        stage.run(1.0)
+        batches = batches_of(monkeypatch)
+        stage.run(20 * BLOCK_S)
+        assert {len(batch) for batch in batches} == {count}, busy
+
+
+def test_streams_of_an_instant_take_turns_with_their_pairs(stage, monkeypatch):
+    """So that no tick is twice as long as before."""
+    for _ in range(2 * PHASES):
+        stage.open(lead=8, window=10_000)
+    stage.run(10 * BLOCK_S)
+    monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
+    stage.run(1.0)
+    batches = batches_of(monkeypatch)
+    stage.run(40 * BLOCK_S)
+    assert {len(batch) for batch in batches} == {2}
+    assert {len(set(map(id, batch))) for batch in batches} == {1}
+
+
+def test_what_a_client_plays_live_is_never_rendered_ahead(stage, monkeypatch):
+    """It has not come yet."""
+    stream, delivered = open_sounding(stage, live=True)
+    monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
+    stage.run(1.0)
+    batches = batches_of(monkeypatch)
+    for sequence in range(10):
+        stream.offer(DryBlock("a", sequence, np.ones(256, np.float32)))
+        stage.run(BLOCK_S)
+    assert {len(batch) for batch in batches} == {1}
+    assert len(blocks(delivered)) > 10
+
+
+def test_no_block_is_due_later_in_pairs(stage, monkeypatch):
+    stream, delivered = open_sounding(stage)
+    monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
+    stage.run(1.0)
+    delivered.clear()
+    ready_s = {}
+    for _ in range(200):
+        stage.run(BLOCK_S / 4)
+        for item in blocks(delivered):
+            ready_s.setdefault(item.block.sequence, (stage.clock.now_s, item.deadline_s))
+        delivered.clear()
+    lead_s = 8 * BLOCK_S
+    assert len(ready_s) > 40
+    assert all(now_s <= deadline_s - lead_s + BLOCK_S / 2 for now_s, deadline_s in ready_s.values())
+    assert stream.session.blocks_dropped == 0
