@@ -28,7 +28,7 @@ from server.loudness import loudness_map
 from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
 from server.streaming import Connection, StreamHost
 from server.telemetry import ServerCollector, exposition
-from server.web_socket import direct_write
+from server.web_socket import direct_way
 from server.whole_field import WholeField
 
 MAX_MAP_POINTS = 2_000
@@ -210,7 +210,7 @@ async def hrtfs(request: Request) -> dict[str, Any]:
 
 @api.websocket("/stream")
 async def stream(websocket: WebSocket) -> None:
-    await Connection(websocket, _host(websocket), write=direct_write(websocket.scope)).run()
+    await Connection(websocket, _host(websocket), way=direct_way(websocket.scope)).run()
 
 
 def _host(connection: Request | WebSocket) -> StreamHost:

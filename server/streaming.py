@@ -14,6 +14,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -36,7 +37,7 @@ from server.session import Session
 from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
 from server.telemetry import StreamTotals
-from server.web_socket import Write
+from server.web_socket import DirectWay
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
 MAX_WAITING_ANSWERS = 256
@@ -85,23 +86,23 @@ class StreamHost:
 
 
 class Connection:
-    """One client from its hello to its goodbye. `write` is the short way out, where there is one."""
+    """One client from its hello to its goodbye. `way` is the short one in and out, where there is one."""
 
     def __init__(
         self,
         websocket: WebSocket,
         host: StreamHost,
         *,
-        write: Write | None = None,
+        way: DirectWay | None = None,
         time_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._websocket = websocket
-        self._write = write
+        self._way = way
         self._host = host
         self._time_s = time_s
         self._outgoing: deque[Outgoing] = deque()
         self._has_outgoing = asyncio.Event()
-        self._is_sending = False
+        self._is_sending = self._is_taking_in = False
         self._capacity = MAX_WAITING_ANSWERS
         self._is_overfull = asyncio.Event()
         self._stream: Stream | None = None
@@ -223,22 +224,43 @@ class Connection:
             task.result()
 
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
+        if self._way is not None:
+            self._way.listen(partial(self._hear, stream))
         while True:
-            await self._take_in(await self._receive(), stream, hello)
+            data = await self._receive()
+            self._is_taking_in = True
+            await self._take_in(data, stream, hello)
+            self._is_taking_in = False
+
+    def _hear(self, stream: Stream, data: str | bytes) -> bool:
+        """Take in what needs nothing but the audio thread, unless something that came before is not yet."""
+        if self._is_taking_in:
+            return False
+        try:
+            message = self._parse(data)
+            if isinstance(message, AddEmitter):
+                return False
+            self._pass_on(message, stream)
+        except RequestError as refusal:
+            self._enqueue([Error.from_refusal(refusal)])
+        return True
 
     async def _take_in(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
         try:
             message = self._parse(data)
-            if isinstance(message, Ping):
-                self._enqueue([Pong(id=message.id)])
-                return
             if isinstance(message, AddEmitter) and message.clip is not None:
                 # Decoded once, here and off the loop, so that the audio thread finds it ready.
                 await asyncio.to_thread(load_clip, self._host.clips[hello.scene], message.clip)
-            if not stream.offer(message):
-                raise RequestError("too_many_messages", "too many messages in one block: this one was not heeded")
+            self._pass_on(message, stream)
         except RequestError as refusal:
             self._enqueue([Error.from_refusal(refusal)])
+
+    def _pass_on(self, message: ClientMessage, stream: Stream) -> None:
+        """Raises RequestError too_many_messages."""
+        if isinstance(message, Ping):
+            self._enqueue([Pong(id=message.id)])
+        elif not stream.offer(message):
+            raise RequestError("too_many_messages", "too many messages in one block: this one was not heeded")
 
     async def _receive(self) -> str | bytes:
         event = await self._websocket.receive()
@@ -257,9 +279,9 @@ class Connection:
     def _deliver(self, outgoing: list[Outgoing]) -> None:
         """Send blocks at once where there is a short way and nothing waits to go before them."""
         sent = 0
-        if self._write is not None and not (self._outgoing or self._is_sending):
+        if self._way is not None and not (self._outgoing or self._is_sending):
             while sent < len(outgoing) and isinstance(first := outgoing[sent], TimedBlock):
-                if not self._write(self._serialize(first)):
+                if not self._way.write(self._serialize(first)):
                     break
                 sent += 1
         if sent < len(outgoing):

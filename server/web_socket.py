@@ -2,19 +2,21 @@
 
 By way of ASGI a message passes through three layers, a task that wakes for it, and a state machine, which for a block
 of audio is most of what its listener costs beside rendering. A whole binary message needs none of that where the
-connection is open and its buffer has room: a header of a few bytes (RFC 6455, 5.2), and the transport. ASGI allows such
-*extensions*: an application finds this one in its scope, and does without where another server runs it.
+connection is open and its buffer has room: a header of a few bytes (RFC 6455, 5.2), and the transport; nor does a
+message that comes, where none waits before it. ASGI allows such *extensions*: an application finds this one in its
+scope, and does without where another server runs it.
 """
 
 import struct
 from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.http11 import Request
 
-Write = Callable[[bytes], bool]
-"""Sends a binary message at once, or says False and has not: then it goes the way of all others."""
+Hear = Callable[[str | bytes], bool]
+"""Takes a message in at once, or says False and has not: then it goes the way of all others."""
 
 _EXTENSION: Final = "nafir.direct"
 _WHOLE_BINARY: Final = 0x82
@@ -23,25 +25,46 @@ _MOST_WAITING = 16
 """Messages that may wait for the application before its client is heard no more."""
 
 
-def direct_write(scope: Mapping[str, Any]) -> Write | None:
+@dataclass(frozen=True)
+class DirectWay:
+    """Past ASGI, in order with what goes by way of it."""
+
+    write: Callable[[bytes], bool]
+    """Sends a binary message at once, or says False and has not."""
+    listen: Callable[[Hear], None]
+    """From now on, whoever is given is told of messages before which none waits."""
+
+
+def direct_way(scope: Mapping[str, Any]) -> DirectWay | None:
     """That of a connection, where its server has one."""
-    write: Write | None = scope.get("extensions", {}).get(_EXTENSION, {}).get("write")
-    return write
+    way: DirectWay | None = scope.get("extensions", {}).get(_EXTENSION, {}).get("way")
+    return way
 
 
-def watched(scope: MutableMapping[str, Any], watch: Callable[[bytes], None]) -> MutableMapping[str, Any]:
-    """A scope of which `watch` is told what was sent directly, after it was."""
-    write = direct_write(scope)
-    if write is None:
+def watched(
+    scope: MutableMapping[str, Any], *, sent: Callable[[bytes], None], heard: Callable[[str | bytes], None]
+) -> MutableMapping[str, Any]:
+    """A scope that tells of what went the direct way: of what was `sent`, and of what was `heard`."""
+    way = direct_way(scope)
+    if way is None:
         return scope
 
-    def write_watched(payload: bytes) -> bool:
-        is_sent = write(payload)
+    def write(payload: bytes) -> bool:
+        is_sent = way.write(payload)
         if is_sent:
-            watch(payload)
+            sent(payload)
         return is_sent
 
-    return {**scope, "extensions": {**scope["extensions"], _EXTENSION: {"write": write_watched}}}
+    def listen(hear: Hear) -> None:
+        def hear_watched(message: str | bytes) -> bool:
+            is_heard = hear(message)
+            if is_heard:
+                heard(message)
+            return is_heard
+
+        way.listen(hear_watched)
+
+    return {**scope, "extensions": {**scope["extensions"], _EXTENSION: {"way": DirectWay(write, listen)}}}
 
 
 def header(length: int) -> bytes:
@@ -57,22 +80,39 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
     """For uvicorn, by `ws="server.web_socket:WebSocketProtocol"`, without extensions of the protocol's own: what is
     written here is neither compressed nor cut."""
 
+    _hear: Hear | None = None
+
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
         if not self.handshake_complete:  # as it is where the request was refused
-            self.scope["extensions"][_EXTENSION] = {"write": self.write_binary}
+            self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
 
-    def write_binary(self, payload: bytes) -> bool:
-        """As `Write`."""
+    def send_receive_event_to_app(self) -> None:
+        """uvicorn stops reading with every message, until the application has taken it in."""
+        if self._hear is not None and self.queue.empty() and not self.close_sent and self._is_heard(self._hear):
+            self.frames = []
+            return
+        super().send_receive_event_to_app()
+        if self.read_paused and self.queue.qsize() < _MOST_WAITING:
+            self.read_paused = False
+            self.transport.resume_reading()
+
+    def _is_heard(self, hear: Hear) -> bool:
+        data = b"".join(self.frames)
+        if self.curr_msg_data_type != "text":
+            return hear(data)
+        try:
+            text = data.decode()
+        except UnicodeDecodeError:
+            return False  # uvicorn knows what to do
+        return hear(text)
+
+    def _listen(self, hear: Hear) -> None:
+        self._hear = hear
+
+    def _write(self, payload: bytes) -> bool:
         is_open = self.handshake_complete and not self.close_sent and not self.transport.is_closing()
         if not is_open or not self.writable.is_set():
             return False
         self.transport.write(header(len(payload)) + payload)
         return True
-
-    def send_receive_event_to_app(self) -> None:
-        """uvicorn stops reading with every message, until the application has taken it in."""
-        super().send_receive_event_to_app()
-        if self.read_paused and self.queue.qsize() < _MOST_WAITING:
-            self.read_paused = False
-            self.transport.resume_reading()

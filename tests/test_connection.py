@@ -20,6 +20,7 @@ from server.replies import Error, Status, parse_server_message
 from server.session import Session
 from server.settings import Settings
 from server.streaming import Connection, StreamHost
+from server.web_socket import DirectWay
 
 HELLO = Hello(protocol=PROTOCOL, scene="flat")
 
@@ -126,7 +127,8 @@ def test_blocks_that_go_the_short_way_and_the_long_one_stay_in_order(field, hrtf
             return True
 
         async with hosting(field, hrtfs) as host:
-            connection = Connection(socket, host, write=write, time_s=lambda: time.monotonic() + 1.0)
+            way = DirectWay(write=write, listen=lambda _: None)
+            connection = Connection(socket, host, way=way, time_s=lambda: time.monotonic() + 1.0)
             running = asyncio.create_task(connection.run())
             socket.say(HELLO)
             while not any(isinstance(message, Status) for message in socket.sent):
@@ -143,6 +145,33 @@ def test_blocks_that_go_the_short_way_and_the_long_one_stay_in_order(field, hrtf
     assert [block.sequence for block in blocks] == list(range(len(blocks)))
     assert 0 < len(written) < len(blocks)
     assert status.blocks_late == pytest.approx(len(blocks), abs=12)
+
+
+def test_what_is_heard_at_once_waits_for_a_clip_that_is_being_read(field, hrtfs):
+    """An emitter whose clip is decoded off the loop is there for whatever came after it."""
+
+    async def scenario():
+        socket, listening = Socket(), asyncio.get_running_loop().create_future()
+        way = DirectWay(write=lambda _: False, listen=listening.set_result)
+        async with hosting(field, hrtfs) as host:
+            running = asyncio.create_task(Connection(socket, host, way=way).run())
+            socket.say(HELLO)
+            hear = await asyncio.wait_for(listening, 5)
+            assert not hear(AddEmitter(id="a", clip="trumpet", position=(1.0, 2.0, 1.0)).serialize())
+            assert hear(Ping(id=1).serialize())
+            assert hear("nonsense")
+            socket.say(AddEmitter(id="a", clip="trumpet", position=(1.0, 2.0, 1.0)))
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            waited = not hear(RemoveEmitter(id="a").serialize())
+            await asyncio.sleep(0.2)
+            await socket.close(1000, "")
+            await running
+        return waited, [message for message in socket.sent if isinstance(message, Error)]
+
+    waited, errors = asyncio.run(scenario())
+    assert waited
+    assert [error.code for error in errors] == ["malformed_message"]
 
 
 @pytest.mark.parametrize("message", [Ping(id=1), RemoveEmitter(id="ghost")])

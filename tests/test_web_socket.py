@@ -8,7 +8,7 @@ import uvicorn
 from websockets.asyncio.client import connect
 from websockets.frames import Frame, Opcode
 
-from server.web_socket import direct_write, header, watched
+from server.web_socket import DirectWay, direct_way, header, watched
 
 PROTOCOL = "server.web_socket:WebSocketProtocol"
 
@@ -43,7 +43,7 @@ def test_headers_are_those_of_the_library(length):
 
 def test_what_is_written_arrives_in_order_among_what_is_sent():
     async def speak(scope, _receive, send):
-        write = direct_write(scope)
+        write = direct_way(scope).write
         for number in range(50):
             if number % 3:
                 assert write(bytes([number]) * 1000)
@@ -64,7 +64,7 @@ def test_a_client_that_does_not_read_is_not_written_to():
     written = []
 
     async def speak(scope, receive, send):
-        write = direct_write(scope)
+        write = direct_way(scope).write
         while write(len(written).to_bytes(4, "little") * 2_000):
             written.append(len(written))
             await asyncio.sleep(0)
@@ -91,7 +91,7 @@ def test_nothing_is_written_to_a_connection_that_closes():
 
     async def speak(scope, _receive, send):
         await send({"type": "websocket.close"})
-        outcome.append(direct_write(scope)(b"too late"))
+        outcome.append(direct_way(scope).write(b"too late"))
 
     async def listen():
         async with serving(speak) as address, connect(address, compression=None) as client:
@@ -105,8 +105,8 @@ def test_another_server_has_no_short_way():
     found = []
 
     async def speak(scope, _receive, send):
-        found.append(direct_write(scope))
-        assert watched(scope, found.append) is scope
+        found.append(direct_way(scope))
+        assert watched(scope, sent=found.append, heard=found.append) is scope
         await send({"type": "websocket.close"})
 
     async def listen():
@@ -117,17 +117,75 @@ def test_another_server_has_no_short_way():
     assert found == [None]
 
 
-def test_who_watches_is_told_of_what_was_written():
-    seen, taken = [], []
+def test_who_watches_is_told_of_what_went_the_direct_way():
+    sent, heard, taken, listeners = [], [], [], []
 
-    def write(payload):
-        taken.append(payload)
-        return payload != b"no room"
+    def take(message):
+        taken.append(message)
+        return message != b"not now"
 
-    scope = {"extensions": {"nafir.direct": {"write": write}, "other": {}}}
-    write_watched = direct_write(watched(scope, seen.append))
-    assert [write_watched(b"one"), write_watched(b"no room")] == [True, False]
-    assert (taken, seen) == ([b"one", b"no room"], [b"one"])
+    way = DirectWay(write=take, listen=listeners.append)
+    scope = {"extensions": {"nafir.direct": {"way": way}, "other": {}}}
+    watched_way = direct_way(watched(scope, sent=sent.append, heard=heard.append))
+    assert [watched_way.write(b"one"), watched_way.write(b"not now")] == [True, False]
+    watched_way.listen(take)
+    (listener,) = listeners
+    assert [listener("two"), listener(b"not now")] == [True, False]
+    assert (taken, sent, heard) == ([b"one", b"not now", "two", b"not now"], [b"one"], ["two"])
+
+
+def test_what_is_heard_at_once_and_what_waits_stay_in_order():
+    """Whoever listens takes some, and leaves others to ASGI: what comes after those waits with them."""
+    heard, is_open = [], asyncio.Event()
+
+    def hear(message):
+        if message == "wait":
+            return False
+        heard.append((message, "at once"))
+        return True
+
+    async def listen(scope, receive, send):
+        direct_way(scope).listen(hear)
+        is_open.set()
+        while len(heard) < 8:
+            message = await receive()
+            heard.append((message.get("text") or message.get("bytes"), "waited"))
+            await asyncio.sleep(0.05)
+        await send({"type": "websocket.close"})
+
+    async def talk():
+        async with serving(listen) as address, connect(address, compression=None) as client:
+            await is_open.wait()
+            for message in ("one", b"two", "wait", "three", b"four"):
+                await client.send(message)
+            await asyncio.sleep(0.3)
+            for message in ("five", "wait", "six"):
+                await client.send(message)
+            await client.wait_closed()
+
+    asyncio.run(talk())
+    assert [message for message, _ in heard] == ["one", b"two", "wait", "three", b"four", "five", "wait", "six"]
+    assert dict(heard)["one"] == dict(heard)["five"] == "at once"
+    assert dict(heard)["wait"] == "waited"
+
+
+def test_text_that_is_none_closes_the_connection():
+    """As it does without anybody who listens."""
+
+    async def listen(scope, receive, _send):
+        direct_way(scope).listen(lambda _: True)
+        while (await receive())["type"] != "websocket.disconnect":
+            pass
+
+    async def talk():
+        async with serving(listen) as address, connect(address, compression=None) as client:
+            await asyncio.sleep(0.1)
+            client.protocol.send_text(b"\xff\xfe")
+            client.transport.writelines(client.protocol.data_to_send())
+            await client.wait_closed()
+            return client.close_code
+
+    assert asyncio.run(talk()) == 1007
 
 
 def test_messages_wait_in_bounded_number():

@@ -102,14 +102,16 @@ class Gauge:
     async def _watch(self, scope: Scope, receive: Receive, send: Send) -> None:
         watch = _Watch()
 
-        async def receive_pose() -> Message:
-            message = await receive()
-            data = message.get("bytes")
-            if data and data[0] == ListenerPose.KIND:
+        def see_pose(data: str | bytes) -> None:
+            if isinstance(data, bytes) and data and data[0] == ListenerPose.KIND:
                 (pose_id,) = POSE_ID.unpack_from(data)
                 now_s = self._time_s()
                 watch.direct.enter(pose_id, now_s)
                 watch.reverberation.enter(pose_id, now_s)
+
+        async def receive_pose() -> Message:
+            message = await receive()
+            see_pose(message.get("bytes") or b"")
             return message
 
         def see_block(data: bytes) -> None:
@@ -126,7 +128,7 @@ class Gauge:
 
         self._watches.add(watch)
         try:
-            await self._app(watched(scope, see_block), receive_pose, send_block)
+            await self._app(watched(scope, sent=see_block, heard=see_pose), receive_pose, send_block)
         finally:
             self._watches.remove(watch)
 
