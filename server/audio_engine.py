@@ -145,7 +145,8 @@ class AudioThread:
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
         """With the place of each: its phase, and which of a pair of blocks it begins pairs with."""
-        self._runs_ahead = False
+        self.runs_ahead = False
+        """Whether it renders blocks in pairs."""
         self._arrivals: deque[tuple[Stream, bool]] = deque()
         self._origin_s: float | None = None
         self._wake = threading.Event()
@@ -206,7 +207,7 @@ class AudioThread:
 
     def _blocks_of(self, stream: Stream) -> int:
         """How many blocks of a stream that is due are rendered now."""
-        if not (self._runs_ahead and stream.session.renderer.runs_by_itself):
+        if not (self.runs_ahead and stream.session.renderer.runs_by_itself):
             return 1
         assert self._origin_s is not None
         since_origin = math.floor((stream.due_s - self._origin_s) / stream.block_s + 0.5 / PHASES)
@@ -249,7 +250,7 @@ class AudioThread:
             stream = by_ladder[ladder]
             made.setdefault(stream, []).extend(stream.step(reason, now_s))
             self.steps[reason] += 1
-        self._runs_ahead = runs_ahead(busy, before=self._runs_ahead)
+        self.runs_ahead = runs_ahead(busy, before=self.runs_ahead)
         share = ir_share(self._ir_share, busy=busy)
         for stream in self._streams:
             stream.ration(streams=len(self._streams), share=share)

@@ -101,6 +101,11 @@ class ServerCollector(Collector):
             value=sum(stream.awaits_irs_since_s is not None for stream in streams),
         )
         yield self._level_steps()
+        yield GaugeMetricFamily(
+            "nafir_threads_running_ahead",
+            "Audio threads that render blocks in pairs, for load.",
+            value=sum(thread.runs_ahead for thread in self._host.audio.threads),
+        )
         yield self._level_costs()
         clips = {name for library in self._host.clips.values() for name in library.names}
         yield GaugeMetricFamily("nafir_clips", "Recordings an emitter can play.", value=len(clips))

@@ -4,6 +4,7 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
+from server import audio_engine
 from server.audio_engine import AudioEngine
 from server.field.levels import Levels
 from server.load import Offer
@@ -79,3 +80,16 @@ class Stage:
 
 def blocks(delivered):
     return [item for item in delivered if isinstance(item, TimedBlock)]
+
+
+def spy_on_batches(monkeypatch):
+    """The renderers of each call that an audio thread makes from now on."""
+    batches = []
+
+    def render_all(renderers):
+        batches.append(list(renderers))
+        return rendered(renderers)
+
+    rendered = audio_engine.render_all
+    monkeypatch.setattr(audio_engine, "render_all", render_all)
+    return batches

@@ -4,6 +4,7 @@ import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from itertools import count
 
 import pytest
 from starlette.websockets import WebSocketDisconnect
@@ -90,17 +91,22 @@ async def stop_reading(socket, message):
         await asyncio.sleep(0.015)  # a block: what the audio thread is to answer has to come slowly
 
 
+async def listen_for_a_second(socket):
+    """Acknowledge blocks until a status comes, and leave."""
+    while not any(isinstance(message, Status) for message in socket.sent):
+        for block in [message for message in socket.sent if isinstance(message, AudioBlock)][-1:]:
+            socket.say(Acknowledge(sequence=block.sequence))
+        await asyncio.sleep(0.01)
+    await socket.close(1000, "")
+
+
 def test_blocks_that_leave_after_their_deadline_are_flagged_and_counted(field, hrtfs):
     async def scenario():
         socket = Socket()
         async with hosting(field, hrtfs) as host:
             running = asyncio.create_task(Connection(socket, host, time_s=lambda: time.monotonic() + 1.0).run())
             socket.say(HELLO)
-            while not any(isinstance(message, Status) for message in socket.sent):
-                for block in [message for message in socket.sent if isinstance(message, AudioBlock)][-1:]:
-                    socket.say(Acknowledge(sequence=block.sequence))
-                await asyncio.sleep(0.01)
-            await socket.close(1000, "")
+            await listen_for_a_second(socket)
             await running
         return socket.sent
 
@@ -113,14 +119,13 @@ def test_blocks_that_leave_after_their_deadline_are_flagged_and_counted(field, h
 
 def test_blocks_that_go_the_short_way_and_the_long_one_stay_in_order(field, hrtfs):
     """Where the short way has no room, what comes waits for what waits; each block is late once, whichever way."""
-    tries, written = [], []
+    tries, written = count(1), []
 
     async def scenario():
         socket = Socket()
 
         def write(data):
-            tries.append(len(tries))
-            if len(tries) % 5 in {0, 1}:
+            if next(tries) % 5 in {0, 1}:
                 return False
             written.append(AudioBlock.parse(data, "f32").sequence)
             socket.sent.append(AudioBlock.parse(data, "f32"))
@@ -131,11 +136,7 @@ def test_blocks_that_go_the_short_way_and_the_long_one_stay_in_order(field, hrtf
             connection = Connection(socket, host, way=way, time_s=lambda: time.monotonic() + 1.0)
             running = asyncio.create_task(connection.run())
             socket.say(HELLO)
-            while not any(isinstance(message, Status) for message in socket.sent):
-                for block in [message for message in socket.sent if isinstance(message, AudioBlock)][-1:]:
-                    socket.say(Acknowledge(sequence=block.sequence))
-                await asyncio.sleep(0.01)
-            await socket.close(1000, "")
+            await listen_for_a_second(socket)
             await running
         return socket.sent
 

@@ -8,7 +8,7 @@ from server.audio_engine import PHASES
 from server.blocks import DryBlock
 from server.load import runs_ahead
 from server.protocol import AddEmitter
-from tests.engine_stage import BLOCK_S, Stage, blocks
+from tests.engine_stage import BLOCK_S, Stage, blocks, spy_on_batches
 
 
 @pytest.fixture
@@ -24,19 +24,6 @@ def open_sounding(stage, **emitter):
         stage.run(2 * BLOCK_S)
         stage.workers.run()
     return stream, delivered
-
-
-def batches_of(monkeypatch):
-    """The renderers of each call."""
-    batches = []
-
-    def render_all(renderers):
-        batches.append(list(renderers))
-        return rendered(renderers)
-
-    rendered = audio_engine.render_all
-    monkeypatch.setattr(audio_engine, "render_all", render_all)
-    return batches
 
 
 def test_pairs_begin_under_load_and_end_well_below_it():
@@ -56,7 +43,7 @@ def test_a_busy_thread_renders_in_pairs_and_an_idle_one_block_by_block(stage, mo
     stream.session.begin_block = take_time
     for busy, count in [(0.2, 1), (0.8, 2), (0.5, 2), (0.2, 1)]:
         stage.run(1.0)
-        batches = batches_of(monkeypatch)
+        batches = spy_on_batches(monkeypatch)
         stage.run(20 * BLOCK_S)
         assert {len(batch) for batch in batches} == {count}, busy
 
@@ -68,7 +55,7 @@ def test_streams_of_an_instant_take_turns_with_their_pairs(stage, monkeypatch):
     stage.run(10 * BLOCK_S)
     monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
     stage.run(1.0)
-    batches = batches_of(monkeypatch)
+    batches = spy_on_batches(monkeypatch)
     stage.run(40 * BLOCK_S)
     assert {len(batch) for batch in batches} == {2}
     assert {len(set(map(id, batch))) for batch in batches} == {1}
@@ -79,7 +66,7 @@ def test_what_a_client_plays_live_is_never_rendered_ahead(stage, monkeypatch):
     stream, delivered = open_sounding(stage, live=True)
     monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
     stage.run(1.0)
-    batches = batches_of(monkeypatch)
+    batches = spy_on_batches(monkeypatch)
     for sequence in range(10):
         stream.offer(DryBlock("a", sequence, np.ones(256, np.float32)))
         stage.run(BLOCK_S)
