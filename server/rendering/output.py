@@ -50,7 +50,8 @@ def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer]]]) -> list[Rendere
         mixer.fill()
     for mixer in mixers:
         mixer.follow()
-    frames = np.empty(sum(output.sum.size for output, _ in listeners), np.float32)
+    size = sum(output.sum.size for output, _ in listeners)
+    frames = np.empty(size, np.float32)
     blocks = []
     end = 0
     rows = []
