@@ -1,4 +1,4 @@
-"""Compiled code is kept on disk, and never outlives its source."""
+"""Compiled code is kept on disk, never outlives its source, and where it works in place allocates nothing."""
 
 import os
 import shutil
@@ -6,9 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numba.core.errors import NumbaError
 
 import server
+from server.compiled import compiled, compiled_in_place
 
 MODULES = {
     "server/__init__.py": "",
@@ -97,3 +100,29 @@ def test_scipys_linear_algebra_is_not_imported_and_can_be(tmp_path):
     }
     output = subprocess.run([sys.executable, "-c", check], env=environment, check=True, capture_output=True, text=True)
     assert output.stdout.split() == ["False", "18.0", "1.0"]
+
+
+def test_what_works_in_place_changes_what_it_is_given_and_cannot_allocate():
+    @compiled_in_place
+    def double(values):
+        for i in range(values.size):
+            values[i] *= 2
+
+    @compiled
+    def one_of_copy(values):
+        copy = np.empty_like(values)
+        copy[:] = values
+        return copy[1]
+
+    @compiled_in_place
+    def one_of_copy_in_place(values):
+        copy = np.empty_like(values)
+        copy[:] = values
+        return copy[1]
+
+    values = np.arange(5.0)
+    double(values[1:4])
+    assert values.tolist() == [0, 2, 4, 6, 4]
+    assert one_of_copy(values) == 2
+    with pytest.raises(NumbaError):
+        one_of_copy_in_place(values)

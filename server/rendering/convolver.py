@@ -1,7 +1,7 @@
 """Convolution of several sources with impulse responses (IRs) that may change while they sound.
 
 Non-uniformly partitioned overlap-save, nothing delayed (`server.rendering.partitions`). Sources are summed in the
-frequency domain, in order of their number; one that is silent costs nothing and adds nothing at all.
+frequency domain, in an order that their numbers alone decide; one that is silent costs nothing and adds nothing at all.
 
 A new IR is exchanged stage by stage: at the stage's next window both IRs run over the same input spectra, and their
 outputs are crossfaded in the time domain over one partition, a raised cosine. Interpolating the spectra instead would
