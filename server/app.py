@@ -31,6 +31,7 @@ from server.routes import api, documents, health
 from server.session import Session
 from server.settings import Settings
 from server.streaming import StreamHost
+from server.workers import Workers
 
 _CALIBRATION_POSES = 3
 _COSTS_AFTER_S = 5.0
@@ -53,7 +54,7 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
         loaded = await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes
         heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
-        with ThreadPoolExecutor(settings.ir_workers, "nafir-ir", initializer=become_background) as workers:
+        with Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers:
             audio = AudioEngine(
                 asyncio.get_running_loop().call_soon_threadsafe,
                 workers,

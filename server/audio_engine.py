@@ -10,10 +10,10 @@ the renderer's call and the way to the event loop would cost about what renderin
 stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly apart, gives a
 new stream the one with the fewest others, and renders all that is due at an instant in one call without the lock.
 
-**Under load**, blocks are rendered in pairs (`server.load.runs_ahead`): of a pair, the second costs less rendering, for
-much of what it reads is in the caches, and hardly any of what waking, messages and the way to the event loop cost. It
-is ready a block before it is due, so poses are heard up to a block later. Half of an instant's streams have their pairs
-in every other block, half in the others.
+**Under load**, two or four blocks of a stream are rendered at once (`server.load.blocks_at_once`): those after the
+first cost less rendering, for much of what they read is in the caches, and hardly any of what waking, messages and the
+way to the event loop cost. They are ready before they are due, so poses are heard up to so many blocks later. The
+streams of an instant take turns with it, so that every instant has as much to do.
 
 **What a stream gets.** Four times a second a thread looks at what its streams went through, and moves them to cheaper
 or better quality (`server.load`).
@@ -30,17 +30,17 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from concurrent.futures import Executor
+from itertools import islice
 from typing import NamedTuple
 
-from server.load import PERIOD_S, LoadControl, Reason, ir_share, runs_ahead
+from server.load import MOST_AT_ONCE, PERIOD_S, LoadControl, Reason, blocks_at_once, ir_share
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
 from server.stream import Outgoing, Stream, StreamFailed
+from server.workers import Workers
 
 PHASES = 2
 """Four streams of 16 emitters cost their two threads 9 % less than at four, and poses are heard 0.4 ms later."""
-_PAIR = 2
 _EARLY_S = 0.0002
 """Blocks due within that are rendered now: sooner than one could sleep and wake again."""
 _PRESUMED_LOAD = 0.02
@@ -66,7 +66,7 @@ class AudioEngine:
     def __init__(
         self,
         post: Post,
-        workers: Executor,
+        workers: Workers,
         *,
         threads: int = 1,
         is_real_time: bool = False,
@@ -125,7 +125,7 @@ class AudioThread:
     def __init__(
         self,
         post: Post,
-        workers: Executor,
+        workers: Workers,
         *,
         number: int,
         is_real_time: bool,
@@ -144,9 +144,9 @@ class AudioThread:
         self._busy_s = 0.0
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
-        """With the place of each: its phase, and which of a pair of blocks it begins pairs with."""
-        self.runs_ahead = False
-        """Whether it renders blocks in pairs."""
+        """With the place of each: its phase, and with which block it begins to be rendered several at once."""
+        self.blocks_at_once = 1
+        """How many blocks of a stream it renders together."""
         self._arrivals: deque[tuple[Stream, bool]] = deque()
         self._origin_s: float | None = None
         self._wake = threading.Event()
@@ -173,7 +173,7 @@ class AudioThread:
         self._wake.set()
 
     def tick(self) -> float | None:
-        """Heed what waits, render one block of every stream that is due one, and hand over what was made.
+        """Heed what waits, render what is due, and hand over what was made.
 
         Seconds until the next is due, None without streams.
         """
@@ -207,11 +207,12 @@ class AudioThread:
 
     def _blocks_of(self, stream: Stream) -> int:
         """How many blocks of a stream that is due are rendered now."""
-        if not (self.runs_ahead and stream.session.renderer.runs_by_itself):
+        count = self.blocks_at_once
+        if count == 1 or not stream.session.renderer.runs_by_itself:
             return 1
         assert self._origin_s is not None
         since_origin = math.floor((stream.due_s - self._origin_s) / stream.block_s + 0.5 / PHASES)
-        return _PAIR if (since_origin - self._streams[stream] // PHASES) % _PAIR == 0 else 1
+        return count - (since_origin - self._streams[stream] // PHASES) % count
 
     def _render(self, due: list["_Due"], made: dict[Stream, list[Outgoing]]) -> None:
         began_s = self._time_s()
@@ -228,14 +229,11 @@ class AudioThread:
                     self._render([each._replace(blocks=1)], made)
             return
         now_s = self._time_s()
-        share_s = (now_s - began_s) / len(renderers)
+        each_s = (now_s - began_s) / len(renderers)
         for (stream, count, cost_s), clock in zip(due, clocks, strict=True):
-            rendered = [next(blocks) for _ in range(count)]
-            size = stream.session.renderer.block_size
+            rendered = list(islice(blocks, count))
             try:
-                for number, block in enumerate(rendered):
-                    spent_s = share_s + cost_s / count
-                    made[stream] += stream.finish_block(clock + number * size, block, cost_s=spent_s, now_s=now_s)
+                made[stream] += stream.finish_blocks(clock, rendered, cost_s=cost_s + count * each_s, now_s=now_s)
             except Exception:
                 _logger.exception(_FAILED)
                 self._fail(stream, made)
@@ -250,7 +248,7 @@ class AudioThread:
             stream = by_ladder[ladder]
             made.setdefault(stream, []).extend(stream.step(reason, now_s))
             self.steps[reason] += 1
-        self.runs_ahead = runs_ahead(busy, before=self.runs_ahead)
+        self.blocks_at_once = blocks_at_once(busy, before=self.blocks_at_once)
         share = ir_share(self._ir_share, busy=busy)
         for stream in self._streams:
             stream.ration(streams=len(self._streams), share=share)
@@ -271,9 +269,15 @@ class AudioThread:
                 self._streams.pop(stream, None)
 
     def _freest_place(self, block_s: float) -> int:
-        taken = Counter(place for stream, place in self._streams.items() if stream.block_s == block_s)
-        phases = Counter(place % PHASES for place in taken.elements())
-        return min(range(PHASES * _PAIR), key=lambda place: (phases[place % PHASES], taken[place]))
+        """Where the fewest streams are of those with blocks as long: of its phase, and of those that would be rendered
+        with it, two at once or more."""
+        taken = [place for stream, place in self._streams.items() if stream.block_s == block_s]
+        periods = [PHASES * count for count in (1, 2, MOST_AT_ONCE)]
+
+        def company(place: int) -> list[int]:
+            return [sum((other - place) % period == 0 for other in taken) for period in periods]
+
+        return min(range(periods[-1]), key=company)
 
     def _origin_of(self, phase: int, block_s: float, now_s: float) -> float:
         """The next instant of `phase` that lies a block ahead at least, so that the first has time to be rendered."""

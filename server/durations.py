@@ -19,11 +19,11 @@ class DurationHistogram:
         self.total_s = 0.0
         self._bins = [0] * _BINS
 
-    def add(self, duration_s: float) -> None:
+    def add(self, duration_s: float, times: int = 1) -> None:
         place = int(math.log2(duration_s / _SHORTEST_S) * _PER_OCTAVE) if duration_s > _SHORTEST_S else 0
-        self._bins[place if place < _BINS else _BINS - 1] += 1
-        self.count += 1
-        self.total_s += duration_s
+        self._bins[place if place < _BINS else _BINS - 1] += times
+        self.count += times
+        self.total_s += times * duration_s
 
     def merge(self, other: "DurationHistogram") -> None:
         """Add what another counted."""

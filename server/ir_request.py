@@ -85,6 +85,8 @@ class IrRequest:
     direct_sound: DirectSound
     """What the field's IRs leave out, as this session's head hears it."""
     channels: int = 2
+    is_first: bool = False
+    """Whether an emitter has none yet, and waits to be heard."""
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,12 @@ _LEAST_RATE_HZ = 2.0
 _FULL = 0.85
 """Share of the time in which an audio thread renders, from which on it has none to spare."""
 _FREE = 0.6
-_PAIRS_ABOVE, _ALONE_BELOW = 0.6, 0.4
-"""Shares of the time. Pairs take a tenth to a fifth less of it."""
+_AT_ONCE = ((1, 0.0), (2, 0.6), (4, 0.78))
+"""Blocks that an audio thread renders at once, and the share of the time above which it does. Each step takes up to a
+tenth less of it."""
+MOST_AT_ONCE = _AT_ONCE[-1][0]
+_FEWER_BELOW = 0.7
+"""Of the share above which so many are rendered."""
 _SHARED = 0.75
 """Share of a core that rendering and impulse responses may take together: the event loop, plans and checks need the
 rest."""
@@ -233,10 +237,13 @@ def ir_share(most: float, *, busy: float) -> float:
     return min(most, max(_SHARED - busy, _LEAST_IR_SHARE * most))
 
 
-def runs_ahead(busy: float, *, before: bool) -> bool:
-    """Whether an audio thread that renders for a share `busy` of the time renders blocks in pairs, the second of them
-    ahead of time, as it did `before` or not: cheaper, and poses are heard up to a block later."""
-    return busy > (_ALONE_BELOW if before else _PAIRS_ABOVE)
+def blocks_at_once(busy: float, *, before: int) -> int:
+    """How many blocks of a stream an audio thread renders at once that renders for a share `busy` of the time, and
+    rendered so many at once `before`: the first in time, the others ahead of it, which is cheaper, and poses are heard
+    up to so many blocks later."""
+    return max(
+        count for count, above in _AT_ONCE if count == 1 or busy > (above if count > before else _FEWER_BELOW * above)
+    )
 
 
 def ir_interval_s(ladder: Ladder, *, request_s: float, streams: int, share: float) -> float:

@@ -58,6 +58,11 @@ class PlanRequest:
     corrections: Mapping[EffectName, str]
     costs: Costs
 
+    @property
+    def is_first(self) -> bool:
+        """Whether an emitter is in none yet."""
+        return self.previous is None or not self.situation.emitters.keys() <= self.previous.by_emitter.keys()
+
     def plan(self) -> Plan:
         """Milliseconds, more of them the more emitters: not for the audio thread."""
         overrides = {**dict.fromkeys(self.corrections, True), **self.overrides}

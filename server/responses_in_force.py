@@ -126,7 +126,8 @@ class ResponsesInForce:
             # Room for other ears comes by itself; whatever else calls for an IR is told.
             self._waits_for_change = not self._effects.wants_other_ears
             return None
-        if is_too_soon and all(emitter.token is not None for emitter in outdated):
+        is_first = any(emitter.token is None for emitter in outdated)
+        if is_too_soon and not is_first:
             self._has_looked = True
             return None
         self._next_request_clock = clock + round(self._interval_s * self._sample_rate)
@@ -149,6 +150,7 @@ class ResponsesInForce:
             ),
             self._direct_sound,
             self._effects.channels,
+            is_first,
         )
         return self._in_flight
 

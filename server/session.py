@@ -5,14 +5,14 @@ the direct sound comes later: `take_request` hands out what impulse responses (I
 them brings the answer back through `accept` between two blocks. Sound never waits for it.
 
 Blocks are rendered in three steps, so that many sessions' can be rendered in one call: `begin_block`, rendering
-`renderer`, `finish_block`.
+`renderer`, `finish_blocks`.
 
 A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from server.acoustics.decibels import db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
@@ -265,34 +265,39 @@ class Session:
         self.renderer.set_orientation(self._listener.orientation)
         self._followed_pose_id = self._responses.newest_pose_id
 
-    def finish_block(self, sample_clock: int, rendered: Rendered) -> AudioBlock | None:
-        """The block just rendered, which began at `sample_clock`; None when the window is full, so that it is not to be
-        sent.
+    def finish_blocks(self, sample_clock: int, rendered: Sequence[Rendered]) -> list[AudioBlock]:
+        """The blocks just rendered at once, the first of which began at `sample_clock`; fewer where the window is full,
+        so that the last are not to be sent.
 
         A block that is not sent was rendered all the same: clips and reverberation keep their place on the clock.
         """
-        self.ir_exchanges += rendered.is_exchange
-        self.blocks_limited += rendered.is_limited
         self._responses.follow_renderer()
-        if not self.window.is_open:
-            self.blocks_dropped += 1
-            return None
-        return AudioBlock(
-            sequence=self.window.take_sequence(),
-            sample_clock=sample_clock,
-            pose_id=self._followed_pose_id,
-            reverberation_pose_id=self._responses.applied_pose_id,
-            samples=rendered.samples,
-            is_exchange=rendered.is_exchange,
-            is_limited=rendered.is_limited,
-        )
+        blocks = []
+        for samples, is_exchange, is_limited in rendered:
+            self.ir_exchanges += is_exchange
+            self.blocks_limited += is_limited
+            if self.window.is_open:
+                blocks.append(
+                    AudioBlock(
+                        sequence=self.window.take_sequence(),
+                        sample_clock=sample_clock,
+                        pose_id=self._followed_pose_id,
+                        reverberation_pose_id=self._responses.applied_pose_id,
+                        samples=samples,
+                        is_exchange=is_exchange,
+                        is_limited=is_limited,
+                    )
+                )
+            else:
+                self.blocks_dropped += 1
+            sample_clock += self.renderer.block_size
+        return blocks
 
     def render_block(self) -> AudioBlock | None:
         """All three steps for this session alone."""
         self.begin_block()
         sample_clock = self.sample_clock
-        (rendered,) = render_all([self.renderer])
-        return self.finish_block(sample_clock, rendered)
+        return next(iter(self.finish_blocks(sample_clock, render_all([self.renderer]))), None)
 
     def live_statuses(self) -> tuple[LiveStatus, ...]:
         return tuple(emitter.live.status for emitter in self._emitters.values() if emitter.live)

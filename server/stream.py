@@ -7,8 +7,8 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
@@ -27,6 +27,7 @@ from server.rendering.output import Rendered
 from server.replies import Durations, Error, ServerMessage, Status
 from server.scene.plan import Plan
 from server.session import Session
+from server.workers import Workers
 
 MAX_WAITING_MESSAGES = 256
 _MAX_BEHIND_S = 0.5
@@ -164,7 +165,7 @@ class Stream:
         """Whether something waits that cannot wait for the next block: for an IR to be asked for, or for an answer."""
         return bool(self._answers or self._plans or (self._messages and not self.session.awaits_irs))
 
-    def take_in(self, workers: Executor) -> list[Outgoing]:
+    def take_in(self, workers: Workers) -> list[Outgoing]:
         """Heed what waits and ask for impulse responses."""
         outgoing: list[Outgoing] = []
         while self._answers:
@@ -181,11 +182,12 @@ class Stream:
         while self._checks:
             self._take_regret(self._checks.popleft())
         self._check_plan(workers)
+        # Who has not been heard yet waits for it; all others only for something better.
         if (wanted := self.session.take_plan_request()) is not None:
-            workers.submit(_plan_timed, wanted).add_done_callback(self._keep_plan)
+            workers.submit(_plan_timed, wanted, is_urgent=wanted.is_first).add_done_callback(self._keep_plan)
         if (request := self.session.take_request()) is not None:
             self._asked_s = self._time_s()
-            answer = workers.submit(_compute_timed, self._levels, request, self.session)
+            answer = workers.submit(_compute_timed, self._levels, request, self.session, is_urgent=request.is_first)
             answer.add_done_callback(partial(self._keep_answer, request))
         return outgoing
 
@@ -211,25 +213,30 @@ class Stream:
         self.session.space_plans(self._plan_s * streams / PLAN_SHARE)
         self.session.space_irs(ir_interval_s(self.ladder, request_s=self._request_s, streams=streams, share=share))
 
-    def finish_block(self, sample_clock: int, rendered: Rendered, *, cost_s: float, now_s: float) -> list[Outgoing]:
-        """Pass on the block just rendered, which took `cost_s` and is ready `now_s`."""
-        outgoing: list[Outgoing] = []
-        block = self.session.finish_block(sample_clock, rendered)
-        clock = self.clock
-        if block is not None:
-            outgoing.append(TimedBlock(block, clock.deadline_s(self.next_block)))
-            self.pose_times.take_effect(block.pose_id, now_s)
-            self.reverberation_times.take_effect(block.reverberation_pose_id, now_s)
-        self.load += _LOAD_SMOOTHING * (cost_s / self.block_s - self.load)
-        self.render_times.add(cost_s)
+    def finish_blocks(
+        self, sample_clock: int, rendered: Sequence[Rendered], *, cost_s: float, now_s: float
+    ) -> list[Outgoing]:
+        """Pass on the blocks just rendered at once, which took `cost_s` together and are ready `now_s`."""
+        clock, count = self.clock, len(rendered)
+        blocks = self.session.finish_blocks(sample_clock, rendered)
+        outgoing: list[Outgoing] = [
+            TimedBlock(block, clock.deadline_s(number)) for number, block in enumerate(blocks, self.next_block)
+        ]
+        if blocks:
+            self.pose_times.take_effect(blocks[0].pose_id, now_s)
+            self.reverberation_times.take_effect(blocks[0].reverberation_pose_id, now_s)
+        each_s = cost_s / count
+        self.load += (1 - (1 - _LOAD_SMOOTHING) ** count) * (each_s / self.block_s - self.load)
+        self.render_times.add(each_s, count)
         if self.next_block >= self._lead:  # the first were due before the stream was
             lateness_s = now_s - self.due_s
             self.latenesses.add(lateness_s)
-            if lateness_s > self._worst_lateness_s:
-                self._worst_lateness_s = lateness_s
+            self._worst_lateness_s = max(self._worst_lateness_s, lateness_s)
+            for ahead in range(1, count):
+                self.latenesses.add(lateness_s - ahead * self.block_s)
         if clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
             clock.slip(self.next_block, now_s)
-        self.next_block += 1
+        self.next_block += count
         self.due_s = clock.due_s(self.next_block)
         if self.next_block * self.block_s >= self._next_status_s:
             self._next_status_s += 1.0
@@ -255,7 +262,7 @@ class Stream:
         self._answers.append((request, answer))  # on the worker's thread
         self._wake()
 
-    def _check_plan(self, workers: Executor) -> None:
+    def _check_plan(self, workers: Workers) -> None:
         clock_s = self.next_block * self.block_s
         if self._next_check_s is None or clock_s < self._next_check_s:
             return

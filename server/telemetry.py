@@ -102,9 +102,9 @@ class ServerCollector(Collector):
         )
         yield self._level_steps()
         yield GaugeMetricFamily(
-            "nafir_threads_running_ahead",
-            "Audio threads that render blocks in pairs, for load.",
-            value=sum(thread.runs_ahead for thread in self._host.audio.threads),
+            "nafir_blocks_at_once",
+            "Blocks of a stream that the busiest audio thread renders together: more under load.",
+            value=max(thread.blocks_at_once for thread in self._host.audio.threads),
         )
         yield self._level_costs()
         clips = {name for library in self._host.clips.values() for name in library.names}

@@ -1,6 +1,6 @@
 """An audio engine on a stage: ticked by hand, with a clock that only a test moves."""
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 
 import numpy as np
 
@@ -24,15 +24,18 @@ class Clock:
         return self.now_s
 
 
-class Patient(Executor):
-    """Runs what it was given when told to."""
+class Patient:
+    """Workers that do what they were given when told to; `urgent` of it was urgent."""
 
     def __init__(self):
         self.work = []
+        self.urgent = []
 
-    def submit(self, function, /, *arguments):
+    def submit(self, function, /, *arguments, is_urgent=False):
         future = Future()
         self.work.append((future, function, arguments))
+        if is_urgent:
+            self.urgent.append(arguments)
         return future
 
     def run(self):

@@ -3,7 +3,6 @@
 import os
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from server.blocks import DryBlock
 from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
 from server.replies import EmitterAdded, Error, Status
 from server.stream import MAX_WAITING_MESSAGES, StreamFailed
+from server.workers import Workers
 from tests.engine_stage import BLOCK_S, Clock, Patient, Stage, blocks, open_stream, spy_on_batches
 
 
@@ -182,7 +182,7 @@ def test_a_field_that_fails_costs_an_error_message_and_no_sound(stage):
     assert blocks(delivered)[-1].block.pose_id == 2
 
 
-@pytest.mark.parametrize("step", ["receive", "take_request", "begin_block", "finish_block"])
+@pytest.mark.parametrize("step", ["receive", "take_request", "begin_block", "finish_blocks"])
 def test_a_stream_that_breaks_leaves_the_others_sounding(stage, step):
     broken, complaints = stage.open()
     _, delivered = stage.open()
@@ -297,7 +297,7 @@ def test_the_real_threads_keep_time_and_stop(field, filters):
         if len(arrived) >= 60:
             enough.set()
 
-    with ThreadPoolExecutor(1) as workers:
+    with Workers(1) as workers:
         engine = AudioEngine(lambda call: call(), workers, threads=2)
         hello = Hello(protocol=PROTOCOL, scene="flat")
         clip = np.ones(64, np.float32)
@@ -318,7 +318,7 @@ def test_where_real_time_is_refused_the_engine_says_so_once_and_runs(field, filt
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     ticked = threading.Event()
-    with ThreadPoolExecutor(1) as workers:
+    with Workers(1) as workers:
         engine = AudioEngine(lambda call: call(), workers, threads=3, is_real_time=True)
         hello, clip = Hello(protocol=PROTOCOL, scene="flat"), np.ones(64, np.float32)
         engine.start()

@@ -2,7 +2,6 @@
 
 import asyncio
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from itertools import count
 
@@ -22,6 +21,7 @@ from server.session import Session
 from server.settings import Settings
 from server.streaming import Connection, StreamHost
 from server.web_socket import DirectWay
+from server.workers import Workers
 
 HELLO = Hello(protocol=PROTOCOL, scene="flat")
 
@@ -60,7 +60,7 @@ class Socket:
 
 @asynccontextmanager
 async def hosting(field, hrtfs, **settings):
-    with ThreadPoolExecutor(1) as workers:
+    with Workers(1) as workers:
         audio = AudioEngine(asyncio.get_running_loop().call_soon_threadsafe, workers)
         host = StreamHost(
             scenes={"flat": Levels([field])},

@@ -1,6 +1,6 @@
 """The audio engine and the load control together, with a clock that only a test moves."""
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -28,13 +28,13 @@ class Room:
         return np.zeros((len(listeners), 2, self.ir_samples), np.float32)
 
 
-class Workers(Executor):
+class Workers:
     """Answer each request `delay_s` after it was made."""
 
     def __init__(self, clock):
         self.clock, self.delay_s, self.work, self.asked_at_s = clock, 0.0, [], []
 
-    def submit(self, function, /, *arguments):
+    def submit(self, function, /, *arguments, is_urgent=False):  # noqa: ARG002  all of it comes as late
         future = Future()
         self.work.append((self.clock.now_s + self.delay_s, future, function, arguments))
         self.asked_at_s.append(self.clock.now_s)
@@ -158,13 +158,13 @@ def test_a_level_there_is_not_is_refused_and_changes_nothing(stage):
 def test_an_audio_thread_without_time_eases_its_streams_and_no_other(field, filters, monkeypatch):
     stage = Stage(field, filters)
     stage.run(0.5)
-    finish = Stream.finish_block
+    finish = Stream.finish_blocks
 
-    def slowly(stream, *arguments, **options):
-        stage.clock.now_s += 0.95 * BLOCK_S
-        return finish(stream, *arguments, **options)
+    def slowly(stream, clock, rendered, **options):
+        stage.clock.now_s += 0.95 * BLOCK_S * len(rendered)
+        return finish(stream, clock, rendered, **options)
 
-    monkeypatch.setattr(Stream, "finish_block", slowly)
+    monkeypatch.setattr(Stream, "finish_blocks", slowly)
     stage.run(4.0)
     assert stage.changes
     assert {reason for _, reason in stage.changes} == {"load"}

@@ -5,6 +5,7 @@ import time
 import pytest
 
 from server.planned_effects import SHARE_OF_ALL
+from server.protocol import AddEmitter, ListenerPose
 from server.regret import Regret
 from server.scene.plan import Plan
 from tests.engine_stage import BLOCK_S, Stage
@@ -57,6 +58,8 @@ def test_the_more_streams_share_a_thread_the_less_often_each_is_checked(stage, s
 class SlowPlan:
     """A request for one, which takes a few milliseconds of CPU time."""
 
+    is_first = False
+
     def plan(self):
         until_s = time.thread_time() + 0.004
         while time.thread_time() < until_s:
@@ -77,3 +80,20 @@ def test_the_more_streams_share_a_thread_the_less_often_plans_are_made(stage):
     stage.run(1.0)
     assert intervals_s[0] == 0.0  # nobody knows yet what they take
     assert 0.004 * 5 / SHARE_OF_ALL <= intervals_s[-1] < 0.02 * 5 / SHARE_OF_ALL
+
+
+def test_who_is_not_heard_yet_goes_before_who_is_to_be_heard_better(stage):
+    stream, _ = stage.open(window=10_000)
+    stream.offer(AddEmitter(id="a", clip="tone", position=(1.0, 2.0, 1.0)))
+    stage.run(BLOCK_S)
+    assert len(stage.workers.urgent) == 1
+    stage.workers.run()
+    stage.run(BLOCK_S)
+    stream.offer(ListenerPose(pose_id=1, position=(2.0, 1.5, 1.5), yaw=0.0))
+    stage.run(BLOCK_S)
+    assert (len(stage.workers.work), len(stage.workers.urgent)) == (1, 1)
+    stage.workers.run()
+    stage.run(BLOCK_S)
+    stream.offer(AddEmitter(id="b", clip="tone", position=(1.0, 2.0, 1.0)))
+    stage.run(BLOCK_S)
+    assert len(stage.workers.urgent) == 2

@@ -111,10 +111,10 @@ def test_steps_are_counted_by_reason(host):
     assert told["nafir_level_steps_total", ("reason", "recovered")] == 0
 
 
-def test_threads_that_render_in_pairs_are_counted(host):
-    assert samples(host)["nafir_threads_running_ahead",] == 0
-    host.audio.threads[0].runs_ahead = True
-    assert samples(host)["nafir_threads_running_ahead",] == 1
+def test_how_many_blocks_are_rendered_at_once_is_told(host):
+    assert samples(host)["nafir_blocks_at_once",] == 1
+    host.audio.threads[0].blocks_at_once = 4
+    assert samples(host)["nafir_blocks_at_once",] == 4
 
 
 def test_a_histogram_sums_what_it_counts():

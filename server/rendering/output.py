@@ -42,41 +42,41 @@ class Rendered(NamedTuple):
     """Whether it would have been too loud, and was turned down."""
 
 
-def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer]]]) -> list[Rendered]:
-    """The next block of each, of its one or two mixers. Who stands there several times, in a row, gets so many; that is
-    for mixers that play by themselves."""
-    mixers = [mixer for _, mixed in listeners for mixer in mixed]
+def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer], int]]) -> list[list[Rendered]]:
+    """The next blocks of each, of its one or two mixers, and how many they are: more than one only where all mixers
+    play by themselves."""
+    mixers = [mixer for _, mixed, _ in listeners for mixer in mixed]
     for mixer in mixers:
         mixer.fill()
     for mixer in mixers:
         mixer.follow()
-    size = sum(output.sum.size for output, _ in listeners)
-    frames = np.empty(size, np.float32)
-    blocks = []
-    end = 0
-    rows = []
-    for output, mixed in listeners:
-        start, end = end, end + output.sum.size
-        blocks.append(frames[start:end].reshape(-1, output.channels).T)
-        if HAS_NUMBA:
-            rows.append((output.address, mixed[0].address, mixed[1].address if len(mixed) > 1 else 0, start, 0, 0))
     if not HAS_NUMBA:
-        return [_mix(output, mixed, block) for (output, mixed), block in zip(listeners, blocks, strict=True)]
-    if not rows:
+        return [[_mix(output, mixed) for _ in range(count)] for output, mixed, count in listeners]
+    if not listeners:
         return []
+    rows, blocks, samples = [], 0, 0
+    for output, mixed, count in listeners:
+        second = mixed[1].address if len(mixed) > 1 else 0
+        rows.append((output.address, mixed[0].address, second, count, blocks, samples))
+        blocks += count
+        samples += count * output.sum.size
     like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
-    limiter = next((output.limiter.state for output, _ in listeners if output.limiter is not None), None)
+    limiter = next((output.limiter.state for output, _, _ in listeners if output.limiter is not None), None)
     kinds = (None if each is None else each.kind for each in (like, limiter))
-    table = np.array(rows, np.int64)
-    mixing_with(*kinds)(table, frames, like, limiter)
+    frames, flags = np.empty(samples, np.float32), np.zeros((blocks, 2), np.int64)
+    mixing_with(*kinds)(np.array(rows, np.int64), frames, flags, like, limiter)
     for mixer in mixers:
         if mixer.convolver is not None:
             mixer.convolver.release()
-    flags = table[:, 4:].tolist()
-    return [Rendered(block, bool(one), bool(other)) for block, (one, other) in zip(blocks, flags, strict=True)]
+    happened = iter(flags.astype(bool).tolist())
+    made = []
+    for (output, _, count), (*_, start) in zip(listeners, rows, strict=True):
+        own = frames[start : start + count * output.sum.size].reshape(count, -1, output.channels)
+        made.append([Rendered(block.T, *next(happened)) for block in own])
+    return made
 
 
-def _mix(output: Output, mixers: Sequence[Mixer], block: FloatArray) -> Rendered:
+def _mix(output: Output, mixers: Sequence[Mixer]) -> Rendered:
     output.sum.fill(0)
     for mixer in mixers:
         mix(mixer)
@@ -84,6 +84,5 @@ def _mix(output: Output, mixers: Sequence[Mixer], block: FloatArray) -> Rendered
         output.sum += mixer.output if mixer.channels <= output.channels else mixer.output.mean(axis=0)
     if output.limiter is not None:
         output.limiter.process(output.sum)
-    block[:] = output.sum
     is_exchange = any(mixer.convolver is not None and mixer.convolver.exchanged for mixer in mixers)
-    return Rendered(block, is_exchange, output.limiter is not None and output.limiter.acted)
+    return Rendered(output.sum.copy(), is_exchange, output.limiter is not None and output.limiter.acted)

@@ -33,34 +33,37 @@ OUTPUT = np.dtype(
 def mix_listeners(
     rows: npt.NDArray[np.int64],
     frames: npt.NDArray[np.float32],
+    flags: npt.NDArray[np.int64],
     like: Reference | None,
     like_limiter: Reference | None,
 ) -> None:
-    """One block for every row, in order. A row (6,) has the addresses of an OUTPUT record and of two MIXER records,
-    the second 0 for none, and where in `frames` its block begins; it is told whether an IR was exchanged in it, and
-    whether it would have been too loud. `like` and `like_limiter` refer to any direct path's state and
-    any limiter's, or are None where there is none."""
+    """The next blocks of every row, in order. A row (6,) has the addresses of an OUTPUT record and of two MIXER records,
+    the second 0 for none, how many blocks it gets, and of the first its row of `flags` (block, 2) and where it begins
+    in `frames`.
+    Flags say of a block whether an IR was exchanged in it, and whether it would have been too loud. `like` and
+    `like_limiter` refer to any direct path's state and any limiter's, or are None where there is none."""
     mode = flush_to_zero()
     for number in range(rows.shape[0]):
         output = carray(pointer(rows[number, 0]), (1,), OUTPUT)[0]
         total = carray(pointer(output.sum), (output.channels, output.block_size), np.float32)
-        total[:] = 0
-        for place in range(1, 3):
-            if rows[number, place] != 0:
-                mixer = carray(pointer(rows[number, place]), (1,), MIXER)[0]
-                mix(mixer, like)
-                _add(mixer, total)
-                if mixer.convolver != 0 and has_exchanged(mixer.convolver):
-                    rows[number, 4] = 1
-        if like_limiter is not None and output.limiter != 0:
-            limiter = reference_at(output.limiter, like_limiter)
-            limit(limiter, total)
-            rows[number, 5] = limiter.counts[0]
-        at = rows[number, 3]
-        for n in range(output.block_size):
-            for channel in range(output.channels):
-                frames[at] = total[channel, n]
-                at += 1
+        at = rows[number, 5]
+        for block in range(rows[number, 4], rows[number, 4] + rows[number, 3]):
+            total[:] = 0
+            for place in range(1, 3):
+                if rows[number, place] != 0:
+                    mixer = carray(pointer(rows[number, place]), (1,), MIXER)[0]
+                    mix(mixer, like)
+                    _add(mixer, total)
+                    if mixer.convolver != 0 and has_exchanged(mixer.convolver):
+                        flags[block, 0] = 1
+            if like_limiter is not None and output.limiter != 0:
+                limiter = reference_at(output.limiter, like_limiter)
+                limit(limiter, total)
+                flags[block, 1] = limiter.counts[0]
+            for n in range(output.block_size):
+                for channel in range(output.channels):
+                    frames[at] = total[channel, n]
+                    at += 1
     restore(mode)
 
 
@@ -86,6 +89,7 @@ def mixing_with(kind: ReferenceType | None, limiter: ReferenceType | None) -> Ca
     signature = (
         types.Array(types.int64, 2, "C"),
         types.Array(types.float32, 1, "C"),
+        types.Array(types.int64, 2, "C"),
         types.none if kind is None else kind,
         types.none if limiter is None else limiter,
     )

@@ -19,6 +19,7 @@ input: what it played before rings out the way it was heard.
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 import numpy.typing as npt
@@ -334,10 +335,10 @@ class Renderer:
         self._changed.clear()
         return self._output, list(self._mixers)
 
-    def _finish(self, rendered: Rendered) -> None:
-        """After a block, let go of what has rung out."""
-        self._blocks_rendered += 1
-        self.exchanged = rendered.is_exchange
+    def _finish(self, blocks: Sequence[Rendered]) -> None:
+        """Let go of what has rung out."""
+        self._blocks_rendered += len(blocks)
+        self.exchanged = any(block.is_exchange for block in blocks)
         if self._mixers.rests:
             return
         emitters = self._emitters.values()
@@ -370,9 +371,10 @@ class Renderer:
 
 def render_all(renderers: Sequence[Renderer]) -> list[Rendered]:
     """Render the next block of each, all in one call without the interpreter's lock. One that `runs_by_itself` may
-    stand there several times, in a row, and gets as many blocks: of all that they read, the second finds much in the
-    caches."""
-    blocks = mix_all([renderer._begin() for renderer in renderers])
-    for renderer, rendered in zip(renderers, blocks, strict=True):
-        renderer._finish(rendered)
-    return blocks
+    stand there several times, in a row, and gets as many blocks: of all that they read, those after the first find much
+    in the caches."""
+    runs = [(renderer, sum(1 for _ in same)) for renderer, same in groupby(renderers)]
+    made = mix_all([(*renderer._begin(), count) for renderer, count in runs])
+    for (renderer, _), blocks in zip(runs, made, strict=True):
+        renderer._finish(blocks)
+    return [block for blocks in made for block in blocks]

@@ -1,4 +1,4 @@
-"""Under load, blocks are rendered in pairs, of which none is later than it would be alone."""
+"""Under load, blocks are rendered several at once, of which none is later than it would be alone."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES
 from server.blocks import DryBlock
-from server.load import runs_ahead
+from server.load import blocks_at_once
 from server.protocol import AddEmitter
 from tests.engine_stage import BLOCK_S, Stage, blocks, spy_on_batches
 
@@ -26,12 +26,21 @@ def open_sounding(stage, **emitter):
     return stream, delivered
 
 
-def test_pairs_begin_under_load_and_end_well_below_it():
-    assert [runs_ahead(busy, before=False) for busy in (0.3, 0.5, 0.7)] == [False, False, True]
-    assert [runs_ahead(busy, before=True) for busy in (0.3, 0.5, 0.7)] == [False, True, True]
+@pytest.fixture(params=[2, 4])
+def count(request, monkeypatch):
+    """Blocks that are rendered at once from now on."""
+    monkeypatch.setattr(audio_engine, "blocks_at_once", lambda _busy, **_: request.param)
+    return request.param
 
 
-def test_a_busy_thread_renders_in_pairs_and_an_idle_one_block_by_block(stage, monkeypatch):
+def test_more_blocks_at_once_begin_under_load_and_end_well_below_it():
+    busy = (0.3, 0.5, 0.57, 0.7, 0.9)
+    assert [blocks_at_once(share, before=1) for share in busy] == [1, 1, 1, 2, 4]
+    assert [blocks_at_once(share, before=2) for share in busy] == [1, 2, 2, 2, 4]
+    assert [blocks_at_once(share, before=4) for share in busy] == [1, 2, 4, 4, 4]
+
+
+def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(stage, monkeypatch):
     stream, _ = open_sounding(stage)
     busy = 0.0
     follow_poses = stream.session.begin_block
@@ -41,30 +50,40 @@ def test_a_busy_thread_renders_in_pairs_and_an_idle_one_block_by_block(stage, mo
         stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
 
     stream.session.begin_block = take_time
-    for busy, count in [(0.2, 1), (0.8, 2), (0.5, 2), (0.2, 1)]:
+    for busy, count in [(0.2, 1), (0.7, 2), (0.9, 4), (0.6, 4), (0.5, 2), (0.2, 1)]:
         stage.run(1.0)
         batches = spy_on_batches(monkeypatch)
         stage.run(20 * BLOCK_S)
         assert {len(batch) for batch in batches} == {count}, busy
 
 
-def test_streams_of_an_instant_take_turns_with_their_pairs(stage, monkeypatch):
-    """So that no tick is twice as long as before."""
-    for _ in range(2 * PHASES):
+def test_streams_of_an_instant_take_turns(stage, monkeypatch, count):
+    """So that no tick is longer than before."""
+    for _ in range(count * PHASES):
         stage.open(lead=8, window=10_000)
-    stage.run(10 * BLOCK_S)
-    monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
     stage.run(1.0)
     batches = spy_on_batches(monkeypatch)
     stage.run(40 * BLOCK_S)
-    assert {len(batch) for batch in batches} == {2}
+    assert {len(batch) for batch in batches} == {count}
     assert {len(set(map(id, batch))) for batch in batches} == {1}
 
 
+def test_who_comes_takes_the_turn_of_who_left(stage):
+    """The fewest streams of an instant have their turn together, whether with two blocks or with four."""
+    streams = [stage.open()[0] for _ in range(4 * PHASES)]
+    stage.run(BLOCK_S)
+    left = stage.thread._streams[streams[5]]
+    stage.engine.close(streams[5])
+    newcomer, _ = stage.open()
+    stage.run(BLOCK_S)
+    assert stage.thread._streams[newcomer] == left
+    assert len(set(stage.thread._streams.values())) == 4 * PHASES
+
+
+@pytest.mark.usefixtures("count")
 def test_what_a_client_plays_live_is_never_rendered_ahead(stage, monkeypatch):
     """It has not come yet."""
     stream, delivered = open_sounding(stage, live=True)
-    monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
     stage.run(1.0)
     batches = spy_on_batches(monkeypatch)
     for sequence in range(10):
@@ -74,9 +93,9 @@ def test_what_a_client_plays_live_is_never_rendered_ahead(stage, monkeypatch):
     assert len(blocks(delivered)) > 10
 
 
-def test_no_block_is_due_later_in_pairs(stage, monkeypatch):
+@pytest.mark.usefixtures("count")
+def test_no_block_is_later_than_alone(stage):
     stream, delivered = open_sounding(stage)
-    monkeypatch.setattr(audio_engine, "runs_ahead", lambda _busy, **_: True)
     stage.run(1.0)
     delivered.clear()
     ready_s = {}
