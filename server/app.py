@@ -23,7 +23,7 @@ from server.ir_request import compute_irs
 from server.load import AUTO, Offer
 from server.memory import collect_as_usual, collect_rarely
 from server.places import place_of_field
-from server.priority import Breaks, become_background
+from server.priority import Breaks, become_background, become_prompt
 from server.problems import install_problems
 from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
 from server.rendering.warm_up import warm_up
@@ -71,6 +71,8 @@ def create_app(
                 # One more than there are IR workers: a map must not hold up an IR.
                 answers=Answers(workers=settings.ir_workers + 1, waiting=settings.max_waiting_requests),
             )
+            if settings.realtime:
+                become_prompt()
             audio.start()
             warming = asyncio.create_task(_become_ready(host))
             try:

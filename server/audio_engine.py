@@ -10,10 +10,10 @@ the renderer's call and the way to the event loop would cost about what renderin
 stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly apart, gives a
 new stream the one with the fewest others, and renders all that is due at an instant in one call without the lock.
 
-**Under load**, two or four blocks of a stream are rendered at once (`server.load.blocks_at_once`): those after the
-first cost less rendering, for much of what they read is in the caches, and hardly any of what waking, messages and the
-way to the event loop cost. They are ready before they are due, so poses are heard up to so many blocks later. The
-streams of an instant take turns with it, so that every instant has as much to do.
+**Under load**, two blocks of a stream are rendered at once, or four, or eight (`server.load.blocks_at_once`): those
+after the first cost less rendering, for much of what they read is in the caches, and hardly any of what waking,
+messages and the way to the event loop cost. They are ready before they are due, so poses are heard up to so many blocks
+later. The streams of an instant take turns with it, so that every instant has as much to do.
 
 **What a stream gets.** Four times a second a thread looks at what its streams went through, and moves them to cheaper
 or better quality (`server.load`).
@@ -33,7 +33,7 @@ from collections.abc import Callable
 from itertools import islice
 from typing import NamedTuple
 
-from server.load import MOST_AT_ONCE, PERIOD_S, LoadControl, Reason, blocks_at_once, ir_share
+from server.load import NUMBERS_AT_ONCE, PERIOD_S, LoadControl, Reason, blocks_at_once, ir_share
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
 from server.stream import Outgoing, Stream, StreamFailed
@@ -272,7 +272,7 @@ class AudioThread:
         """Where the fewest streams are of those with blocks as long: of its phase, and of those that would be rendered
         with it, two at once or more."""
         taken = [place for stream, place in self._streams.items() if stream.block_s == block_s]
-        periods = [PHASES * count for count in (1, 2, MOST_AT_ONCE)]
+        periods = [PHASES * count for count in NUMBERS_AT_ONCE]
 
         def company(place: int) -> list[int]:
             return [sum((other - place) % period == 0 for other in taken) for period in periods]

@@ -1,20 +1,29 @@
-"""Who goes first on a busy machine: threads that render sound before all others, threads that prepare it last, and what
-nobody waits for now and then.
+"""Who goes first on a busy machine: threads that render sound before all others, next the one that passes it on,
+threads that prepare it last, and what nobody waits for now and then.
 
 Priorities belong to the calling thread; where the system has none per thread, or allows none, nothing changes.
 """
 
 import contextlib
+import ctypes
 import os
+import platform
 import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError
+from typing import ClassVar
 
 _REAL_TIME = 20
 """Above every ordinary thread, below what keeps the machine itself alive (1 to 99)."""
 _NICENESS = 5
+_PROMPT_NICENESS = -10
+_PROMPT_SLICE_NS = 100_000
+"""The shortest slice of time that Linux has. Who has a shorter one than the thread at work need not wait for that one's
+to end: of the usual 3 ms on a core that audio fills to nine tenths, that is 30."""
+_ORDINARY, _RESET_ON_FORK = 0, 1
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 def become_real_time() -> str | None:
@@ -29,6 +38,35 @@ def become_real_time() -> str | None:
     except OSError as exc:
         return exc.strerror or str(exc)
     return None
+
+
+class _Attributes(ctypes.Structure):
+    """Linux's `struct sched_attr`; for ordinary threads, `runtime_ns` is their slice."""
+
+    _fields_: ClassVar = [
+        ("size", ctypes.c_uint32),
+        ("policy", ctypes.c_uint32),
+        ("flags", ctypes.c_uint64),
+        ("nice", ctypes.c_int32),
+        ("priority", ctypes.c_uint32),
+        ("runtime_ns", ctypes.c_uint64),
+        ("deadline_ns", ctypes.c_uint64),
+        ("period_ns", ctypes.c_uint64),
+    ]
+
+
+def become_prompt() -> bool:
+    """Have the calling thread go before other ordinary ones as soon as it has something to do, for as short as that
+    takes; whether the system allows it. Not real-time: ordinary threads that starve get their share of Linux at one go,
+    50 ms in which no audio thread renders. Threads that it starts are as they would have been."""
+    number = _SCHED_SETATTR.get(platform.machine())
+    if sys.platform != "linux" or number is None:
+        return False
+    wanted = _Attributes(
+        ctypes.sizeof(_Attributes), _ORDINARY, _RESET_ON_FORK, _PROMPT_NICENESS, runtime_ns=_PROMPT_SLICE_NS
+    )
+    refused: int = ctypes.CDLL(None).syscall(number, 0, ctypes.byref(wanted), 0)
+    return not refused
 
 
 def become_background() -> None:

@@ -6,9 +6,11 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES
 from server.blocks import DryBlock
-from server.load import blocks_at_once
+from server.load import NUMBERS_AT_ONCE, blocks_at_once
 from server.protocol import AddEmitter
 from tests.engine_stage import BLOCK_S, Stage, blocks, spy_on_batches
+
+MOST = max(NUMBERS_AT_ONCE)
 
 
 @pytest.fixture
@@ -26,7 +28,7 @@ def open_sounding(stage, **emitter):
     return stream, delivered
 
 
-@pytest.fixture(params=[2, 4])
+@pytest.fixture(params=[2, 4, 8])
 def count(request, monkeypatch):
     """Blocks that are rendered at once from now on."""
     monkeypatch.setattr(audio_engine, "blocks_at_once", lambda _busy, **_: request.param)
@@ -34,10 +36,11 @@ def count(request, monkeypatch):
 
 
 def test_more_blocks_at_once_begin_under_load_and_end_well_below_it():
-    busy = (0.3, 0.5, 0.57, 0.7, 0.9)
-    assert [blocks_at_once(share, before=1) for share in busy] == [1, 1, 1, 2, 4]
-    assert [blocks_at_once(share, before=2) for share in busy] == [1, 2, 2, 2, 4]
-    assert [blocks_at_once(share, before=4) for share in busy] == [1, 2, 4, 4, 4]
+    busy = (0.3, 0.5, 0.57, 0.7, 0.8, 0.9)
+    assert [blocks_at_once(share, before=1) for share in busy] == [1, 1, 1, 2, 4, 8]
+    assert [blocks_at_once(share, before=2) for share in busy] == [1, 2, 2, 2, 4, 8]
+    assert [blocks_at_once(share, before=4) for share in busy] == [1, 2, 4, 4, 4, 8]
+    assert [blocks_at_once(share, before=8) for share in busy] == [1, 2, 4, 8, 8, 8]
 
 
 def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(stage, monkeypatch):
@@ -50,7 +53,7 @@ def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(st
         stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
 
     stream.session.begin_block = take_time
-    for busy, count in [(0.2, 1), (0.7, 2), (0.9, 4), (0.6, 4), (0.5, 2), (0.2, 1)]:
+    for busy, count in [(0.2, 1), (0.7, 2), (0.8, 4), (0.95, 8), (0.65, 8), (0.57, 4), (0.5, 2), (0.2, 1)]:
         stage.run(1.0)
         batches = spy_on_batches(monkeypatch)
         stage.run(20 * BLOCK_S)
@@ -69,15 +72,15 @@ def test_streams_of_an_instant_take_turns(stage, monkeypatch, count):
 
 
 def test_who_comes_takes_the_turn_of_who_left(stage):
-    """The fewest streams of an instant have their turn together, whether with two blocks or with four."""
-    streams = [stage.open()[0] for _ in range(4 * PHASES)]
+    """The fewest streams of an instant have their turn together, however many blocks a turn is."""
+    streams = [stage.open()[0] for _ in range(MOST * PHASES)]
     stage.run(BLOCK_S)
     left = stage.thread._streams[streams[5]]
     stage.engine.close(streams[5])
     newcomer, _ = stage.open()
     stage.run(BLOCK_S)
     assert stage.thread._streams[newcomer] == left
-    assert len(set(stage.thread._streams.values())) == 4 * PHASES
+    assert len(set(stage.thread._streams.values())) == MOST * PHASES
 
 
 @pytest.mark.usefixtures("count")

@@ -218,6 +218,21 @@ def test_what_moves_faster_than_it_did_is_planned_for_at_once(mirrored_field, wh
     assert 3 <= sum(walks) <= 5  # once a second, of so many
 
 
+def test_a_plan_is_a_first_one_where_an_emitter_is_in_none_yet(mirrored_field):
+    planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE))
+    emitters = {}
+    for number, (clock_s, is_first) in enumerate([(0.0, True), (10.0, False), (20.0, True)]):
+        if is_first:
+            emitters[str(number)] = Emitter(number, Pose(THERE))
+        pose = Pose((HERE[0] + 0.5 * number, *HERE[1:]))
+        for name, emitter in emitters.items():
+            planned.follow_emitter(name, emitter.pose, clock_s)
+        planned.follow_listener(pose, clock_s)
+        request = planned.take_request(pose, emitters, clock_s)
+        assert request.is_first is is_first
+        planned.accept(request.plan())
+
+
 def test_plans_are_made_less_often_under_load_but_before_they_are_outdated(mirrored_field):
     planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE))
     emitters = {"one": Emitter(1, Pose(THERE))}

@@ -6,7 +6,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import pytest
 
-from server.priority import Breaks, become_background, become_real_time
+from server.priority import Breaks, become_background, become_prompt, become_real_time
 
 on_linux = pytest.mark.skipif(sys.platform != "linux", reason="priorities of single threads are Linux's")
 
@@ -18,6 +18,20 @@ def in_a_thread(function):
     thread.start()
     thread.join()
     return returned[0]
+
+
+@on_linux
+def test_who_is_prompt_goes_before_ordinary_threads_and_threads_it_starts_are_ordinary():
+    def look():
+        return os.getpriority(os.PRIO_PROCESS, 0), os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+
+    def work():
+        return become_prompt(), look(), in_a_thread(look)
+
+    is_allowed, of_itself, of_its_threads = in_a_thread(work)
+    ordinary = in_a_thread(look)
+    assert of_itself == ((-10, os.SCHED_OTHER) if is_allowed else ordinary)
+    assert of_its_threads == ordinary
 
 
 @on_linux

@@ -17,7 +17,7 @@ from server.acoustics.cache_lines import zeros_on_lines
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.compiled import HAS_NUMBA
-from server.rendering.direct_path_kernel import TILE, render_direct_paths, transform_tables
+from server.rendering.direct_path_kernel import TILE, ask, render_direct_paths, transform_tables
 from server.rendering.direct_path_records import SLOT, DirectPathState, FloatArray
 from server.rendering.fade import raised_cosine
 from server.rendering.fractional_delay import AFTER, TAPS, sinc_table
@@ -68,6 +68,8 @@ class DirectPath:
         self.state = _state(slots, block_size, ears, speed_of_sound, air_db_per_m, max_distance_m)
         self._blocks = np.zeros((slots, block_size), np.float32)
         self._heard = np.zeros((self.channels, block_size), np.float32)
+        # Compiled here, where it may take its time, and not on the audio thread at the first pose.
+        self.set_targets([], np.zeros(0), np.zeros((0, 3)), np.zeros((0, len(OCTAVE_BANDS_HZ))))
         self.reset()
 
     def set_target(self, slot: int, target: PathTarget, *, jump: bool = False) -> None:
@@ -89,12 +91,8 @@ class DirectPath:
         band_gains_db: npt.NDArray[np.floating],
     ) -> None:
         """`set_target` of several slots (n,) at once: lengths (n,), arrivals (n, 3), gains (n, band)."""
-        records, rows = self.state.slots, np.asarray(slots, np.intp)
-        records["present"][rows] = True
-        records["asked"][rows] = True
-        records["goal_m"][rows] = lengths_m
-        records["arrival"][rows] = arrivals
-        records["band_gain_db"][rows] = band_gains_db
+        asked = (np.ascontiguousarray(values, np.float64) for values in (lengths_m, arrivals, band_gains_db))
+        ask(self.state.slots, np.asarray(slots, np.int64), *asked)
 
     def set_muted(self, slot: int, is_muted: bool) -> None:
         """Have a slot fade out, and do nothing more for it than keep what it plays; or fade in, where it is by then."""

@@ -24,6 +24,7 @@ seconds.
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from server.compiled import HAS_NUMBA, compiled_in_place
 from server.rendering.direct_path_records import BANDS, DirectPathState, DoubleArray, FloatArray
@@ -51,6 +52,26 @@ _REST_S = 3e-9
 TILE = loops.TILE
 transform_tables = loops.transform_tables
 _ANCHOR, _AT, _SPEED = 0, 1, 2
+
+
+@compiled_in_place
+def ask(
+    slots: Any,
+    rows: npt.NDArray[np.int64],
+    lengths_m: DoubleArray,
+    arrivals: DoubleArray,
+    band_gains_db: DoubleArray,
+) -> None:
+    """Enter what is asked for of the slots in `rows` (n,): lengths (n,), arrivals (n, 3), gains (n, band)."""
+    for number in range(rows.size):
+        slot = slots[rows[number]]
+        slot.present = True
+        slot.asked = True
+        slot.goal_m = lengths_m[number]
+        for axis in range(3):
+            slot.arrival[axis] = arrivals[number, axis]
+        for band in range(BANDS):
+            slot.band_gain_db[band] = band_gains_db[number, band]
 
 
 @compiled_in_place

@@ -37,7 +37,7 @@ def mix_listeners(
     like: Reference | None,
     like_limiter: Reference | None,
 ) -> None:
-    """The next blocks of every row, in order. A row (6,) has the addresses of an OUTPUT record and of two MIXER records,
+    """The next blocks of every row, in order. A row (6,) has the addresses of an OUTPUT record and two MIXER records,
     the second 0 for none, how many blocks it gets, and of the first its row of `flags` (block, 2) and where it begins
     in `frames`.
     Flags say of a block whether an IR was exchanged in it, and whether it would have been too loud. `like` and
