@@ -371,8 +371,8 @@ def test_rendering_leaves_the_interpreter_to_others():
         engine.set_ir(str(number), room(number))
     run(engine, 2)
     # The same one, over and over: some hundred ms.
-    rows = np.tile(np.array([engine._output.address, engine._mixer.address, 0, 0], np.int64), (20_000, 1))
-    frames = np.zeros(engine._output.sum.size, np.float32)
+    rows = np.tile(np.array([engine._output.address, engine._mixer.address, 0, 1, 0, 0], np.int64), (20_000, 1))
+    frames, flags = np.zeros(engine._output.sum.size, np.float32), np.zeros((1, 2), np.int64)
     counted = []
 
     def count():
@@ -383,7 +383,7 @@ def test_rendering_leaves_the_interpreter_to_others():
     thread = threading.Thread(target=count)
     thread.start()
     before = len(counted)
-    mix_listeners(rows, frames, None, None)
+    mix_listeners(rows, frames, flags, None, None)
     during = len(counted) - before
     counted.append(-1)
     thread.join()
