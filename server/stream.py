@@ -230,10 +230,9 @@ class Stream:
         self.render_times.add(each_s, count)
         if self.next_block >= self._lead:  # the first were due before the stream was
             lateness_s = now_s - self.due_s
-            self.latenesses.add(lateness_s)
             self._worst_lateness_s = max(self._worst_lateness_s, lateness_s)
-            for ahead in range(1, count):
-                self.latenesses.add(lateness_s - ahead * self.block_s)
+            for ahead in range(count):  # what is early is not late
+                self.latenesses.add(max(0.0, lateness_s - ahead * self.block_s))
         if clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
             clock.slip(self.next_block, now_s)
         self.next_block += count
