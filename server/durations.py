@@ -1,6 +1,7 @@
 """How long things took, kept so cheaply that every block can be measured."""
 
 import math
+from bisect import bisect_left
 from itertools import accumulate
 
 _SHORTEST_S = 1e-6
@@ -37,12 +38,11 @@ class DurationHistogram:
         sums = list(accumulate(self._bins))
         return [(_SHORTEST_S * 2**octave, sums[octave * _PER_OCTAVE - 1]) for octave in range(1, _OCTAVES + 1)]
 
-    def quantile_s(self, share: float) -> float | None:
-        """The shortest duration that `share` of all do not exceed; None before the first."""
-        wanted = max(1, math.ceil(share * self.count))
-        seen = 0
-        for place, count in enumerate(self._bins):
-            seen += count
-            if seen >= wanted:
-                return float(_SHORTEST_S * 2 ** ((place + 0.5) / _PER_OCTAVE))
-        return None
+    def quantiles_s(self, *shares: float) -> list[float | None]:
+        """For each, the shortest duration that such a share of all do not exceed; None before the first."""
+        if not self.count:
+            return [None] * len(shares)
+        sums = list(accumulate(self._bins))
+        # Another thread may be about to count in what it has added to a bin.
+        wanted = [min(max(1, math.ceil(share * self.count)), sums[-1]) for share in shares]
+        return [_SHORTEST_S * 2 ** ((bisect_left(sums, count) + 0.5) / _PER_OCTAVE) for count in wanted]

@@ -12,7 +12,7 @@ import dataclasses
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -51,6 +51,14 @@ def load_clip(clips: ClipLibrary, name: str) -> DryAudio:
         return clips.load(name)
     except DecodeError as exc:
         raise RequestError("undecodable_clip", str(exc), field="clip") from exc
+
+
+def _first_blocks(outgoing: Iterable[Outgoing]) -> Iterator[TimedBlock]:
+    """Those before which nothing else is."""
+    for each in outgoing:
+        if not isinstance(each, TimedBlock):
+            return
+        yield each
 
 
 class ClosingError(Exception):
@@ -278,14 +286,14 @@ class Connection:
 
     def _deliver(self, outgoing: list[Outgoing]) -> None:
         """Send blocks at once where there is a short way and nothing waits to go before them."""
-        sent = 0
+        blocks: list[bytes] = []
         if self._way is not None and not (self._outgoing or self._is_sending):
-            while sent < len(outgoing) and isinstance(first := outgoing[sent], TimedBlock):
-                if not self._way.write(self._serialize(first)):
-                    break
-                sent += 1
-        if sent < len(outgoing):
-            self._enqueue(outgoing[sent:])
+            now_s = self._time_s()
+            blocks = [self._serialize(block, now_s) for block in _first_blocks(outgoing)]
+            if blocks and not self._way.write(blocks):
+                blocks = []
+        if len(blocks) < len(outgoing):
+            self._enqueue(outgoing[len(blocks) :])
 
     def _enqueue(self, outgoing: list[Outgoing]) -> None:
         """Where there is no room, what comes is lost, and the connection ends."""
@@ -309,7 +317,7 @@ class Connection:
             while self._outgoing:
                 match self._outgoing.popleft():
                     case TimedBlock() as timed:
-                        await self._websocket.send_bytes(self._serialize(timed))
+                        await self._websocket.send_bytes(self._serialize(timed, self._time_s()))
                     case StreamFailed():
                         await self._send_message(Error(code="internal_error", message="the stream failed"))
                         await self._websocket.close(INTERNAL_ERROR, "internal_error")
@@ -318,9 +326,9 @@ class Connection:
                         await self._send_message(message)
             self._is_sending = False
 
-    def _serialize(self, timed: TimedBlock) -> bytes:
+    def _serialize(self, timed: TimedBlock, now_s: float) -> bytes:
         block = timed.block
-        if not block.is_late and self._time_s() > timed.deadline_s:
+        if not block.is_late and now_s > timed.deadline_s:
             assert self._stream is not None
             self._stream.blocks_late += 1
             block.is_late = True

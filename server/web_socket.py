@@ -7,20 +7,21 @@ message that comes, where none waits before it. ASGI allows such *extensions*: a
 scope, and does without where another server runs it.
 """
 
-import struct
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.http11 import Request
+from websockets.protocol import OPEN
+
+from server.web_socket_frames import FrameCutter, header
 
 Hear = Callable[[str | bytes], bool]
 """Takes a message in at once, or says False and has not: then it goes the way of all others."""
 
 _EXTENSION: Final = "nafir.direct"
-_WHOLE_BINARY: Final = 0x82
-_SHORT, _LONG = 126, 127
+_END_OF_REQUEST: Final = b"\r\n\r\n"
 _MOST_WAITING = 16
 """Messages that may wait for the application before its client is heard no more."""
 
@@ -29,8 +30,8 @@ _MOST_WAITING = 16
 class DirectWay:
     """Past ASGI, in order with what goes by way of it."""
 
-    write: Callable[[bytes], bool]
-    """Sends a binary message at once, or says False and has not."""
+    write: Callable[[Sequence[bytes]], bool]
+    """Sends binary messages at once, or says False and has not sent any."""
     listen: Callable[[Hear], None]
     """From now on, whoever is given is told of messages before which none waits."""
 
@@ -42,17 +43,17 @@ def direct_way(scope: Mapping[str, Any]) -> DirectWay | None:
 
 
 def watched(
-    scope: MutableMapping[str, Any], *, sent: Callable[[bytes], None], heard: Callable[[str | bytes], None]
+    scope: MutableMapping[str, Any], *, sent: Callable[[Sequence[bytes]], None], heard: Callable[[str | bytes], None]
 ) -> MutableMapping[str, Any]:
     """A scope that tells of what went the direct way: of what was `sent`, and of what was `heard`."""
     way = direct_way(scope)
     if way is None:
         return scope
 
-    def write(payload: bytes) -> bool:
-        is_sent = way.write(payload)
+    def write(payloads: Sequence[bytes]) -> bool:
+        is_sent = way.write(payloads)
         if is_sent:
-            sent(payload)
+            sent(payloads)
         return is_sent
 
     def listen(hear: Hear) -> None:
@@ -67,52 +68,53 @@ def watched(
     return {**scope, "extensions": {**scope["extensions"], _EXTENSION: {"way": DirectWay(write, listen)}}}
 
 
-def header(length: int) -> bytes:
-    """Of a whole binary message that a server sends, of so many bytes."""
-    if length < _SHORT:
-        return struct.pack(">BB", _WHOLE_BINARY, length)
-    if length < 1 << 16:
-        return struct.pack(">BBH", _WHOLE_BINARY, _SHORT, length)
-    return struct.pack(">BBQ", _WHOLE_BINARY, _LONG, length)
-
-
 class WebSocketProtocol(WebSocketsSansIOProtocol):
     """For uvicorn, by `ws="server.web_socket:WebSocketProtocol"`, without extensions of the protocol's own: what is
     written here is neither compressed nor cut."""
 
     _hear: Hear | None = None
+    _cutter: FrameCutter | None = None
 
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
         if not self.handshake_complete:  # as it is where the request was refused
             self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
 
+    def data_received(self, data: bytes) -> None:
+        if self._cutter is None:
+            super().data_received(data)
+            # With bytes behind the request, the parser may be in the midst of a frame.
+            if self.handshake_initiated and data.find(_END_OF_REQUEST) == len(data) - len(_END_OF_REQUEST):
+                self._cutter = FrameCutter()
+            return
+        for cut in self._cutter.cut(data):
+            if cut.message is None or not self._is_heard(cut.message, is_text=cut.is_text):
+                super().data_received(cut.raw)
+
     def send_receive_event_to_app(self) -> None:
         """uvicorn stops reading with every message, until the application has taken it in."""
-        if self._hear is not None and self.queue.empty() and not self.close_sent and self._is_heard(self._hear):
-            self.frames = []
-            return
         super().send_receive_event_to_app()
         if self.read_paused and self.queue.qsize() < _MOST_WAITING:
             self.read_paused = False
             self.transport.resume_reading()
 
-    def _is_heard(self, hear: Hear) -> bool:
-        data = b"".join(self.frames)
-        if self.curr_msg_data_type != "text":
-            return hear(data)
+    def _is_heard(self, message: bytes, *, is_text: bool) -> bool:
+        if self._hear is None or self.close_sent or self.conn.state is not OPEN or not self.queue.empty():
+            return False
+        if not is_text:
+            return self._hear(message)
         try:
-            text = data.decode()
+            text = message.decode()
         except UnicodeDecodeError:
             return False  # uvicorn knows what to do
-        return hear(text)
+        return self._hear(text)
 
     def _listen(self, hear: Hear) -> None:
         self._hear = hear
 
-    def _write(self, payload: bytes) -> bool:
+    def _write(self, payloads: Sequence[bytes]) -> bool:
         is_open = self.handshake_complete and not self.close_sent and not self.transport.is_closing()
         if not is_open or not self.writable.is_set():
             return False
-        self.transport.write(header(len(payload)) + payload)
+        self.transport.write(b"".join([part for payload in payloads for part in (header(len(payload)), payload)]))
         return True

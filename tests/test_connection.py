@@ -124,11 +124,12 @@ def test_blocks_that_go_the_short_way_and_the_long_one_stay_in_order(field, hrtf
     async def scenario():
         socket = Socket()
 
-        def write(data):
+        def write(messages):
             if next(tries) % 5 in {0, 1}:
                 return False
-            written.append(AudioBlock.parse(data, "f32").sequence)
-            socket.sent.append(AudioBlock.parse(data, "f32"))
+            blocks = [AudioBlock.parse(data, "f32") for data in messages]
+            written.extend(block.sequence for block in blocks)
+            socket.sent.extend(blocks)
             return True
 
         async with hosting(field, hrtfs) as host:

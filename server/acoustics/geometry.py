@@ -86,11 +86,13 @@ class Pose:
     orientation: Quaternion = LEVEL
 
     def __post_init__(self) -> None:
-        if len(self.position) != 3 or not all(math.isfinite(c) for c in self.position):
+        if len(self.position) != 3:
             raise ValueError("position must be three finite numbers")
-        if any(abs(c) > FARTHEST_M for c in self.position):
+        x, y, z = map(float, self.position)  # listeners move hundreds of times a second: no loops here
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+            raise ValueError("position must be three finite numbers")
+        if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
             raise ValueError(f"position must lie within {FARTHEST_M:g} m")
-        x, y, z = (float(c) for c in self.position)
         object.__setattr__(self, "position", (x, y, z))
         if type(self.orientation) is not Quaternion:  # what is one stays as it is, to the last bit
             if len(self.orientation) != 4:

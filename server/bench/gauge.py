@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -114,21 +114,23 @@ class Gauge:
             see_pose(message.get("bytes") or b"")
             return message
 
-        def see_block(data: bytes) -> None:
-            if data[0] == AudioBlock.KIND:
-                pose_id, reverberation_pose_id = POSE_IDS.unpack_from(data)
-                now_s = self._time_s()
-                watch.direct.leave(pose_id, now_s)
-                watch.reverberation.leave(reverberation_pose_id, now_s)
+        def see_blocks(messages: Sequence[bytes]) -> None:
+            """Those of one moment."""
+            now_s = self._time_s()
+            for data in messages:
+                if data[0] == AudioBlock.KIND:
+                    pose_id, reverberation_pose_id = POSE_IDS.unpack_from(data)
+                    watch.direct.leave(pose_id, now_s)
+                    watch.reverberation.leave(reverberation_pose_id, now_s)
 
         async def send_block(message: Message) -> None:
             await send(message)
             if data := message.get("bytes"):
-                see_block(data)
+                see_blocks([data])
 
         self._watches.add(watch)
         try:
-            await self._app(watched(scope, sent=see_block, heard=see_pose), receive_pose, send_block)
+            await self._app(watched(scope, sent=see_blocks, heard=see_pose), receive_pose, send_block)
         finally:
             self._watches.remove(watch)
 

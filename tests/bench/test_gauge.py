@@ -48,8 +48,8 @@ def test_a_pose_is_followed_by_the_first_block_that_is_not_older():
     assert waiting.times.count == 0
     waiting.leave(2, 0.030)  # the first waited 30 ms, the second 20
     assert waiting.times.count == 2
-    assert waiting.times.quantile_s(1) == pytest.approx(0.030, rel=0.03)
-    assert waiting.times.quantile_s(0.5) == pytest.approx(0.020, rel=0.03)
+    assert waiting.times.quantiles_s(1) == [pytest.approx(0.030, rel=0.03)]
+    assert waiting.times.quantiles_s(0.5) == [pytest.approx(0.020, rel=0.03)]
     waiting.leave(3, 0.040)
     waiting.leave(3, 0.050)
     assert waiting.times.count == 3
