@@ -1,13 +1,13 @@
-"""Where the sound that comes before all reflections travels in a scene: what makes a renderer's direct paths follow
-poses, or a response hold those of emitters that stand still. Beside it, where the scene wants them from geometry, the
-first reflections.
+"""Where the sound that comes before all reflections travels in a scene: what a renderer's direct paths follow
+(`server.aim`), or a response holds of emitters that stand still. Beside it, where the scene wants them from geometry,
+the first reflections.
 
 Metres; positions and directions in the world's axes.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from server.acoustics.decibels import amplitude_to_db, db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import FloorPlan, Pose
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.binaural import Binauralization
 from server.early_reflections import EarlyReflections
 from server.radiation import departure_gain_db, reverberation_gain
@@ -48,12 +48,36 @@ class Aimed(Protocol):
     def effects(self) -> EmitterEffects: ...
 
 
-class _Paths(NamedTuple):
+class FoundPaths(NamedTuple):
     """Of n emitters: lengths (n,), directions of arrival (n, 3), gains (n, band) beside distance and air."""
 
     length_m: _Floats
     arrival: _Floats
     gain_db: _Floats
+
+
+class Ways(Generic[Key]):
+    """The ways from emitters whose paths are found alike, as long as those stay as and where they are."""
+
+    def __init__(self, finder: SoundPathFinder, emitters: Sequence[tuple[Key, Aimed]]) -> None:
+        self.keys = [key for key, _ in emitters]
+        self._finder = finder
+        self._places = np.array([emitter.pose.position for _, emitter in emitters])
+        self._paths = SoundPaths.empty(len(emitters))
+        self._unbent = [row for row, (_, emitter) in enumerate(emitters) if not emitter.effects.diffraction]
+        self._beaming = [
+            (row, emitter) for row, (_, emitter) in enumerate(emitters) if emitter.directivity is not OMNIDIRECTIONAL
+        ]
+
+    def find(self, listener: Pose) -> FoundPaths:
+        """The paths to a listener, in the order of `keys`; good until the next are found."""
+        paths = self._finder.find(np.array(listener.position), self._places, self._paths)
+        gain_db = paths.screen_db
+        for row in self._unbent:
+            gain_db[row] = 0.0 if paths.in_sight[row] else _SILENT_DB
+        for row, emitter in self._beaming:
+            gain_db[row] += departure_gain_db(emitter, paths.departure[row])
+        return FoundPaths(paths.length_m, paths.arrival, gain_db)
 
 
 class DirectSound:
@@ -132,14 +156,6 @@ class DirectSound:
         """Those that two ears hear, or one without a head."""
         return self.early_reflections if channels == 2 else self.early_without_head
 
-    def aim(self, renderer: Renderer, listener: Pose, emitters: Mapping[str, Aimed]) -> None:
-        """Have `renderer` hear `emitters`, by id, where they are now."""
-        if self._filters is None:
-            return
-        for finder, named in self._by_finder(emitters.items()):
-            paths = self._find(finder, listener, [emitter for _, emitter in named])
-            renderer.set_paths([name for name, _ in named], *paths)
-
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Aimed]) -> None:
         """Add the direct sound that `listener` hears of each emitter to its response (B, ear, sample), for emitters
         whose direct sound stands still; sample 0 is emission.
@@ -148,9 +164,9 @@ class DirectSound:
         """
         if self._filters is None:
             return
-        for finder, rows in self._by_finder(enumerate(emitters)):
-            paths = self._find(finder, listener, [emitter for _, emitter in rows])
-            for (row, emitter), length_m, arrival, gain_db in zip(rows, *paths, strict=True):
+        for ways in self.ways_from(enumerate(emitters)):
+            for row, length_m, arrival, gain_db in zip(ways.keys, *ways.find(listener), strict=True):
+                emitter = emitters[row]
                 effects = emitter.effects
                 gain = gain_db - amplitude_to_db(reverberation_gain(emitter.directivity))
                 if not effects.distance_attenuation:
@@ -160,26 +176,19 @@ class DirectSound:
                     np.array([length_m]), arrival[np.newaxis], gain[np.newaxis], listener.orientation, responses[row]
                 )
 
-    def _by_finder(
-        self, emitters: Iterable[tuple[Key, Aimed]]
-    ) -> list[tuple[SoundPathFinder, list[tuple[Key, Aimed]]]]:
-        """Emitters that walls may hide are looked for round corners; for others nothing is looked for."""
+    @property
+    def is_heard_apart(self) -> bool:
+        """Whether there is a direct sound beside what the scene's fields hold."""
+        return self._filters is not None
+
+    def ways_from(self, emitters: Iterable[tuple[Key, Aimed]]) -> list["Ways[Key]"]:
+        """From emitters, each with what tells it from others. Those that walls may hide are looked for round corners;
+        for others nothing is looked for."""
         hidden: list[tuple[Key, Aimed]] = []
         open_: list[tuple[Key, Aimed]] = []
         for each in emitters:
             (hidden if each[1].effects.occlusion else open_).append(each)
-        return [(finder, some) for finder, some in ((self._finder, hidden), (self._straight, open_)) if some]
-
-    def _find(self, finder: SoundPathFinder, listener: Pose, emitters: Sequence[Aimed]) -> _Paths:
-        places = np.asarray([emitter.pose.position for emitter in emitters])
-        paths = finder.find(np.asarray(listener.position), places)
-        gain_db = paths.screen_db
-        for number, emitter in enumerate(emitters):
-            if not emitter.effects.diffraction:
-                gain_db[number] = 0.0 if paths.in_sight[number] else _SILENT_DB
-            if emitter.directivity is not OMNIDIRECTIONAL:
-                gain_db[number] += departure_gain_db(emitter, paths.departure[number])
-        return _Paths(paths.length_m, paths.arrival, gain_db)
+        return [Ways(finder, some) for finder, some in ((self._finder, hidden), (self._straight, open_)) if some]
 
     def _still(self, channels: int, *, has_air: bool) -> StillPaths:
         return self._still_paths[channels - 1][has_air]

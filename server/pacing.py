@@ -51,14 +51,11 @@ class SendWindow:
     def unacknowledged(self) -> int:
         return self.sent - self._acknowledged
 
-    @property
-    def is_open(self) -> bool:
-        return self.unacknowledged < self.size
-
-    def take_sequence(self) -> int:
-        """Sequence number of the next block; call only while the window is open."""
-        self.sent += 1
-        return self.sent - 1
+    def take_sequences(self, blocks: int) -> range:
+        """The sequence numbers of so many blocks, or of the first of them for which the window has room."""
+        first = self.sent
+        self.sent += max(0, min(blocks, self.size - self.unacknowledged))
+        return range(first, self.sent)
 
     def acknowledge(self, sequence: int) -> None:
         """Blocks up to and including `sequence` arrived. Raises RequestError for one that was never sent."""

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose, Quaternion
+from server.aim import Aim
 from server.direct_sound import DirectSound
 from server.effects_in_force import EffectsInForce, as_asked
 from server.emitters import Emitter
@@ -273,6 +274,7 @@ class _Walk:
         self._listener = start
         self._has_begun = False
         self._emitters: dict[str, Emitter] = {}
+        self._aim = Aim(direct_sound, self.renderer, self._emitters)
         for number, emitter in enumerate(emitters):
             name = str(number)
             self.renderer.add_emitter(name, ClipPlayer(emitter.clip, loop=emitter.loop), gain=emitter.gain)
@@ -289,11 +291,8 @@ class _Walk:
         if direct is not None:
             self._move(direct)
         self._plan()
-        displaced = {name: emitter for name, emitter in self._emitters.items() if emitter.is_displaced}
-        if self._has_begun and displaced:
-            self._direct_sound.aim(self.renderer, self._listener, displaced)
-            for emitter in displaced.values():
-                emitter.is_displaced = False
+        if self._has_begun:
+            self._aim.follow(self._listener)
         if reverberation is not None:
             for emitter in self._emitters.values():
                 emitter.is_outdated = True
@@ -304,7 +303,6 @@ class _Walk:
     def _move(self, pose: Pose) -> None:
         moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
         for name, emitter in self._emitters.items():
-            emitter.is_displaced |= moves
             if moves or (turns and self._effects.shared.head):
                 self._effects.unfold(name, emitter)
         self._listener, self._has_begun = pose, True

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from server.acoustics.decibels import db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
+from server.aim import Aim
 from server.blocks import AudioBlock, DryBlock
 from server.direct_sound import DirectSound
 from server.effects_in_force import EffectsInForce
@@ -128,6 +129,7 @@ class Session:
             has_late=bool(self._bundle.manifest.fields),
         )
         self._emitters: dict[str, Emitter] = {}
+        self._aim = Aim(self._direct_sound, self.renderer, self._emitters)
         self._responses = ResponsesInForce(
             self.renderer, self._effects, self._emitters, levels=levels, direct_sound=self._direct_sound, rung=rung
         )
@@ -257,11 +259,7 @@ class Session:
 
     def begin_block(self) -> None:
         """Have the direct paths of the next block follow the newest poses."""
-        displaced = {name: emitter for name, emitter in self._emitters.items() if emitter.is_displaced}
-        if displaced:
-            self._direct_sound.aim(self.renderer, self._listener, displaced)
-            for emitter in displaced.values():
-                emitter.is_displaced = False
+        self._aim.follow(self._listener)
         self.renderer.set_orientation(self._listener.orientation)
         self._followed_pose_id = self._responses.newest_pose_id
 
@@ -272,25 +270,18 @@ class Session:
         A block that is not sent was rendered all the same: clips and reverberation keep their place on the clock.
         """
         self._responses.follow_renderer()
+        sequences = self.window.take_sequences(len(rendered))
+        self.blocks_dropped += len(rendered) - len(sequences)
+        pose_ids = self._followed_pose_id, self._responses.applied_pose_id
+        size = self.renderer.block_size
+        clocks = range(sample_clock, sample_clock + len(rendered) * size, size)
         blocks = []
-        for samples, is_exchange, is_limited in rendered:
+        for number, (samples, is_exchange, is_limited) in enumerate(rendered):
             self.ir_exchanges += is_exchange
             self.blocks_limited += is_limited
-            if self.window.is_open:
-                blocks.append(
-                    AudioBlock(
-                        sequence=self.window.take_sequence(),
-                        sample_clock=sample_clock,
-                        pose_id=self._followed_pose_id,
-                        reverberation_pose_id=self._responses.applied_pose_id,
-                        samples=samples,
-                        is_exchange=is_exchange,
-                        is_limited=is_limited,
-                    )
-                )
-            else:
-                self.blocks_dropped += 1
-            sample_clock += self.renderer.block_size
+            if number < len(sequences):
+                place = sequences[number], clocks[number]
+                blocks.append(AudioBlock(*place, *pose_ids, samples, is_exchange=is_exchange, is_limited=is_limited))
         return blocks
 
     def render_block(self) -> AudioBlock | None:
@@ -324,7 +315,6 @@ class Session:
         shared = self._effects.shared
         for identifier, emitter in self._emitters.items():
             emitter.is_outdated |= moves or (turns and shared.head and shared.head_rotation)
-            emitter.is_displaced |= moves
             if moves or (turns and shared.head):
                 self._effects.unfold(identifier, emitter)
         self._listener = pose

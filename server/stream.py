@@ -229,10 +229,12 @@ class Stream:
         self.load += (1 - (1 - _LOAD_SMOOTHING) ** count) * (each_s / self.block_s - self.load)
         self.render_times.add(each_s, count)
         if self.next_block >= self._lead:  # the first were due before the stream was
-            lateness_s = now_s - self.due_s
+            lateness_s = max(0.0, now_s - self.due_s)  # what is early is not late
             self._worst_lateness_s = max(self._worst_lateness_s, lateness_s)
-            for ahead in range(count):  # what is early is not late
-                self.latenesses.add(max(0.0, lateness_s - ahead * self.block_s))
+            after_due = min(count, 1 + int(lateness_s / self.block_s))
+            for ahead in range(after_due):
+                self.latenesses.add(lateness_s - ahead * self.block_s)
+            self.latenesses.add(0.0, count - after_due)
         if clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
             clock.slip(self.next_block, now_s)
         self.next_block += count

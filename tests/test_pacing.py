@@ -27,17 +27,17 @@ def test_after_a_stall_the_next_block_is_due_within_a_block_and_the_rest_follow_
 
 def test_a_window_closes_when_full_and_opens_with_an_acknowledgement():
     window = SendWindow(3)
-    assert [window.take_sequence() for _ in range(3)] == [0, 1, 2]
-    assert not window.is_open
+    assert list(window.take_sequences(2)) == [0, 1]
+    assert list(window.take_sequences(2)) == [2]
+    assert list(window.take_sequences(2)) == []
     window.acknowledge(1)
-    assert window.is_open
     assert window.unacknowledged == 1
+    assert list(window.take_sequences(2)) == [3, 4]
 
 
 def test_acknowledgements_are_cumulative_and_never_go_back():
     window = SendWindow(8)
-    for _ in range(5):
-        window.take_sequence()
+    window.take_sequences(5)
     window.acknowledge(4)
     window.acknowledge(2)
     assert window.unacknowledged == 0

@@ -290,11 +290,11 @@ class Renderer:
         for mixer in self._mixers:
             if mixer.direct is None:
                 continue
-            rows = [number for number, emitter in enumerate(emitters) if emitter.mixer is mixer]
-            slots = [emitters[row].slot for row in rows]
-            if len(rows) == len(emitters):
+            slots = [emitter.slot for emitter in emitters if emitter.mixer is mixer]
+            if len(slots) == len(emitters):
                 mixer.direct.set_targets(slots, lengths_m, arrivals, band_gains_db)
-            elif rows:
+            elif slots:
+                rows = [number for number, emitter in enumerate(emitters) if emitter.mixer is mixer]
                 mixer.direct.set_targets(slots, lengths_m[rows], arrivals[rows], band_gains_db[rows])
 
     def hear_direct(self, emitter_id: str, *, is_heard: bool = True, distance: bool = True, air: bool = True) -> None:

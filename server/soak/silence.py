@@ -9,6 +9,7 @@ import time
 import numpy as np
 
 from server.acoustics.geometry import Pose
+from server.aim import Aim
 from server.direct_sound import DirectSound
 from server.emitters import Emitter
 from server.field.field import AcousticField
@@ -39,7 +40,7 @@ def silence_to_sound(field: AcousticField) -> float:
         )
         renderer.add_emitter("noise", ClipPlayer(DryAudio(loud), loop=False))
         renderer.set_ir("noise", ir)
-        direct.aim(renderer, listener, {"noise": emitter})
+        Aim(direct, renderer, {"noise": emitter}).follow(listener)
         times_s: dict[bool, list[float]] = {True: [], False: []}
         for block in range(round((_SOUND_S + _SILENCE_S) * rate / _BLOCK_SIZE)):
             started_s = time.perf_counter()
