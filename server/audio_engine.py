@@ -31,6 +31,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from itertools import islice
+from operator import attrgetter
 from typing import NamedTuple
 
 from server.load import NUMBERS_AT_ONCE, PERIOD_S, LoadControl, Reason, blocks_at_once, ir_share
@@ -41,8 +42,15 @@ from server.workers import Workers
 
 PHASES = 2
 """Four streams of 16 emitters cost their two threads 9 % less than at four, and poses are heard 0.4 ms later."""
+_APART = 5
+"""Places from one that is taken to the next: a number without a divisor in common with how many there are."""
 _EARLY_S = 0.0002
 """Blocks due within that are rendered now: sooner than one could sleep and wake again."""
+_MOST_AT_A_TICK = 1.5
+"""What is rendered at a tick takes about so many blocks' time, or is of one stream."""
+_GIVE_WAY_S = 0.002
+"""How long an audio thread waits for the event loop at the most. Where both have but one core, and the thread hardly
+sleeps, the loop got nothing of it for up to 0.1 s: blocks were ready in time and sent too late."""
 _PRESUMED_LOAD = 0.02
 """Share of a core that a stream is taken to need at least, as long as it has shown no more."""
 _SWITCH_S = 0.0005
@@ -150,6 +158,9 @@ class AudioThread:
         self._arrivals: deque[tuple[Stream, bool]] = deque()
         self._origin_s: float | None = None
         self._wake = threading.Event()
+        self._has_arrived = threading.Event()
+        """What was handed to the event loop."""
+        self._has_arrived.set()
         self._is_stopping = False
         self._thread = threading.Thread(target=self._run, name=f"nafir-audio-{number}", daemon=True)
 
@@ -159,6 +170,7 @@ class AudioThread:
     def stop(self) -> None:
         self._is_stopping = True
         self._wake.set()
+        self._has_arrived.set()
 
     def join(self) -> None:
         self._thread.join()
@@ -181,18 +193,17 @@ class AudioThread:
         self._admit(now_s)
         made: dict[Stream, list[Outgoing]] = {}
         due: list[_Due] = []
-        soonest_s = min((stream.due_s for stream in self._streams), default=math.inf)
-        takes_along = self.blocks_at_once == NUMBERS_AT_ONCE[-1] and soonest_s <= now_s + _EARLY_S
+        blocks_of = self._due(now_s)
         for stream in tuple(self._streams):
-            is_due = stream.due_s <= now_s + _EARLY_S or (takes_along and self._may_come_along(stream, now_s))
-            if not is_due and not stream.has_news:
+            blocks = blocks_of.get(stream)
+            if blocks is None and not stream.has_news:
                 continue
             try:
                 made[stream] = stream.take_in(self._workers)
-                if is_due:
+                if blocks is not None:
                     began_s = self._time_s()
                     stream.session.begin_block()
-                    due.append(_Due(stream, self._blocks_of(stream), self._time_s() - began_s))
+                    due.append(_Due(stream, blocks, self._time_s() - began_s))
             except Exception:
                 _logger.exception(_FAILED)
                 self._fail(stream, made)
@@ -201,11 +212,29 @@ class AudioThread:
             self._busy_s += self._time_s() - now_s
         if now_s - self._looked_s >= PERIOD_S:
             self._look(now_s, made)
-        if made:
-            self._post(lambda: _deliver(made))
+        if any(made.values()):
+            self._has_arrived.clear()
+            self._post(lambda: self._deliver(made))
         if not self._streams:
             return None
         return min(stream.due_s for stream in self._streams) - self._time_s()
+
+    def _due(self, now_s: float) -> dict[Stream, int]:
+        """Whose blocks to render now, and how many: of all that are due those that have been for longest, as many as
+        a tick has time for. A thread that fell behind has the first of them sent before it goes on."""
+        soon_s = now_s + _EARLY_S
+        due = sorted((stream for stream in self._streams if stream.due_s <= soon_s), key=attrgetter("due_s"))
+        if due and self.blocks_at_once == NUMBERS_AT_ONCE[-1]:
+            due += [stream for stream in self._streams if stream.due_s > soon_s and self._may_come_along(stream, now_s)]
+        blocks_of: dict[Stream, int] = {}
+        takes = 0.0
+        for stream in due:
+            blocks = self._blocks_of(stream)
+            takes += blocks * stream.load
+            if blocks_of and takes > _MOST_AT_A_TICK:
+                break
+            blocks_of[stream] = blocks
+        return blocks_of
 
     def _may_come_along(self, stream: Stream, now_s: float) -> bool:
         """With the most blocks at once, those of the next instant are rendered together with this one's: half as many
@@ -278,14 +307,17 @@ class AudioThread:
 
     def _freest_place(self, block_s: float) -> int:
         """Where the fewest streams are of those with blocks as long: of its phase, and of those that would be rendered
-        with it, two at once or more."""
+        with it, two at once or more. Of equal ones, one that lies apart from those taken before: where one instant has
+        more to do, the next is to have less, or neither the event loop nor IRs get anything for long."""
         taken = [place for stream, place in self._streams.items() if stream.block_s == block_s]
-        periods = [PHASES * count for count in NUMBERS_AT_ONCE]
+        *periods, cycle = [PHASES * count for count in NUMBERS_AT_ONCE]
 
         def company(place: int) -> list[int]:
-            return [sum((other - place) % period == 0 for other in taken) for period in periods]
+            alike = [sum((other - place) % period == 0 for other in taken) for period in periods]
+            # With the most at once, all phases of a block are rendered together.
+            return [*alike, sum(other // PHASES == place // PHASES for other in taken), taken.count(place)]
 
-        return min(range(periods[-1]), key=company)
+        return min((number * _APART % cycle for number in range(cycle)), key=company)
 
     def _origin_of(self, phase: int, block_s: float, now_s: float) -> float:
         """The next instant of `phase` that lies a block ahead at least, so that the first has time to be rendered."""
@@ -298,10 +330,25 @@ class AudioThread:
         if self._is_real_time and (reason := become_real_time()) is not None and self._number == 0:
             _logger.warning("audio threads run at ordinary priority: %s", reason)
         while not self._is_stopping:
-            wait_s = self.tick()
-            if wait_s is None or wait_s > 0:
-                self._wake.wait(wait_s)
-            self._wake.clear()
+            self._rest(self.tick())
+
+    def _rest(self, wait_s: float | None) -> None:
+        """Sleep until the next stream is due. Where there is no time for that, let the event loop have the core as long
+        as it takes to send what was made: before that, nobody hears it."""
+        if wait_s is not None and wait_s < _GIVE_WAY_S and not self._has_arrived.is_set():
+            self._has_arrived.wait(_GIVE_WAY_S)
+            return
+        if wait_s is None or wait_s > 0:
+            self._wake.wait(wait_s)
+        self._wake.clear()
+
+    def _deliver(self, made: dict[Stream, list[Outgoing]]) -> None:
+        """On the event loop."""
+        try:
+            for stream, outgoing in made.items():
+                stream.deliver(outgoing)
+        finally:
+            self._has_arrived.set()
 
 
 class _Due(NamedTuple):
@@ -310,8 +357,3 @@ class _Due(NamedTuple):
     stream: Stream
     blocks: int
     cost_s: float
-
-
-def _deliver(made: dict[Stream, list[Outgoing]]) -> None:
-    for stream, outgoing in made.items():
-        stream.deliver(outgoing)

@@ -1,14 +1,17 @@
 """Under load, blocks are rendered several at once, of which none is later than it would be alone."""
 
+from itertools import pairwise
+from queue import Empty, SimpleQueue
+
 import numpy as np
 import pytest
 
 from server import audio_engine
-from server.audio_engine import PHASES
+from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
 from server.load import NUMBERS_AT_ONCE, blocks_at_once
-from server.protocol import AddEmitter
-from tests.engine_stage import BLOCK_S, Stage, blocks, spy_on_batches
+from server.protocol import PROTOCOL, AddEmitter, Hello
+from tests.engine_stage import BLOCK_S, Patient, Stage, blocks, open_stream, spy_on_batches
 
 MOST = max(NUMBERS_AT_ONCE)
 
@@ -83,6 +86,65 @@ def test_who_comes_takes_the_turn_of_who_left(stage):
     stage.run(BLOCK_S)
     assert stage.thread._streams[newcomer] == left
     assert len(set(stage.thread._streams.values())) == MOST * PHASES
+
+
+@pytest.mark.parametrize("streams", [MOST * PHASES + more for more in (2, 3, 4)])
+def test_long_instants_lie_between_shorter_ones(stage, monkeypatch, streams):
+    """What else a core has to do gets its time between them."""
+    monkeypatch.setattr(audio_engine, "blocks_at_once", lambda _busy, **_: MOST)
+    for _ in range(streams):
+        stage.open(lead=8, window=10_000)
+    stage.run(1.0)
+    batches = spy_on_batches(monkeypatch)
+    stage.run(4 * MOST * BLOCK_S)
+    sizes = [len(batch) // MOST for batch in batches]
+    assert set(sizes) == {PHASES, PHASES + 1}
+    in_a_row = list(pairwise(sizes)).count((PHASES + 1, PHASES + 1))
+    assert in_a_row <= len(sizes) / MOST, "once in a cycle at the most"
+
+
+def test_a_thread_that_fell_behind_begins_with_who_waits_longest(stage, monkeypatch):
+    """And has that sent, rather than have it wait for all others."""
+    streams = [stage.open(lead=8, window=10_000)[0] for _ in range(7)]
+    stage.run(1.0)
+    for stream in streams:
+        stream.load = 0.5
+    stage.clock.now_s += 1.5 * BLOCK_S
+    first = sorted(streams, key=lambda stream: stream.due_s)[:3]
+    batches = spy_on_batches(monkeypatch)
+    assert stage.thread.tick() < 0
+    assert [len(batch) for batch in batches] == [3]
+    assert set(batches[0]) == {stream.session.renderer for stream in first}
+
+
+def test_a_thread_without_time_to_sleep_gives_way_until_what_it_made_has_arrived(field, filters, monkeypatch):
+    """On one core with the event loop, it would keep that from sending anything."""
+    monkeypatch.setattr(audio_engine, "_GIVE_WAY_S", 60.0)
+    posted = SimpleQueue()
+    engine = AudioEngine(posted.put, Patient())
+    hello = Hello(protocol=PROTOCOL, scene="flat")
+    stream = open_stream(hello, field, filters, lambda _: np.ones(64, np.float32), lead=8, deliver=lambda _: None)
+    engine.start()
+    engine.open(stream)
+    for _ in range(3):
+        arrive = posted.get(timeout=5)
+        with pytest.raises(Empty):
+            posted.get(timeout=4 * BLOCK_S)
+        arrive()
+    engine.stop()
+
+
+def test_a_thread_with_time_to_sleep_sleeps(field, filters):
+    """Whatever the event loop does meanwhile."""
+    posted = SimpleQueue()
+    engine = AudioEngine(posted.put, Patient())
+    hello = Hello(protocol=PROTOCOL, scene="flat")
+    stream = open_stream(hello, field, filters, lambda _: np.ones(64, np.float32), lead=8, deliver=lambda _: None)
+    engine.start()
+    engine.open(stream)
+    for _ in range(10):
+        posted.get(timeout=5)
+    engine.stop()
 
 
 @pytest.mark.usefixtures("count")
