@@ -48,9 +48,10 @@ _EARLY_S = 0.0002
 """Blocks due within that are rendered now: sooner than one could sleep and wake again."""
 _MOST_AT_A_TICK = 1.5
 """What is rendered at a tick takes about so many blocks' time, or is of one stream."""
-_GIVE_WAY_S = 0.002
-"""How long an audio thread waits for the event loop at the most. Where both have but one core, and the thread hardly
-sleeps, the loop got nothing of it for up to 0.1 s: blocks were ready in time and sent too late."""
+_GIVE_WAY_S = 0.001
+"""How long an audio thread that would sleep less waits for the event loop at the most, about twice as long as the loop
+takes. Where both have but one core, and the thread hardly sleeps, the loop got nothing of it for up to 0.1 s: blocks
+were ready in time and sent too late."""
 _PRESUMED_LOAD = 0.02
 """Share of a core that a stream is taken to need at least, as long as it has shown no more."""
 _SWITCH_S = 0.0005

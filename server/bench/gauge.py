@@ -50,6 +50,8 @@ class _Watch:
 
     def __init__(self) -> None:
         self.direct, self.reverberation = Waiting(), Waiting()
+        self.newest: tuple[int, ...] = ()
+        """Pose ids of the block seen last."""
 
 
 class _Counts:
@@ -118,8 +120,8 @@ class Gauge:
             """Those of one moment."""
             now_s = self._time_s()
             for data in messages:
-                if data[0] == AudioBlock.KIND:
-                    pose_id, reverberation_pose_id = POSE_IDS.unpack_from(data)
+                if data[0] == AudioBlock.KIND and (pose_ids := POSE_IDS.unpack_from(data)) != watch.newest:
+                    watch.newest = pose_id, reverberation_pose_id = pose_ids
                     watch.direct.leave(pose_id, now_s)
                     watch.reverberation.leave(reverberation_pose_id, now_s)
 

@@ -9,16 +9,16 @@ import numpy as np
 from numba import carray
 
 from server.acoustics.cache_lines import LINE_BYTES
-from server.acoustics.simd import (
-    broadcast,
-    load,
-    load_int,
-    multiply,
-    multiply_add,
-    multiply_subtract,
-    pointer,
-    prefetch,
-    store,
+from server.acoustics.simd import load_int, pointer, prefetch
+from server.acoustics.wide_simd import (
+    broadcast_16,
+    load_16,
+    load_opposed,
+    load_twice,
+    multiply_16,
+    multiply_add_16,
+    store_16,
+    swap_halves,
 )
 from server.compiled import compiled
 from server.rendering.partitions import NEAR, TURNS
@@ -71,11 +71,10 @@ def member_of(stage, member):
 
 
 @compiled
-def _multiply_add(re, im, xr, xi, filters, h):
-    """The complex sum of `re` and `im`, and of the product of x and what is in a filter."""
-    hr, hi = load(filters, h), load(filters, h + 8)
-    re, im = multiply_add(xr, hr, re), multiply_add(xr, hi, im)
-    return multiply_subtract(xi, hi, re), multiply_add(xi, hr, im)
+def _multiply_add(total, real, opposed, filters, h):
+    """The sum of eight complex numbers, and of the product of eight others and what is in a filter."""
+    taps = load_16(filters, h)
+    return multiply_add_16(opposed, swap_halves(taps), multiply_add_16(real, taps, total))
 
 
 @compiled
@@ -84,12 +83,6 @@ def _fetch_filter(filters, h) -> None:
     itself, and with many listeners all of it lies in main memory."""
     prefetch(filters + 4 * h + _FILTER_AHEAD)
     prefetch(filters + 4 * h + _FILTER_AHEAD + LINE_BYTES)
-
-
-@compiled
-def _keep(mix, at, re, im) -> None:
-    store(mix, at, re)
-    store(mix, at + 8, im)
 
 
 @compiled
@@ -111,40 +104,40 @@ def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
             h = 16 * channels * (tiles * partition + tile)
             left = mixed(channels, tile, 0, (stage.window + partition) % TURNS)
             right = left + 16 * COLUMNS * (channels - 1)
-            lr, li, rr, ri = load(mix, left), load(mix, left + 8), load(mix, right), load(mix, right + 8)
+            left_sum, right_sum = load_16(mix, left), load_16(mix, right)
             for member in range(members):
                 filters, count, ring = member_of(stage, member)
                 if partition < count:
-                    xr, xi = load(ring, x), load(ring, x + 8)
+                    real, opposed = load_twice(ring, x), load_opposed(ring, x + 8)
                     _fetch_filter(filters, h)
-                    lr, li = _multiply_add(lr, li, xr, xi, filters, h)
-                    rr, ri = _multiply_add(rr, ri, xr, xi, filters, h + 16 * (channels - 1))
-            _keep(mix, right, rr, ri)
-            _keep(mix, left, lr, li)
+                    left_sum = _multiply_add(left_sum, real, opposed, filters, h)
+                    right_sum = _multiply_add(right_sum, real, opposed, filters, h + 16 * (channels - 1))
+            store_16(mix, right, right_sum)
+            store_16(mix, left, left_sum)
 
 
 @compiled
 def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, column, first, last, sign) -> None:
     """Add partitions `begin` to `end` of a filter, times `sign` and the spectra in the ring, to a column of the mix,
     which is that of a window `ahead` of the one whose spectrum is in slot `newest`."""
-    mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast(sign)
+    mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast_16(sign)
     spectrum = apart(stage.size)
     near = min(NEAR, count)
     start = (newest + begin - ahead) % slots
     for tile in range(first, last):
         left, right = mixed(channels, tile, 0, column), mixed(channels, tile, channels - 1, column)
-        lr, li, rr, ri = load(mix, left), load(mix, left + 8), load(mix, right), load(mix, right + 8)
+        left_sum, right_sum = load_16(mix, left), load_16(mix, right)
         slot = start
         h = packed(channels, tiles, count, tile, begin)
         for partition in range(begin, end):
             x = spectrum * slot + 16 * tile
-            xr, xi = multiply(load(ring, x), factor), multiply(load(ring, x + 8), factor)
-            lr, li = _multiply_add(lr, li, xr, xi, filters, h)
-            rr, ri = _multiply_add(rr, ri, xr, xi, filters, h + 16 * (channels - 1))
+            real, opposed = multiply_16(load_twice(ring, x), factor), multiply_16(load_opposed(ring, x + 8), factor)
+            left_sum = _multiply_add(left_sum, real, opposed, filters, h)
+            right_sum = _multiply_add(right_sum, real, opposed, filters, h + 16 * (channels - 1))
             h += _step(near, tiles, channels, count, tile, partition)
             slot = slot + 1 if slot + 1 < slots else 0
-        _keep(mix, left, lr, li)
-        _keep(mix, right, rr, ri)
+        store_16(mix, left, left_sum)
+        store_16(mix, right, right_sum)
 
 
 @compiled
@@ -155,47 +148,51 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
     mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
     spectrum = apart(stage.size)
     other = 16 * COLUMNS * (channels - 1)  # from one channel to the other, which is the same if there is only one
-    zero = broadcast(np.float32(0))
+    zero = broadcast_16(np.float32(0))
     for tile in range(first, last):
         a = mixed(channels, tile, 0, stage.window % TURNS)
         b = mixed(channels, tile, 0, (stage.window + 1) % TURNS)
         c = mixed(channels, tile, 0, (stage.window + 2) % TURNS)
         d = mixed(channels, tile, 0, (stage.window + 3) % TURNS)
-        lr_a, li_a, lr_b, li_b = load(mix, a), load(mix, a + 8), load(mix, b), load(mix, b + 8)
-        lr_c, li_c, lr_d, li_d = load(mix, c), load(mix, c + 8), load(mix, d), load(mix, d + 8)
-        a, b, c, d = a + other, b + other, c + other, d + other
-        rr_a, ri_a, rr_b, ri_b = load(mix, a), load(mix, a + 8), load(mix, b), load(mix, b + 8)
-        rr_c, ri_c, rr_d, ri_d = load(mix, c), load(mix, c + 8), load(mix, d), load(mix, d + 8)
+        l_a, l_b, l_c, l_d = load_16(mix, a), load_16(mix, b), load_16(mix, c), load_16(mix, d)
+        r_a, r_b = load_16(mix, a + other), load_16(mix, b + other)
+        r_c, r_d = load_16(mix, c + other), load_16(mix, d + other)
         for member in range(members):
             filters, count, ring = member_of(stage, member)
             near = min(NEAR, count)
-            xr_b, xi_b, xr_c, xi_c, xr_d, xi_d = zero, zero, zero, zero, zero, zero
+            real_b, opposed_b, real_c, opposed_c, real_d, opposed_d = zero, zero, zero, zero, zero, zero
             slot = newest
             h = 16 * channels * tile
             for partition in range(count):
                 x = spectrum * slot + 16 * tile
-                xr_a, xi_a = load(ring, x), load(ring, x + 8)
+                real_a, opposed_a = load_twice(ring, x), load_opposed(ring, x + 8)
                 prefetch(ring + 4 * x + _SPECTRUM_AHEAD)
                 _fetch_filter(filters, h)
-                lr_a, li_a = _multiply_add(lr_a, li_a, xr_a, xi_a, filters, h)
-                lr_b, li_b = _multiply_add(lr_b, li_b, xr_b, xi_b, filters, h)
-                lr_c, li_c = _multiply_add(lr_c, li_c, xr_c, xi_c, filters, h)
-                lr_d, li_d = _multiply_add(lr_d, li_d, xr_d, xi_d, filters, h)
+                l_a = _multiply_add(l_a, real_a, opposed_a, filters, h)
+                l_b = _multiply_add(l_b, real_b, opposed_b, filters, h)
+                l_c = _multiply_add(l_c, real_c, opposed_c, filters, h)
+                l_d = _multiply_add(l_d, real_d, opposed_d, filters, h)
                 if channels == 2:
-                    rr_a, ri_a = _multiply_add(rr_a, ri_a, xr_a, xi_a, filters, h + 16)
-                    rr_b, ri_b = _multiply_add(rr_b, ri_b, xr_b, xi_b, filters, h + 16)
-                    rr_c, ri_c = _multiply_add(rr_c, ri_c, xr_c, xi_c, filters, h + 16)
-                    rr_d, ri_d = _multiply_add(rr_d, ri_d, xr_d, xi_d, filters, h + 16)
-                xr_b, xi_b, xr_c, xi_c, xr_d, xi_d = xr_a, xi_a, xr_b, xi_b, xr_c, xi_c
+                    r_a = _multiply_add(r_a, real_a, opposed_a, filters, h + 16)
+                    r_b = _multiply_add(r_b, real_b, opposed_b, filters, h + 16)
+                    r_c = _multiply_add(r_c, real_c, opposed_c, filters, h + 16)
+                    r_d = _multiply_add(r_d, real_d, opposed_d, filters, h + 16)
+                real_b, opposed_b, real_c, opposed_c, real_d, opposed_d = (
+                    real_a,
+                    opposed_a,
+                    real_b,
+                    opposed_b,
+                    real_c,
+                    opposed_c,
+                )
                 h += _step(near, tiles, channels, count, tile, partition)
                 slot = slot + 1 if slot + 1 < slots else 0
         if channels == 2:
-            _keep(mix, a, rr_a, ri_a)
-            _keep(mix, b, rr_b, ri_b)
-            _keep(mix, c, rr_c, ri_c)
-            _keep(mix, d, rr_d, ri_d)
-        a, b, c, d = a - other, b - other, c - other, d - other
-        _keep(mix, a, lr_a, li_a)
-        _keep(mix, b, lr_b, li_b)
-        _keep(mix, c, lr_c, li_c)
-        _keep(mix, d, lr_d, li_d)
+            store_16(mix, a + other, r_a)
+            store_16(mix, b + other, r_b)
+            store_16(mix, c + other, r_c)
+            store_16(mix, d + other, r_d)
+        store_16(mix, a, l_a)
+        store_16(mix, b, l_b)
+        store_16(mix, c, l_c)
+        store_16(mix, d, l_d)
