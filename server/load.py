@@ -33,11 +33,11 @@ _FULL = 0.85
 """Share of the time in which an audio thread renders, from which on it has none to spare."""
 _FREE = 0.6
 _AT_ONCE = ((1, 0.0), (2, 0.6), (4, 0.76), (8, 0.84))
-"""Blocks that an audio thread renders at once, and the share of the time above which it does. Each step takes up to a
-tenth less of it."""
+"""Blocks that an audio thread renders at once, and the share of the time above which it does. Each step takes about
+an eighth less of it."""
 NUMBERS_AT_ONCE = tuple(count for count, _ in _AT_ONCE)
-_FEWER_BELOW = 0.7
-"""Of the share above which so many are rendered."""
+_FEWER_BELOW = 0.83
+"""Of the share above which so many are rendered: half as many, which take more of the time, are not too few at once."""
 _SHARED = 0.75
 """Share of a core that rendering and impulse responses may take together: the event loop, plans and checks need the
 rest."""

@@ -42,8 +42,8 @@ def test_more_blocks_at_once_begin_under_load_and_end_well_below_it():
     busy = (0.3, 0.5, 0.57, 0.7, 0.8, 0.9)
     assert [blocks_at_once(share, before=1) for share in busy] == [1, 1, 1, 2, 4, 8]
     assert [blocks_at_once(share, before=2) for share in busy] == [1, 2, 2, 2, 4, 8]
-    assert [blocks_at_once(share, before=4) for share in busy] == [1, 2, 4, 4, 4, 8]
-    assert [blocks_at_once(share, before=8) for share in busy] == [1, 2, 4, 8, 8, 8]
+    assert [blocks_at_once(share, before=4) for share in busy] == [1, 2, 2, 4, 4, 8]
+    assert [blocks_at_once(share, before=8) for share in busy] == [1, 2, 2, 8, 8, 8]
 
 
 def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(stage, monkeypatch):
@@ -56,7 +56,7 @@ def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(st
         stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
 
     stream.session.begin_block = take_time
-    for busy, count in [(0.2, 1), (0.7, 2), (0.8, 4), (0.95, 8), (0.65, 8), (0.57, 4), (0.5, 2), (0.2, 1)]:
+    for busy, count in [(0.2, 1), (0.7, 2), (0.8, 4), (0.95, 8), (0.75, 8), (0.55, 2), (0.2, 1)]:
         stage.run(1.0)
         batches = spy_on_batches(monkeypatch)
         stage.run(20 * BLOCK_S)
