@@ -8,7 +8,8 @@ picked up at the next block: an audio thread waits for no field and no network.
 Were all origins arbitrary, a thread would wake for every block of every stream, and each time the interpreter's lock,
 the renderer's call and the way to the event loop would cost about what rendering does; were all the same, the first
 stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly apart, gives a
-new stream the one with the fewest others, and renders all that is due at an instant in one call without the lock.
+new stream the one with the fewest others, and renders what is due at an instant in one call without the lock, or, where
+it fell behind, as much of it as a tick has time for.
 
 **Under load**, two blocks of a stream are rendered at once, or four, or eight (`server.load.blocks_at_once`): those
 after the first cost less rendering, for much of what they read is in the caches, and hardly any of what waking,
@@ -47,7 +48,7 @@ _APART = 5
 _EARLY_S = 0.0002
 """Blocks due within that are rendered now: sooner than one could sleep and wake again."""
 _MOST_AT_A_TICK = 1.5
-"""What is rendered at a tick takes about so many blocks' time, or is of one stream."""
+"""What is rendered at a tick takes about so many blocks' time, of the shortest, or is of one stream."""
 _GIVE_WAY_S = 0.001
 """How long an audio thread that would sleep less waits for the event loop at the most, about twice as long as the loop
 takes. Where both have but one core, and the thread hardly sleeps, the loop got nothing of it for up to 0.1 s: blocks
@@ -204,7 +205,8 @@ class AudioThread:
                 if blocks is not None:
                     began_s = self._time_s()
                     stream.session.begin_block()
-                    due.append(_Due(stream, blocks, self._time_s() - began_s))
+                    # Of what it has just heard, something may have to be looked after block by block.
+                    due.append(_Due(stream, min(blocks, self._blocks_of(stream)), self._time_s() - began_s))
             except Exception:
                 _logger.exception(_FAILED)
                 self._fail(stream, made)
@@ -221,18 +223,18 @@ class AudioThread:
         return min(stream.due_s for stream in self._streams) - self._time_s()
 
     def _due(self, now_s: float) -> dict[Stream, int]:
-        """Whose blocks to render now, and how many: of all that are due those that have been for longest, as many as
-        a tick has time for. A thread that fell behind has the first of them sent before it goes on."""
+        """Whose blocks to render now, and how many: of all that are due those that are late soonest, as many as a tick
+        has time for. A thread that fell behind has the first of them sent before it goes on."""
         soon_s = now_s + _EARLY_S
-        due = sorted((stream for stream in self._streams if stream.due_s <= soon_s), key=attrgetter("due_s"))
+        due = sorted((stream for stream in self._streams if stream.due_s <= soon_s), key=attrgetter("deadline_s"))
         if due and self.blocks_at_once == NUMBERS_AT_ONCE[-1]:
             due += [stream for stream in self._streams if stream.due_s > soon_s and self._may_come_along(stream, now_s)]
         blocks_of: dict[Stream, int] = {}
-        takes = 0.0
+        left_s = _MOST_AT_A_TICK * min((stream.block_s for stream in due), default=0.0)
         for stream in due:
             blocks = self._blocks_of(stream)
-            takes += blocks * stream.load
-            if blocks_of and takes > _MOST_AT_A_TICK:
+            left_s -= blocks * stream.load * stream.block_s
+            if blocks_of and left_s < 0:
                 break
             blocks_of[stream] = blocks
         return blocks_of
@@ -336,8 +338,13 @@ class AudioThread:
     def _rest(self, wait_s: float | None) -> None:
         """Sleep until the next stream is due. Where there is no time for that, let the event loop have the core as long
         as it takes to send what was made: before that, nobody hears it."""
-        if wait_s is not None and wait_s < _GIVE_WAY_S and not self._has_arrived.is_set():
-            self._has_arrived.wait(_GIVE_WAY_S)
+        is_short = wait_s is not None and wait_s < _GIVE_WAY_S and not self._is_stopping
+        if wait_s is not None and is_short and not self._has_arrived.is_set():
+            began_s = self._time_s()
+            # Of several at once, all but the first are early.
+            self._has_arrived.wait(_GIVE_WAY_S if wait_s <= 0 or self.blocks_at_once > 1 else wait_s)
+            if wait_s < 0:
+                self._busy_s += self._time_s() - began_s
             return
         if wait_s is None or wait_s > 0:
             self._wake.wait(wait_s)

@@ -36,7 +36,7 @@ class Emitter:
     is_outdated: bool = True
     """Whether its impulse response is of another pose."""
     is_displaced: bool = True
-    """Whether its direct path is of another pose."""
+    """Whether its direct path is of another pose of its own, or of other effects."""
     identity: Hashable | None = None
     """Of its impulse response, where poses share responses."""
     found_for: Hashable | None = None

@@ -133,6 +133,11 @@ class Stream:
         """When the request for impulse responses was made that is unanswered."""
         return self._asked_s
 
+    @property
+    def deadline_s(self) -> float:
+        """When its next block is late."""
+        return self.clock.deadline_s(self.next_block)
+
     def attach(self, *, wake: Callable[[], None], time_s: Callable[[], float]) -> None:
         """`wake` has the audio thread look at what waits; `time_s` is its clock."""
         self._wake, self._time_s = wake, time_s

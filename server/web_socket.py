@@ -33,7 +33,7 @@ class DirectWay:
     write: Callable[[Sequence[bytes]], bool]
     """Sends binary messages at once, or says False and has not sent any."""
     listen: Callable[[Hear], None]
-    """From now on, whoever is given is told of messages before which none waits."""
+    """From now on, whoever is given is told of messages before which none waits, if they come in one piece."""
 
 
 def direct_way(scope: Mapping[str, Any]) -> DirectWay | None:
@@ -82,14 +82,20 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
 
     def data_received(self, data: bytes) -> None:
         if self._cutter is None:
+            was_open = self.handshake_initiated
             super().data_received(data)
             # With bytes behind the request, the parser may be in the midst of a frame.
-            if self.handshake_initiated and data.find(_END_OF_REQUEST) == len(data) - len(_END_OF_REQUEST):
-                self._cutter = FrameCutter()
+            is_request = data.partition(_END_OF_REQUEST)[1:] == (_END_OF_REQUEST, b"")
+            if is_request and self.handshake_initiated and not was_open:
+                self._cutter = FrameCutter(self.config.ws_max_size)
             return
+        unheard: list[bytes] = []
         for cut in self._cutter.cut(data):
-            if cut.message is None or not self._is_heard(cut.message, is_text=cut.is_text):
-                super().data_received(cut.raw)
+            # After the first that is not heard, all wait their turn.
+            if unheard or cut.message is None or not self._is_heard(cut.message, is_text=cut.is_text):
+                unheard.append(cut.raw)
+        if unheard:
+            super().data_received(b"".join(unheard))
 
     def send_receive_event_to_app(self) -> None:
         """uvicorn stops reading with every message, until the application has taken it in."""

@@ -37,11 +37,12 @@ class FrameCutter:
     """Cuts what one client sends, from the first byte after the handshake, into whole messages and what else there is.
 
     All that comes in goes out in order, in `raw`. What there is so far of a header, and of a message of less than 126
-    bytes, waits for the rest. Nothing is checked here: what is no whole message, masked and without the bits of an
-    extension, is left to a parser that is given everything else, too.
+    bytes, waits for the rest. Nothing is checked here: what is no whole message of at most `longest` bytes, masked and
+    without the bits of an extension, is left to a parser that is given everything else, too.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, longest: int) -> None:
+        self._longest = longest
         self._begun = b""
         self._to_come = 0
         """Bytes of a frame that is passed on in parts."""
@@ -63,6 +64,7 @@ class FrameCutter:
             start += _KEY_BYTES if second >= _MASKED else 0
             past = start + length
             is_message = first in (_WHOLE_TEXT, _WHOLE_BINARY) and second >= _MASKED and not self._is_fragmented
+            is_message = is_message and length <= self._longest
             if start > end or (past > end and is_message and not is_long):
                 break
             if is_message and past <= end:

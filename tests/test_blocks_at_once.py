@@ -10,7 +10,7 @@ from server import audio_engine
 from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
 from server.load import NUMBERS_AT_ONCE, blocks_at_once
-from server.protocol import PROTOCOL, AddEmitter, Hello
+from server.protocol import PROTOCOL, AddEmitter, Hello, RemoveEmitter
 from tests.engine_stage import BLOCK_S, Patient, Stage, blocks, open_stream, spy_on_batches
 
 MOST = max(NUMBERS_AT_ONCE)
@@ -136,15 +136,20 @@ def test_a_thread_without_time_to_sleep_gives_way_until_what_it_made_has_arrived
 
 def test_a_thread_with_time_to_sleep_sleeps(field, filters):
     """Whatever the event loop does meanwhile."""
-    posted = SimpleQueue()
+    posted, waited = SimpleQueue(), []
     engine = AudioEngine(posted.put, Patient())
+    engine.threads[0]._has_arrived.wait = waited.append
     hello = Hello(protocol=PROTOCOL, scene="flat")
     stream = open_stream(hello, field, filters, lambda _: np.ones(64, np.float32), lead=8, deliver=lambda _: None)
     engine.start()
     engine.open(stream)
+    for _ in range(16):  # with those that its lead has it make at once
+        posted.get(timeout=5)
+    waited.clear()
     for _ in range(10):
         posted.get(timeout=5)
     engine.stop()
+    assert len(waited) < 5  # none, but for a test that gets no core for as long as blocks last
 
 
 @pytest.mark.usefixtures("count")
@@ -158,6 +163,18 @@ def test_what_a_client_plays_live_is_never_rendered_ahead(stage, monkeypatch):
         stage.run(BLOCK_S)
     assert {len(batch) for batch in batches} == {1}
     assert len(blocks(delivered)) > 10
+
+
+@pytest.mark.usefixtures("count")
+def test_who_has_something_looked_after_is_rendered_block_by_block_from_then_on(stage, monkeypatch):
+    """An emitter that leaves fades out in one block, and lets go of its place after it."""
+    stream, _ = open_sounding(stage)
+    stage.run(1.0)
+    batches = spy_on_batches(monkeypatch)
+    stream.offer(RemoveEmitter(id="a"))
+    while not batches:
+        stage.run(BLOCK_S / 8)
+    assert [len(batch) for batch in batches] == [1]
 
 
 @pytest.mark.usefixtures("count")

@@ -3,8 +3,10 @@
 import asyncio
 from contextlib import asynccontextmanager
 
+import pytest
 import uvicorn
 from websockets.asyncio.client import connect
+from websockets.frames import Frame, Opcode
 
 from server.web_socket import DirectWay, direct_way, watched
 
@@ -12,7 +14,7 @@ PROTOCOL = "server.web_socket:WebSocketProtocol"
 
 
 @asynccontextmanager
-async def serving(application, ws=PROTOCOL):
+async def serving(application, ws=PROTOCOL, **more):
     """The address of a server that runs `application(scope, receive, send)` for every connection, once accepted."""
 
     async def accepted(scope, receive, send):
@@ -20,7 +22,7 @@ async def serving(application, ws=PROTOCOL):
         await send({"type": "websocket.accept"})
         await application(scope, receive, send)
 
-    options = {"port": 0, "ws": ws, "ws_per_message_deflate": False, "lifespan": "off", "log_level": "warning"}
+    options = {"port": 0, "ws": ws, "ws_per_message_deflate": False, "lifespan": "off", "log_level": "warning", **more}
     server = uvicorn.Server(uvicorn.Config(accepted, **options, timeout_graceful_shutdown=1))
     running = asyncio.create_task(server.serve())
     while not server.started:  # noqa: ASYNC110  it has no event for it
@@ -199,3 +201,47 @@ def test_messages_wait_in_bounded_number():
 
     asyncio.run(talk())
     assert 1 < waiting[0] <= 40
+
+
+@pytest.mark.parametrize("hears", [True, False])
+def test_a_message_that_is_too_long_closes_the_connection(hears):
+    heard = []
+
+    async def listen(scope, receive, _send):
+        direct_way(scope).listen(lambda message: hears and not heard.append(len(message)))
+        while (await receive())["type"] != "websocket.disconnect":
+            pass
+
+    async def talk():
+        async with serving(listen, ws_max_size=1000) as address, connect(address, compression=None) as client:
+            await asyncio.sleep(0.1)
+            await client.send(bytes(1000))
+            await client.send(bytes(1001))
+            await client.wait_closed()
+            return client.close_code
+
+    assert asyncio.run(talk()) == 1009
+    assert heard == [1000] * hears
+
+
+def test_what_comes_after_a_breach_of_the_protocol_is_not_heard():
+    """And the application is told of one end, not of one for each message."""
+    heard, events = [], []
+
+    async def listen(scope, receive, _send):
+        direct_way(scope).listen(lambda message: not heard.append(message))
+        await asyncio.sleep(0.5)
+        queue = receive.__self__.queue
+        events.extend(queue.get_nowait()["type"] for _ in range(queue.qsize()))
+
+    async def talk():
+        async with serving(listen) as address, connect(address, compression=None) as client:
+            await asyncio.sleep(0.1)
+            before, after = (Frame(Opcode.BINARY, data).serialize(mask=True) for data in (b"before", b"after"))
+            client.transport.write(before + b"\x83" + after[1:] + 1000 * after)
+            await client.wait_closed()
+
+    asyncio.run(talk())
+    assert heard == [b"before"]
+    assert set(events) == {"websocket.disconnect"}
+    assert len(events) <= 2, "one of the breach, and one of the connection that was lost for it"

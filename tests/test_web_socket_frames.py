@@ -41,7 +41,7 @@ def _sent_as(first, data):
 @given(st.lists(FRAMES, max_size=6), st.lists(st.integers(0, 200_000), max_size=8))
 def test_all_that_came_goes_on_in_order(frames, borders):
     """Wherever it was cut on the way, and but for what waits for its end."""
-    data, cutter = sent(frames), FrameCutter()
+    data, cutter = sent(frames), FrameCutter(1 << 20)
     borders = sorted(border % (len(data) + 1) for border in borders)
     pieces = [data[start:end] for start, end in zip([0, *borders], [*borders, len(data)], strict=True)]
     cuts = [cut for piece in pieces for cut in cutter.cut(piece)]
@@ -63,11 +63,11 @@ def test_messages_are_those_of_the_librarys_parser(messages):
     parser = Protocol(Side.SERVER)
     parser.receive_data(sent(frames))
     parsed = [(bytes(frame.data), frame.opcode is Opcode.TEXT) for frame in parser.events_received()]
-    assert [(cut.message, cut.is_text) for cut in FrameCutter().cut(sent(frames))] == parsed
+    assert [(cut.message, cut.is_text) for cut in FrameCutter(1 << 20).cut(sent(frames))] == parsed
 
 
 def test_a_message_of_one_byte_at_a_time_is_whole():
-    cutter = FrameCutter()
+    cutter = FrameCutter(1 << 20)
     data = Frame(Opcode.TEXT, b"bit by bit").serialize(mask=True)
     cuts = [cut for at in range(len(data)) for cut in cutter.cut(data[at : at + 1])]
     assert [(cut.raw, cut.message) for cut in cuts] == [(data, b"bit by bit")]
@@ -77,15 +77,21 @@ def test_a_message_of_one_byte_at_a_time_is_whole():
 def test_nothing_of_a_long_message_is_kept_back(length):
     """It would be memory, of which a client could claim as much as it says that its message has."""
     data = Frame(Opcode.BINARY, bytes(length)).serialize(mask=True)[:-1]
-    cutter = FrameCutter()
+    cutter = FrameCutter(1 << 20)
     assert [cut.raw for cut in cutter.cut(data)] == [data]
     assert [(cut.raw, cut.message) for cut in cutter.cut(b"!")] == [(b"!", None)]
+
+
+def test_what_is_longer_than_allowed_is_left_to_the_parser():
+    """Which closes the connection."""
+    allowed, longer = (Frame(Opcode.BINARY, bytes(length)).serialize(mask=True) for length in (100, 101))
+    assert [cut.message for cut in FrameCutter(100).cut(allowed + longer)] == [bytes(100), None]
 
 
 def test_what_is_not_masked_is_no_message():
     """It breaks the protocol, and the parser is to say so."""
     data = Frame(Opcode.BINARY, b"plain").serialize(mask=False)
-    assert [(cut.raw, cut.message) for cut in FrameCutter().cut(data)] == [(data, None)]
+    assert [(cut.raw, cut.message) for cut in FrameCutter(1 << 20).cut(data)] == [(data, None)]
 
 
 @pytest.mark.parametrize("length", [0, 1, 125, 126, 2_080, 65_535, 65_536])

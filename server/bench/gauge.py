@@ -50,8 +50,6 @@ class _Watch:
 
     def __init__(self) -> None:
         self.direct, self.reverberation = Waiting(), Waiting()
-        self.newest: tuple[int, ...] = ()
-        """Pose ids of the block seen last."""
 
 
 class _Counts:
@@ -119,11 +117,10 @@ class Gauge:
         def see_blocks(messages: Sequence[bytes]) -> None:
             """Those of one moment."""
             now_s = self._time_s()
-            for data in messages:
-                if data[0] == AudioBlock.KIND and (pose_ids := POSE_IDS.unpack_from(data)) != watch.newest:
-                    watch.newest = pose_id, reverberation_pose_id = pose_ids
-                    watch.direct.leave(pose_id, now_s)
-                    watch.reverberation.leave(reverberation_pose_id, now_s)
+            blocks = {POSE_IDS.unpack_from(data) for data in messages if data[0] == AudioBlock.KIND}
+            for pose_id, reverberation_pose_id in blocks:
+                watch.direct.leave(pose_id, now_s)
+                watch.reverberation.leave(reverberation_pose_id, now_s)
 
         async def send_block(message: Message) -> None:
             await send(message)

@@ -7,6 +7,8 @@ send besides for the convolver. Both reach what is wanted by the end of a block,
 What nothing is sent to is not there: a mixer without a convolver has none and pays for none.
 """
 
+from typing import TypeGuard
+
 import numpy as np
 
 from server.compiled import HAS_NUMBA
@@ -18,6 +20,11 @@ from server.rendering.sources import ClipPlayer, Source
 if HAS_NUMBA:
     from server.rendering.by_reference import Reference
     from server.rendering.mixing_kernel import enter_convolver, record_of
+
+
+def is_read_by_compiled_code(source: Source) -> TypeGuard[ClipPlayer]:
+    """Of others, Python has to ask for each block."""
+    return HAS_NUMBA and isinstance(source, ClipPlayer)
 
 
 class Mixer:
@@ -80,7 +87,7 @@ class Mixer:
     def play(self, slot: int, source: Source) -> None:
         """Have a slot play what a source makes, from the next block on. Compiled code reads clips by itself."""
         self.plays[slot] = 1
-        if HAS_NUMBA and isinstance(source, ClipPlayer):
+        if is_read_by_compiled_code(source):
             self.clip[slot] = source.clip.ctypes.data
             self.clip_samples[slot], self.clip_at[slot], self.clip_loops[slot] = source.clip.size, 0, source.loop
             self._clips[slot] = source.clip  # alive as long as it is played

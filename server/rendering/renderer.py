@@ -31,7 +31,7 @@ from server.rendering.direct_path import DirectPath, PathTarget
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import require_gain
 from server.rendering.mixer_set import MixerSet
-from server.rendering.mixing import Mixer
+from server.rendering.mixing import Mixer, is_read_by_compiled_code
 from server.rendering.output import Output, Rendered, mix_all
 from server.rendering.sources import Source
 
@@ -136,7 +136,11 @@ class Renderer:
     @property
     def runs_by_itself(self) -> bool:
         """Whether several blocks may be rendered in one call: nothing has to be looked after between them."""
-        return self._mixers.rests and all(mixer.plays_by_itself for mixer in self._mixers)
+        return (
+            self._mixers.rests
+            and all(mixer.plays_by_itself for mixer in self._mixers)
+            and all(emitter.has_played or is_read_by_compiled_code(emitter.source) for emitter in self._changed)
+        )
 
     @property
     def samples_silenced(self) -> int:

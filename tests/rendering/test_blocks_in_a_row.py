@@ -97,3 +97,16 @@ def test_a_renderer_that_has_to_be_asked_or_looked_after_does_not_run_by_itself(
     engine.set_path("live", PathTarget(2.0, np.array([1.0, 0.0, 0.0]), np.zeros(7)))
     engine.process()
     assert not engine.runs_by_itself
+
+
+def test_who_is_about_to_play_live_is_asked_for_each_block(open_renderer):
+    """Its samples wait with it for its first response, and were played as often as there were blocks at once."""
+    engine = open_renderer()
+    render_all([engine])
+    assert engine.runs_by_itself
+    live = LiveSource(capacity=4096, lead=2 * SIZE)
+    engine.add_emitter("c", live, gain=0.02)
+    live.push(noise(1, 8 * SIZE))
+    assert engine.runs_by_itself
+    engine.set_ir("c", room(3))
+    assert not engine.runs_by_itself
