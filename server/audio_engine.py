@@ -338,8 +338,7 @@ class AudioThread:
     def _rest(self, wait_s: float | None) -> None:
         """Sleep until the next stream is due. Where there is no time for that, let the event loop have the core as long
         as it takes to send what was made: before that, nobody hears it."""
-        is_short = wait_s is not None and wait_s < _GIVE_WAY_S and not self._is_stopping
-        if wait_s is not None and is_short and not self._has_arrived.is_set():
+        if wait_s is not None and wait_s < _GIVE_WAY_S and not (self._is_stopping or self._has_arrived.is_set()):
             began_s = self._time_s()
             # Of several at once, all but the first are early.
             self._has_arrived.wait(_GIVE_WAY_S if wait_s <= 0 or self.blocks_at_once > 1 else wait_s)

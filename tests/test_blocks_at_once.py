@@ -134,6 +134,21 @@ def test_a_thread_without_time_to_sleep_gives_way_until_what_it_made_has_arrived
     engine.stop()
 
 
+def test_time_that_is_given_away_in_arrears_is_taken_for_work(stage):
+    """A thread that cannot render in it is as full as if it did."""
+    thread = stage.thread
+
+    def wait(longest_s):
+        stage.clock.now_s += longest_s
+
+    thread._has_arrived.clear()
+    thread._has_arrived.wait = wait
+    thread._rest(0.5 * audio_engine._GIVE_WAY_S)
+    assert thread._busy_s == 0.0
+    thread._rest(-BLOCK_S)
+    assert thread._busy_s == pytest.approx(audio_engine._GIVE_WAY_S)
+
+
 def test_a_thread_with_time_to_sleep_sleeps(field, filters):
     """Whatever the event loop does meanwhile."""
     posted, waited = SimpleQueue(), []

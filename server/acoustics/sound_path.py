@@ -60,8 +60,8 @@ class SoundPathFinder:
         # Compiled here, where it may take its time, and not on the audio thread at the first pose.
         self.find(np.zeros(3), np.zeros((1, 3)))
 
-    def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike, room: SoundPaths | None = None) -> SoundPaths:
-        """Paths to `listener` (3,) from `emitters` (n, 3), all inside the scene; in `room` for as many, where given.
+    def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike, into: SoundPaths | None = None) -> SoundPaths:
+        """Paths to `listener` (3,) from `emitters` (n, 3), all inside the room; put `into` as many, where given.
 
         From a point that is not, where nothing leads, sound goes straight through the walls.
         """
@@ -69,7 +69,7 @@ class SoundPathFinder:
         emitters = np.ascontiguousarray(emitters, dtype=np.float64)
         if not HAS_NUMBA:
             return self.find_with_numpy(listener, emitters)
-        paths = SoundPaths.empty(len(emitters)) if room is None else room
+        paths = SoundPaths.empty(len(emitters)) if into is None else into
         find_sound_paths(
             self._corners,
             self._bends,

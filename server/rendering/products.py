@@ -160,7 +160,8 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
         for member in range(members):
             filters, count, ring = member_of(stage, member)
             near = min(NEAR, count)
-            real_b, opposed_b, real_c, opposed_c, real_d, opposed_d = zero, zero, zero, zero, zero, zero
+            real_b, real_c, real_d = zero, zero, zero
+            opposed_b, opposed_c, opposed_d = zero, zero, zero
             slot = newest
             h = 16 * channels * tile
             for partition in range(count):
@@ -177,14 +178,8 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
                     r_b = _multiply_add(r_b, real_b, opposed_b, filters, h + 16)
                     r_c = _multiply_add(r_c, real_c, opposed_c, filters, h + 16)
                     r_d = _multiply_add(r_d, real_d, opposed_d, filters, h + 16)
-                real_b, opposed_b, real_c, opposed_c, real_d, opposed_d = (
-                    real_a,
-                    opposed_a,
-                    real_b,
-                    opposed_b,
-                    real_c,
-                    opposed_c,
-                )
+                real_b, real_c, real_d = real_a, real_b, real_c
+                opposed_b, opposed_c, opposed_d = opposed_a, opposed_b, opposed_c
                 h += _step(near, tiles, channels, count, tile, partition)
                 slot = slot + 1 if slot + 1 < slots else 0
         if channels == 2:
