@@ -81,6 +81,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
 
     def data_received(self, data: bytes) -> None:
+        if self.conn.parser_exc is not None:
+            return  # of a client that does not know yet
         if self._cutter is None:
             was_open = self.handshake_initiated
             super().data_received(data)
@@ -101,6 +103,28 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         """uvicorn stops reading with every message, until the application has taken it in."""
         super().send_receive_event_to_app()
         if self.read_paused and self.queue.qsize() < _MOST_WAITING:
+            self.read_paused = False
+            self.transport.resume_reading()
+
+    def handle_parser_exception(self) -> None:
+        """uvicorn closes the connection at once, and a client that is still sending then meets a reset in place of the
+        reason: here it may finish, unheard, until it has closed its side or `close_timeout` is over (RFC 6455, 7.1.1).
+        """
+        if self.close_sent:
+            return  # the application said so first
+        failure = self.conn.close_sent
+        if failure is None:  # a breach before the connection is open
+            self.transport.close()
+            return
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": failure.code, "reason": failure.reason})
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = True
+        if not self.transport.can_write_eof():  # as with TLS, which has a close of its own
+            self.transport.close()
+            return
+        self.transport.write_eof()
+        self.close_timer = self.loop.call_later(self.close_timeout, self.transport.close)
+        if self.read_paused:
             self.read_paused = False
             self.transport.resume_reading()
 

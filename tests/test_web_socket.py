@@ -6,7 +6,9 @@ from contextlib import asynccontextmanager
 import pytest
 import uvicorn
 from websockets.asyncio.client import connect
+from websockets.client import ClientProtocol
 from websockets.frames import Frame, Opcode
+from websockets.uri import parse_uri
 
 from server.web_socket import DirectWay, direct_way, watched
 
@@ -245,3 +247,34 @@ def test_what_comes_after_a_breach_of_the_protocol_is_not_heard():
     assert heard == [b"before"]
     assert set(events) == {"websocket.disconnect"}
     assert len(events) <= 2, "one of the breach, and one of the connection that was lost for it"
+
+
+@pytest.mark.parametrize(("breach", "reason"), [(b"too long" * 200_000, 1009), (b"no text \xff", 1007)])
+def test_a_client_that_is_still_sending_learns_why_the_connection_closes(breach, reason):
+    """What it sends on is neither heard nor answered by a reset, which would take the reason with it."""
+    heard = []
+
+    async def listen(scope, receive, _send):
+        direct_way(scope).listen(lambda message: not heard.append(message))
+        while (await receive())["type"] != "websocket.disconnect":
+            pass
+
+    async def talk():
+        client = ClientProtocol(parse_uri("ws://127.0.0.1"))
+        client.send_request(client.connect())
+        async with serving(listen, ws_max_size=1000) as address:
+            reader, writer = await asyncio.open_connection(port=address.rpartition(":")[2], host="127.0.0.1")
+            writer.writelines(client.data_to_send())
+            client.receive_data(await reader.readuntil(b"\r\n\r\n"))
+            before, after = (Frame(Opcode.TEXT, text).serialize(mask=True) for text in (breach, b"on"))
+            sent = before + 100 * after
+            for at in range(0, len(sent), 400_000):
+                await asyncio.sleep(0.1)
+                writer.write(sent[at : at + 400_000])
+                await writer.drain()
+            client.receive_data(await reader.read())
+            writer.close()
+            return client.close_rcvd
+
+    assert asyncio.run(talk()).code == reason
+    assert not heard
