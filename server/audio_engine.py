@@ -11,7 +11,7 @@ stream rendered would wait for the last. So a thread offers `PHASES` instants pe
 new stream the one with the fewest others, and renders what is due at an instant in one call without the lock, or, where
 it fell behind, as much of it as a tick has time for.
 
-**Under load**, two blocks of a stream are rendered at once, or four, or eight (`server.load.blocks_at_once`): those
+**Under load**, two blocks of a stream are rendered at once, or four, or eight (`server.blocks_at_once`): those
 after the first cost less rendering, for much of what they read is in the caches, and hardly any of what waking,
 messages and the way to the event loop cost. They are ready before they are due, so poses are heard up to so many blocks
 later. The streams of an instant take turns with it, so that every instant has as much to do.
@@ -35,7 +35,9 @@ from itertools import islice
 from operator import attrgetter
 from typing import NamedTuple
 
-from server.load import NUMBERS_AT_ONCE, PERIOD_S, LoadControl, Reason, blocks_at_once, ir_share
+from server.blocks_at_once import NUMBERS as NUMBERS_AT_ONCE
+from server.blocks_at_once import BlocksAtOnce
+from server.load import PERIOD_S, LoadControl, Reason, ir_share
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
 from server.stream import Outgoing, Stream, StreamFailed
@@ -155,8 +157,7 @@ class AudioThread:
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
         """With the place of each: its phase, and with which block it begins to be rendered several at once."""
-        self.blocks_at_once = 1
-        """How many blocks of a stream it renders together."""
+        self._at_once = BlocksAtOnce()
         self._arrivals: deque[tuple[Stream, bool]] = deque()
         self._origin_s: float | None = None
         self._wake = threading.Event()
@@ -165,6 +166,11 @@ class AudioThread:
         self._has_arrived.set()
         self._is_stopping = False
         self._thread = threading.Thread(target=self._run, name=f"nafir-audio-{number}", daemon=True)
+
+    @property
+    def blocks_at_once(self) -> int:
+        """How many blocks of a stream it renders together."""
+        return self._at_once.count
 
     def start(self) -> None:
         self._thread.start()
@@ -288,7 +294,7 @@ class AudioThread:
             stream = by_ladder[ladder]
             made.setdefault(stream, []).extend(stream.step(reason, now_s))
             self.steps[reason] += 1
-        self.blocks_at_once = blocks_at_once(busy, before=self.blocks_at_once)
+        self._at_once.look(busy)
         share = ir_share(self._ir_share, busy=busy)
         for stream in self._streams:
             stream.ration(streams=len(self._streams), share=share)

@@ -32,12 +32,6 @@ _LEAST_RATE_HZ = 2.0
 _FULL = 0.85
 """Share of the time in which an audio thread renders, from which on it has none to spare."""
 _FREE = 0.6
-_AT_ONCE = ((1, 0.0), (2, 0.6), (4, 0.76), (8, 0.84))
-"""Blocks that an audio thread renders at once, and the share of the time above which it does. Each step takes about
-an eighth less of it."""
-NUMBERS_AT_ONCE = tuple(count for count, _ in _AT_ONCE)
-_FEWER_BELOW = 0.83
-"""Of the share above which so many are rendered: half as many, which take more of the time, are not too few at once."""
 _SHARED = 0.75
 """Share of a core that rendering and impulse responses may take together: the event loop, plans and checks need the
 rest."""
@@ -235,15 +229,6 @@ def _best_off(ladders: Mapping[Ladder, Strain]) -> Sequence[Ladder]:
 def ir_share(most: float, *, busy: float) -> float:
     """Of a core, for IRs of the streams of an audio thread that renders for a share `busy` of the time."""
     return min(most, max(_SHARED - busy, _LEAST_IR_SHARE * most))
-
-
-def blocks_at_once(busy: float, *, before: int) -> int:
-    """How many blocks of a stream an audio thread renders at once that renders for a share `busy` of the time, and
-    rendered so many at once `before`: the first in time, the others ahead of it, which is cheaper, and poses are heard
-    up to so many blocks later."""
-    return max(
-        count for count, above in _AT_ONCE if count == 1 or busy > (above if count > before else _FEWER_BELOW * above)
-    )
 
 
 def ir_interval_s(ladder: Ladder, *, request_s: float, streams: int, share: float) -> float:

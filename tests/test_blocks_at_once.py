@@ -9,11 +9,11 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
-from server.load import NUMBERS_AT_ONCE, blocks_at_once
+from server.blocks_at_once import NUMBERS, BlocksAtOnce
 from server.protocol import PROTOCOL, AddEmitter, Hello, RemoveEmitter
 from tests.engine_stage import BLOCK_S, Patient, Stage, blocks, open_stream, spy_on_batches
 
-MOST = max(NUMBERS_AT_ONCE)
+MOST = max(NUMBERS)
 
 
 @pytest.fixture
@@ -31,19 +31,69 @@ def open_sounding(stage, **emitter):
     return stream, delivered
 
 
+def render_at_once(monkeypatch, count):
+    monkeypatch.setattr(BlocksAtOnce, "look", lambda self, _busy: setattr(self, "count", count))
+
+
 @pytest.fixture(params=[2, 4, 8])
 def count(request, monkeypatch):
     """Blocks that are rendered at once from now on."""
-    monkeypatch.setattr(audio_engine, "blocks_at_once", lambda _busy, **_: request.param)
+    render_at_once(monkeypatch, request.param)
     return request.param
 
 
-def test_more_blocks_at_once_begin_under_load_and_end_well_below_it():
-    busy = (0.3, 0.5, 0.57, 0.7, 0.8, 0.9)
-    assert [blocks_at_once(share, before=1) for share in busy] == [1, 1, 1, 2, 4, 8]
-    assert [blocks_at_once(share, before=2) for share in busy] == [1, 2, 2, 2, 4, 8]
-    assert [blocks_at_once(share, before=4) for share in busy] == [1, 2, 2, 4, 4, 8]
-    assert [blocks_at_once(share, before=8) for share in busy] == [1, 2, 2, 8, 8, 8]
+class Core:
+    """Which a thread takes `demand` of, block by block, and an eighth less each time that it renders twice as many at
+    once, or whatever else `saves`."""
+
+    def __init__(self, saves=1 / 8):
+        self.at_once, self.saves = BlocksAtOnce(), saves
+
+    def run(self, demand, periods=40):
+        """How many blocks were rendered at once in each."""
+        counts = []
+        for _ in range(periods):
+            counts.append(self.at_once.count)
+            self.at_once.look(min(1.0, demand * (1 - self.saves) ** NUMBERS.index(self.at_once.count)))
+        return counts
+
+
+@pytest.mark.parametrize(("demand", "count"), [(0.4, 1), (0.69, 1), (0.75, 2), (0.94, 2), (1.0, 4), (1.2, 8)])
+def test_as_many_blocks_are_rendered_at_once_as_the_load_calls_for(demand, count):
+    core = Core()
+    core.run(demand)
+    assert set(core.run(demand)) == {count}
+
+
+@pytest.mark.parametrize("demand", [0.4, 0.75, 0.9])
+def test_what_fills_a_core_for_a_moment_changes_nothing(demand):
+    core = Core()
+    before = core.run(demand)[-1]
+    core.at_once.look(0.94)
+    assert set(core.run(demand)) == {before}
+
+
+def test_a_thread_that_falls_behind_renders_more_at_once_without_waiting_for_a_mean():
+    core = Core()
+    assert core.run(1.3, periods=5) == [1, 2, 4, 8, 8]
+
+
+@pytest.mark.parametrize("demand", np.arange(0.5, 1.2, 0.05))
+def test_who_renders_more_at_once_than_is_needed_soon_does_not(demand):
+    """A server opens with more to do than it has later."""
+    core, calm = Core(), Core()
+    core.run(1.5)
+    needed = calm.run(demand)[-1]
+    assert core.run(demand)[12] <= 2 * needed
+
+
+@pytest.mark.parametrize("saves", [0.0, 0.04, 1 / 8])
+def test_a_steady_load_keeps_its_number(saves):
+    """Whatever rendering more at once saves on a host, up to an eighth: no to and fro."""
+    for demand in np.arange(0.3, 1.1, 0.01):
+        core = Core(saves)
+        core.run(demand)
+        assert len(set(core.run(demand))) == 1, demand
 
 
 def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(stage, monkeypatch):
@@ -56,8 +106,8 @@ def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(st
         stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
 
     stream.session.begin_block = take_time
-    for busy, count in [(0.2, 1), (0.7, 2), (0.8, 4), (0.95, 8), (0.75, 8), (0.55, 2), (0.2, 1)]:
-        stage.run(1.0)
+    for busy, count in [(0.2, 1), (0.75, 2), (0.9, 8), (0.75, 8), (0.65, 2), (0.87, 8), (0.2, 1)]:
+        stage.run(4.0)
         batches = spy_on_batches(monkeypatch)
         stage.run(20 * BLOCK_S)
         assert {len(batch) for batch in batches} == {count}, busy
@@ -91,7 +141,7 @@ def test_who_comes_takes_the_turn_of_who_left(stage):
 @pytest.mark.parametrize("streams", [MOST * PHASES + more for more in (2, 3, 4)])
 def test_long_instants_lie_between_shorter_ones(stage, monkeypatch, streams):
     """What else a core has to do gets its time between them."""
-    monkeypatch.setattr(audio_engine, "blocks_at_once", lambda _busy, **_: MOST)
+    render_at_once(monkeypatch, MOST)
     for _ in range(streams):
         stage.open(lead=8, window=10_000)
     stage.run(1.0)

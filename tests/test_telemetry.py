@@ -113,7 +113,7 @@ def test_steps_are_counted_by_reason(host):
 
 def test_how_many_blocks_are_rendered_at_once_is_told(host):
     assert samples(host)["nafir_blocks_at_once",] == 1
-    host.audio.threads[0].blocks_at_once = 4
+    host.audio.threads[0]._at_once.count = 4
     assert samples(host)["nafir_blocks_at_once",] == 4
 
 
