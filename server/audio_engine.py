@@ -19,7 +19,8 @@ later. The streams of an instant take turns with it, so that every instant has a
 **What a stream gets.** Four times a second a thread looks at what its streams went through, and moves them to cheaper
 or better quality (`server.load`).
 
-Messages that may call for an IR wake the thread at once, which asks for the IR and renders nothing early.
+Messages that may call for an IR wake the thread at once, which asks for the IR and renders nothing early. Streams take
+turns with that (`server.turns`).
 
 Who may touch what: a `Stream` belongs to its audio thread, but for `Stream.offer`; `AudioEngine` to the event loop.
 """
@@ -41,6 +42,7 @@ from server.load import PERIOD_S, LoadControl, Reason, ir_share
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
 from server.stream import Outgoing, Stream, StreamFailed
+from server.turns import Turns
 from server.workers import Workers
 
 PHASES = 2
@@ -55,6 +57,8 @@ _GIVE_WAY_S = 0.001
 """How long an audio thread that would sleep less waits for the event loop at the most, about twice as long as the loop
 takes. Where both have but one core, and the thread hardly sleeps, the loop got nothing of it for up to 0.1 s: blocks
 were ready in time and sent too late."""
+_AHEAD = 1
+"""Requests for IRs beside those that workers compute: none of them waits for the next."""
 _PRESUMED_LOAD = 0.02
 """Share of a core that a stream is taken to need at least, as long as it has shown no more."""
 _SWITCH_S = 0.0005
@@ -70,9 +74,9 @@ Post = Callable[[Callable[[], None]], object]
 class AudioEngine:
     """Renders streams until stopped.
 
-    `workers` computes IRs; each stream has at most one request with it, so its queue is never longer than there are
-    streams. Under load, those of one audio thread's streams take `ir_share` of a core, or less where rendering leaves
-    less. `is_real_time` asks the system to schedule audio threads before all others.
+    `workers` computes IRs; each stream has at most one request with it. Under load, those of one audio thread's streams
+    take `ir_share` of a core, or less where rendering leaves less. `is_real_time` asks the system to schedule audio
+    threads before all others.
     """
 
     def __init__(
@@ -85,9 +89,10 @@ class AudioEngine:
         ir_share: float = 0.25,
         time_s: Callable[[], float] = time.monotonic,
     ) -> None:
+        requests = _AHEAD + math.ceil(workers.threads / threads)
         self.threads = [
-            AudioThread(post, workers, number=number, is_real_time=is_real_time, ir_share=ir_share, time_s=time_s)
-            for number in range(threads)
+            AudioThread(post, workers, requests, number=n, is_real_time=is_real_time, ir_share=ir_share, time_s=time_s)
+            for n in range(threads)
         ]
         self._thread_of: dict[Stream, AudioThread] = {}
         self._switch_s_before = sys.getswitchinterval()
@@ -138,6 +143,7 @@ class AudioThread:
         self,
         post: Post,
         workers: Workers,
+        requests: int,
         *,
         number: int,
         is_real_time: bool,
@@ -146,6 +152,7 @@ class AudioThread:
     ) -> None:
         self._post = post
         self._workers = workers
+        self._turns = Turns(requests)
         self._number = number
         self._is_real_time = is_real_time
         self._ir_share = ir_share
@@ -184,7 +191,7 @@ class AudioThread:
         self._thread.join()
 
     def open(self, stream: Stream) -> None:
-        stream.attach(wake=self._wake.set, time_s=self._time_s)
+        stream.attach(wake=self._wake.set, time_s=self._time_s, turns=self._turns)
         self._arrivals.append((stream, True))
         self._wake.set()
 
@@ -202,9 +209,10 @@ class AudioThread:
         made: dict[Stream, list[Outgoing]] = {}
         due: list[_Due] = []
         blocks_of = self._due(now_s)
+        self._turns.deal(self._streams)
         for stream in tuple(self._streams):
             blocks = blocks_of.get(stream)
-            if blocks is None and not stream.has_news:
+            if blocks is None and not stream.has_news and not self._turns.is_next(stream):
                 continue
             try:
                 made[stream] = stream.take_in(self._workers)

@@ -59,6 +59,11 @@ class ResponsesInForce:
         """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
         return self._in_flight is not None or self._renderer.sample_clock < self._next_request_clock
 
+    @property
+    def are_wanted(self) -> bool:
+        """Whether there was something to ask for when it was looked last, and it is time to."""
+        return self._has_looked and not self.are_awaited and not self._waits_for_change
+
     def hear(self, rung: Rung, reason: Reason) -> list[ServerMessage]:
         """Have IRs come from another rung: from now on, or, where it takes another level's, from when they are
         there."""
@@ -112,13 +117,14 @@ class ResponsesInForce:
         self._look_again()
         return events
 
-    def take_request(self, listener: Pose) -> IrRequest | None:
-        """The IRs to compute now. None while an earlier request is unanswered, or when every IR is up to date."""
+    def take_request(self, listener: Pose, *, only_first: bool = False) -> IrRequest | None:
+        """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
+        `only_first` ones may be asked for and none is the first of an emitter."""
         if self._in_flight is not None or self._waits_for_change:
             return None
         clock = self._renderer.sample_clock
-        is_too_soon = clock < self._next_request_clock
-        if is_too_soon and self._has_looked:
+        is_held = only_first or clock < self._next_request_clock
+        if is_held and self._has_looked:
             return None
         outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter, listener)]
         if not outdated and not self._effects.awaits_ears:
@@ -127,7 +133,7 @@ class ResponsesInForce:
             self._waits_for_change = not self._effects.wants_other_ears
             return None
         is_first = any(emitter.token is None for emitter in outdated)
-        if is_too_soon and not is_first:
+        if is_held and not is_first:
             self._has_looked = True
             return None
         self._next_request_clock = clock + round(self._interval_s * self._sample_rate)

@@ -193,9 +193,15 @@ class Session:
             return [Error.from_refusal(refusal)]
         return []
 
-    def take_request(self) -> IrRequest | None:
-        """The IRs to compute now. None while an earlier request is unanswered, or when every IR is up to date."""
-        return self._responses.take_request(self._listener)
+    @property
+    def wants_irs(self) -> bool:
+        """Whether there was something to ask for when `take_request` looked last, and it is time to."""
+        return self._responses.are_wanted
+
+    def take_request(self, *, only_first: bool = False) -> IrRequest | None:
+        """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
+        `only_first` ones may be asked for and none is the first of an emitter."""
+        return self._responses.take_request(self._listener, only_first=only_first)
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""

@@ -27,6 +27,7 @@ from server.rendering.output import Rendered
 from server.replies import Durations, Error, ServerMessage, Status
 from server.scene.plan import Plan
 from server.session import Session
+from server.turns import Turns
 from server.workers import Workers
 
 MAX_WAITING_MESSAGES = 256
@@ -105,14 +106,19 @@ class Stream:
         """CPU time that a request for impulse responses has taken of late."""
         self._plan_s = 0.0
         """And a plan of effects."""
+        self.wants_turn = False
+        """Whether impulse responses are to be asked for as soon as it is its turn."""
+        self.asked_last_s = -math.inf
+        self._has_asked = False
         self._asked_s: float | None = None
-        """When the request was made that is unanswered."""
+        """Since when it waits for them: for its turn, or for an answer."""
         self._longest_wait_s: float | None = None
         self._worst_lateness_s = 0.0
         self._lead = lead
         self._clock: StreamClock | None = None
         self._wake: Callable[[], None] = lambda: None
         self._time_s: Callable[[], float] = time.monotonic
+        self._turns = Turns(1)
         self._messages: deque[tuple[float, ClientMessage]] = deque()
         self._answers: deque[tuple[IrRequest, Future[_Computed]]] = deque()
         self._plans: deque[Future[tuple[Plan, float]]] = deque()
@@ -130,7 +136,7 @@ class Stream:
 
     @property
     def awaits_irs_since_s(self) -> float | None:
-        """When the request for impulse responses was made that is unanswered."""
+        """When impulse responses were called for that have not come."""
         return self._asked_s
 
     @property
@@ -138,9 +144,9 @@ class Stream:
         """When its next block is late."""
         return self.clock.deadline_s(self.next_block)
 
-    def attach(self, *, wake: Callable[[], None], time_s: Callable[[], float]) -> None:
-        """`wake` has the audio thread look at what waits; `time_s` is its clock."""
-        self._wake, self._time_s = wake, time_s
+    def attach(self, *, wake: Callable[[], None], time_s: Callable[[], float], turns: Turns) -> None:
+        """`wake` has the audio thread look at what waits; `time_s` is its clock; `turns` are those of its streams."""
+        self._wake, self._time_s, self._turns = wake, time_s, turns
 
     def offer(self, message: ClientMessage) -> bool:
         """Leave a message for the audio thread; False, and the message refused, where too many wait already.
@@ -151,7 +157,7 @@ class Stream:
             return False
         self._messages.append((self._time_s(), message))
         # While one is computed, no other is asked for until its answer comes, and that wakes too.
-        if isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and not self.session.awaits_irs:
+        if isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once:
             self._wake()
         return True
 
@@ -168,10 +174,19 @@ class Stream:
     @property
     def has_news(self) -> bool:
         """Whether something waits that cannot wait for the next block: for an IR to be asked for, or for an answer."""
-        return bool(self._answers or self._plans or (self._messages and not self.session.awaits_irs))
+        return bool(self._answers or self._plans or (self._messages and self._asks_at_once))
+
+    @property
+    def _asks_at_once(self) -> bool:
+        return not self.session.awaits_irs and self._turns.are_left
+
+    @property
+    def is_unanswered(self) -> bool:
+        """Whether impulse responses have been asked for, and no answer has come."""
+        return self._has_asked and not self._answers
 
     def take_in(self, workers: Workers) -> list[Outgoing]:
-        """Heed what waits and ask for impulse responses."""
+        """Heed what waits and ask for impulse responses, or, where it is not its turn, `wants_turn` from then on."""
         outgoing: list[Outgoing] = []
         while self._answers:
             outgoing += self._take_answer(*self._answers.popleft())
@@ -190,11 +205,22 @@ class Stream:
         # Who has not been heard yet waits for it; all others only for something better.
         if (wanted := self.session.take_plan_request()) is not None:
             workers.submit(_plan_timed, wanted, is_urgent=wanted.is_first).add_done_callback(self._keep_plan)
-        if (request := self.session.take_request()) is not None:
-            self._asked_s = self._time_s()
+        self._ask(workers)
+        return outgoing
+
+    def _ask(self, workers: Workers) -> None:
+        """For the impulse responses of the newest poses, if it is its turn, or for the first of an emitter."""
+        request = self.session.take_request(only_first=not self._turns.may_ask(self))
+        self.wants_turn = self.session.wants_irs
+        if request is not None:
+            self._has_asked, self.asked_last_s = True, self._time_s()
+            self._turns.note(self)
             answer = workers.submit(_compute_timed, self._levels, request, self.session, is_urgent=request.is_first)
             answer.add_done_callback(partial(self._keep_answer, request))
-        return outgoing
+        if not (self._has_asked or self.wants_turn):
+            self._asked_s = None
+        elif self._asked_s is None:
+            self._asked_s = self._time_s()
 
     def strain(self, now_s: float) -> Strain:
         """What it went through since this was asked last."""
@@ -304,6 +330,7 @@ class Stream:
         return self.session.adopt(plan)
 
     def _take_answer(self, request: IrRequest, answer: "Future[_Computed]") -> list[ServerMessage]:
+        self._has_asked = False
         if self._asked_s is not None:
             self._longest_wait_s = max(self._longest_wait_s or 0.0, self._time_s() - self._asked_s)
             self._asked_s = None

@@ -13,6 +13,7 @@ class Workers:
     """So many threads; leaving the context waits until everything is done."""
 
     def __init__(self, threads: int, name: str = "worker", *, initializer: Callable[[], None] | None = None) -> None:
+        self.threads = threads
         self._threads = ThreadPoolExecutor(threads, name, initializer)
         self._urgent: deque[Callable[[], None]] = deque()
         self._usual: deque[Callable[[], None]] = deque()

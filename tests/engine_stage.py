@@ -27,6 +27,8 @@ class Clock:
 class Patient:
     """Workers that do what they were given when told to; `urgent` of it was urgent."""
 
+    threads = 64
+
     def __init__(self):
         self.work = []
         self.urgent = []

@@ -31,6 +31,8 @@ class Room:
 class Workers:
     """Answer each request `delay_s` after it was made."""
 
+    threads = 1
+
     def __init__(self, clock):
         self.clock, self.delay_s, self.work, self.asked_at_s = clock, 0.0, [], []
 

@@ -10,6 +10,7 @@ from server.protocol import PROTOCOL, AddEmitter, Hello
 from server.session import Session
 from server.stream import Stream
 from server.telemetry import ServerCollector, StreamTotals, exposition
+from tests.engine_stage import Patient
 
 BLOCK_S = 256 / 24_000
 
@@ -27,7 +28,7 @@ class Host:
 @pytest.fixture
 def host(field):
     offer = Offer((field.level,), {"standard": 2.5})
-    return Host(AudioEngine(lambda call: call(), None, time_s=lambda: 50.0), {"flat": offer})
+    return Host(AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0), {"flat": offer})
 
 
 def open_stream(host, field, filters):
