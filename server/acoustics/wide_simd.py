@@ -111,6 +111,14 @@ def swap_halves(_context: Any, _a: Any) -> Any:
 
 
 @intrinsic
+def add_16(_context: Any, _a: Any, _b: Any) -> Any:
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.fadd(*args)
+
+    return float32x16(float32x16, float32x16), generate
+
+
+@intrinsic
 def multiply_16(_context: Any, _a: Any, _b: Any) -> Any:
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.fmul(*args)

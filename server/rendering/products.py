@@ -11,6 +11,7 @@ from numba import carray
 from server.acoustics.cache_lines import LINE_BYTES
 from server.acoustics.simd import load_int, pointer, prefetch
 from server.acoustics.wide_simd import (
+    add_16,
     broadcast_16,
     load_16,
     load_opposed,
@@ -78,6 +79,12 @@ def _multiply_add(total, real, opposed, filters, h):
 
 
 @compiled
+def _add_to(mix, at, sums) -> None:
+    """Only sums meet the mix: added one by one to what is large already, products of many sources would lose more."""
+    store_16(mix, at, add_16(load_16(mix, at), sums))
+
+
+@compiled
 def _fetch_filter(filters, h) -> None:
     """Have what a few tiles on are multiplied by come near. There are more streams than a processor follows by
     itself, and with many listeners all of it lies in main memory."""
@@ -98,13 +105,14 @@ def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
     """Add the products of the newest spectra of a group, in slot `newest` of their rings, to the mix of the window at
     work, and of the `ahead` - 1 that follow it: with the first partition of their filters, the second and so on."""
     mix, tiles, start = stage.mix, stage.size // 8, apart(stage.size) * newest
+    zero = broadcast_16(np.float32(0))
     for tile in range(first, last):
         x = start + 16 * tile
         for partition in range(ahead):
             h = 16 * channels * (tiles * partition + tile)
             left = mixed(channels, tile, 0, (stage.window + partition) % TURNS)
             right = left + 16 * COLUMNS * (channels - 1)
-            left_sum, right_sum = load_16(mix, left), load_16(mix, right)
+            left_sum, right_sum = zero, zero
             for member in range(members):
                 filters, count, ring = member_of(stage, member)
                 if partition < count:
@@ -112,8 +120,9 @@ def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
                     _fetch_filter(filters, h)
                     left_sum = _multiply_add(left_sum, real, opposed, filters, h)
                     right_sum = _multiply_add(right_sum, real, opposed, filters, h + 16 * (channels - 1))
-            store_16(mix, right, right_sum)
-            store_16(mix, left, left_sum)
+            if channels == 2:
+                _add_to(mix, right, right_sum)
+            _add_to(mix, left, left_sum)
 
 
 @compiled
@@ -122,11 +131,12 @@ def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, 
     which is that of a window `ahead` of the one whose spectrum is in slot `newest`."""
     mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast_16(sign)
     spectrum = apart(stage.size)
+    zero = broadcast_16(np.float32(0))
     near = min(NEAR, count)
     start = (newest + begin - ahead) % slots
     for tile in range(first, last):
         left, right = mixed(channels, tile, 0, column), mixed(channels, tile, channels - 1, column)
-        left_sum, right_sum = load_16(mix, left), load_16(mix, right)
+        left_sum, right_sum = zero, zero
         slot = start
         h = packed(channels, tiles, count, tile, begin)
         for partition in range(begin, end):
@@ -136,8 +146,9 @@ def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, 
             right_sum = _multiply_add(right_sum, real, opposed, filters, h + 16 * (channels - 1))
             h += _step(near, tiles, channels, count, tile, partition)
             slot = slot + 1 if slot + 1 < slots else 0
-        store_16(mix, left, left_sum)
-        store_16(mix, right, right_sum)
+        _add_to(mix, left, left_sum)
+        if channels == 2:
+            _add_to(mix, right, right_sum)
 
 
 @compiled
@@ -154,9 +165,8 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
         b = mixed(channels, tile, 0, (stage.window + 1) % TURNS)
         c = mixed(channels, tile, 0, (stage.window + 2) % TURNS)
         d = mixed(channels, tile, 0, (stage.window + 3) % TURNS)
-        l_a, l_b, l_c, l_d = load_16(mix, a), load_16(mix, b), load_16(mix, c), load_16(mix, d)
-        r_a, r_b = load_16(mix, a + other), load_16(mix, b + other)
-        r_c, r_d = load_16(mix, c + other), load_16(mix, d + other)
+        l_a, l_b, l_c, l_d = zero, zero, zero, zero
+        r_a, r_b, r_c, r_d = zero, zero, zero, zero
         for member in range(members):
             filters, count, ring = member_of(stage, member)
             near = min(NEAR, count)
@@ -183,11 +193,11 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
                 h += _step(near, tiles, channels, count, tile, partition)
                 slot = slot + 1 if slot + 1 < slots else 0
         if channels == 2:
-            store_16(mix, a + other, r_a)
-            store_16(mix, b + other, r_b)
-            store_16(mix, c + other, r_c)
-            store_16(mix, d + other, r_d)
-        store_16(mix, a, l_a)
-        store_16(mix, b, l_b)
-        store_16(mix, c, l_c)
-        store_16(mix, d, l_d)
+            _add_to(mix, a + other, r_a)
+            _add_to(mix, b + other, r_b)
+            _add_to(mix, c + other, r_c)
+            _add_to(mix, d + other, r_d)
+        _add_to(mix, a, l_a)
+        _add_to(mix, b, l_b)
+        _add_to(mix, c, l_c)
+        _add_to(mix, d, l_d)

@@ -37,6 +37,22 @@ def test_a_second_of_response_stays_exact_however_many_sources(is_compiled, sour
     assert error_db(stream(convolver, dry), expected) < -120
 
 
+def test_many_sources_are_added_up_as_exactly_as_few(is_compiled):
+    """None of their products is lost beside the sum of all others."""
+    if not is_compiled:
+        pytest.skip("NumPy adds spectrum by spectrum")
+    errors_db = []
+    for sources in (4, 64):
+        dry, irs = noise(3, sources, 520 * 128), noise(4, sources, 2, 48_000)
+        convolver = Convolver(sources=sources, channels=2, block_size=128, ir_samples=48_000)
+        for source, ir in enumerate(irs):
+            convolver.set_ir(source, ir)
+        expected = sum(convolve(dry[source], ir) for source, ir in enumerate(irs))
+        errors_db.append(error_db(stream(convolver, dry), expected))
+    few_db, many_db = errors_db
+    assert many_db < few_db + 3
+
+
 @settings(deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
