@@ -8,10 +8,12 @@ scope, and does without where another server runs it.
 """
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import InvalidState
 from websockets.http11 import Request
 from websockets.protocol import OPEN
 
@@ -74,6 +76,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
 
     _hear: Hear | None = None
     _cutter: FrameCutter | None = None
+    _has_failed = False
+    """Whether the client broke the protocol, and was told so."""
 
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
@@ -81,8 +85,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
 
     def data_received(self, data: bytes) -> None:
-        if self.conn.parser_exc is not None:
-            return  # of a client that does not know yet
+        if self._has_failed:
+            return  # the client does not know yet
         if self._cutter is None:
             was_open = self.handshake_initiated
             super().data_received(data)
@@ -101,7 +105,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
 
     def send_receive_event_to_app(self) -> None:
         """uvicorn stops reading with every message, until the application has taken it in."""
-        super().send_receive_event_to_app()
+        with suppress(InvalidState):  # of text that is none, where the client closes in the same breath
+            super().send_receive_event_to_app()
         if self.read_paused and self.queue.qsize() < _MOST_WAITING:
             self.read_paused = False
             self.transport.resume_reading()
@@ -118,15 +123,20 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             return
         self.queue.put_nowait({"type": "websocket.disconnect", "code": failure.code, "reason": failure.reason})
         self.transport.write(b"".join(self.conn.data_to_send()))
-        self.close_sent = True
+        # To the application it is lost: what that may still send is no fault of its own.
+        self.close_sent = self.disconnected = self._has_failed = True
         if not self.transport.can_write_eof():  # as with TLS, which has a close of its own
             self.transport.close()
             return
         self.transport.write_eof()
-        self.close_timer = self.loop.call_later(self.close_timeout, self.transport.close)
+        self.close_timer = self.loop.call_later(self.close_timeout, self.transport.abort)
         if self.read_paused:
             self.read_paused = False
             self.transport.resume_reading()
+
+    def handle_ping(self) -> None:
+        if not self._has_failed:
+            super().handle_ping()
 
     def _is_heard(self, message: bytes, *, is_text: bool) -> bool:
         if self._hear is None or self.close_sent or self.conn.state is not OPEN or not self.queue.empty():

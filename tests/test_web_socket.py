@@ -249,15 +249,19 @@ def test_what_comes_after_a_breach_of_the_protocol_is_not_heard():
     assert len(events) <= 2, "one of the breach, and one of the connection that was lost for it"
 
 
+@pytest.mark.parametrize("hears", [True, False])
 @pytest.mark.parametrize(("breach", "reason"), [(b"too long" * 200_000, 1009), (b"no text \xff", 1007)])
-def test_a_client_that_is_still_sending_learns_why_the_connection_closes(breach, reason):
-    """What it sends on is neither heard nor answered by a reset, which would take the reason with it."""
+def test_a_client_that_is_still_sending_learns_why_the_connection_closes(breach, reason, hears, caplog):
+    """What it sends on is neither heard nor answered by a reset, which would take the reason with it; nor does an
+    application fail that sends to it."""
     heard = []
 
-    async def listen(scope, receive, _send):
-        direct_way(scope).listen(lambda message: not heard.append(message))
-        while (await receive())["type"] != "websocket.disconnect":
-            pass
+    async def listen(scope, receive, send):
+        if hears:
+            direct_way(scope).listen(lambda message: not heard.append(message))
+        while (event := await receive())["type"] != "websocket.disconnect":
+            heard.append(event)
+        await send({"type": "websocket.send", "bytes": b"too late"})
 
     async def talk():
         client = ClientProtocol(parse_uri("ws://127.0.0.1"))
@@ -266,15 +270,16 @@ def test_a_client_that_is_still_sending_learns_why_the_connection_closes(breach,
             reader, writer = await asyncio.open_connection(port=address.rpartition(":")[2], host="127.0.0.1")
             writer.writelines(client.data_to_send())
             client.receive_data(await reader.readuntil(b"\r\n\r\n"))
-            before, after = (Frame(Opcode.TEXT, text).serialize(mask=True) for text in (breach, b"on"))
-            sent = before + 100 * after
-            for at in range(0, len(sent), 400_000):
-                await asyncio.sleep(0.1)
-                writer.write(sent[at : at + 400_000])
+            frames = ((Opcode.TEXT, breach), (Opcode.PING, b""), (Opcode.TEXT, b"on"))
+            first, ping, then = (Frame(*frame).serialize(mask=True) for frame in frames)
+            for part in (first[:400_000], first[400_000:] + ping, ping + then, ping, 100 * then):
+                writer.write(part)
                 await writer.drain()
+                await asyncio.sleep(0.1)
             client.receive_data(await reader.read())
             writer.close()
             return client.close_rcvd
 
     assert asyncio.run(talk()).code == reason
     assert not heard
+    assert not caplog.records
