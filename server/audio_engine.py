@@ -58,7 +58,7 @@ _GIVE_WAY_S = 0.001
 takes. Where both have but one core, and the thread hardly sleeps, the loop got nothing of it for up to 0.1 s: blocks
 were ready in time and sent too late."""
 _AHEAD = 1
-"""Requests for IRs beside those that workers compute: none of them waits for the next."""
+"""Requests for IRs beside those being computed, so that no worker waits for the next."""
 _PRESUMED_LOAD = 0.02
 """Share of a core that a stream is taken to need at least, as long as it has shown no more."""
 _SWITCH_S = 0.0005
@@ -89,10 +89,10 @@ class AudioEngine:
         ir_share: float = 0.25,
         time_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        requests = _AHEAD + math.ceil(workers.threads / threads)
+        self._workers = workers
         self.threads = [
-            AudioThread(post, workers, requests, number=n, is_real_time=is_real_time, ir_share=ir_share, time_s=time_s)
-            for n in range(threads)
+            AudioThread(post, workers, number=number, is_real_time=is_real_time, ir_share=ir_share, time_s=time_s)
+            for number in range(threads)
         ]
         self._thread_of: dict[Stream, AudioThread] = {}
         self._switch_s_before = sys.getswitchinterval()
@@ -127,13 +127,21 @@ class AudioEngine:
             loads[thread] += max(_PRESUMED_LOAD, other.load)
         thread = min(self.threads, key=loads.__getitem__)
         self._thread_of[stream] = thread
+        self._share_workers()
         thread.open(stream)
 
     def close(self, stream: Stream) -> None:
         """Stop rendering a stream; what it made before may still be delivered. Closing twice does no harm."""
         thread = self._thread_of.pop(stream, None)
         if thread is not None:
+            self._share_workers()
             thread.close(stream)
+
+    def _share_workers(self) -> None:
+        """Have threads with streams keep as many of them busy as each other."""
+        sharing = set(self._thread_of.values())
+        for thread in sharing:
+            thread.turns.requests = _AHEAD + math.ceil(self._workers.threads / len(sharing))
 
 
 class AudioThread:
@@ -143,7 +151,6 @@ class AudioThread:
         self,
         post: Post,
         workers: Workers,
-        requests: int,
         *,
         number: int,
         is_real_time: bool,
@@ -152,7 +159,8 @@ class AudioThread:
     ) -> None:
         self._post = post
         self._workers = workers
-        self._turns = Turns(requests)
+        self.turns = Turns(1)
+        """Of its streams, to ask for IRs."""
         self._number = number
         self._is_real_time = is_real_time
         self._ir_share = ir_share
@@ -191,7 +199,7 @@ class AudioThread:
         self._thread.join()
 
     def open(self, stream: Stream) -> None:
-        stream.attach(wake=self._wake.set, time_s=self._time_s, turns=self._turns)
+        stream.attach(wake=self._wake.set, time_s=self._time_s, turns=self.turns)
         self._arrivals.append((stream, True))
         self._wake.set()
 
@@ -209,10 +217,10 @@ class AudioThread:
         made: dict[Stream, list[Outgoing]] = {}
         due: list[_Due] = []
         blocks_of = self._due(now_s)
-        self._turns.deal(self._streams)
+        self.turns.deal(self._streams)
         for stream in tuple(self._streams):
             blocks = blocks_of.get(stream)
-            if blocks is None and not stream.has_news and not self._turns.is_next(stream):
+            if blocks is None and not stream.has_news and not self.turns.is_next(stream):
                 continue
             try:
                 made[stream] = stream.take_in(self._workers)
@@ -298,11 +306,12 @@ class AudioThread:
         self._looked_s = now_s
         by_ladder = {stream.ladder: stream for stream in self._streams}
         strains = {ladder: stream.strain(now_s) for ladder, stream in by_ladder.items()}
-        for ladder, reason in self._load.decide(now_s, busy, strains).items():
+        self._at_once.look(busy)
+        can_make_time = self._at_once.can_be_more
+        for ladder, reason in self._load.decide(now_s, busy, strains, can_make_time=can_make_time).items():
             stream = by_ladder[ladder]
             made.setdefault(stream, []).extend(stream.step(reason, now_s))
             self.steps[reason] += 1
-        self._at_once.look(busy)
         share = ir_share(self._ir_share, busy=busy)
         for stream in self._streams:
             stream.ration(streams=len(self._streams), share=share)
@@ -316,6 +325,8 @@ class AudioThread:
         while self._arrivals:
             stream, is_opening = self._arrivals.popleft()
             if is_opening:
+                if not self._streams:
+                    self._at_once = BlocksAtOnce()
                 place = self._freest_place(stream.block_s)
                 stream.start(self._origin_of(place % PHASES, stream.block_s, now_s))
                 self._streams[stream] = place

@@ -8,11 +8,11 @@ which something else has the core is not worth them: clients have blocks in hand
 from typing import Final
 
 NUMBERS: Final = (1, 2, 4, 8)
-_MORE_ABOVE = {1: 0.7, 2: 0.84, 4: 0.84, 8: float("inf")}
+_MORE_ABOVE = {1: 0.7, 2: 0.84, 4: 0.84}
 """Share of the time that rendering so many at once takes in the mean, above which it is twice as many."""
 _FULL = 0.95
 """Share of the time in one period from which on a thread falls behind: no time for a mean."""
-_SAVED = 1 / 8
+_SAVED = 1 / 7
 """Of the time, by twice as many, at the most: a thread whose time would do for half as many renders half as many."""
 _LOOKS = 3
 """Periods, after a change, until a mean says something."""
@@ -33,11 +33,15 @@ class BlocksAtOnce:
         self._looks += 1
         self._busy += max(1 / self._looks, _NEWEST) * (busy - self._busy)
         has_mean = self._looks >= _LOOKS
-        if busy > _FULL or (has_mean and self._busy > _MORE_ABOVE[self.count]):
+        if self.can_be_more and (busy > _FULL or (has_mean and self._busy > _MORE_ABOVE[self.count])):
             self._change(2 * self.count)
         elif has_mean and self.count > 1 and self._busy / (1 - _SAVED) < _MORE_ABOVE[self.count // 2]:
             self._change(self.count // 2)
 
+    @property
+    def can_be_more(self) -> bool:
+        """Whether a thread that has no time left can still make some."""
+        return self.count < NUMBERS[-1]
+
     def _change(self, count: int) -> None:
-        self.count = min(count, NUMBERS[-1])
-        self._looks = 0
+        self.count, self._looks = count, 0

@@ -191,11 +191,13 @@ class LoadControl:
         self._well_since_s: float | None = None
         self._moved_s = -_SETTLE_S
 
-    def decide(self, now_s: float, busy: float, strains: Mapping[Ladder, Strain]) -> dict[Ladder, Reason]:
+    def decide(
+        self, now_s: float, busy: float, strains: Mapping[Ladder, Strain], *, can_make_time: bool = False
+    ) -> dict[Ladder, Reason]:
         """Every `PERIOD_S`: which ladders have been moved by a rung, and why. `busy` is the share of the period in
-        which the thread rendered."""
+        which the thread rendered; one that `can_make_time` otherwise strains nobody as long as no block is late."""
         worst = max((strain.lateness for strain in strains.values()), default=0.0)
-        is_strained = busy > _FULL or worst > _TIGHT
+        is_strained = (busy > _FULL and not can_make_time) or worst > _TIGHT
         self._strained = self._strained + 1 if is_strained else 0
         if busy > _FREE or worst > _EASY:
             self._well_since_s = None

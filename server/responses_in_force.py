@@ -100,7 +100,7 @@ class ResponsesInForce:
         if pose_id <= self.newest_pose_id:
             raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")
         self.newest_pose_id = pose_id
-        self._look_again()
+        self._waits_for_change = False
 
     def retry(self) -> None:
         """Look again at what to ask for: somebody has come, or is decided about."""
@@ -129,6 +129,7 @@ class ResponsesInForce:
         outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter, listener)]
         if not outdated and not self._effects.awaits_ears:
             self._accepted_pose_id = self.newest_pose_id
+            self._has_looked = False
             # Room for other ears comes by itself; whatever else calls for an IR is told.
             self._waits_for_change = not self._effects.wants_other_ears
             return None
@@ -136,6 +137,7 @@ class ResponsesInForce:
         if is_held and not is_first:
             self._has_looked = True
             return None
+        self._has_looked = False
         self._next_request_clock = clock + round(self._interval_s * self._sample_rate)
         asked = {emitter.serial: as_asked(emitter) for emitter in outdated}
         for emitter in outdated:

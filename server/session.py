@@ -378,6 +378,7 @@ class Session:
         if self._effects.planned is not None:
             self._effects.planned.forget_emitter(message.id)
         self.renderer.remove_emitter(message.id)
+        self._responses.retry()
         return [EmitterRemoved(id=message.id), *([] if self._emitters else self._responses.change_rung())]
 
     def _require_emitter(self, identifier: str) -> Emitter:

@@ -109,6 +109,8 @@ class Stream:
         self.wants_turn = False
         """Whether impulse responses are to be asked for as soon as it is its turn."""
         self.asked_last_s = -math.inf
+        self._brings_emitter = False
+        """Whether one waits among the messages."""
         self._has_asked = False
         self._asked_s: float | None = None
         """Since when it waits for them: for its turn, or for an answer."""
@@ -151,11 +153,12 @@ class Stream:
     def offer(self, message: ClientMessage) -> bool:
         """Leave a message for the audio thread; False, and the message refused, where too many wait already.
 
-        What may call for an impulse response is looked at now, anything else with the next block.
+        What may call for an impulse response that can be asked for is looked at now, anything else with the next block.
         """
         if len(self._messages) >= MAX_WAITING_MESSAGES:
             return False
         self._messages.append((self._time_s(), message))
+        self._brings_emitter |= isinstance(message, AddEmitter)
         # While one is computed, no other is asked for until its answer comes, and that wakes too.
         if isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once:
             self._wake()
@@ -178,7 +181,8 @@ class Stream:
 
     @property
     def _asks_at_once(self) -> bool:
-        return not self.session.awaits_irs and self._turns.are_left
+        """Whether it need not wait for its turn, be it since an emitter comes that is not heard yet."""
+        return not self.session.awaits_irs and (self._brings_emitter or self._turns.are_left)
 
     @property
     def is_unanswered(self) -> bool:
@@ -188,6 +192,7 @@ class Stream:
     def take_in(self, workers: Workers) -> list[Outgoing]:
         """Heed what waits and ask for impulse responses, or, where it is not its turn, `wants_turn` from then on."""
         outgoing: list[Outgoing] = []
+        self._brings_emitter = False
         while self._answers:
             outgoing += self._take_answer(*self._answers.popleft())
         while self._plans:

@@ -97,7 +97,7 @@ class ServerCollector(Collector):
         )
         yield GaugeMetricFamily(
             "nafir_ir_requests_waiting",
-            "Streams whose request for impulse responses is unanswered.",
+            "Streams that wait for impulse responses, for their turn to ask or for an answer.",
             value=sum(stream.awaits_irs_since_s is not None for stream in streams),
         )
         yield self._level_steps()

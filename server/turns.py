@@ -1,7 +1,8 @@
 """Who of an audio thread's streams asks for impulse responses next.
 
 A request that waits in a long queue is of poses long gone when it is answered. So only as many are made as keep the
-workers busy, each of the newest poses, and whoever has not asked for longest is next.
+workers busy, each of the newest poses, and whoever has not asked for longest is next. Threads share workers and know
+nothing of each other's turns: each counts on its part of them.
 """
 
 from collections.abc import Iterable
@@ -24,10 +25,10 @@ class Asker(Protocol):
 
 
 class Turns:
-    """At most so many requests are unanswered, but for first ones of emitters, which are asked for at once."""
+    """At most so many `requests` are unanswered, but for first ones of emitters, which are asked for at once."""
 
     def __init__(self, requests: int) -> None:
-        self._requests = requests
+        self.requests = requests
         self._next: list[Asker] = []
         self._left = requests
 
@@ -37,9 +38,9 @@ class Turns:
         return self._left > 0
 
     def deal(self, askers: Iterable[Asker]) -> None:
-        """Find whose turn it is, of those who were there to be found."""
+        """Give this tick's turns to those who wait, longest first; what is left is for who comes."""
         askers = tuple(askers)
-        left = self._requests - sum(asker.is_unanswered for asker in askers)
+        left = self.requests - sum(asker.is_unanswered for asker in askers)
         waiting = [asker for asker in askers if asker.wants_turn] if left > 0 else []
         self._next = sorted(waiting, key=attrgetter("asked_last_s"))[:left]
         self._left = left - len(self._next)

@@ -118,7 +118,7 @@ def test_a_pose_asks_for_its_response_at_once_and_renders_nothing_early(stage):
     stage.run(4 * BLOCK_S)
     stage.clock.now_s = stream.due_s - 0.5 * BLOCK_S
     count, woken = len(blocks(delivered)), []
-    stream.attach(wake=lambda: woken.append(True), time_s=stage.clock, turns=stage.thread._turns)
+    stream.attach(wake=lambda: woken.append(True), time_s=stage.clock, turns=stage.thread.turns)
     stream.offer(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)))
     assert woken == [True]
     stage.thread.tick()

@@ -73,6 +73,26 @@ def test_what_fills_a_core_for_a_moment_changes_nothing(demand):
     assert set(core.run(demand)) == {before}
 
 
+def test_a_full_period_among_others_does_not_keep_a_thread_at_the_most():
+    core = Core()
+    core.run(1.5)
+    assert core.at_once.count == MOST
+    for number in range(12):
+        core.at_once.look(0.97 if number % 3 == 0 else 0.5)
+    assert core.at_once.count < MOST
+
+
+def test_a_thread_that_had_no_streams_begins_with_one(stage):
+    stream, _ = stage.open()
+    stage.run(BLOCK_S)
+    stage.thread._at_once.count = MOST
+    stage.engine.close(stream)
+    stage.run(BLOCK_S)
+    stage.open()
+    stage.run(BLOCK_S)
+    assert stage.thread.blocks_at_once == 1
+
+
 def test_a_thread_that_falls_behind_renders_more_at_once_without_waiting_for_a_mean():
     core = Core()
     assert core.run(1.3, periods=5) == [1, 2, 4, 8, 8]

@@ -97,6 +97,20 @@ def test_one_hiccup_that_makes_nothing_late_changes_nothing():
     assert Host([ladder(1, 2)], strain=lambda _: next(strains, Strain())).run(60).steps == []
 
 
+@pytest.mark.parametrize(("lateness", "steps"), [(0.0, {}), (0.6, {"load"})])
+def test_a_full_thread_that_can_make_time_strains_nobody_until_blocks_are_nearly_late(lateness, steps):
+    one = ladder(1, 2)
+    control = LoadControl()
+    moved = [
+        reason
+        for period in range(8)
+        for reason in control.decide(
+            100 + period * PERIOD_S, 0.99, {one: Strain(lateness=lateness)}, can_make_time=True
+        ).values()
+    ]
+    assert set(moved) == set(steps)
+
+
 def test_late_blocks_are_answered_in_the_same_period():
     host = Host([ladder(1, 2)], strain=lambda _: Strain(lateness=1.5)).run(PERIOD_S)
     assert [reason for _, _, reason in host.steps] == ["load"]

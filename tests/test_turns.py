@@ -2,10 +2,12 @@
 
 from collections import Counter
 
+import numpy as np
 import pytest
 
-from server.protocol import AddEmitter, ListenerPose
-from tests.engine_stage import BLOCK_S, Stage
+from server.audio_engine import AudioEngine
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, RemoveEmitter
+from tests.engine_stage import BLOCK_S, Patient, Stage, open_stream
 
 STREAMS = 6
 REQUESTS = 2
@@ -75,15 +77,39 @@ def test_streams_get_as_many_as_each_other(crowd):
 
 
 def test_an_emitter_that_is_not_heard_yet_waits_for_nobody(crowd):
-    newcomer = crowd.streams[-1]
-    waiting = [request for _, request in crowd.asked]
-    crowd.answer(REQUESTS)  # so that it has no request that is unanswered
+    newcomer = next(stream for stream in crowd.streams if not stream.is_unanswered)
     newcomer.offer(AddEmitter(id="b", clip="tone", position=(1.0, 2.5, 1.0)))
-    crowd.stage.run(BLOCK_S)
-    first = [session for session, request in crowd.asked if request.is_first]
-    assert first == [newcomer.session]
-    assert waiting
-    assert len(crowd.asked) <= REQUESTS + 1
+    crowd.stage.thread.tick()
+    assert [session for session, request in crowd.asked if request.is_first] == [newcomer.session]
+    assert len(crowd.asked) == REQUESTS + 1
+
+
+def test_who_wanted_responses_of_an_emitter_that_left_wants_them_no_more(crowd):
+    """Neither does its ladder think that it waits, nor does it use up a turn."""
+    stream = next(stream for stream in crowd.streams if not stream.is_unanswered)
+    assert stream.wants_turn
+    stream.offer(RemoveEmitter(id="a"))
+    crowd.stage.run(2 * BLOCK_S)
+    assert not stream.wants_turn
+    assert stream.awaits_irs_since_s is None
+
+
+def test_threads_with_streams_share_the_workers(field, filters, monkeypatch):
+    monkeypatch.setattr("tests.engine_stage.Patient.threads", 5)
+    engine = AudioEngine(lambda call: call(), Patient(), threads=3)
+    hello = Hello(protocol=PROTOCOL, scene="flat")
+    streams = [
+        open_stream(hello, field, filters, lambda _: np.ones(64, np.float32), lead=8, deliver=lambda _: None)
+        for _ in range(3)
+    ]
+    requests = []
+    for stream in streams:
+        engine.open(stream)
+        requests.append([thread.turns.requests for thread in engine.threads if thread.turns.requests > 1])
+    for stream in streams[1:]:
+        engine.close(stream)
+    assert requests == [[6], [4, 4], [3, 3, 3]]
+    assert engine.threads[0].turns.requests == 6
 
 
 def test_who_leaves_unanswered_takes_no_turn_along(crowd):
@@ -116,7 +142,7 @@ def test_nobody_is_woken_who_could_not_ask(crowd):
     """The thread would tick for every pose of every stream."""
     stream = next(stream for stream in crowd.streams if not stream.is_unanswered)
     woken = []
-    stream.attach(wake=lambda: woken.append(True), time_s=crowd.stage.clock, turns=crowd.stage.thread._turns)
+    stream.attach(wake=lambda: woken.append(True), time_s=crowd.stage.clock, turns=crowd.stage.thread.turns)
     stream.offer(ListenerPose(pose_id=crowd.pose_id + 1, position=(2.0, 2.5, 1.5)))
     assert not woken
     crowd.answer(REQUESTS)
