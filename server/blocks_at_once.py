@@ -10,8 +10,9 @@ from typing import Final
 NUMBERS: Final = (1, 2, 4, 8)
 _MORE_ABOVE = {1: 0.7, 2: 0.84, 4: 0.84}
 """Share of the time that rendering so many at once takes in the mean, above which it is twice as many."""
-_FULL = 0.95
-"""Share of the time in one period from which on a thread falls behind: no time for a mean."""
+_FULL, _BEHIND = 0.95, 0.25
+"""Share of the time in one period, and lateness of a block as a share of what its client has in hand, beyond both of
+which a thread falls behind: no time for a mean."""
 _SAVED = 1 / 7
 """Of the time, by twice as many, at the most: a thread whose time would do for half as many renders half as many."""
 _LOOKS = 3
@@ -28,12 +29,14 @@ class BlocksAtOnce:
         self._busy = 0.0
         self._looks = 0
 
-    def look(self, busy: float) -> None:
-        """Every `server.load.PERIOD_S`, with the share of it in which the thread rendered."""
+    def look(self, busy: float, lateness: float) -> None:
+        """Every `server.load.PERIOD_S`, with the share of it in which the thread rendered, and how late a block was at
+        worst, as a share of what its client has in hand."""
         self._looks += 1
         self._busy += max(1 / self._looks, _NEWEST) * (busy - self._busy)
         has_mean = self._looks >= _LOOKS
-        if self.can_be_more and (busy > _FULL or (has_mean and self._busy > _MORE_ABOVE[self.count])):
+        falls_behind = busy > _FULL and lateness > _BEHIND
+        if self.can_be_more and (falls_behind or (has_mean and self._busy > _MORE_ABOVE[self.count])):
             self._change(2 * self.count)
         elif has_mean and self.count > 1 and self._busy / (1 - _SAVED) < _MORE_ABOVE[self.count // 2]:
             self._change(self.count // 2)

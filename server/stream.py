@@ -209,7 +209,8 @@ class Stream:
         self._check_plan(workers)
         # Who has not been heard yet waits for it; all others only for something better.
         if (wanted := self.session.take_plan_request()) is not None:
-            workers.submit(_plan_timed, wanted, is_urgent=wanted.is_first).add_done_callback(self._keep_plan)
+            plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
+            plan.add_done_callback(self._keep_plan)
         self._ask(workers)
         return outgoing
 
@@ -220,7 +221,9 @@ class Stream:
         if request is not None:
             self._has_asked, self.asked_last_s = True, self._time_s()
             self._turns.note(self)
-            answer = workers.submit(_compute_timed, self._levels, request, self.session, is_urgent=request.is_first)
+            answer = workers.submit(
+                _compute_timed, self._levels, request, self.session, kind="response", is_urgent=request.is_first
+            )
             answer.add_done_callback(partial(self._keep_answer, request))
         if not (self._has_asked or self.wants_turn):
             self._asked_s = None
@@ -306,7 +309,8 @@ class Stream:
         self._next_check_s = clock_s + PERIOD_S
         if (check := self.session.take_check()) is not None:
             self._next_check_s = None
-            workers.submit(check.run, self._levels[check.level]).add_done_callback(self._keep_regret)
+            regret = workers.submit(check.run, self._levels[check.level], kind="plan")
+            regret.add_done_callback(self._keep_regret)
 
     def _keep_regret(self, regret: "Future[Regret]") -> None:
         self._checks.append(regret)  # on the worker's thread; looked at with the next block

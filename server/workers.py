@@ -1,12 +1,15 @@
-"""Threads that compute what audio threads wait for: in the order in which it was asked for, what is urgent first."""
+"""Threads that compute what audio threads wait for: what is urgent first, then one of each kind in turns, each kind in
+the order in which it was asked for. A kind that many ask for keeps no other waiting."""
 
 import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar, get_args
 
 T = TypeVar("T")
+Kind = Literal["response", "plan"]
+"""Impulse responses, and plans of effects with their checks."""
 
 
 class Workers:
@@ -16,7 +19,8 @@ class Workers:
         self.threads = threads
         self._threads = ThreadPoolExecutor(threads, name, initializer)
         self._urgent: deque[Callable[[], None]] = deque()
-        self._usual: deque[Callable[[], None]] = deque()
+        self._usual: dict[Kind, deque[Callable[[], None]]] = {kind: deque() for kind in get_args(Kind)}
+        self._turns = deque(self._usual)
         self._choosing = threading.Lock()
 
     def __enter__(self) -> Self:
@@ -25,8 +29,8 @@ class Workers:
     def __exit__(self, *_: object) -> None:
         self._threads.shutdown()
 
-    def submit(self, work: Callable[..., T], /, *args: Any, is_urgent: bool = False) -> Future[T]:
-        """What `work` returns or raises. What is urgent is done before all that is not."""
+    def submit(self, work: Callable[..., T], /, *args: Any, kind: Kind, is_urgent: bool = False) -> Future[T]:
+        """What `work` returns or raises. Waits for no lock, which a thread of low priority might hold for long."""
         future: Future[T] = Future()
 
         def run() -> None:
@@ -39,11 +43,17 @@ class Workers:
             else:
                 future.set_result(result)
 
-        (self._urgent if is_urgent else self._usual).append(run)
+        (self._urgent if is_urgent else self._usual[kind]).append(run)
         self._threads.submit(self._run_next)
         return future
 
     def _run_next(self) -> None:
         with self._choosing:
-            run = (self._urgent or self._usual).popleft()
+            run = self._urgent.popleft() if self._urgent else self._next_usual()
         run()
+
+    def _next_usual(self) -> Callable[[], None]:
+        kind = next(kind for kind in self._turns if self._usual[kind])
+        self._turns.remove(kind)
+        self._turns.append(kind)
+        return self._usual[kind].popleft()

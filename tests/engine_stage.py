@@ -33,7 +33,7 @@ class Patient:
         self.work = []
         self.urgent = []
 
-    def submit(self, function, /, *arguments, is_urgent=False):
+    def submit(self, function, /, *arguments, kind, is_urgent=False):  # noqa: ARG002  in the order of asking
         future = Future()
         self.work.append((future, function, arguments))
         if is_urgent:

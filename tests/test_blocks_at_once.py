@@ -32,7 +32,7 @@ def open_sounding(stage, **emitter):
 
 
 def render_at_once(monkeypatch, count):
-    monkeypatch.setattr(BlocksAtOnce, "look", lambda self, _busy: setattr(self, "count", count))
+    monkeypatch.setattr(BlocksAtOnce, "look", lambda self, *_: setattr(self, "count", count))
 
 
 @pytest.fixture(params=[2, 4, 8])
@@ -54,7 +54,8 @@ class Core:
         counts = []
         for _ in range(periods):
             counts.append(self.at_once.count)
-            self.at_once.look(min(1.0, demand * (1 - self.saves) ** NUMBERS.index(self.at_once.count)))
+            busy = demand * (1 - self.saves) ** NUMBERS.index(self.at_once.count)
+            self.at_once.look(min(1.0, busy), lateness=busy - 0.7)
         return counts
 
 
@@ -65,11 +66,11 @@ def test_as_many_blocks_are_rendered_at_once_as_the_load_calls_for(demand, count
     assert set(core.run(demand)) == {count}
 
 
-@pytest.mark.parametrize("demand", [0.4, 0.75, 0.9])
+@pytest.mark.parametrize("demand", [0.4, 0.75, 0.85])
 def test_what_fills_a_core_for_a_moment_changes_nothing(demand):
     core = Core()
     before = core.run(demand)[-1]
-    core.at_once.look(0.94)
+    core.at_once.look(1.0, lateness=0.2)
     assert set(core.run(demand)) == {before}
 
 
@@ -78,7 +79,7 @@ def test_a_full_period_among_others_does_not_keep_a_thread_at_the_most():
     core.run(1.5)
     assert core.at_once.count == MOST
     for number in range(12):
-        core.at_once.look(0.97 if number % 3 == 0 else 0.5)
+        core.at_once.look(0.97 if number % 3 == 0 else 0.5, lateness=0.3)
     assert core.at_once.count < MOST
 
 

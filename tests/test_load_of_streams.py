@@ -36,7 +36,7 @@ class Workers:
     def __init__(self, clock):
         self.clock, self.delay_s, self.work, self.asked_at_s = clock, 0.0, [], []
 
-    def submit(self, function, /, *arguments, is_urgent=False):  # noqa: ARG002  all of it comes as late
+    def submit(self, function, /, *arguments, kind, is_urgent=False):  # noqa: ARG002  all of it comes as late
         future = Future()
         self.work.append((self.clock.now_s + self.delay_s, future, function, arguments))
         self.asked_at_s.append(self.clock.now_s)
