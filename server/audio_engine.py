@@ -306,8 +306,8 @@ class AudioThread:
         self._looked_s = now_s
         by_ladder = {stream.ladder: stream for stream in self._streams}
         strains = {ladder: stream.strain(now_s) for ladder, stream in by_ladder.items()}
-        self._at_once.look(busy, max((strain.lateness for strain in strains.values()), default=0.0))
         can_make_time = self._at_once.can_be_more
+        self._at_once.look(busy, max((strain.lateness for strain in strains.values()), default=0.0))
         for ladder, reason in self._load.decide(now_s, busy, strains, can_make_time=can_make_time).items():
             stream = by_ladder[ladder]
             made.setdefault(stream, []).extend(stream.step(reason, now_s))

@@ -91,7 +91,10 @@ class EffectsInForce:
         ):
             return False
         if asked.folds:
-            if not emitter.effects.folds or (emitter.is_outdated and not emitter.effects.holds_still):
+            if asked != emitter.effects:  # it holds the direct sound as it was to be heard
+                emitter.is_outdated = True
+                return False
+            if emitter.is_outdated and not emitter.effects.holds_still:
                 return False
             self._renderer.set_ir(name, ir, token=token)
             self._renderer_hears(name, emitter, is_folded=True)
@@ -126,6 +129,8 @@ class EffectsInForce:
             emitter.is_folded, emitter.unfolded = False, None
         elif emitter.is_folded and (not effects.folds or before != effects):
             self.unfold(name, emitter)
+            if emitter.is_folded:  # in a response that nothing stands for
+                self._outdate(emitter)
         self._renderer_hears(name, emitter, is_folded=emitter.is_folded)
 
     def _outdate(self, emitter: Emitter) -> None:

@@ -49,6 +49,10 @@ class ResponsesInForce:
         self._reason: Reason = "chosen"
         self._accepted_pose_id = 0
         self._in_flight: IrRequest | None = None
+        self._is_partial = False
+        """Whether that is for first IRs only, where others are out of date too."""
+        self._has_changed = False
+        """Whether anything has, since it was made, that may call for another."""
         self._waits_for_change = self._has_looked = False
         self._interval_s = 0.0
         self._next_request_clock = 0
@@ -100,7 +104,9 @@ class ResponsesInForce:
         if pose_id <= self.newest_pose_id:
             raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")
         self.newest_pose_id = pose_id
-        self._waits_for_change = False
+        self._waits_for_change, self._has_changed = False, True
+        if self._levels[self._wanted.level].level.reuse is not None:
+            self._has_looked = False  # what is heard may be its response again
 
     def retry(self) -> None:
         """Look again at what to ask for: somebody has come, or is decided about."""
@@ -109,6 +115,7 @@ class ResponsesInForce:
     def _look_again(self) -> None:
         """Something has changed that may call for an IR."""
         self._waits_for_change = self._has_looked = False
+        self._has_changed = True
 
     def enforce_plan(self) -> list[ServerMessage]:
         """Put the plan of effects into effect, with the block that follows."""
@@ -119,7 +126,8 @@ class ResponsesInForce:
 
     def take_request(self, listener: Pose, *, only_first: bool = False) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
-        `only_first` ones may be asked for and none is the first of an emitter."""
+        `only_first` ones may be asked for and none is the first of an emitter. Where it is not time for others, first
+        ones are asked for alone."""
         if self._in_flight is not None or self._waits_for_change:
             return None
         clock = self._renderer.sample_clock
@@ -133,12 +141,17 @@ class ResponsesInForce:
             # Room for other ears comes by itself; whatever else calls for an IR is told.
             self._waits_for_change = not self._effects.wants_other_ears
             return None
-        is_first = any(emitter.token is None for emitter in outdated)
-        if is_held and not is_first:
+        newcomers = [emitter for emitter in outdated if emitter.token is None]
+        if is_held and not newcomers:
             self._has_looked = True
             return None
-        self._has_looked = False
-        self._next_request_clock = clock + round(self._interval_s * self._sample_rate)
+        self._has_looked = self._has_changed = False
+        is_of_a_kind = self._wanted.level == self.heard.level and not self._effects.awaits_ears
+        self._is_partial = is_held and is_of_a_kind and len(newcomers) < len(outdated)
+        if self._is_partial:
+            outdated = newcomers
+        else:
+            self._next_request_clock = clock + round(self._interval_s * self._sample_rate)
         asked = {emitter.serial: as_asked(emitter) for emitter in outdated}
         for emitter in outdated:
             emitter.is_outdated = False
@@ -158,7 +171,7 @@ class ResponsesInForce:
             ),
             self._direct_sound,
             self._effects.channels,
-            is_first,
+            is_first=bool(newcomers),
         )
         return self._in_flight
 
@@ -181,15 +194,17 @@ class ResponsesInForce:
             if self._effects.hear(identifier, emitter, ir, snapshot.effects, pose_id):
                 emitter.identity = snapshot.identity
                 events += self._announce([identifier])
-        self._accepted_pose_id = pose_id
+        if not self._is_partial:
+            self._accepted_pose_id = pose_id
         if response.request.level == self._wanted.level:
             events += self.change_rung()
         return events
 
     def give_up(self, request: IrRequest) -> list[ServerMessage]:
-        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
+        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes, or
+        at once where one has since."""
         self._in_flight = None
-        self._waits_for_change = True
+        self._waits_for_change = not self._has_changed
         failed = {emitter.serial for emitter in request.emitters}
         for emitter in self._emitters.values():
             emitter.is_outdated |= emitter.serial in failed

@@ -8,14 +8,13 @@ scope, and does without where another server runs it.
 """
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import InvalidState
 from websockets.http11 import Request
-from websockets.protocol import OPEN
+from websockets.protocol import CONNECTING, OPEN
 
 from server.web_socket_frames import FrameCutter, header
 
@@ -105,8 +104,11 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
 
     def send_receive_event_to_app(self) -> None:
         """uvicorn stops reading with every message, until the application has taken it in."""
-        with suppress(InvalidState):  # of text that is none, where the client closes in the same breath
+        try:
             super().send_receive_event_to_app()
+        except InvalidState:  # text that is none, before the connection is open or once the client closes it
+            if self.conn.state is CONNECTING:
+                self.transport.close()
         if self.read_paused and self.queue.qsize() < _MOST_WAITING:
             self.read_paused = False
             self.transport.resume_reading()

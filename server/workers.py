@@ -30,7 +30,8 @@ class Workers:
         self._threads.shutdown()
 
     def submit(self, work: Callable[..., T], /, *args: Any, kind: Kind, is_urgent: bool = False) -> Future[T]:
-        """What `work` returns or raises. Waits for no lock, which a thread of low priority might hold for long."""
+        """What `work` returns or raises. Waits for no thread that chooses what comes next: one of low priority may take
+        long for that."""
         future: Future[T] = Future()
 
         def run() -> None:

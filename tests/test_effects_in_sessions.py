@@ -176,6 +176,18 @@ def test_what_stands_still_is_part_of_the_response_and_follows_at_once_when_it_m
     assert level_db(before) - level_db(heard[False]) < -120
 
 
+def test_a_switch_is_heard_of_direct_sound_that_is_held_in_a_response(open_stage):
+    """Nothing moves, and nothing else would have it computed anew."""
+    stage = open_stage(effects={"propagation_delay": False})
+    stage.add()
+    stage.hear(1.0)
+    assert stage.is_folded == [True]
+    before_db = level_db(stage.hear(0.5))
+    stage.tell(SetEffects(effects={"distance_attenuation": False, "propagation_delay": False}))
+    stage.hear(1.5)
+    assert level_db(stage.hear(0.5)) > before_db + 3
+
+
 def test_a_pose_that_is_sent_again_moves_nothing(open_stage):
     stage = open_stage()
     stage.add()

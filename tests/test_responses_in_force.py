@@ -135,6 +135,36 @@ def test_after_a_failure_whoever_comes_is_asked_for_with_everything_outstanding(
     assert len(session.take_request().emitters) == 2
 
 
+def test_what_changes_while_a_request_fails_is_asked_for_at_once(session):
+    add(session, "a")
+    failing = session.take_request()
+    add(session, "b")
+    session.receive(ListenerPose(pose_id=1, position=HERE))
+    session.give_up(failing)
+    again = session.take_request()
+    assert (again.pose_id, len(again.emitters)) == (1, 2)
+    session.give_up(again)
+    assert session.take_request() is None, "nothing has changed since: no failure after the other"
+
+
+def test_a_newcomer_is_asked_for_alone_where_it_is_not_time_for_others(session, field):
+    """Who waits to be heard waits for nobody else's response; nor does a client hear of a pose that is not heard."""
+    add(session, "a")
+    answer(session, field)
+    session.render_block()
+    session.receive(ListenerPose(pose_id=1, position=HERE))
+    add(session, "b")
+    request = session.take_request(only_first=True)
+    assert [emitter.serial for emitter in request.emitters] == [1]
+    assert request.is_first
+    session.accept(compute_irs(Levels([field]), request, session.renderer))
+    assert poses(session.render_block()) == (1, 0)
+    assert session.take_request(only_first=True) is None
+    assert session.wants_irs
+    assert [emitter.serial for emitter in session.take_request().emitters] == [0]
+    assert not session.wants_irs
+
+
 def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
     shape = 1, 2, field.ir_samples
     field.impulse_responses = lambda *_, **__: np.full(shape, np.nan, np.float32)
