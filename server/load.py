@@ -30,7 +30,7 @@ Reason = Literal["chosen", "load", "recovered"]
 _RATES_HZ = (12.0, 5.0)
 _LEAST_RATE_HZ = 2.0
 _FULL = 0.85
-"""Share of the time in which an audio thread renders, from which on it has none to spare."""
+"""Share of the time in which an audio thread renders, from which on it has none to spare, unless it can make some."""
 _FREE = 0.6
 _SHARED = 0.75
 """Share of a core that rendering and impulse responses may take together: the event loop, plans and checks need the

@@ -204,7 +204,9 @@ class ResponsesInForce:
         """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes, or
         at once where one has since."""
         self._in_flight = None
-        self._waits_for_change = not self._has_changed
+        # Others than the newcomers that it was for are still to be asked for, in their turn.
+        self._has_looked |= self._is_partial and not self._has_changed
+        self._waits_for_change = not (self._has_changed or self._is_partial)
         failed = {emitter.serial for emitter in request.emitters}
         for emitter in self._emitters.values():
             emitter.is_outdated |= emitter.serial in failed

@@ -165,6 +165,18 @@ def test_a_newcomer_is_asked_for_alone_where_it_is_not_time_for_others(session, 
     assert not session.wants_irs
 
 
+def test_where_a_newcomers_request_fails_others_still_get_theirs(session, field):
+    add(session, "a")
+    answer(session, field)
+    session.render_block()
+    session.receive(ListenerPose(pose_id=1, position=HERE))
+    add(session, "b")
+    session.give_up(session.take_request(only_first=True))
+    assert session.take_request(only_first=True) is None, "no failure after the other"
+    assert session.wants_irs
+    assert len(session.take_request().emitters) == 2
+
+
 def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
     shape = 1, 2, field.ir_samples
     field.impulse_responses = lambda *_, **__: np.full(shape, np.nan, np.float32)
