@@ -77,7 +77,13 @@ class ResponsesInForce:
             self._look_again()
             self._next_request_clock = 0
         self._wanted, self._reason = rung, reason
-        return self.change_rung() if rung.level == self.heard.level or not self._emitters else []
+        return self.change_rung() if rung.level == self.heard.level else self.change_rung_unheard()
+
+    def change_rung_unheard(self) -> list[ServerMessage]:
+        """Stand on the rung that was asked for last where no emitter has, or is to have, an IR that tells levels
+        apart."""
+        has_irs = any(not emitter.is_decided or emitter.effects.has_response for emitter in self._emitters.values())
+        return [] if has_irs else self.change_rung()
 
     def change_rung(self) -> list[ServerMessage]:
         """Stand on the rung that was asked for last, with the block that follows."""
@@ -122,7 +128,7 @@ class ResponsesInForce:
         events = self._announce(self._effects.enforce(self._emitters))
         self._effects.share_tail(self.heard.shared_tail, self._emitters)
         self._look_again()
-        return events
+        return events + self.change_rung_unheard()
 
     def take_request(self, listener: Pose, *, only_first: bool = False) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where

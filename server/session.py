@@ -379,7 +379,7 @@ class Session:
             self._effects.planned.forget_emitter(message.id)
         self.renderer.remove_emitter(message.id)
         self._responses.retry()
-        return [EmitterRemoved(id=message.id), *([] if self._emitters else self._responses.change_rung())]
+        return [EmitterRemoved(id=message.id), *self._responses.change_rung_unheard()]
 
     def _require_emitter(self, identifier: str) -> Emitter:
         if identifier not in self._emitters:

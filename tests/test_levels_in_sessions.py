@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from server.field.levels import Levels
 from server.ir_request import compute_irs
 from server.load import Rung
-from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, RemoveEmitter
+from server.places import place_of_field
+from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, RemoveEmitter, SetEffects
 from server.replies import EmitterAdded, LevelChanged
 from server.scene.manifest import QualityLevel
 from server.session import Session
@@ -128,6 +129,21 @@ def test_without_emitters_there_is_nothing_to_wait_for(open_session):
     assert session.take_request().level == "fast"
     session.hear(GOOD, "chosen")
     assert changes(session.receive(RemoveEmitter(id="talker"))) == [("good", "chosen")]
+
+
+def test_where_nothing_has_a_response_there_is_nothing_to_wait_for(levels, filters, field):
+    off = {"early_reflections": False, "late_reverberation": False}
+    hello = Hello(protocol=PROTOCOL, scene="flat", effects=off)
+    session = Session(hello, levels, filters, lambda _: CLIP, rung=GOOD, window=10_000, place=place_of_field(field))
+    add(session)
+    assert changes(session.hear(FAST, "chosen")) == []  # nobody knows yet whether it will have one
+    assert changes(session.adopt(session.take_plan_request().plan())) == [("fast", "chosen")]
+    assert changes(session.hear(GOOD, "chosen")) == [("good", "chosen")]
+    assert session.take_request() is None
+    session.receive(SetEffects(effects=dict.fromkeys(off)))
+    session.adopt(session.take_plan_request().plan())
+    assert changes(session.hear(FAST, "chosen")) == []
+    assert changes(answer(session, levels)) == [("fast", "chosen")]
 
 
 def test_an_answer_of_a_level_nobody_wants_any_more_is_not_heard(open_session, levels):

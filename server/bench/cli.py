@@ -1,6 +1,7 @@
 """`nafir bench`: what things cost on this host. Medians of several rounds; run it on an idle machine."""
 
 import asyncio
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -47,7 +48,7 @@ def convolver(
 ) -> None:
     """The convolver beside pedalboard and SciPy: speed, exactness, evenness, exchanges, drift, start.
 
-    Six minutes, or one with --quick. Without pedalboard (extra `dev`) its columns stay empty.
+    Two to six minutes, or one at most with --quick. Without pedalboard (extra `dev`) its columns stay empty.
     """
     from server.bench.convolver import FULL, QUICK, measure_convolver
 
@@ -74,14 +75,16 @@ def stream(
     poses_per_second: Annotated[float, typer.Option(min=0, help="Of each listener; 0 to stand still.")] = 30.0,
     as_json: AsJson = False,
 ) -> None:
-    """How many sessions one core serves, with fewer than one block in a thousand late."""
+    """How many sessions one core serves, with fewer than one block in a thousand late.
+
+    A search takes about five minutes for each number of emitters, a number of sessions one and a half. Every step is
+    told as it ends; what Ctrl-C interrupts, prints what it has.
+    """
     from server.bench.sessions import Plan, measure_sessions
 
     counts = tuple(emitters) if emitters else Plan.emitters
-    with _progress(total=None) as advance:
-        measured = measure_sessions(
-            Plan(emitters=counts, sessions=sessions, duration_s=duration_s, poses_per_s=poses_per_second), advance
-        )
+    plan = Plan(emitters=counts, sessions=sessions, duration_s=duration_s, poses_per_s=poses_per_second)
+    measured = measure_sessions(plan, _steps_told())
     if as_json:
         print_json(measured)
     else:
@@ -128,8 +131,14 @@ def listen(
     _report(as_json, f"One stream of {url}", measured)
 
 
+def _steps_told() -> Callable[[str], None]:
+    """A line for each step, where nobody knows how many there will be."""
+    console, began_s = Console(stderr=True), time.monotonic()
+    return lambda step: console.print(f"{time.monotonic() - began_s:6.0f} s  {step}", highlight=False)
+
+
 @contextmanager
-def _progress(total: int | None) -> Iterator[Callable[[str], None]]:
+def _progress(total: int) -> Iterator[Callable[[str], None]]:
     """Redrawn between measurements only: a thread that redraws would be measured too."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
@@ -170,7 +179,9 @@ def _print_convolver(measured: dict[str, Any]) -> None:
 def _print_sessions(measured: dict[str, Any]) -> None:
     for case in measured["cases"]:
         rows = {name: value for name, value in case.items() if name not in {"emitters", "trials"}}
-        print_measures(f"{case['emitters']} emitters", rows)
+        again = {name: rows.pop(name) for name in case if name.startswith("with_")}
+        for name, measures in {"": rows, **again}.items():
+            print_measures(f"{case['emitters']} emitters {name}".replace("_", " "), measures)
     print_rows("Goals", measured["summary"])
 
 

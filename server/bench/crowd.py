@@ -30,7 +30,7 @@ _TURN_S = 12.0
 _PLACES = (0.5, 0.5, 0.5), (7.5, 2.5, 2.3)
 _GOLDEN = 0.618
 """Of a period, from one walker's poses to the next one's: any number of them is spread evenly."""
-_PATIENCE_S = 20.0
+_PATIENCE_S = 10.0
 _SEQUENCE = struct.Struct("<4xI")
 _TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
 _WHOLE, _MASKED = 0x80, 0x80
@@ -129,6 +129,11 @@ class Walker(asyncio.Protocol):
         if not self._is_closing:
             self._fail(f"the connection was lost: {exc}")
 
+    @property
+    def is_content(self) -> bool:
+        """Hears all its emitters."""
+        return self._silent == 0 and not self.is_lost
+
     def begin(self) -> None:
         """Count and time anew."""
         self.poses.times = DurationHistogram()
@@ -206,7 +211,7 @@ class Crowd:
 
     async def resize(self, count: int) -> None:
         """Have `count` walkers hear all their emitters. Raises ConnectionError and TimeoutError where that fails."""
-        kept = [walker for walker in self.walkers if not walker.is_lost][:count]
+        kept = [walker for walker in self.walkers if walker.is_content][:count]
         for walker in self.walkers:
             if walker not in kept:
                 walker.close()

@@ -150,10 +150,12 @@ def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_on
         stream.session.blocks_dropped += 3
         stream.blocks_late += 2
         clock.now_s += 1.0  # a hundred blocks were due
-        return await ask(gauge, "/bench/report")
+        return await ask(gauge, "/bench/blocks"), await ask(gauge, "/bench/report")
 
-    report = asyncio.run(scenario())
+    blocks, report = asyncio.run(scenario())
     counts = {name: report[f"blocks_{name}"] for name in ("sent", "late", "dropped", "missing")}
     assert counts == {"sent": 90, "late": 2, "dropped": 3, "missing": 6}
+    assert blocks == {name: report[name] for name in blocks}
+    assert len(blocks) == 6
     assert report["block_ms"]["p50"] == pytest.approx(2, rel=0.03)
     assert report["lateness_ms"]["p50"] is None
