@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from server.scene.effects import CATALOGUE, OF_DIRECT_SOUND, OF_RESPONSES, EffectName, Overrides
 from server.scene.listening import SHARED, without_delay
 from server.scene.plan import Decision, Plan
-from server.scene.prediction import UNCHANGED, Change, Floats, Off, Prediction, worst
+from server.scene.prediction import UNCHANGED, Change, Off, Prediction, worst
 from server.scene.reasons import reason
 from server.scene.situation import Emitter, Situation
 
@@ -69,17 +69,17 @@ class _Planner:
         self._overrides = overrides
         self._costs = costs
         self._prediction = Prediction(situation) if situation.emitters else None
-        self._without: dict[Off, dict[str, Floats]] = {}
+        self._without: dict[Off, list[Change]] = {}
         """Changes of all emitters without several effects at once: most emitters are without the same."""
 
     def plan(self) -> Plan:
         if self._prediction is None:
             return Plan({}, {})
         asked = [name for name in _OF_ENERGY if self._may_change(name)]
-        changes = self._prediction.changes([frozenset({name}) for name in asked])
+        changes = worst(self._prediction.changes([frozenset({name}) for name in asked]))
         by_emitter = {}
         for number, emitter in enumerate(self._situation.emitters):
-            alone = {name: worst(changes, variant, number) for variant, name in enumerate(asked)}
+            alone = {name: of_all[number] for name, of_all in zip(asked, changes, strict=True)}
             alone[EffectName.PROPAGATION_DELAY] = without_delay(self._prediction, number)
             by_emitter[emitter] = self._of_emitter(emitter, number, alone)
         shared = {}
@@ -129,8 +129,8 @@ class _Planner:
                 return
             without = frozenset(off)
             if without not in self._without:
-                self._without[without] = self._prediction.changes([without])
-            together = worst(self._without[without], 0, number)
+                (self._without[without],) = worst(self._prediction.changes([without]))
+            together = self._without[without][number]
             if together.jnd < ENTER_JND:
                 return
             largest = max(candidates, key=lambda name: decisions[name].change_jnd)

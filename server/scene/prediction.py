@@ -178,8 +178,7 @@ class Prediction:
         """(v, e) change of each parameter in each variant, in JND, the worst within reach."""
         left = self.energies(variants)
         without = self._parameters(left)
-        spectrum_db = np.maximum(self._spectral_change_db(left, 1.0), self._spectral_change_db(left, self._facing_gain))
-        changes = {"spectrum": self.reach.most(spectrum_db) / HEARD["spectrum"].amount}
+        changes = {"spectrum": self.reach.most(self._spectral_change_db(left)) / HEARD["spectrum"].amount}
         for name, heard in self._heard.items():
             if name == "edt":
                 # A decay that cannot be told, with or without, changes nothing: energies tell the rest.
@@ -215,27 +214,31 @@ class Prediction:
             "edt": self._decays.early_decay_s(energies),
         }
 
-    def _spectral_change_db(self, left: Energies, gain: float) -> Floats:
-        """(v, n) in the band where it is greatest, at an ear that hears the direct sound by `gain` louder than what
-        comes from everywhere.
+    def _spectral_change_db(self, left: Energies) -> Floats:
+        """(v, n) in the band where it is greatest, at an ear that hears the direct sound as it comes, or at one that
+        faces it and hears it louder than what comes from everywhere.
 
         What a field holds is noise: in a third of an octave it is more or less in phase with the rest by chance, and
         the more so the fewer modes there are, of which a decay has as many as its bandwidth times its duration.
         """
         owner, whole = self.reach.owner, self.whole
+        mirrored, held = whole.mirrored, whole.held
+        mirrored_change = np.abs(np.sqrt(mirrored) - np.sqrt(left.mirrored))[:, owner]
+        held_root = np.sqrt(held)[:, owner]
+        held_change = np.abs(np.sqrt(held) - np.sqrt(left.held))[:, owner]
+        after, other_after = (energies.held + energies.mirrored for energies in (whole, left))
+        after, other_after = (energy[:, owner] + _SILENCE for energy in (after, other_after))
+        mirrored, chance = mirrored[:, owner], 2 * self._chance[owner]
 
-        def parts(energies: Energies) -> tuple[Floats, Floats, Floats]:
-            return energies.direct * gain, energies.mirrored[:, owner], energies.held[:, owner]
+        def change(gain: float) -> Floats:
+            direct, other_direct = whole.direct * gain, left.direct * gain
+            amplitude = np.abs(np.sqrt(direct) - np.sqrt(other_direct)) + mirrored_change
+            by_chance = amplitude * held_root + held_change * np.sqrt(direct + mirrored)
+            before, without = direct + after, other_direct + other_after
+            most = np.abs(before - without) + by_chance * chance
+            return np.asarray((most / np.minimum(before, without)).max(axis=-1))
 
-        direct, mirrored, held = parts(whole)
-        other_direct, other_mirrored, other_held = parts(left)
-        amplitude = np.abs(np.sqrt(direct) - np.sqrt(other_direct)) + np.abs(
-            np.sqrt(mirrored) - np.sqrt(other_mirrored)
-        )
-        by_chance = amplitude * np.sqrt(held) + np.abs(np.sqrt(held) - np.sqrt(other_held)) * np.sqrt(direct + mirrored)
-        before, after = direct + mirrored + held + _SILENCE, other_direct + other_mirrored + other_held + _SILENCE
-        most = np.abs(before - after) + 2 * by_chance * self._chance[owner]
-        return np.asarray(power_to_db(1 + most / np.minimum(before, after)).max(axis=-1))
+        return power_to_db(1 + np.maximum(change(1.0), change(self._facing_gain)))
 
     @cached_property
     def _chance(self) -> Floats:
@@ -339,6 +342,11 @@ class _Decays:
         return np.where(told, -60 / np.where(told, slope, -1.0), 0.0)
 
 
-def worst(changes: Mapping[str, Floats], variant: int, emitter: int) -> Change:
-    name = max(changes, key=lambda parameter: float(changes[parameter][variant, emitter]))
-    return Change(float(changes[name][variant, emitter]), name)
+def worst(changes: Mapping[str, Floats]) -> list[list[Change]]:
+    """Of all parameters, [variant][emitter]; `changes` are (v, e) of each."""
+    parameters, all_changes = list(changes), np.stack(list(changes.values()))
+    most, which = all_changes.max(axis=0).tolist(), all_changes.argmax(axis=0).tolist()
+    return [
+        [Change(jnd, parameters[number]) for jnd, number in zip(*row, strict=True)]
+        for row in zip(most, which, strict=True)
+    ]
