@@ -74,6 +74,16 @@ def test_the_most_is_confirmed_by_a_long_run_and_the_goal_measured_besides(long,
     )
 
 
+@pytest.mark.parametrize(("late_share", "most"), [(0.3, 50), (0.9, 7)])
+def test_a_step_that_fails_once_decides_nothing_unless_it_is_hopeless(late_share, most):
+    class DisturbedOnce(Trials):
+        async def run(self, sessions, duration_s, *, until_failed=False):
+            measured = await super().run(sessions, duration_s, until_failed=until_failed)
+            return {**measured, "late_share": late_share} if len(self.ran) == 1 else measured
+
+    assert asyncio.run(bench._measure_case(Plan(), DisturbedOnce(50, 50)))["sessions"] == most
+
+
 def test_a_run_ends_once_it_has_failed(monkeypatch):
     """Of ten sessions a thousandth of 75,000 blocks may be late in 40 s; here every look finds 40 more."""
     asked, late = [], iter(range(40, 1_000, 40))
