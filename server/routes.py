@@ -24,15 +24,14 @@ from server.impulse_response import (
     parse_format,
     parse_position,
 )
-from server.loudness import loudness_map
+from server.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
 from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
 from server.streaming import Connection, StreamHost
 from server.telemetry import ServerCollector, exposition
 from server.web_socket import direct_way
 from server.whole_field import WholeField
 
-MAX_MAP_POINTS = 2_000
-"""A point costs milliseconds."""
+MAX_MAP_SPACING_M = 20.0
 MAX_MAP_S = 120.0
 MAX_PLANNED = 16
 CACHE_CONTROL = "public, max-age=3600"
@@ -121,7 +120,10 @@ async def loudness(
     scene: str,
     emitter: PositionText,
     height_m: Annotated[FiniteFloat, Query(description="of the listener's ears")] = 1.5,
-    spacing_m: Annotated[FiniteFloat, Query(ge=0.1, le=2, description="between map points")] = 0.25,
+    spacing_m: Annotated[
+        FiniteFloat | None,
+        Query(ge=FINEST_M, le=MAX_MAP_SPACING_M, description="between map points; by default as the scene's size asks"),
+    ] = None,
     level: LevelText = None,
     format: Annotated[str, Query(description="png or json")] = "png",  # noqa: A002  the parameter's name
 ) -> Response:
@@ -135,9 +137,10 @@ async def loudness(
     if not bounds.minimum[2] <= height_m <= bounds.maximum[2]:
         raise RequestError("position_out_of_bounds", f"height_m {height_m:g} is outside the scene", field="height_m")
 
+    spacing_m = usual_spacing_m(field.bundle) if spacing_m is None else spacing_m
     points = field.bundle.floor_plan.area_m2 / spacing_m**2
-    if points > MAX_MAP_POINTS:
-        raise RequestError("map_too_fine", f"more than {MAX_MAP_POINTS} points: widen spacing_m", field="spacing_m")
+    if points > MAX_POINTS:
+        raise RequestError("map_too_fine", f"more than {MAX_POINTS} points: widen spacing_m", field="spacing_m")
     offer = _host(request).offers.get(scene)
     if offer and points * offer.ms_here[field.level.name] > 1000 * MAX_MAP_S:
         problem = (
