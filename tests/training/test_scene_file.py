@@ -23,7 +23,7 @@ def changed(tiny_scene, tmp_path, old: str, new: str):
         ("rays = 500", "rays = 5", "simulation.rays"),
         ("duration_s = 0.25", "duration_s = inf", "simulation.duration_s"),
         ("absorption = [0.3,", "absorption = [1.3,", "geometry.materials.walls.absorption.0"),
-        ("[4.0, 0.0], [4.0, 3.0], [0.0, 3.0]", "[0.0, 3.0], [4.0, 3.0], [4.0, 0.0]", "geometry: "),
+        ("[4.0, 0.0], [4.0, 3.0], [0.0, 3.0]", "[0.0, 3.0], [4.0, 3.0], [4.0, 0.0]", "geometry.corners"),
         ("heights_m = [1.2, 1.8]", "heights_m = [1.8, 1.2]", "probes.heights_m"),
         ("heights_m = [1.2, 1.8]", "heights_m = [1.2, 2.8]", "probes.heights_m"),
         ("listener = [1.0,", "listener = [-1.0,", "start.listener"),
