@@ -11,6 +11,8 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 from onnxruntime import InferenceSession, SessionOptions
 from onnxruntime.capi import onnxruntime_pybind11_state as _state
 
+from server.field.external_data import refers_to_other_files
+
 __all__ = ["SESSION_ERRORS", "InferenceSession", "open_session"]
 
 SESSION_ERRORS: tuple[type[Exception], ...] = (
@@ -28,7 +30,10 @@ _ERRORS_ONLY = 3
 
 
 def open_session(model: bytes, *, threads: int = 1) -> InferenceSession:
-    """A session for the bytes of an ONNX file. Raises ValueError for bytes that are no usable graph."""
+    """A session for the bytes of an ONNX file. Raises ValueError for bytes that are no usable graph, or not all of
+    one."""
+    if refers_to_other_files(model):
+        raise ValueError("it keeps weights in other files; save it with all of them inside")
     # Not session.set_denormal_as_zero: it reaches the runtime's own threads, and a session of one thread has none.
     options = SessionOptions()
     options.intra_op_num_threads = threads

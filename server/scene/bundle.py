@@ -8,24 +8,35 @@ that exists as an object was read and checked whole.
 import hashlib
 import io
 import json
+import stat
 import zipfile
 import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
 from server.acoustics.geometry import FloorPlan, Vector3
+from server.core.npy import MOST_HEADER_BYTES, NpyError, NpyHeader
 from server.errors import BundleError, RequestError
 from server.scene.manifest import ARRAYS_FILE, Manifest
 
 MANIFEST_FILE = "scene.json"
 BUNDLED = Path(__file__).parent / "bundles"
 
-# What `zipfile` and NumPy raise between them for bytes that are no archive, or archives that hold no array.
+MOST_MANIFEST_BYTES = 4 * 2**20
+"""The bundled apartment, with its whole frontier, takes 31 kB."""
+MOST_FILE_BYTES = 2**31 - 1
+"""What an ONNX file may have: protobuf knows no larger message. All listed files together may have as much."""
+_CHUNK_BYTES = 2**20
+_NOISE_MEMBER = "frozen_noise.npy"
+_WIDEST_SAMPLE_BYTES = 8
+_ARCHIVE_OVERHEAD_BYTES = 2**16
+# What `zipfile` raises for bytes that are no archive, or a damaged one; NotImplementedError is a RuntimeError.
 _ARCHIVE_ERRORS = (OSError, EOFError, KeyError, ValueError, RuntimeError, zlib.error, zipfile.BadZipFile)
 
 
@@ -44,20 +55,14 @@ class Bundle:
     def load(cls, folder: Path) -> "Bundle":
         """Raises BundleError naming file and field for anything missing, damaged or out of bounds."""
         path = folder / MANIFEST_FILE
-        text = _read(path)
+        text = _read(folder, MANIFEST_FILE, MOST_MANIFEST_BYTES)
         try:
             manifest = Manifest.model_validate_json(text)
         except ValidationError as exc:
             first = exc.errors()[0]
             field = ".".join(str(part) for part in first["loc"]) or "document"
             raise BundleError(path, field, first["msg"]) from exc
-        contents = {}
-        for name, expected in manifest.files.items():
-            contents[name] = _read(folder / name)
-            if hashlib.sha256(contents[name]).hexdigest() != expected:
-                raise BundleError(
-                    folder / name, "sha256", f"differs from the one in {MANIFEST_FILE}; the file is damaged"
-                )
+        contents = _read_listed(folder, manifest)
         noise = np.zeros((2, 0), np.float32)
         if manifest.fields:
             noise = _frozen_noise(folder / ARRAYS_FILE, contents[ARRAYS_FILE], manifest.codec.samples)
@@ -99,8 +104,11 @@ def write_bundle(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> B
 def find_bundle(scene: str) -> Path:
     """The folder of a bundled scene by id, or of any scene by path. Raises RequestError `unknown_scene`."""
     for folder in (BUNDLED / scene, Path(scene)):
-        if (folder / MANIFEST_FILE).is_file():
-            return folder
+        try:
+            if (folder / MANIFEST_FILE).is_file():
+                return folder
+        except (OSError, ValueError):  # no name that a file could have
+            continue
     known = ", ".join(folder.name for folder in bundled_scenes())
     raise RequestError(
         "unknown_scene", f"{scene!r} is neither a bundled scene ({known}) nor a scene folder", field="scene", status=404
@@ -112,23 +120,102 @@ def bundled_scenes() -> list[Path]:
     return sorted(path.parent for path in BUNDLED.glob(f"*/{MANIFEST_FILE}"))
 
 
-def _read(path: Path) -> bytes:
+def _read_listed(folder: Path, manifest: Manifest) -> dict[str, bytes]:
+    """The files that the manifest lists, by name. No more is read of any than it may have, nor kept of one that is
+    not the one that was hashed."""
+    contents = {}
+    left = MOST_FILE_BYTES
+    for name, expected in manifest.files.items():
+        most = left
+        if name == ARRAYS_FILE and manifest.fields:
+            most = min(left, _noise_bytes(manifest.codec.samples) + _ARCHIVE_OVERHEAD_BYTES)
+        contents[name] = _read(folder, name, most, sha256=expected)
+        left -= len(contents[name])
+    return contents
+
+
+def _noise_bytes(samples: int) -> int:
+    return MOST_HEADER_BYTES + 2 * samples * _WIDEST_SAMPLE_BYTES
+
+
+def _read(folder: Path, name: str, most_bytes: int, *, sha256: str | None = None) -> bytes:
+    """The file `name` of a bundle. Raises BundleError for one that is missing, no regular file, outside the folder,
+    longer than `most_bytes`, or of another hash; nothing is kept before that is known."""
+    path = folder / name
     try:
-        return path.read_bytes()
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise BundleError(path, "file", f"is a link to {path.resolve()}, outside of the bundle; copy the file here")
+        # Before opening, which would wait for whoever writes to a pipe.
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise BundleError(path, "file", "cannot be read: not a regular file")
+        if status.st_size > most_bytes:
+            raise BundleError(path, "size", f"is {status.st_size} bytes, and at most {most_bytes} are allowed here")
+        with path.open("rb") as stream:
+            if sha256 is not None and _hash_of(stream, most_bytes) != sha256:
+                raise BundleError(path, "sha256", f"differs from the one in {MANIFEST_FILE}; the file is damaged")
+            stream.seek(0)
+            return stream.read(status.st_size)
     except OSError as exc:
         raise BundleError(path, "file", f"cannot be read: {exc.strerror}") from exc
+    except RuntimeError as exc:  # links that lead round in a circle
+        raise BundleError(path, "file", f"cannot be read: {exc}") from exc
+
+
+def _hash_of(stream: IO[bytes], most_bytes: int) -> str:
+    digest = hashlib.sha256()
+    for _ in range(most_bytes // _CHUNK_BYTES + 1):
+        chunk = stream.read(_CHUNK_BYTES)
+        if not chunk:
+            break
+        digest.update(chunk)
+    return digest.hexdigest()
 
 
 def _frozen_noise(path: Path, data: bytes, samples: int) -> npt.NDArray[np.float32]:
+    """(2, samples) of the archive. What its directory and the array's header claim is compared with what the manifest
+    expects before any of it is unpacked."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open("frozen_noise.npy") as member:
-            noise = np.lib.format.read_array(member, allow_pickle=False)
-    except _ARCHIVE_ERRORS as exc:
+        with (
+            zipfile.ZipFile(io.BytesIO(data)) as archive,
+            archive.open(_noise_member(path, archive, samples)) as member,
+        ):
+            header = NpyHeader.read(member)
+            _require_noise(path, header, samples)
+            # One byte more, so that `zipfile` sees the end, and compares its checksum.
+            stored = header.array(member.read(header.data_bytes + 1))
+    except (NpyError, *_ARCHIVE_ERRORS) as exc:
         raise BundleError(path, "frozen_noise", f"cannot be read: {exc}") from exc
-    if not np.issubdtype(noise.dtype, np.floating):
-        raise BundleError(path, "frozen_noise", f"holds {noise.dtype}, expected floating point")
-    if noise.shape != (2, samples):
-        raise BundleError(path, "frozen_noise", f"has shape {noise.shape}, expected {(2, samples)}")
+    with np.errstate(over="ignore"):  # seen below
+        noise = stored.astype(np.float32)
     if not np.isfinite(noise).all():
         raise BundleError(path, "frozen_noise", "holds non-finite samples")
-    return noise.astype(np.float32, copy=False)
+    return noise
+
+
+def _noise_member(path: Path, archive: zipfile.ZipFile, samples: int) -> zipfile.ZipInfo:
+    """The one member of the archive. Raises BundleError for another, for two, and for one that unpacks to more than the
+    manifest allows."""
+    members = archive.infolist()
+    names = [member.filename for member in members]
+    if _NOISE_MEMBER not in names:
+        raise BundleError(path, "frozen_noise", "cannot be read: there is no such array in the archive")
+    if len(names) > 1:
+        others = [name for name in names if name != _NOISE_MEMBER]
+        problem = f"there are others beside it, {others[0]!r} for one" if others else "it is there twice"
+        raise BundleError(path, "frozen_noise", problem)
+    if members[0].file_size > _noise_bytes(samples):
+        raise BundleError(
+            path,
+            "frozen_noise",
+            f"unpacks to {members[0].file_size} bytes, and {samples} samples by the manifest need at most "
+            f"{_noise_bytes(samples)}",
+        )
+    return members[0]
+
+
+def _require_noise(path: Path, header: NpyHeader, samples: int) -> None:
+    if not np.issubdtype(header.dtype, np.floating):
+        raise BundleError(path, "frozen_noise", f"holds {header.dtype}, expected floating point")
+    if header.shape != (2, samples):
+        raise BundleError(path, "frozen_noise", f"has shape {header.shape}, expected {(2, samples)}")

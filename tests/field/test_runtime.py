@@ -24,5 +24,5 @@ def test_nothing_is_left_in_the_home_folder(bundle, tmp_path):
 
 
 def test_bytes_that_are_no_graph_are_a_value_error():
-    with pytest.raises(ValueError, match="INVALID"):
+    with pytest.raises(ValueError, match="no protobuf message"):
         open_session(b"not a graph")

@@ -9,6 +9,7 @@ import numpy as np
 
 from server.blocks import DryBlock
 from server.errors import BundleError, RequestError
+from server.field.external_data import refers_to_other_files
 from server.protocol import parse_client_message
 from server.scene.bundle import BUNDLED, MANIFEST_FILE, Bundle
 from server.scene.manifest import ARRAYS_FILE
@@ -58,6 +59,16 @@ def load(folder: Path) -> Bundle | None:
         refusal = exc
     assert refusal.field
     assert str(refusal.path).startswith(str(folder))
+    return None
+
+
+def look_for_other_files(model: bytes) -> bool | None:
+    """Whether a graph keeps weights in other files; None for what is no protobuf."""
+    try:
+        return refers_to_other_files(model)
+    except ValueError as exc:
+        refusal = exc
+    assert str(refusal)
     return None
 
 

@@ -5,8 +5,10 @@ before. What is raised and is no refusal ends it, with the input written beside.
 """
 
 import argparse
+import io
 import sys
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,12 +16,15 @@ import atheris
 
 with atheris.instrument_imports(include=["server"]):
     from server import blocks, protocol  # noqa: F401  what is instrumented is what is imported here
+    from server.core import npy  # noqa: F401
+    from server.field import external_data  # noqa: F401
     from server.scene import bundle, geometry, manifest  # noqa: F401
 
 from doors import (  # beside this script
     BLOCKS,
     MESSAGES,
     load,
+    look_for_other_files,
     receive,
     write_arrays,
     write_bundle_without_fields,
@@ -39,19 +44,32 @@ def messages(_folder: Path) -> tuple[Callable[[bytes], None], list[bytes]]:
 
 
 def bundles(folder: Path) -> tuple[Callable[[bytes], None], list[bytes]]:
-    """The first byte says which file the others are."""
+    """The first byte says what the others are: a manifest, arrays, the array file in them, or a graph."""
     written = write_bundle_without_fields(folder / "scene")
     whole = (written / MANIFEST_FILE).read_bytes()
+    arrays = (written / ARRAYS_FILE).read_bytes()
+    with zipfile.ZipFile(io.BytesIO(arrays)) as archive:
+        noise = archive.read("frozen_noise.npy")
 
     def one(data: bytes) -> None:
+        kind, content = data[:1], data[1:]
         write_manifest(written, whole)
-        if data[:1] == b"a":
-            write_arrays(written, data[1:])
+        if kind == b"g":
+            look_for_other_files(content)
+        elif kind == b"n":
+            packed = io.BytesIO()
+            with zipfile.ZipFile(packed, "w") as archive:
+                archive.writestr("frozen_noise.npy", content)
+            write_arrays(written, packed.getvalue())
+        elif kind == b"a":
+            write_arrays(written, content)
         else:
-            write_manifest(written, data[1:])
+            write_manifest(written, content)
         load(written)
 
-    return one, [b"m" + whole, b"a" + (written / ARRAYS_FILE).read_bytes()[:4_000]]
+    # A tag of a graph, of its node, of an attribute of that, and of a tensor that says where it is.
+    graph = bytes([0x3A, 8, 0x0A, 6, 0x2A, 4, 0x2A, 2, 0x70, 0])
+    return one, [b"m" + whole, b"a" + arrays[:4_000], b"n" + noise[:4_000], b"g" + graph]
 
 
 DOORS = {"messages": messages, "bundles": bundles}

@@ -1,8 +1,11 @@
 """Scene bundles that are damaged, or say what cannot be: refused with file and field, and nothing half-loads."""
 
 import copy
+import io
 import json
 import math
+import warnings
+import zipfile
 
 import numpy as np
 import pytest
@@ -87,6 +90,37 @@ def test_arrays_with_any_byte_changed_load_whole_or_not_at_all(folder, bundle, t
     write_arrays(folder, bytes(data))
     loaded = load(folder)
     assert loaded is None or np.isfinite(loaded.frozen_noise).all()
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["frozen_noise.npy", "more.npy", "../evil", "folder/"]),
+            st.tuples(
+                st.sampled_from(["<f4", "<f8", ">f2", "|O", "<c16", "<i8"]),
+                st.lists(st.sampled_from([0, 1, 2, 4_000, 1 << 20, 1 << 40]), max_size=4),
+                st.integers(0, 40_000),
+            ),
+        ),
+        max_size=3,
+    )
+)
+def test_archives_of_any_members_load_whole_or_not_at_all(folder, bundle, text, members):
+    """Headers of any type and shape, with any number of zeros behind them."""
+    archive = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as writer:
+        warnings.simplefilter("ignore")  # of names that are there twice
+        for name, (descr, shape, zeros) in members:
+            header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {tuple(shape)}, }}".encode()
+            start = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little")
+            writer.writestr(name, start + header + bytes(zeros))
+    write_manifest(folder, text)
+    write_arrays(folder, archive.getvalue())
+    loaded = load(folder)
+    if loaded is not None:
+        ((name, (descr, shape, zeros)),) = members
+        assert (name, shape) == ("frozen_noise.npy", [2, bundle.manifest.codec.samples])
+        assert zeros == 2 * bundle.manifest.codec.samples * np.dtype(descr).itemsize
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -2,6 +2,9 @@
 
 import io
 import json
+import os
+import tracemalloc
+import warnings
 import zipfile
 
 import numpy as np
@@ -187,3 +190,110 @@ def test_the_bundled_apartment_is_whole_small_and_walled():
     assert sum(path.stat().st_size for path in bundle.folder.iterdir()) <= 15e6
     with pytest.raises(RequestError, match="inside a wall"):
         bundle.require_inside((4.1, 1.0, 1.5), "emitter")
+
+
+def _npy_claiming(shape, descr="<f4", data=b""):
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data
+
+
+def _archive_of(*members):
+    buffer = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        warnings.simplefilter("ignore")  # of names that are there twice
+        for name, content in members:
+            archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+NOISE = ("frozen_noise.npy", _npy())
+LYING_ARCHIVES = {
+    "16 TiB": (_archive_of(("frozen_noise.npy", _npy_claiming((1 << 40, 4)))), "has shape .1099511627776, 4."),
+    "the right shape, without its samples": (_archive_of(("frozen_noise.npy", _npy_claiming((2, 4000)))), "claims"),
+    "a header that never ends": (_archive_of(("frozen_noise.npy", _npy_claiming("((((("))), "header"),
+    "a bomb": (_archive_of(("frozen_noise.npy", bytes(100_000_000))), "unpacks to 100000000 bytes"),
+    "an array of objects": (_archive_of(("frozen_noise.npy", _npy_claiming((2, 4000), "|O"))), "not numbers|header"),
+    "the same name twice": (_archive_of(NOISE, NOISE), "twice"),
+    "another beside it": (_archive_of(NOISE, ("more.npy", b"")), "'more.npy'"),
+    "a path out of the folder": (_archive_of(NOISE, ("../../evil", b"")), "'../../evil'"),
+    "another name": (_archive_of(("noise.npy", _npy())), "no such array"),
+    "more samples than claimed": (_archive_of(("frozen_noise.npy", _npy() + bytes(400))), "claims"),
+}
+
+
+@pytest.mark.parametrize(("content", "told"), LYING_ARCHIVES.values(), ids=LYING_ARCHIVES)
+def test_an_archive_that_lies_is_refused_before_it_is_unpacked(bundle, tmp_path, content, told):
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    tracemalloc.start()
+    try:
+        with pytest.raises(BundleError, match=rf"arrays\.npz: frozen_noise: .*({told})"):
+            write_bundle(tmp_path / "noise", bundle.manifest, {**files, "arrays.npz": content})
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_files_longer_than_a_bundle_may_have_are_refused_unread(bundle_copy):
+    with (bundle_copy / "arrays.npz").open("r+b") as stream:
+        stream.truncate(1 << 40)  # sparse
+    with pytest.raises(BundleError, match=r"arrays\.npz: size: is 1099511627776 bytes, and at most"):
+        Bundle.load(bundle_copy)
+
+
+@pytest.mark.parametrize(("name", "told"), [("arithmetic.onnx", "onnx: size"), ("scene.json", "json: size")])
+def test_every_file_has_a_most(bundle_copy, name, told):
+    with (bundle_copy / name).open("r+b") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(BundleError, match=told):
+        Bundle.load(bundle_copy)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, '{"id": "a", "geometry": ' + "[" * 5_000])
+def test_a_manifest_of_any_depth_is_refused(bundle_copy, text):
+    (bundle_copy / "scene.json").write_text(text)
+    with pytest.raises(BundleError, match=r"scene\.json"):
+        Bundle.load(bundle_copy)
+
+
+@pytest.mark.parametrize("name", ["scene.json", "arrays.npz", "arithmetic.onnx"])
+def test_a_link_out_of_the_bundle_is_refused_and_one_within_is_not(bundle_copy, tmp_path_factory, name):
+    outside = tmp_path_factory.mktemp("outside") / name
+    (bundle_copy / name).rename(bundle_copy / "kept")
+    (bundle_copy / name).symlink_to("kept")
+    Bundle.load(bundle_copy)
+    (bundle_copy / "kept").rename(outside)
+    (bundle_copy / name).unlink()
+    (bundle_copy / name).symlink_to(outside)
+    with pytest.raises(BundleError, match=rf"{name}: file: is a link to .*outside"):
+        Bundle.load(bundle_copy)
+
+
+def test_a_bundle_may_be_reached_by_a_link(bundle, tmp_path):
+    (tmp_path / "link").symlink_to(bundle.folder)
+    assert Bundle.load(tmp_path / "link").digest == bundle.digest
+
+
+def test_pipes_devices_and_circles_are_refused_at_once(bundle_copy):
+    path = bundle_copy / "arithmetic.onnx"
+    for make in (os.mkfifo, lambda at: at.symlink_to(at.name), lambda at: at.mkdir()):
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
+        else:
+            path.unlink()
+        make(path)
+        with pytest.raises(BundleError, match=r"arithmetic\.onnx: file: cannot be read"):
+            Bundle.load(bundle_copy)
+
+
+@pytest.mark.parametrize("name", ["../scene.json", "/etc/hostname", "a/../../b", "..", "", "a\0b", "x" * 5_000])
+def test_a_manifest_lists_plain_names_alone(bundle_copy, name):
+    document = json.loads((bundle_copy / "scene.json").read_text())
+    _edit(bundle_copy, files={**document["files"], name: "0" * 64})
+    with pytest.raises(BundleError, match=r"files|cannot be read"):
+        Bundle.load(bundle_copy)
+
+
+@pytest.mark.parametrize("scene", ["x" * 5_000, "a\0b", "", "/dev/null"])
+def test_a_scene_of_any_name_is_unknown_and_no_more(scene):
+    with pytest.raises(RequestError, match="neither a bundled scene"):
+        find_bundle(scene)
