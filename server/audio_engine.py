@@ -34,7 +34,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from itertools import islice
 from operator import attrgetter
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from server.blocks_at_once import NUMBERS as NUMBERS_AT_ONCE
 from server.blocks_at_once import BlocksAtOnce
@@ -165,7 +165,8 @@ class AudioThread:
         self._is_real_time = is_real_time
         self._ir_share = ir_share
         self._time_s = time_s
-        self.steps: Counter[Reason] = Counter()
+        # All reasons from the start: whoever reads it on another thread must not find it growing.
+        self.steps: Counter[Reason] = Counter(dict.fromkeys(get_args(Reason), 0))
         """Times that streams were moved to other quality."""
         self._load = LoadControl()
         self._busy_s = 0.0

@@ -19,6 +19,7 @@ from functools import partial
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.answers import Answers
+from server.api.stream_counts import StreamLedger
 from server.audio_engine import AudioEngine
 from server.blocks import Encoding
 from server.catalogue import describe_scene
@@ -36,7 +37,6 @@ from server.scene.situation import Place
 from server.session import Session
 from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
-from server.telemetry import StreamTotals
 from server.web_socket import DirectWay
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
@@ -87,8 +87,8 @@ class StreamHost:
     """What plans of effects are made for, by scene."""
     effect_costs: dict[str, Costs] = dataclasses.field(default_factory=dict)
     """By scene, once they were measured."""
-    past: StreamTotals = dataclasses.field(default_factory=StreamTotals)
-    """Of streams that have ended."""
+    ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
+    """What all streams have counted."""
     is_ready: bool = False
     streams: int = 0
 
@@ -214,6 +214,7 @@ class Connection:
     async def _pump(self, stream: Stream, hello: Hello) -> None:
         """Read and send until either ends or fails, or too much waits to be sent."""
         self._stream, self._encoding = stream, hello.encoding
+        self._host.ledger.open(stream)
         self._host.audio.open(stream)
         tasks = [
             asyncio.create_task(self._read_incoming(stream, hello)),
@@ -224,7 +225,7 @@ class Connection:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._host.audio.close(stream)
-            self._host.past.add(stream)
+            self._host.ledger.close(stream)
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
