@@ -48,8 +48,10 @@ def simulate(
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from training.simulation.run import simulate as simulate_scene
 
-    ready = simulation.simulation_of(scene, seed, effects)
-    simulation.wide_console(stderr=True).print(simulation.plan_table(ready.plan))
+    console = simulation.wide_console(stderr=True)
+    with console.status("planning, and tracing the late sound that pairs may share"):
+        ready = simulation.simulation_of(scene, seed, effects)
+    simulation.print_plan(console, ready.scene, ready.plan)
     processes = workers or os.cpu_count() or 1
     with _progress() as progress:
         dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, simulation=ready)
