@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import get_args
 
 from fastapi import FastAPI
-from starlette.staticfiles import StaticFiles
 
 from server.answers import Answers
+from server.api.page_files import PageFiles
+from server.api.strict_requests import StrictRequests
 from server.audio_engine import AudioEngine
 from server.calibration import calibrate
 from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
@@ -94,7 +95,8 @@ def create_app(
     app.include_router(health)
     app.include_router(documents)
     app.include_router(api)
-    app.mount("/", StaticFiles(directory=WEB, html=True, check_dir=False), name="web")
+    app.add_middleware(StrictRequests, routes=app.router.routes)
+    app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
 
 

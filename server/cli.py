@@ -17,6 +17,7 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from server.bench import cli as bench
+from server.core.command_line import StrictTyper
 from server.errors import NafirError, RequestError
 from server.health.cli import check
 from server.soak.cli import soak
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from server.render import RenderedEmitter
     from server.settings import Settings
 
-app = typer.Typer(
+app = StrictTyper(
     name="nafir",
     help="Hear how a place sounds while you move through it.",
     no_args_is_help=True,
@@ -82,7 +83,8 @@ def serve(
         settings = Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as exc:
         first = exc.errors()[0]
-        raise NafirError(f"setting {'.'.join(str(part) for part in first['loc'])}: {first['msg']}") from exc
+        place = f"setting {'.'.join(str(part) for part in first['loc'])}: " if first["loc"] else ""
+        raise NafirError(f"{place}{first['msg'].removeprefix('Value error, ')}") from exc
     scenes = load_scenes(settings.bundles)
     if not scenes:
         raise NafirError("there is no scene to serve: give one with --bundle FOLDER")

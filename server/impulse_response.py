@@ -18,6 +18,7 @@ import numpy.typing as npt
 import scipy.io.wavfile
 
 from server.acoustics.geometry import Vector3
+from server.core.numerals import DECIMAL, parse_decimal
 from server.errors import RequestError
 from server.field.field import AcousticField
 from server.whole_field import WholeField
@@ -27,14 +28,19 @@ IR_FORMATS: tuple[IrFormat, ...] = get_args(IrFormat)
 MEDIA_TYPES: dict[IrFormat, str] = {"wav": "audio/wav", "npy": "application/octet-stream", "json": "application/json"}
 
 
+POSITION_PATTERN = rf"^ *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *$"
+"""What `parse_position` takes, as a regular expression of JSON Schema."""
+
+
 def parse_position(text: str, field: str) -> Vector3:
-    """Three finite numbers between commas, metres. Raises RequestError malformed_pose naming `field`."""
+    """Three decimal numbers between commas, metres. Raises RequestError malformed_pose naming `field`."""
+    parts = text.split(",", 3)
+    if len(parts) != 3:
+        raise RequestError("malformed_pose", f"{field}: {text!r} is not three numbers x,y,z", field=field)
     try:
-        x, y, z = (float(part) for part in text.split(","))
+        x, y, z = map(parse_decimal, parts)
     except ValueError as exc:
-        raise RequestError("malformed_pose", f"{field}: {text!r} is not three numbers x,y,z", field=field) from exc
-    if not all(math.isfinite(coordinate) for coordinate in (x, y, z)):
-        raise RequestError("malformed_pose", f"{field}: {text!r} is not finite", field=field)
+        raise RequestError("malformed_pose", f"{field}: in x,y,z {exc}", field=field) from exc
     return (x, y, z)
 
 

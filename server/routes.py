@@ -45,14 +45,12 @@ LevelText = Annotated[str | None, Query(description="quality level; by default t
 PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"])]
 
 
-@health.head("/livez", include_in_schema=False)
 @health.get("/livez")
 async def livez() -> dict[str, str]:
     """The process answers."""
     return {"status": "live"}
 
 
-@health.head("/readyz", include_in_schema=False)
 @health.get("/readyz")
 async def readyz(request: Request) -> dict[str, str]:
     """Streams may be opened: everything is loaded and warmed up."""

@@ -2,10 +2,16 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self, get_args
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from server.core.near_names import suggestion
+from server.core.numerals import parse_decimal, parse_integer
+
+_PREFIX = "NAFIR_"
 
 
 def _usable_cores() -> int:
@@ -24,7 +30,7 @@ Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_split_paths)]
 class Settings(BaseSettings):
     """Built once, at the edge, and handed down."""
 
-    model_config = SettingsConfigDict(env_prefix="NAFIR_", frozen=True)
+    model_config = SettingsConfigDict(env_prefix=_PREFIX, frozen=True)
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
@@ -58,3 +64,24 @@ class Settings(BaseSettings):
     hello_timeout_s: Annotated[float, Field(gt=0)] = 10.0
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
     """HTTP requests that may wait for a worker; one more is answered 503."""
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _read_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """By the grammar of every other number that comes as text, where the setting is one."""
+        annotation = cls.model_fields[info.field_name or ""].annotation
+        kinds = {annotation, *get_args(annotation)}
+        if isinstance(value, str) and kinds & {int, float}:
+            return parse_decimal(value) if float in kinds else parse_integer(value)
+        return value
+
+    @model_validator(mode="after")
+    def _knows_the_environment(self) -> Self:
+        """A misspelt variable would otherwise be a setting that stays as it is."""
+        known = [name.upper() for name in type(self).model_fields]
+        for variable in sorted(os.environ):
+            name = variable.upper().removeprefix(_PREFIX)
+            if variable.upper().startswith(_PREFIX) and name not in known:
+                problem = f"the environment has {variable}, which is no setting{suggestion(name, known, _PREFIX)}"
+                raise PydanticCustomError("unknown_setting", "{problem}", {"problem": problem})
+        return self

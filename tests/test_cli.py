@@ -101,7 +101,10 @@ def test_ir_tells_programs_what_it_did(nafir, bundle, tmp_path):
         (("--listener", "1,2", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener"),
         (("--listener", "1,2,99", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener"),
         (("--listener", "1,2,1.5", "--emitter", "nan,3,1.5", "-o", "ir.wav"), "emitter"),
-        ((*PLACES, "--yaw-deg", "inf", "-o", "ir.wav"), "yaw-deg"),
+        ((*PLACES, "--yaw-deg", "inf", "-o", "ir.wav"), "--yaw-deg: 'inf' is not finite"),
+        ((*PLACES, "--yaw-deg", "0_1", "-o", "ir.wav"), "--yaw-deg: '0_1' is not a number"),
+        ((*PLACES, "--yaw-deg", "90", "--yaw-deg", "0", "-o", "ir.wav"), "--yaw-deg is given 2 times"),
+        (("--listener", "0_1,2,1.5", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener: in x,y,z '0_1'"),
         ((*PLACES, "-o", "ir.mp3"), "mp3"),
         ((*PLACES, "-o", "no/such/folder/ir.wav"), "No such file"),
     ],
@@ -200,7 +203,7 @@ def test_render_says_what_is_wrong_in_one_line(nafir, bundle, tmp_path, monkeypa
     assert not (tmp_path / output).exists()
 
 
-@pytest.mark.parametrize("duration_s", ["0", "-1", "1e-9", "7201", "1e308", "inf", "nan"])
+@pytest.mark.parametrize("duration_s", ["0", "-1", "1e-9", "7201", "1e308"])
 def test_render_says_how_long_it_may_be(nafir, bundle, tmp_path, duration_s):
     path, output = tmp_path / "path.csv", tmp_path / "out.wav"
     path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")

@@ -1,4 +1,5 @@
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -40,9 +41,34 @@ def test_the_environment_is_heeded_and_arguments_win(monkeypatch):
         ("AUDIO_THREADS", "0"),
         ("REALTIME", "perhaps"),
         ("HELLO_TIMEOUT_S", "soon"),
+        ("HELLO_TIMEOUT_S", "1_0"),
+        ("HELLO_TIMEOUT_S", "inf"),
+        ("HELLO_TIMEOUT_S", "٣"),
+        ("MAX_STREAMS", "6_4"),
+        ("MAX_STREAMS", "64.0"),
     ],
 )
 def test_impossible_settings_are_refused(monkeypatch, name, value):
     monkeypatch.setenv(f"NAFIR_{name}", value)
     with pytest.raises(ValidationError, match=name.lower()):
         Settings()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("NAFIR_MAX_STREAM", "NAFIR_MAX_STREAM, which is no setting; did you mean 'NAFIR_MAX_STREAMS'?"),
+        ("nafir_prot", "nafir_prot, which is no setting; did you mean 'NAFIR_PORT'?"),
+        ("NAFIR_", "NAFIR_, which is no setting"),
+    ],
+)
+def test_a_variable_that_is_no_setting_is_refused(monkeypatch, name, message):
+    monkeypatch.setenv(name, "3")
+    with pytest.raises(ValidationError, match=re.escape(message)):
+        Settings()
+
+
+def test_other_variables_are_nobodys_business(monkeypatch):
+    monkeypatch.setenv("NAFIRISH", "3")
+    monkeypatch.setenv("MY_NAFIR_PORT", "3")
+    Settings()

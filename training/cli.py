@@ -10,13 +10,14 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from server.core.command_line import StrictTyper
 from server.errors import NafirError
 from training.evaluation import cli as evaluation
 from training.importers.cli import importing
 from training.options import Json, Seed
 from training.simulation import cli as simulation
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = StrictTyper(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(importing, name="import")
 app.command()(simulation.plan)
 

@@ -22,9 +22,10 @@ from server.bench.report import (
     print_measures,
     print_rows,
 )
+from server.core.command_line import StrictTyper
 from server.errors import NafirError
 
-app = typer.Typer(help="Measure what things cost on this host.", no_args_is_help=True)
+app = StrictTyper(help="Measure what things cost on this host.", no_args_is_help=True)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
