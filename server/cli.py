@@ -75,6 +75,7 @@ def serve(
     from server.app import create_app
     from server.catalogue import load_hrtfs, load_scenes
     from server.memory import give_back_large_arrays
+    from server.runtime.open_files import allow_connections
     from server.settings import Settings
 
     give_back_large_arrays()
@@ -85,6 +86,7 @@ def serve(
         first = exc.errors()[0]
         place = f"setting {'.'.join(str(part) for part in first['loc'])}: " if first["loc"] else ""
         raise NafirError(f"{place}{first['msg'].removeprefix('Value error, ')}") from exc
+    allow_connections(settings.max_connections)
     scenes = load_scenes(settings.bundles)
     if not scenes:
         raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
@@ -99,7 +101,12 @@ def serve(
 
 def server_options(settings: "Settings") -> dict[str, Any]:
     """How uvicorn has to run the application."""
+    from server.api.connection_limits import ConnectionLimits
+    from server.api.http_protocol import limited_http
+
     return {
+        "http": limited_http(ConnectionLimits.of(settings)),
+        "timeout_keep_alive": settings.keep_alive_s,
         "host": settings.host,
         "port": settings.port,
         "loop": "auto",  # uvloop wherever it exists

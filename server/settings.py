@@ -62,6 +62,22 @@ class Settings(BaseSettings):
     """A longer WebSocket message is refused; one longer than `max_frame_bytes` closes the connection."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
     hello_timeout_s: Annotated[float, Field(gt=0)] = 10.0
+    request_timeout_s: Annotated[float, Field(gt=0)] = 10.0
+    """For a whole HTTP request to come, from the connection or from its first byte: half-sent requests are answered
+    408, connections that say nothing are closed."""
+    response_timeout_s: Annotated[float, Field(gt=0)] = 30.0
+    """For a client to take 64 KiB of a response, or what is left of it."""
+    keep_alive_s: Annotated[float, Field(gt=0)] = 5.0
+    """For the next request on a connection."""
+    max_headers_bytes: Annotated[int, Field(ge=1024)] = 32 * 1024
+    """Of all headers of a request together; of one, and of the request line, at most 8,000."""
+    max_body_bytes: Annotated[int, Field(ge=0, le=64 * 1024)] = 64 * 1024
+    """Of a request. No route has a use for one."""
+    max_connections: Annotated[int, Field(ge=1)] = 1024
+    """In all. When all are taken, who comes gets that on which nothing has been under way for longest; where there is
+    none such, health checks alone are answered."""
+    max_connections_per_address: Annotated[int, Field(ge=1)] = 256
+    """Of one IP address, or IPv6 network of 64 bits. Behind a proxy everybody comes from its address."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
     """HTTP requests that may wait for a worker; one more is answered 503."""
 
