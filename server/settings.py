@@ -56,5 +56,9 @@ class Settings(BaseSettings):
     """A longer WebSocket message is refused; one longer than `max_frame_bytes` closes the connection."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
     hello_timeout_s: Annotated[float, Field(gt=0)] = 10.0
+    max_silent: Annotated[int, Field(ge=1)] = 64
+    """WebSocket connections that may be open without a hello; one more ends that which has been silent for longest."""
+    stall_timeout_s: Annotated[float, Field(gt=0)] = 15.0
+    """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
     """HTTP requests that may wait for a worker; one more is answered 503."""

@@ -7,6 +7,7 @@ message that comes, where none waits before it. ASGI allows such *extensions*: a
 scope, and does without where another server runs it.
 """
 
+import asyncio
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -82,6 +83,13 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         super().handle_connect(event)
         if not self.handshake_complete:  # as it is where the request was refused
             self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
+
+    def on_task_complete(self, task: asyncio.Task[None]) -> None:
+        """The application is done. It holds this protocol by the way, and is held by whom it has listen: with neither,
+        nothing of either waits for the collector."""
+        super().on_task_complete(task)
+        self._hear = None
+        self.scope["extensions"].pop(_EXTENSION, None)
 
     def data_received(self, data: bytes) -> None:
         if self._has_failed:
