@@ -21,6 +21,7 @@ from server.message import Message
 from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter, TextMessage
 from server.replies import EmitterAdded, EmitterRemoved, Error, Pong, ServerMessage, Welcome
 from server.settings import Settings
+from server.stream import PAUSE_AFTER_S
 from server.stream_codes import CLOSE_CODES, ERROR_CODES
 
 Object = dict[str, Any]
@@ -69,8 +70,10 @@ newest pose of its direct sound and that of its reverberation, so that a client 
 
 **Flow control by acknowledgement.** At most `window` blocks (of the `welcome`) are sent that no `acknowledge` has told
 to have arrived; one stands for all blocks before it, so that every fourth block or so is enough. While the window is
-full, blocks are rendered and not sent: `sequence` has no gap then, and `sample_clock` jumps. A client whose answers
-pile up, since it does not read, is cut off.
+full, blocks are rendered and not sent: `sequence` has no gap then, and `sample_clock` jumps. Once it has been full for
+{PAUSE_AFTER_S:g} s, the stream stands still, its clock included, until an `acknowledge` makes room: it goes on where it
+was. After {_default("stall_timeout_s"):g} s the connection is closed (`stalled`). A client whose answers pile up, since
+it does not read, is cut off.
 
 **Errors.** A message that is refused changes nothing, and the stream goes on, unless it was the hello. An `error` that
 ends the connection is followed by a close frame whose reason is the error's code.

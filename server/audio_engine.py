@@ -211,7 +211,7 @@ class AudioThread:
     def tick(self) -> float | None:
         """Heed what waits, render what is due, and hand over what was made.
 
-        Seconds until the next is due, None without streams.
+        Seconds until the next is due, None where no stream is to be rendered.
         """
         now_s = self._time_s()
         self._admit(now_s)
@@ -241,9 +241,8 @@ class AudioThread:
         if any(made.values()):
             self._has_arrived.clear()
             self._post(lambda: self._deliver(made))
-        if not self._streams:
-            return None
-        return min(stream.due_s for stream in self._streams) - self._time_s()
+        next_s = min((stream.due_s for stream in self._streams), default=math.inf)
+        return None if next_s == math.inf else next_s - self._time_s()
 
     def _due(self, now_s: float) -> dict[Stream, int]:
         """Whose blocks to render now, and how many: of all that are due those that are late soonest, as many as a tick

@@ -78,6 +78,10 @@ class Settings(BaseSettings):
     none such, health checks alone are answered."""
     max_connections_per_address: Annotated[int, Field(ge=1)] = 256
     """Of one IP address, or IPv6 network of 64 bits. Behind a proxy everybody comes from its address."""
+    max_silent: Annotated[int, Field(ge=1)] = 64
+    """WebSocket connections that may be open without a hello; one more ends that which has been silent for longest."""
+    stall_timeout_s: Annotated[float, Field(gt=0)] = 15.0
+    """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
     """HTTP requests that may wait for a worker; one more is answered 503."""
 

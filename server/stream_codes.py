@@ -38,6 +38,7 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "field_failure": "no impulse response could be computed; the last ones stay in effect",
     "plan_failure": "no plan of effects could be made; what is on stays on",
     "reads_too_slowly": "the client does not read what it is sent",
+    "stalled": "the window has been full for too long, and nothing was acknowledged",
     "internal_error": "the stream failed, by a defect of the server",
 }
 
@@ -46,7 +47,7 @@ CLOSE_CODES: Final[Mapping[int, str]] = {
     1002: "a frame breaks RFC 6455",
     1007: "a text message is not UTF-8",
     1009: "a WebSocket message was longer than the server takes at all",
-    POLICY_VIOLATION: "the hello was refused or did not come, or the client reads too slowly",
+    POLICY_VIOLATION: "the hello was refused or did not come, or the client reads too slowly or acknowledges nothing",
     INTERNAL_ERROR: "the stream failed, by a defect of the server",
     1012: "the server is shutting down",
     TRY_AGAIN_LATER: "the server is still warming up, or has no free stream",

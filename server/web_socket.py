@@ -138,6 +138,13 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if not self.handshake_complete:  # as it is where the request was refused
             self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
 
+    def on_task_complete(self, task: asyncio.Task[None]) -> None:
+        """The application is done. It holds this protocol by the way, and is held by whom it has listen: with neither,
+        nothing of either waits for the collector."""
+        super().on_task_complete(task)
+        self._hear = None
+        self.scope["extensions"].pop(_EXTENSION, None)
+
     def data_received(self, data: bytes) -> None:
         if self._has_failed:
             return  # the client does not know yet

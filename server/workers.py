@@ -5,6 +5,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any, Literal, Self, TypeVar, get_args
 
 T = TypeVar("T")
@@ -33,28 +34,33 @@ class Workers:
         """What `work` returns or raises. Waits for no thread that chooses what comes next: one of low priority may take
         long for that."""
         future: Future[T] = Future()
-
-        def run() -> None:
-            if not future.set_running_or_notify_cancel():
-                return
-            try:
-                result = work(*args)
-            except BaseException as exc:  # noqa: BLE001  whoever asks for the result has it raised
-                future.set_exception(exc)
-            else:
-                future.set_result(result)
-
+        run = partial(_settle, future, work, args)
         (self._urgent if is_urgent else self._usual[kind]).append(run)
         self._threads.submit(self._run_next)
         return future
 
     def _run_next(self) -> None:
+        self._next()()  # in no variable: a traceback of what fails would hold it
+
+    def _next(self) -> Callable[[], None]:
         with self._choosing:
-            run = self._urgent.popleft() if self._urgent else self._next_usual()
-        run()
+            return self._urgent.popleft() if self._urgent else self._next_usual()
 
     def _next_usual(self) -> Callable[[], None]:
         kind = next(kind for kind in self._turns if self._usual[kind])
         self._turns.remove(kind)
         self._turns.append(kind)
         return self._usual[kind].popleft()
+
+
+def _settle(future: Future[T], work: Callable[..., T], args: tuple[Any, ...]) -> None:
+    if not future.set_running_or_notify_cancel():
+        return
+    try:
+        result = work(*args)
+    except BaseException as exc:  # noqa: BLE001  whoever asks for the result has it raised
+        future.set_exception(exc)
+        # The traceback holds this frame: with the future in it, all three would wait for the collector.
+        del future
+    else:
+        future.set_result(result)

@@ -10,9 +10,9 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
-from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
 from server.replies import EmitterAdded, Error, Status
-from server.stream import MAX_WAITING_MESSAGES, StreamFailed
+from server.stream import MAX_WAITING_MESSAGES, PAUSE_AFTER_S, StreamFailed
 from server.workers import Workers
 from tests.engine_stage import BLOCK_S, Clock, Patient, Stage, blocks, open_stream, spy_on_batches
 
@@ -345,3 +345,56 @@ def test_samples_that_are_no_audio_are_told_of_once_a_second_and_the_stream_goes
     assert (first.id, first.samples_gated, second.samples_gated) == ("voice", 1536, 1536)
     assert second.underruns == 1
     assert all(np.isfinite(item.block.samples).all() for item in blocks(delivered))
+
+
+def test_for_a_client_that_acknowledges_nothing_rendering_stops_soon(stage):
+    stream, delivered = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S + 0.1)
+    clock = stream.session.sample_clock
+    assert len(blocks(delivered)) == 10
+    assert stage.thread.tick() is None, "there is nothing to do until somebody says something"
+    stage.run(5.0)
+    assert stream.session.sample_clock == clock
+    assert 6.0 < stream.stalled_s < 6.3
+
+
+def test_a_stream_that_stood_still_goes_on_where_it_was(stage):
+    """Its blocks are due from now on, and none is late for what was before."""
+    stream, delivered = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S + 3.0)
+    clock = stream.session.sample_clock
+    delivered.clear()
+    assert stream.offer(Acknowledge(sequence=9))
+    assert stream.has_news
+    resumed_s = stage.clock.now_s
+    stage.run(5.5 * BLOCK_S)
+    sent = blocks(delivered)
+    assert [each.block.sequence for each in sent] == list(range(10, 10 + len(sent)))
+    assert [each.block.sample_clock for each in sent] == [clock + 256 * number for number in range(len(sent))]
+    assert 5 <= len(sent) <= 6
+    assert all(each.deadline_s > resumed_s for each in sent)
+    assert stream.stalled_s == 0
+
+
+def test_a_stream_that_stands_still_calls_for_no_responses(stage):
+    stream, _ = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S + 0.1)
+    stage.workers.work.clear()
+    stream.offer(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
+    stage.run(1.0)
+    assert stage.workers.work == []
+    stream.offer(Acknowledge(sequence=9))
+    stage.run(BLOCK_S)
+    assert stage.workers.work
+
+
+def test_a_short_stall_costs_only_what_there_was_no_room_for(stage):
+    stream, delivered = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S / 2)
+    delivered.clear()
+    stream.offer(Acknowledge(sequence=9))
+    stage.run(2.5 * BLOCK_S)
+    (first, *_) = blocks(delivered)
+    dropped = stream.session.blocks_dropped
+    assert (first.block.sequence, first.block.sample_clock) == (10, 256 * (10 + dropped))
+    assert dropped * BLOCK_S == pytest.approx(PAUSE_AFTER_S / 2, abs=6 * BLOCK_S)
