@@ -73,7 +73,8 @@ full, blocks are rendered and not sent: `sequence` has no gap then, and `sample_
 pile up, since it does not read, is cut off.
 
 **Errors.** A message that is refused changes nothing, and the stream goes on, unless it was the hello. An `error` that
-ends the connection is followed by a close frame whose reason is the error's code.
+ends the connection is followed by a close frame whose reason is the error's code. A server that is told to stop sends
+every stream the error `server_draining` and closes it with 1012: the client opens it again, there or elsewhere.
 
 **An exchange**
 

@@ -31,6 +31,8 @@ from server.places import place_of
 from server.protocol import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
 from server.rendering.ingest import DryAudio
 from server.replies import Error, Pong, ServerMessage, Welcome
+from server.runtime.racing import StoppedError, run_until
+from server.runtime.readiness import Readiness
 from server.scene.planner import Costs
 from server.scene.situation import Place
 from server.session import Session
@@ -39,7 +41,7 @@ from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
 from server.telemetry import StreamTotals
 from server.web_socket import DirectWay
 
-NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
+NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
 MAX_WAITING_ANSWERS = 256
 _GOODBYE_S = 1.0
 """Even closing waits for room in the socket, and a client that does not read makes none."""
@@ -82,6 +84,7 @@ class StreamHost:
     audio: AudioEngine
     settings: Settings
     answers: Answers
+    readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     places: dict[str, Place] = dataclasses.field(default_factory=dict)
     """What plans of effects are made for, by scene."""
@@ -89,7 +92,6 @@ class StreamHost:
     """By scene, once they were measured."""
     past: StreamTotals = dataclasses.field(default_factory=StreamTotals)
     """Of streams that have ended."""
-    is_ready: bool = False
     streams: int = 0
 
 
@@ -118,20 +120,30 @@ class Connection:
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
-        with contextlib.suppress(WebSocketDisconnect):
+        with contextlib.suppress(WebSocketDisconnect), self._host.readiness.drain.in_flight():
             await self._websocket.accept()
             try:
-                await self._serve()
+                await self._serve_until_drained()
             except ClosingError as closing:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(_GOODBYE_S):
                         await self._send_message(closing.error)
                         await self._websocket.close(closing.close_code, closing.error.code)
 
+    async def _serve_until_drained(self) -> None:
+        readiness = self._host.readiness
+        try:
+            if not readiness.drain.has_begun:
+                await run_until(self._serve(), readiness.drain.begun())
+                return
+        except StoppedError:
+            pass
+        raise ClosingError(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
+
     async def _serve(self) -> None:
         host = self._host
-        if not host.is_ready:
-            raise ClosingError(TRY_AGAIN_LATER, Error(code="not_ready", message="the server is still warming up"))
+        if (obstacle := host.readiness.obstacle) is not None:
+            raise ClosingError(TRY_AGAIN_LATER, Error(code="not_ready", message=obstacle.message))
         if host.streams >= host.settings.max_streams:
             raise ClosingError(TRY_AGAIN_LATER, Error(code="server_busy", message="the server has no free stream"))
         host.streams += 1

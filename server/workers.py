@@ -4,20 +4,29 @@ the order in which it was asked for. A kind that many ask for keeps no other wai
 import threading
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Any, Literal, Self, TypeVar, get_args
+
+from server.runtime.thread_pool import ThreadPool
 
 T = TypeVar("T")
 Kind = Literal["response", "plan"]
 """Impulse responses, and plans of effects with their checks."""
 
 
+_PATIENCE_S = 10.0
+"""Impulse responses and plans take milliseconds, checks of plans up to a second."""
+_STOP_S = 1.0
+
+
 class Workers:
-    """So many threads; leaving the context waits until everything is done."""
+    """So many threads; leaving the context waits until everything is done, for a second at the most."""
 
     def __init__(self, threads: int, name: str = "worker", *, initializer: Callable[[], None] | None = None) -> None:
         self.threads = threads
-        self._threads = ThreadPoolExecutor(threads, name, initializer)
+        self.pool = ThreadPool(threads, name, initializer=initializer, patience_s=_PATIENCE_S)
+        self._unfinished: deque[None] = deque()
+        """As many as there are pieces of work that are not done."""
         self._urgent: deque[Callable[[], None]] = deque()
         self._usual: dict[Kind, deque[Callable[[], None]]] = {kind: deque() for kind in get_args(Kind)}
         self._turns = deque(self._usual)
@@ -27,7 +36,12 @@ class Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._threads.shutdown()
+        self.pool.stop(_STOP_S)
+
+    @property
+    def are_busy(self) -> bool:
+        """Whether anything is being done or waits; may be asked from any thread."""
+        return bool(self._unfinished)
 
     def submit(self, work: Callable[..., T], /, *args: Any, kind: Kind, is_urgent: bool = False) -> Future[T]:
         """What `work` returns or raises. Waits for no thread that chooses what comes next: one of low priority may take
@@ -44,14 +58,18 @@ class Workers:
             else:
                 future.set_result(result)
 
+        self._unfinished.append(None)
         (self._urgent if is_urgent else self._usual[kind]).append(run)
-        self._threads.submit(self._run_next)
+        self.pool.submit(self._run_next)
         return future
 
     def _run_next(self) -> None:
         with self._choosing:
             run = self._urgent.popleft() if self._urgent else self._next_usual()
-        run()
+        try:
+            run()
+        finally:
+            self._unfinished.pop()
 
     def _next_usual(self) -> Callable[[], None]:
         kind = next(kind for kind in self._turns if self._usual[kind])

@@ -7,6 +7,9 @@ from server.durations import DurationHistogram
 from server.field.levels import Levels
 from server.load import Offer
 from server.protocol import PROTOCOL, AddEmitter, Hello
+from server.runtime.drain import Drain
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
 from server.session import Session
 from server.stream import Stream
 from server.telemetry import ServerCollector, StreamTotals, exposition
@@ -22,7 +25,8 @@ class Clips:
 class Host:
     def __init__(self, audio, offers):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
-        self.past, self.is_ready = StreamTotals(), True
+        self.past = StreamTotals()
+        self.readiness = Readiness(Drain(8.0), ThreadWatch((audio,)), warm_up="done")
 
 
 @pytest.fixture
