@@ -76,7 +76,8 @@ was. After {_default("stall_timeout_s"):g} s the connection is closed (`stalled`
 it does not read, is cut off.
 
 **Errors.** A message that is refused changes nothing, and the stream goes on, unless it was the hello. An `error` that
-ends the connection is followed by a close frame whose reason is the error's code.
+ends the connection is followed by a close frame whose reason is the error's code. A server that is told to stop sends
+every stream the error `server_draining` and closes it with 1012: the client opens it again, there or elsewhere.
 
 **An exchange**
 

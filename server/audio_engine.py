@@ -41,6 +41,7 @@ from server.blocks_at_once import BlocksAtOnce
 from server.load import PERIOD_S, LoadControl, Reason, ir_share
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
+from server.runtime.thread_watch import Watched
 from server.stream import Outgoing, Stream, StreamFailed
 from server.turns import Turns
 from server.workers import Workers
@@ -64,6 +65,7 @@ _PRESUMED_LOAD = 0.02
 _SWITCH_S = 0.0005
 """How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, one that is busy
 half of the time holds audio up for longer than blocks last."""
+_STOP_S = 1.0
 _FAILED = "a stream failed and is closed"
 _logger = logging.getLogger(__name__)
 
@@ -76,8 +78,11 @@ class AudioEngine:
 
     `workers` computes IRs; each stream has at most one request with it. Under load, those of one audio thread's streams
     take `ir_share` of a core, or less where rendering leaves less. `is_real_time` asks the system to schedule audio
-    threads before all others.
+    threads before all others. Its threads are watched (`server.runtime.thread_watch`).
     """
+
+    patience_s = 1.0
+    """How long a tick may take; it takes milliseconds."""
 
     def __init__(
         self,
@@ -103,11 +108,12 @@ class AudioEngine:
             thread.start()
 
     def stop(self) -> None:
-        """Return once the threads have ended, which takes one tick."""
+        """Return once the threads have ended, which takes one tick; of one that is stuck, without that."""
         for thread in self.threads:
             thread.stop()
+        until_s = time.monotonic() + _STOP_S
         for thread in self.threads:
-            thread.join()
+            thread.join(max(0.0, until_s - time.monotonic()))
         sys.setswitchinterval(self._switch_s_before)
 
     @property
@@ -136,6 +142,28 @@ class AudioEngine:
         if thread is not None:
             self._share_workers()
             thread.close(stream)
+
+    def replace(self, dead: Watched) -> None:
+        """Start a thread in the place of one that died. Its streams go on there, unless it died at work on them: nobody
+        knows their state then, and they have failed."""
+        number, thread = next((number, each) for number, each in enumerate(self.threads) if each is dead)
+        successor = self.threads[number] = thread.successor()
+        for stream in self._streams_of(thread):
+            self._thread_of[stream] = successor
+            if thread.work_number is None:
+                successor.open(stream)
+            else:
+                stream.deliver([StreamFailed()])
+        self._share_workers()
+        successor.start()
+
+    def give_up(self, stuck: Watched) -> None:
+        """Tell the streams of a thread that is stuck that they have failed."""
+        for stream in self._streams_of(stuck):
+            stream.deliver([StreamFailed()])
+
+    def _streams_of(self, thread: Watched) -> list[Stream]:
+        return [stream for stream, its_thread in self._thread_of.items() if its_thread is thread]
 
     def _share_workers(self) -> None:
         """Have threads with streams keep as many of them busy as each other."""
@@ -181,6 +209,8 @@ class AudioThread:
         """What was handed to the event loop."""
         self._has_arrived.set()
         self._is_stopping = False
+        self._ticks = 0
+        self._is_ticking = False
         self._thread = threading.Thread(target=self._run, name=f"nafir-audio-{number}", daemon=True)
 
     @property
@@ -188,16 +218,44 @@ class AudioThread:
         """How many blocks of a stream it renders together."""
         return self._at_once.count
 
+    @property
+    def name(self) -> str:
+        return self._thread.name
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether it has ended by itself."""
+        return self._thread.ident is not None and not (self._thread.is_alive() or self._is_stopping)
+
+    @property
+    def work_number(self) -> int | None:
+        """Which tick it is at; None between two. Of a thread that died, where it died."""
+        return self._ticks if self._is_ticking else None
+
     def start(self) -> None:
         self._thread.start()
+
+    def successor(self) -> "AudioThread":
+        """One without streams, that counts on."""
+        thread = AudioThread(
+            self._post,
+            self._workers,
+            number=self._number,
+            is_real_time=self._is_real_time,
+            ir_share=self._ir_share,
+            time_s=self._time_s,
+        )
+        thread.steps = self.steps
+        return thread
 
     def stop(self) -> None:
         self._is_stopping = True
         self._wake.set()
         self._has_arrived.set()
 
-    def join(self) -> None:
-        self._thread.join()
+    def join(self, timeout_s: float) -> None:
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
 
     def open(self, stream: Stream) -> None:
         stream.attach(wake=self._wake.set, time_s=self._time_s, turns=self.turns)
@@ -358,7 +416,11 @@ class AudioThread:
         if self._is_real_time and (reason := become_real_time()) is not None and self._number == 0:
             _logger.warning("audio threads run at ordinary priority: %s", reason)
         while not self._is_stopping:
-            self._rest(self.tick())
+            self._ticks += 1
+            self._is_ticking = True
+            wait_s = self.tick()
+            self._is_ticking = False
+            self._rest(wait_s)
 
     def _rest(self, wait_s: float | None) -> None:
         """Sleep until the next stream is due. Where there is no time for that, let the event loop have the core as long

@@ -53,9 +53,9 @@ async def livez() -> dict[str, str]:
 
 @health.get("/readyz")
 async def readyz(request: Request) -> dict[str, str]:
-    """Streams may be opened: everything is loaded and warmed up."""
-    if not _host(request).is_ready:
-        raise RequestError("not_ready", "the server is still warming up", status=503)
+    """Streams may be opened: everything is warmed up, all threads do their work, and the server is not told to stop."""
+    if (obstacle := _host(request).readiness.obstacle) is not None:
+        raise RequestError(obstacle.code, obstacle.message, status=503, retry_after_s=obstacle.retry_after_s)
     return {"status": "ready"}
 
 

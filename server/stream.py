@@ -184,8 +184,9 @@ class Stream:
         return True
 
     def start(self, origin_s: float) -> None:
-        """Block 0 plays at `origin_s`."""
-        self._clock = StreamClock(origin_s=origin_s, block_s=self.block_s, lead=self._lead)
+        """The next block, number 0 unless another thread has rendered some before, plays at `origin_s`."""
+        first_s = origin_s - self.next_block * self.block_s
+        self._clock = StreamClock(origin_s=first_s, block_s=self.block_s, lead=self._lead)
         self.due_s = self._clock.due_s(self.next_block)
 
     @property

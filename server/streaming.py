@@ -38,6 +38,8 @@ from server.places import place_of
 from server.protocol import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
 from server.rendering.ingest import DryAudio
 from server.replies import Error, Pong, ServerMessage, Welcome
+from server.runtime.racing import StoppedError, run_until
+from server.runtime.readiness import Readiness
 from server.scene.planner import Costs
 from server.scene.situation import Place
 from server.session import Session
@@ -45,7 +47,7 @@ from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
 from server.web_socket import DirectWay
 
-NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
+NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
 MAX_WAITING_ANSWERS = 256
 _GOODBYE_S = 1.0
 """Even closing waits for room in the socket, and a client that does not read makes none."""
@@ -76,7 +78,7 @@ class Goodbye:
 
 
 _TOO_SLOW: Final = Goodbye(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
-_NOT_READY: Final = Goodbye(TRY_AGAIN_LATER, Error(code="not_ready", message="the server is still warming up"))
+_DRAINING: Final = Goodbye(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
 _BUSY: Final = Goodbye(TRY_AGAIN_LATER, Error(code="server_busy", message="the server has no free stream"))
 _FAILED: Final = Goodbye(INTERNAL_ERROR, Error(code="internal_error", message="the stream failed"))
 
@@ -97,6 +99,7 @@ class StreamHost:
     audio: AudioEngine
     settings: Settings
     answers: Answers
+    readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     places: dict[str, Place] = dataclasses.field(default_factory=dict)
     """What plans of effects are made for, by scene."""
@@ -104,7 +107,6 @@ class StreamHost:
     """By scene, once they were measured."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
     """What all streams have counted."""
-    is_ready: bool = False
     streams: int = 0
     """Those open, and those being opened."""
     silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
@@ -147,9 +149,9 @@ class Connection:
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
-        with contextlib.suppress(WebSocketDisconnect):
+        with contextlib.suppress(WebSocketDisconnect), self._host.readiness.drain.in_flight():
             await self._websocket.accept()
-            goodbye = await self._serve()
+            goodbye = await self._serve_until_drained()
             if goodbye is not None:
                 await self._say(goodbye)
 
@@ -159,11 +161,20 @@ class Connection:
                 await self._send_message(goodbye.error)
                 await self._websocket.close(goodbye.close_code, goodbye.error.code)
 
+    async def _serve_until_drained(self) -> Goodbye | None:
+        drain = self._host.readiness.drain
+        if drain.has_begun:
+            return _DRAINING
+        try:
+            return await run_until(self._serve(), drain.begun())
+        except StoppedError:
+            return _DRAINING
+
     async def _serve(self) -> Goodbye | None:
         """Until the client has gone, which returns None, or is to be sent away."""
         host = self._host
-        if not host.is_ready:
-            return _NOT_READY
+        if (obstacle := host.readiness.obstacle) is not None:
+            return Goodbye(TRY_AGAIN_LATER, Error(code="not_ready", message=obstacle.message))
         if host.is_full():
             return _BUSY
         hello = await self._receive_hello()

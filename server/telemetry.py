@@ -20,6 +20,8 @@ from server.clips import ClipLibrary
 from server.durations import DurationHistogram
 from server.load import Offer
 from server.regret import RegretRecord
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
 from server.stream import Stream
 
 _SHORTEST_S, _LONGEST_S = 3e-5, 10.0
@@ -42,7 +44,7 @@ class Host(Protocol):
     def ledger(self) -> StreamLedger: ...
 
     @property
-    def is_ready(self) -> bool: ...
+    def readiness(self) -> Readiness: ...
 
 
 class ServerCollector(Collector):
@@ -57,7 +59,12 @@ class ServerCollector(Collector):
         yield InfoMetricFamily(
             "nafir_build", "What runs.", value={"version": version("nafir"), "python": platform.python_version()}
         )
-        yield GaugeMetricFamily("nafir_ready", "1 where streams may be opened.", value=self._host.is_ready)
+        readiness = self._host.readiness
+        is_ready = readiness.obstacle is None
+        yield GaugeMetricFamily("nafir_ready", "1 where streams may be opened.", value=is_ready)
+        is_draining = readiness.drain.has_begun
+        yield GaugeMetricFamily("nafir_draining", "1 where the server is shutting down.", value=is_draining)
+        yield from _threads(readiness.watch)
         yield from self._streams(streams)
         yield from self._blocks(totals)
         yield from _regrets(totals.regrets)
@@ -140,6 +147,21 @@ class ServerCollector(Collector):
             for name, ms in offer.ms_here.items():
                 costs.add_metric([scene, name], ms / 1000)
         return costs
+
+
+def _threads(watch: ThreadWatch) -> Iterator[Metric]:
+    states = watch.states
+    healthy = GaugeMetricFamily(
+        "nafir_thread_healthy", "1 where a thread does its work, 0 where it is stuck or dead.", labels=["thread"]
+    )
+    restarts = CounterMetricFamily(
+        "nafir_thread_restarts", "Times that a thread died and was replaced: a fault wherever not 0.", labels=["thread"]
+    )
+    for name, state in states.items():
+        healthy.add_metric([name], state == "working")
+        restarts.add_metric([name], watch.restarts[name])
+    yield healthy
+    yield restarts
 
 
 def _regrets(record: RegretRecord) -> Iterator[Metric]:

@@ -17,6 +17,8 @@ from server.load import Offer
 from server.places import place_of_field
 from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, Ping, RemoveEmitter
 from server.replies import Error, Status, parse_server_message
+from server.runtime.drain import Drain
+from server.runtime.readiness import Readiness
 from server.session import Session
 from server.settings import Settings
 from server.streaming import Connection, StreamHost
@@ -71,7 +73,7 @@ async def hosting(field, hrtfs, **settings):
             answers=Answers(workers=1, waiting=1),
             offers={"flat": Offer((field.level,), {field.level.name: 1.0})},
             places={"flat": place_of_field(field)},
-            is_ready=True,
+            readiness=Readiness(Drain(8.0), warm_up="done"),
         )
         audio.start()
         try:
@@ -208,7 +210,7 @@ def test_before_the_server_is_warm_a_client_is_told_to_come_back(field, hrtfs):
     async def scenario():
         socket = Socket()
         async with hosting(field, hrtfs) as host:
-            host.is_ready = False
+            host.readiness.warm_up = "under way"
             await Connection(socket, host).run()
         return socket
 
@@ -391,3 +393,39 @@ def test_a_client_that_acknowledges_in_time_is_not_closed(field, hrtfs):
         return socket
 
     assert codes(asyncio.run(scenario())) == []
+
+
+def test_a_stream_is_told_when_the_server_ends_and_so_is_who_has_not_said_hello_and_who_comes_later(field, hrtfs):
+    async def scenario():
+        playing, silent, late = Socket(), Socket(), Socket()
+        async with hosting(field, hrtfs) as host:
+            running = [asyncio.create_task(Connection(socket, host).run()) for socket in (playing, silent)]
+            playing.say(HELLO)
+            await asyncio.wait_for(playing.has_sent.wait(), 5)
+            await asyncio.sleep(0.1)
+            await asyncio.wait_for(host.readiness.drain.settle(), 5)
+            assert all(task.done() for task in running)
+            assert not host.audio.streams
+            assert host.streams == 0
+            await asyncio.wait_for(Connection(late, host).run(), 5)
+        return playing, silent, late
+
+    for socket in asyncio.run(scenario()):
+        assert socket.close_code == 1012
+        assert socket.sent[-1].code == "server_draining"
+
+
+def test_a_client_that_does_not_read_keeps_the_server_from_ending_for_a_moment_only(field, hrtfs):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field, hrtfs) as host:
+            running = asyncio.create_task(Connection(socket, host).run())
+            socket.say(HELLO)
+            await asyncio.wait_for(socket.has_sent.wait(), 5)
+            socket.reads.clear()
+            began_s = time.monotonic()
+            await host.readiness.drain.settle()
+            assert running.done()
+            return time.monotonic() - began_s
+
+    assert asyncio.run(scenario()) < 4

@@ -8,6 +8,9 @@ from server.durations import DurationHistogram
 from server.field.levels import Levels
 from server.load import Offer
 from server.protocol import PROTOCOL, AddEmitter, Hello
+from server.runtime.drain import Drain
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
 from server.session import Session
 from server.stream import Stream
 from server.telemetry import ServerCollector, exposition
@@ -23,7 +26,8 @@ class Clips:
 class Host:
     def __init__(self, audio, offers):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
-        self.ledger, self.is_ready = StreamLedger(), True
+        self.ledger = StreamLedger()
+        self.readiness = Readiness(Drain(8.0), ThreadWatch((audio,)), warm_up="done")
 
 
 @pytest.fixture
