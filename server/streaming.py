@@ -145,7 +145,10 @@ class Connection:
     async def _receive_hello(self) -> Hello:
         try:
             async with asyncio.timeout(self._host.settings.hello_timeout_s):
-                message = self._parse(await self._receive())
+                first = await self._receive()
+                if isinstance(first, bytes):
+                    raise RequestError("hello_expected", "the first message is a hello, as JSON text, and not binary")
+                message = self._parse(first)
         except TimeoutError as exc:
             raise ClosingError(POLICY_VIOLATION, Error(code="hello_expected", message="no hello came")) from exc
         except RequestError as refusal:

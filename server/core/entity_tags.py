@@ -22,17 +22,17 @@ _PACKAGE = Path(__file__).parents[1]
 @cache
 def fingerprint() -> str:
     """Digest of what computes: this package's code and data, the libraries under it, interpreter and processor."""
-    code = hashlib.sha256()
+    source = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
-        code.update(f"{path.relative_to(_PACKAGE)}\0".encode() + path.read_bytes())
+        source.update(f"{path.relative_to(_PACKAGE)}\0".encode() + path.read_bytes())
     for path in sorted((_PACKAGE / "rendering" / "hrtf_data").rglob("*")):
         if path.is_file():
-            code.update(f"{path.name}\0".encode() + path.read_bytes())
+            source.update(f"{path.name}\0".encode() + path.read_bytes())
     features = sorted(name for name, has in llvm.get_host_cpu_features().items() if has)
     return _digest(
         [
             version("nafir"),
-            code.hexdigest(),
+            source.hexdigest(),
             {name: version(name) for name in _COMPUTE},
             sys.version,
             platform.machine(),
