@@ -19,6 +19,7 @@ from server.api.strict_requests import StrictRequests
 from server.audio_engine import AudioEngine
 from server.calibration import calibrate
 from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
+from server.core.entity_tags import fingerprint
 from server.effect_costs import measure_costs
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
@@ -151,6 +152,7 @@ def _warm_up(host: StreamHost) -> None:
     """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render. And
     see how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
+    fingerprint()
     for scene, levels in host.scenes.items():
         host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)

@@ -5,12 +5,10 @@ Metres; angles in degrees, since these are human edges. Samples are (channel, sa
 of a scene that one microphone heard there is one channel, and the head's yaw changes nothing.
 """
 
-import hashlib
 import io
 import json
 import math
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,6 +16,7 @@ import numpy.typing as npt
 import scipy.io.wavfile
 
 from server.acoustics.geometry import Vector3
+from server.core.entity_tags import computed_tag
 from server.core.numerals import DECIMAL, parse_decimal
 from server.errors import RequestError
 from server.field.field import AcousticField
@@ -66,17 +65,13 @@ class IrQuery:
         field.bundle.require_inside(self.emitter, "emitter")
 
     def etag(self, field: AcousticField, name: str) -> str:
-        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and the package's
-        version."""
+        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and what computes it."""
         return entity_tag(field, "impulse-response", asdict(self), name)
 
 
 def entity_tag(field: AcousticField, kind: str, parameters: dict[str, object], name: str) -> str:
     """Tag of whatever is computed from a field's bundle, its level and `parameters`, written in format `name`."""
-    canonical = json.dumps(
-        [version("nafir"), field.bundle.digest, field.level.name, kind, parameters, name], sort_keys=True
-    )
-    return f'"{hashlib.sha256(canonical.encode()).hexdigest()[:32]}"'
+    return computed_tag(field.bundle.digest, field.level.name, kind, parameters, name)
 
 
 @dataclass(frozen=True)

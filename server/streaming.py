@@ -195,9 +195,12 @@ class Connection:
             async with asyncio.timeout(host.settings.hello_timeout_s) as patience:
                 host.await_hello(patience)
                 try:
-                    message = self._parse(await self._receive())
+                    first = await self._receive()
                 finally:
                     host.silent.pop(patience, None)
+            if isinstance(first, bytes):
+                raise RequestError("hello_expected", "the first message is a hello, as JSON text, and not binary")
+            message = self._parse(first)
         except TimeoutError:
             return Goodbye(POLICY_VIOLATION, Error(code="hello_expected", message="no hello came in time"))
         except RequestError as refusal:

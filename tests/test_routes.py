@@ -153,7 +153,7 @@ def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_a
     [
         ("/v1/scenes/moon", {}, 404, "unknown_scene", "scene"),
         ("/v1/scenes/moon/impulse-response", PLACES, 404, "unknown_scene", "scene"),
-        ("/v1/scenes/moon/loudness", PLACES, 404, "unknown_scene", "scene"),
+        ("/v1/scenes/moon/loudness", {"emitter": "6,3,1.5"}, 404, "unknown_scene", "scene"),
         (IR, {"listener": "1,2,1.5"}, 422, "malformed_pose", "emitter"),
         (IR, {**PLACES, "listener": "1,2"}, 422, "malformed_pose", "listener"),
         (IR, {**PLACES, "listener": "1,2,three"}, 422, "malformed_pose", "listener"),
