@@ -14,7 +14,7 @@ import soxr
 from scipy.spatial import cKDTree
 
 from server.acoustics.minimum_phase import excess_delays_samples, folded_cepstrum
-from server.rendering.sofa import HeadMeasurements, HrtfError, read_sofa
+from server.rendering.sofa import HeadMeasurements, HrtfError, portions, read_sofa
 from server.rendering.sphere import CoverageError, Triangulation, fill_gaps, solid_angles, triangulate
 
 _Floats = npt.NDArray[np.float64]
@@ -80,25 +80,30 @@ class Hrtf:
 
 def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats:
     """(direction, ear, sample): the head's response alone, tapered at both ends."""
-    count, ears, samples = measured.responses.shape
-    in_rows = measured.responses.reshape(-1, samples).T
-    resampled = (
-        soxr.resample(in_rows, measured.sample_rate, sample_rate) if measured.sample_rate != sample_rate else in_rows
-    )
-    responses = resampled.T.reshape(count, ears, -1)
-    if swapped:
-        responses = responses[:, ::-1]
     lead, length, taper = (round(time_s * sample_rate) for time_s in (_LEAD_S, _LENGTH_S, _TAPER_S))
-    ahead = responses[np.argmax(measured.directions[:, 0])]
+    first = int(np.argmax(measured.directions[:, 0]))
+    ahead = _resampled(measured, sample_rate, slice(first, first + 1), swapped)[0]
     centre = int(np.min(np.argmax(np.abs(ahead) > 0.1 * np.max(np.abs(ahead)), axis=-1)))
     before = max(0, lead - centre)
-    padded = np.pad(responses, ((0, 0), (0, 0), (before, length)))
     start = centre - lead + before
-    cut = padded[..., start : start + length].copy()
     fade = 0.5 + 0.5 * np.cos(np.pi * np.arange(taper) / taper)
+    cut = np.empty((*measured.responses.shape[:2], length))
+    for part in portions(len(cut)):
+        padded = np.pad(_resampled(measured, sample_rate, part, swapped), ((0, 0), (0, 0), (before, length)))
+        cut[part] = padded[..., start : start + length]
     cut[..., -taper:] *= fade
     cut[..., :taper] *= fade[::-1]
-    return np.asarray(cut)
+    return cut
+
+
+def _resampled(measured: HeadMeasurements, sample_rate: int, part: slice, swapped: bool) -> _Floats:
+    """(direction, ear, sample) of some directions, the left ear first."""
+    responses = measured.responses[part]
+    count, ears, samples = responses.shape
+    if measured.sample_rate != sample_rate:
+        in_rows = soxr.resample(responses.reshape(-1, samples).T, measured.sample_rate, sample_rate)
+        responses = in_rows.T.reshape(count, ears, -1)
+    return responses[:, ::-1] if swapped else responses
 
 
 def filter_taps(sample_rate: int) -> int:
@@ -129,10 +134,13 @@ class HeadFilters:
             taps = filter_taps(hrtf.sample_rate)
         responses = hrtf.impulse_responses
         n_fft = 8 * 2 ** int(np.ceil(np.log2(max(responses.shape[-1], taps))))
-        magnitude = np.abs(np.fft.rfft(responses, n_fft))
-        magnitude = np.maximum(magnitude, _FLOOR * magnitude.max(axis=-1, keepdims=True))
-        cepstra = folded_cepstrum(np.log(magnitude))[..., :taps]
-        delays_s = excess_delays_samples(responses, hrtf.sample_rate) / hrtf.sample_rate
+        cepstra = np.empty((*responses.shape[:2], taps))
+        delays_s = np.empty(responses.shape[:2])
+        for part in portions(len(responses)):
+            magnitude = np.abs(np.fft.rfft(responses[part], n_fft))
+            magnitude = np.maximum(magnitude, _FLOOR * magnitude.max(axis=-1, keepdims=True))
+            cepstra[part] = folded_cepstrum(np.log(magnitude))[..., :taps]
+            delays_s[part] = excess_delays_samples(responses[part], hrtf.sample_rate) / hrtf.sample_rate
         common_s = delays_s.mean(axis=-1)
         delays_s += (_smooth(hrtf.directions, common_s) - common_s)[:, None]
         directions, shares = fill_gaps(hrtf.directions)

@@ -1,24 +1,26 @@
 """Head-related impulse responses as a SOFA file holds them (AES69, convention SimpleFreeFieldHRIR).
 
-Directions are unit vectors in the head's frame: x ahead, y left, z up. `sofar` takes a third of a second to import, so
-it is imported where a file is read.
+Directions are unit vectors in the head's frame: x ahead, y left, z up.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from server.errors import NafirError
+from server.rendering.sofa_file import SofaError, SofaFile, delay_rows
 
 _Floats = npt.NDArray[np.float64]
 
 CONVENTION = "SimpleFreeFieldHRIR"
 FEWEST_DIRECTIONS = 4
 _SAME_DIRECTION = np.radians(0.2)
+_ROUNDING = 1e-7
+_MOST_SAMPLES = 2**16
+_PORTION = 1024
 
 
 class HrtfError(NafirError):
@@ -44,31 +46,18 @@ def read_sofa(path: Path) -> HeadMeasurements:
 
     Raises HrtfError for anything but finite two-ear responses of at least `FEWEST_DIRECTIONS` directions.
     """
-    if path.suffix != ".sofa":  # sofar would open another file: it replaces any other suffix
-        raise HrtfError(path, "a SOFA file's name ends in .sofa")
-    if not path.is_file():
-        raise HrtfError(path, "no such file")
-    import sofar
-
     try:
-        # As stored: sofar's check of a whole file refuses harmless faults that published files are full of.
-        sofa = sofar.read_sofa_as_netcdf(str(path))
-    except (OSError, ValueError) as exc:
-        raise HrtfError(path, f"not a readable SOFA file ({exc})") from exc
-    convention = getattr(sofa, "GLOBAL_SOFAConventions", None)
-    if convention != CONVENTION:
-        raise HrtfError(path, f"its convention is {convention}, not {CONVENTION}")
-    try:
-        responses = _delayed(_numbers(sofa.Data_IR), getattr(sofa, "Data_Delay", 0.0))
-        rate = np.unique(_numbers(sofa.Data_SamplingRate))
+        sofa = SofaFile.open(path)
+        convention = sofa.text("GLOBAL_SOFAConventions")
+        if convention != CONVENTION:
+            raise HrtfError(path, f"its convention is {convention}, not {CONVENTION}")
+        responses = _responses(sofa)
+        rate = sofa.sampling_rate_hz()
         offsets = _offsets(sofa, len(responses))
-    except (AttributeError, ValueError) as exc:
-        raise HrtfError(path, f"its variables do not fit the convention ({exc})") from exc
+    except SofaError as exc:
+        problem = exc.problem if exc.variable == "file" else f"{exc.variable}: {exc.problem}"
+        raise HrtfError(path, problem) from exc
     distance = np.linalg.norm(offsets, axis=-1)
-    if rate.size != 1 or not 0 < rate[0] < np.inf:
-        raise HrtfError(path, f"its sampling rate is {rate}")
-    if responses.shape[1] != 2:
-        raise HrtfError(path, f"it has {responses.shape[1]} receivers, not two ears")
     if not np.isfinite(responses).all():
         raise HrtfError(path, "it has samples or delays that are not finite")
     if not (np.isfinite(distance) & (distance > 0)).all():
@@ -79,63 +68,48 @@ def read_sofa(path: Path) -> HeadMeasurements:
     kept = _farthest(directions, distance)
     if len(kept) < FEWEST_DIRECTIONS:
         raise HrtfError(path, f"it has {len(kept)} directions; at least {FEWEST_DIRECTIONS} are needed")
-    return HeadMeasurements(directions[kept], responses[kept], float(rate[0]))
+    return HeadMeasurements(directions[kept], responses[kept], rate)
 
 
-def _numbers(value: Any) -> _Floats:
-    """What a file leaves out is masked when read: it becomes NaN."""
-    return np.ma.filled(np.ma.asarray(value, dtype=np.float64), np.nan)
-
-
-def _delayed(responses: _Floats, delay: Any) -> _Floats:
-    """(measurement, receiver, sample) shifted by delays (1 or measurement, receiver) in samples, the least being 0."""
-    if responses.ndim != 3:
-        raise ValueError(f"Data.IR has shape {responses.shape}")
-    delays = np.broadcast_to(np.atleast_2d(_numbers(delay)), responses.shape[:2])
-    delays = delays - delays.min()
+def _responses(sofa: SofaFile) -> _Floats:
+    """(measurement, ear, sample), shifted by `Data.Delay` (1 or measurement, ear), the least delay being 0."""
+    responses = sofa.numbers("Data_IR")
+    sofa.require("Data_IR", responses.ndim == 3 and 0 not in responses.shape, f"has shape {responses.shape}")
+    count, ears, samples = responses.shape
+    sofa.require("Data_IR", ears == 2, f"it has {ears} receivers, not two ears")
+    sofa.require("Data_IR", samples <= _MOST_SAMPLES, f"it has responses of {samples} samples, as no head has")
+    delays = np.atleast_2d(sofa.numbers("Data_Delay", 0.0))
+    fits = delays.ndim == 2 and delays.shape[0] in {1, count} and delays.shape[1] in {1, 2}
+    sofa.require("Data_Delay", fits, f"has shape {delays.shape}")
+    delays = np.broadcast_to(delays - delays.min(), (count, ears))
     if not delays.any():
         return responses
-    if not np.ptp(delays) < 10 * responses.shape[-1] + 10_000:  # NaN too
-        raise ValueError("Data.Delay is not finite, or too long")
-    samples = responses.shape[-1] + int(np.ceil(delays.max()))
-    n_fft = 2 * samples
-    shift = np.exp(-2j * np.pi * np.fft.rfftfreq(n_fft) * delays[..., None])
-    return np.asarray(np.fft.irfft(np.fft.rfft(responses, n_fft) * shift, n_fft)[..., :samples])
+    longest = delays.max()
+    sofa.require("Data_Delay", longest < 10 * samples + 10_000, "is not finite, or too long")  # NaN too
+    return np.concatenate([delay_rows(responses[part], delays[part], longest) for part in portions(count)])
 
 
-def _offsets(sofa: Any, measurements: int) -> _Floats:
+def portions(count: int) -> list[slice]:
+    """Of `count` directions: what is computed of all of them is computed of some at a time, in bounded memory."""
+    return [slice(start, start + _PORTION) for start in range(0, count, _PORTION)]
+
+
+def _offsets(sofa: SofaFile, measurements: int) -> _Floats:
     """(measurement, xyz) from the listener to the source, in the listener's frame."""
-    source = _cartesian(sofa, "SourcePosition", sofa.SourcePosition)
-    listener = _cartesian(sofa, "ListenerPosition", getattr(sofa, "ListenerPosition", [0.0, 0.0, 0.0]))
-    ahead = _cartesian(sofa, "ListenerView", getattr(sofa, "ListenerView", [1.0, 0.0, 0.0]))
-    up = _cartesian(sofa, "ListenerView", getattr(sofa, "ListenerUp", [0.0, 0.0, 1.0]))
-    left = np.cross(up, ahead)
-    offset = np.broadcast_to(source - listener, (measurements, 3))
-    axes = [ahead, left, np.cross(ahead, left)]
-    return np.stack([np.sum(offset * axis, axis=-1) / np.linalg.norm(axis, axis=-1) for axis in axes], axis=-1)
-
-
-def _cartesian(sofa: Any, variable: str, value: Any) -> _Floats:
-    positions = np.atleast_2d(_numbers(value))
-    if positions.shape[-1] != 3:
-        raise ValueError(f"{variable} has shape {positions.shape}")
-    kind = getattr(sofa, f"{variable}_Type", "spherical" if variable == "SourcePosition" else "cartesian")
-    # Files without a listener's view, or one written as it is by default, say nothing of its type.
-    if kind.lower() != "spherical":
-        return positions
-    units = getattr(sofa, f"{variable}_Units", "degree")
-    angles = positions[:, :2] if units.strip().lower().startswith("rad") else np.radians(positions[:, :2])
-    azimuth, elevation = angles.T
     # Some files leave the distance at zero.
-    radius = np.where(positions[:, 2] > 0, positions[:, 2], 1.0)
-    towards = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    return np.asarray(radius[:, None] * np.stack(towards, axis=-1))
+    source = sofa.points("SourcePosition", measurements, default="spherical", unknown_radius_m=1.0)
+    listener = sofa.points("ListenerPosition", measurements, fallback=[0.0, 0.0, 0.0], default="cartesian")
+    return np.einsum("mx,mxa->ma", source - listener, sofa.frames("Listener", measurements))
 
 
 def _farthest(directions: _Floats, distance: _Floats) -> npt.NDArray[np.int64]:
     """Indices of one measurement per direction, in the order of the file."""
-    dropped = np.zeros(len(directions), np.bool)
-    for pair in sorted(cKDTree(directions).query_pairs(_SAME_DIRECTION)):
+    # Of those that agree to rounding, which may be very many, one is left to compare with its neighbours.
+    order = np.lexsort((np.arange(len(directions)), -distance))
+    _, first = np.unique(np.round(directions[order] / _ROUNDING), axis=0, return_index=True)
+    chosen = np.sort(order[first])
+    dropped = np.zeros(len(chosen), np.bool)
+    for pair in sorted(cKDTree(directions[chosen]).query_pairs(_SAME_DIRECTION)):
         if not dropped[list(pair)].any():
-            dropped[pair[int(distance[pair[0]] >= distance[pair[1]])]] = True
-    return np.flatnonzero(~dropped)
+            dropped[pair[int(distance[chosen[pair[0]]] >= distance[chosen[pair[1]]])]] = True
+    return chosen[~dropped]

@@ -10,11 +10,11 @@ published files have it, or the sense of azimuth, wrong.
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from server.rendering.sofa_file import SofaError, SofaFile, delay_rows
 from training.importers.conditioning import SourceError, ears_agree
 from training.importers.receivers import Receivers
 from training.importers.report import ImportReport
@@ -34,6 +34,20 @@ _CONVENTIONS = {
 }
 
 
+@dataclass(frozen=True)
+class _Room:
+    """What a file holds. `head` (measurement, xyz, axis); `origin` (measurement, 3); `emitter_at`, `receiver_at`
+    (measurement, emitter or receiver, 3); `responses` (measurement, receiver, emitter, sample)."""
+
+    sample_rate: int
+    head: _Floats
+    origin: _Floats
+    emitter_at: _Floats
+    receiver_at: _Floats | None
+    """None where receivers are ears."""
+    responses: npt.NDArray[np.float32]
+
+
 def read(
     path: Path,
     report: ImportReport,
@@ -45,33 +59,26 @@ def read(
 
     Raises SourceError for another convention, or variables that do not fit it.
     """
-    sofa = _opened(path)
-    convention = sofa.text("GLOBAL_SOFAConventions")
-    if convention not in _CONVENTIONS:
-        raise SourceError(path, "SOFAConventions", f"is {convention}; known are {', '.join(_CONVENTIONS)}")
-    kind = receivers or _CONVENTIONS[convention]
-    responses = _responses(sofa)
-    measurements, channels, emitters, _ = responses.shape
-    if kind == Receivers.EARS and channels != 2:
-        raise SourceError(path, "Data.IR", f"has {channels} receivers, not two ears")
-    rate = np.unique(sofa.numbers("Data_SamplingRate"))
-    if rate.size != 1 or not 0 < rate[0] < np.inf or rate[0] % 1:
-        raise SourceError(path, "Data.SamplingRate", f"is {rate}, not one whole number of hertz")
-    head = sofa.frames("Listener", measurements)
-    origin = sofa.points("ListenerPosition", measurements)
-    source = sofa.points("SourcePosition", measurements)
-    emitter_at = source[:, np.newaxis] + np.einsum(
-        "mxa,mea->mex", sofa.frames("Source", measurements), sofa.parts("EmitterPosition", emitters, measurements)
-    )
-    if kind == Receivers.EARS:
+    try:
+        room = _room(SofaFile.open(path), receivers)
+    except SofaError as exc:
+        raise SourceError(path, exc.variable, exc.problem) from exc
+    measurements, channels, emitters, _ = room.responses.shape
+    if room.receiver_at is None:
         rows = [
-            (m, e, Measurement(tuple(origin[m]), tuple(emitter_at[m, e]), responses[m, :, e], int(rate[0]), yaw))
-            for m, yaw in enumerate(np.arctan2(head[:, 1, 0], head[:, 0, 0]))
+            (
+                m,
+                e,
+                Measurement(
+                    tuple(room.origin[m]), tuple(room.emitter_at[m, e]), room.responses[m, :, e], room.sample_rate, yaw
+                ),
+            )
+            for m, yaw in enumerate(np.arctan2(room.head[:, 1, 0], room.head[:, 0, 0]))
             for e in range(emitters)
         ]
         if _swapped(path, [row for *_, row in rows], report):
             rows = [(m, e, _ears_exchanged(row)) for m, e, row in rows]
-        pitch = np.arcsin(np.clip(head[:, 2, 0], -1.0, 1.0))
+        pitch = np.arcsin(np.clip(room.head[:, 2, 0], -1.0, 1.0))
         for index in track(list(range(len(rows)))):
             m, e, row = rows[index]
             name = f"measurement {m}" + (f", emitter {e}" if emitters > 1 else "")
@@ -80,14 +87,37 @@ def read(
                 continue
             yield name, row
         return
-    receiver_at = origin[:, np.newaxis] + np.einsum(
-        "mxa,mra->mrx", head, sofa.parts("ReceiverPosition", channels, measurements)
-    )
     for m in track(list(range(measurements))):
         for r in range(channels):
             for e in range(emitters):
-                row = Measurement(tuple(receiver_at[m, r]), tuple(emitter_at[m, e]), responses[m, [r], e], int(rate[0]))
+                ends = tuple(room.receiver_at[m, r]), tuple(room.emitter_at[m, e])
+                row = Measurement(*ends, room.responses[m, [r], e], room.sample_rate)
                 yield f"measurement {m}, receiver {r}" + (f", emitter {e}" if emitters > 1 else ""), row
+
+
+def _room(sofa: SofaFile, receivers: Receivers | None) -> _Room:
+    """Raises SofaError."""
+    convention = sofa.text("GLOBAL_SOFAConventions")
+    if convention not in _CONVENTIONS:
+        raise SofaError(sofa.path, "SOFAConventions", f"is {convention}; known are {', '.join(_CONVENTIONS)}")
+    kind = receivers or _CONVENTIONS[convention]
+    rate = sofa.sampling_rate_hz()
+    sofa.require("Data_SamplingRate", rate % 1 == 0, f"is {rate:g}, not a whole number of hertz")
+    responses = _responses(sofa)
+    measurements, channels, emitters, _ = responses.shape
+    if kind == Receivers.EARS and channels != 2:
+        raise SofaError(sofa.path, "Data.IR", f"has {channels} receivers, not two ears")
+    head = sofa.frames("Listener", measurements)
+    origin = sofa.points("ListenerPosition", measurements)
+    beside_source = sofa.parts("EmitterPosition", emitters, measurements)
+    emitter_at = sofa.points("SourcePosition", measurements)[:, np.newaxis] + np.einsum(
+        "mxa,mea->mex", sofa.frames("Source", measurements), beside_source
+    )
+    receiver_at = None
+    if kind == Receivers.MICROPHONES:
+        beside_origin = sofa.parts("ReceiverPosition", channels, measurements)
+        receiver_at = origin[:, np.newaxis] + np.einsum("mxa,mra->mrx", head, beside_origin)
+    return _Room(int(rate), head, origin, emitter_at, receiver_at, responses)
 
 
 def _swapped(path: Path, rows: list[Measurement], report: ImportReport) -> bool:
@@ -108,98 +138,7 @@ def _ears_exchanged(row: Measurement) -> Measurement:
     return Measurement(row.listener, row.emitter, row.response[::-1], row.sample_rate, row.yaw)
 
 
-@dataclass(frozen=True)
-class _File:
-    path: Path
-    content: Any
-
-    def text(self, name: str) -> str:
-        return str(getattr(self.content, name, ""))
-
-    def numbers(self, name: str, default: npt.ArrayLike | None = None) -> _Floats:
-        value = getattr(self.content, name, default)
-        if value is None:
-            raise SourceError(self.path, name.replace("_", "."), "is missing")
-        try:
-            # What a file leaves out is masked when read.
-            return np.ma.filled(np.ma.asarray(value, dtype=np.float64), np.nan)
-        except (TypeError, ValueError) as exc:
-            raise SourceError(self.path, name.replace("_", "."), f"is not of numbers ({exc})") from exc
-
-    def cartesian(self, name: str, values: _Floats, *, described_by: str | None = None) -> _Floats:
-        """(..., 3) by the variable's own Type and Units."""
-        kind = self.text(f"{described_by or name}_Type").strip().lower()
-        units = [unit.strip().lower() for unit in self.text(f"{described_by or name}_Units").split(",")]
-        if kind == "cartesian":
-            self._require(name, set(units) <= {"metre", "meter", "metres", "meters", "m"}, f"Units are {units}")
-            return values
-        self._require(name, kind == "spherical", f"Type is {kind!r}, neither cartesian nor spherical")
-        by_unit = {"degree": np.pi / 180, "degrees": np.pi / 180, "radian": 1.0, "radians": 1.0}
-        # Some files repeat one unit, or leave out the last.
-        angles = units[:2] if len(units) >= 2 else units * 2
-        self._require(name, all(unit in by_unit for unit in angles), f"Units are {units}")
-        azimuth, elevation = values[..., 0] * by_unit[angles[0]], values[..., 1] * by_unit[angles[1]]
-        radius = values[..., 2]
-        towards = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        return np.asarray(radius[..., np.newaxis] * np.stack(towards, axis=-1))
-
-    def points(self, name: str, measurements: int) -> _Floats:
-        """(measurement, 3)"""
-        values = np.atleast_2d(self.numbers(name))
-        self._require(name, values.shape in {(1, 3), (measurements, 3)}, f"has shape {values.shape}")
-        return np.broadcast_to(self.cartesian(name, values), (measurements, 3))
-
-    def parts(self, name: str, count: int, measurements: int) -> _Floats:
-        """(measurement, part, 3) of receivers or emitters, stored (part, 3), (part, 3, 1) or (part, 3, measurement)."""
-        values = self.numbers(name)
-        if values.ndim == 2:
-            values = values[..., np.newaxis]
-        fits = values.ndim == 3 and values.shape[0] in {1, count} and values.shape[1] == 3
-        self._require(name, fits and values.shape[2] in {1, measurements}, f"has shape {values.shape}")
-        return np.broadcast_to(self.cartesian(name, np.moveaxis(values, -1, 0)), (measurements, count, 3))
-
-    def frames(self, owner: str, measurements: int) -> _Floats:
-        """(measurement, xyz, axis) of the room's frame; columns are ahead, left and up of a listener or source."""
-        view, up = f"{owner}View", f"{owner}Up"
-        if not hasattr(self.content, view):
-            return np.broadcast_to(np.eye(3), (measurements, 3, 3))
-        ahead = self._directions(view, measurements, view)
-        ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
-        # Up shares the type of View in published files, and says so in none.
-        upward = self._directions(up, measurements, up if self.text(f"{up}_Type") else view)
-        left = np.cross(upward, ahead)
-        length = np.linalg.norm(left, axis=-1, keepdims=True)
-        self._require(up, bool((length > 1e-6).all()), f"is parallel to {view}, or not finite")
-        left /= length
-        return np.stack([ahead, left, np.cross(ahead, left)], axis=-1)
-
-    def _directions(self, name: str, measurements: int, described_by: str) -> _Floats:
-        values = np.atleast_2d(self.numbers(name, [0.0, 0.0, 1.0]))
-        self._require(name, values.shape in {(1, 3), (measurements, 3)}, f"has shape {values.shape}")
-        directions = self.cartesian(name, values, described_by=described_by)
-        self._require(name, bool((np.linalg.norm(directions, axis=-1) > 1e-6).all()), "is no direction")
-        return np.broadcast_to(directions, (measurements, 3)).copy()
-
-    def _require(self, name: str, condition: bool, problem: str) -> None:
-        if not condition:
-            raise SourceError(self.path, name, problem)
-
-
-def _opened(path: Path) -> _File:
-    if path.suffix != ".sofa":  # sofar would open another file: it replaces any other suffix
-        raise SourceError(path, "file", "a SOFA file's name ends in .sofa")
-    if not path.is_file():
-        raise SourceError(path, "file", "no such file")
-    import sofar
-
-    try:
-        # As stored: sofar's check of a whole file refuses harmless faults that published files are full of.
-        return _File(path, sofar.read_sofa_as_netcdf(str(path)))
-    except (OSError, ValueError) as exc:
-        raise SourceError(path, "file", f"not a readable SOFA file ({exc})") from exc
-
-
-def _responses(sofa: _File) -> npt.NDArray[np.float32]:
+def _responses(sofa: SofaFile) -> npt.NDArray[np.float32]:
     """(measurement, receiver, emitter, sample), `Data.Delay` applied."""
     responses = sofa.numbers("Data_IR")
     kind = sofa.text("GLOBAL_DataType").upper()
@@ -208,21 +147,20 @@ def _responses(sofa: _File) -> npt.NDArray[np.float32]:
     elif kind == "FIR":
         responses = responses[:, :, np.newaxis] if responses.ndim == 3 else responses
     elif kind != "FIRE":
-        raise SourceError(sofa.path, "DataType", f"is {kind}, not FIR, FIRE or FIR-E")
+        raise SofaError(sofa.path, "DataType", f"is {kind}, not FIR, FIRE or FIR-E")
     if responses.ndim != 4 or 0 in responses.shape:
-        raise SourceError(sofa.path, "Data.IR", f"has shape {sofa.numbers('Data_IR').shape}")
+        raise SofaError(sofa.path, "Data.IR", f"has shape {sofa.numbers('Data_IR').shape}")
     delays = np.atleast_2d(sofa.numbers("Data_Delay", 0.0))
     delays = delays[..., np.newaxis] if delays.ndim == 2 else delays
     try:
         delays = np.broadcast_to(delays, responses.shape[:3])
     except ValueError as exc:
-        raise SourceError(sofa.path, "Data.Delay", f"has shape {delays.shape}") from exc
+        raise SofaError(sofa.path, "Data.Delay", f"has shape {delays.shape}") from exc
     if not delays.any():
         return responses.astype(np.float32)
-    longest = _LONGEST_DELAY_S * float(sofa.numbers("Data_SamplingRate").max())
+    longest = _LONGEST_DELAY_S * sofa.sampling_rate_hz()
     if not (delays.min() >= 0 and delays.max() < longest):  # NaN too
-        raise SourceError(sofa.path, "Data.Delay", "is negative, not finite, or too long")
-    samples = responses.shape[-1] + int(np.ceil(delays.max()))
-    n_fft = 2 * samples
-    shift = np.exp(-2j * np.pi * np.fft.rfftfreq(n_fft) * delays[..., np.newaxis])
-    return np.fft.irfft(np.fft.rfft(responses, n_fft) * shift, n_fft)[..., :samples].astype(np.float32)
+        raise SofaError(sofa.path, "Data.Delay", "is negative, not finite, or too long")
+    most = float(delays.max())
+    delayed = [delay_rows(*of_measurement, most) for of_measurement in zip(responses, delays, strict=True)]
+    return np.array(delayed, dtype=np.float32)

@@ -75,6 +75,15 @@ def imported(path, **options):
     return list(conditioned(read(path, report, **options), Conditioning(), report)), report
 
 
+def test_a_rate_in_kilohertz_and_a_type_of_any_spelling_are_read(tmp_path):
+    source = (spherical(EMITTERS, "degree"), "Spherical ", "degrees, degrees, meters")
+    rate = ([RATE / 1000], None, "kHz")
+    responses = [wave(HEAD, emitter, 0.0) for emitter in EMITTERS]
+    rows, _ = imported(brirs(tmp_path / "room.sofa", responses, SourcePosition=source, Data_SamplingRate=rate))
+    assert {row.sample_rate for row in rows} == {RATE}
+    np.testing.assert_allclose([row.emitter for row in rows], EMITTERS, atol=1e-9)
+
+
 @pytest.mark.parametrize("stored", ["cartesian", "degree", "radian"])
 def test_type_and_units_are_read(tmp_path, stored):
     source = at(EMITTERS)
@@ -223,6 +232,10 @@ def test_a_head_that_nods_is_skipped(tmp_path):
         ({"EmitterPosition": at(EMITTERS[:2])}, "EmitterPosition"),
         ({"Data_SamplingRate": ([0.0], None, "hertz")}, "Data.SamplingRate"),
         ({"Data_SamplingRate": ([44_100.0, 48_000.0], None, "hertz")}, "Data.SamplingRate"),
+        ({"Data_SamplingRate": ([48.0], None, "hertz")}, "Data.SamplingRate"),
+        ({"Data_SamplingRate": ([48.0], None, "furlong")}, "Data.SamplingRate"),
+        ({"ListenerPosition": (HEAD[None], "interaural-polar", "degree, degree, metre")}, "ListenerPosition"),
+        ({"EmitterPosition": ([[[0.0], [0.0], [0.0]]], "cartesian", "parsec")}, "EmitterPosition"),
         ({"Data_Delay": ([[-1.0, 0.0]], None, None)}, "Data.Delay"),
         ({"Data_Delay": (np.zeros((3, 2)), None, None)}, "Data.Delay"),
         ({"ListenerView": at([0.0, 0.0, 1.0])}, "ListenerUp"),
