@@ -19,8 +19,9 @@ from server.acoustics.transmission import transmission_loss_db, walls_between
 from training.dataset import SPEED_OF_SOUND
 from training.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation.diffuse_room import DiffuseRoom
+from training.simulation.neighbourhoods import receiver_radii
 from training.simulation.plan import SimulationPlan
-from training.simulation.rays import receiver_radii, surface_shares
+from training.simulation.rays import surface_shares
 from training.simulation.tracing import RoomTracer
 
 _Floats = npt.NDArray[np.float64]
