@@ -1,6 +1,7 @@
 """What an operator can set: by argument, or by an environment variable that begins with NAFIR_."""
 
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Any, Self, get_args
 
@@ -12,6 +13,8 @@ from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
 
 _PREFIX = "NAFIR_"
+_SERVICE_LINK = re.compile(r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)|(\w+_)?PORT_\d+_(TCP|UDP|SCTP)(_\w+)?")
+"""What Kubernetes puts into every container about a service called nafir, behind the prefix."""
 
 
 def _usable_cores() -> int:
@@ -104,7 +107,9 @@ class Settings(BaseSettings):
         known = [name.upper() for name in type(self).model_fields]
         for variable in sorted(os.environ):
             name = variable.upper().removeprefix(_PREFIX)
-            if variable.upper().startswith(_PREFIX) and name not in known:
+            if not variable.upper().startswith(_PREFIX) or _SERVICE_LINK.fullmatch(name):
+                continue
+            if name not in known:
                 problem = f"the environment has {variable}, which is no setting{suggestion(name, known, _PREFIX)}"
                 raise PydanticCustomError("unknown_setting", "{problem}", {"problem": problem})
         return self
