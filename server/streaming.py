@@ -25,6 +25,7 @@ from typing import Final
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.answers import Answers
+from server.api.inflow import Allowance
 from server.api.stream_counts import StreamLedger
 from server.audio_engine import AudioEngine
 from server.blocks import Encoding
@@ -291,6 +292,8 @@ class Connection:
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
         """Until the client has gone."""
         if self._way is not None:
+            emitters, rate = self._host.settings.max_emitters, self._host.scenes[hello.scene].default.sample_rate
+            self._way.allow(Allowance.of(emitters=emitters, sample_rate=rate))
             self._way.listen(self._hear)
         with contextlib.suppress(WebSocketDisconnect):
             while True:
