@@ -1,7 +1,6 @@
 """HTTP and WebSocket endpoints: they parse, hand over, and answer. Angles in degrees, positions in metres."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Annotated, Any
 
@@ -10,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response, WebSocket
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import FiniteFloat
 
+from server.api.response_cache import Compute, Kind
 from server.asyncapi import document
 from server.catalogue import describe_scene, playable_clips
 from server.errors import RequestError
@@ -26,6 +26,8 @@ from server.impulse_response import (
 )
 from server.loudness import loudness_map
 from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
+from server.runtime.pace import Checkpoint
+from server.runtime.racing import StoppedError, run_until
 from server.streaming import Connection, StreamHost
 from server.telemetry import ServerCollector, exposition
 from server.web_socket import direct_way
@@ -35,6 +37,7 @@ MAX_MAP_POINTS = 2_000
 """A point costs milliseconds."""
 MAX_MAP_S = 120.0
 MAX_PLANNED = 16
+CLIENT_CLOSED_REQUEST = 499
 CACHE_CONTROL = "public, max-age=3600"
 """Entity tags outlive it: after an hour an unchanged answer costs a 304."""
 
@@ -111,7 +114,7 @@ async def impulse_response(
         request,
         query.etag(field, name),
         MEDIA_TYPES[name],
-        lambda: ImpulseResponse.compute(field, query).encode(name),
+        lambda _: ImpulseResponse.compute(field, query).encode(name),
     )
 
 
@@ -145,14 +148,14 @@ async def loudness(
         )
         raise RequestError("map_too_slow", problem, field="level")
 
-    def draw() -> bytes:
+    def draw(checkpoint: Checkpoint) -> bytes:
         whole = WholeField.through_kemar(field)
-        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m)
+        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m, checkpoint=checkpoint)
         return levels.to_png() if format == "png" else json.dumps(levels.to_json()).encode()
 
     parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
     media_type = "image/png" if format == "png" else "application/json"
-    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw)
+    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw, kind="map")
 
 
 @api.get("/scenes/{scene}/plan", response_model=PlanDocument)
@@ -187,7 +190,7 @@ async def plan(
         request,
         entity_tag(field, "plan", asdict(query), "json"),
         "application/json",
-        lambda: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
+        lambda _: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
     )
 
 
@@ -226,13 +229,24 @@ def _levels(request: Request, scene: str) -> Levels:
         raise RequestError("unknown_scene", f"there is no scene {scene!r}", field="scene", status=404) from None
 
 
-async def _cached(request: Request, etag: str, media_type: str, compute: Callable[[], bytes]) -> Response:
-    """Answer 304 where the client has it already, and else compute in a worker thread."""
+async def _cached(request: Request, etag: str, media_type: str, compute: Compute, *, kind: Kind = "single") -> Response:
+    """Answer 304 where the client has it already, and else compute it, for as long as the client waits."""
     headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
     if _has_tag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    body = await _host(request).answers.get(etag, compute)
+    client = "" if request.client is None else request.client.host
+    computing = _host(request).responses.get(etag, compute, kind=kind, client=client)
+    try:
+        body = await run_until(computing, _disconnected(request))
+    except StoppedError:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)  # for the log: nobody reads it
     return Response(body, media_type=media_type, headers=headers)
+
+
+async def _disconnected(request: Request) -> None:
+    """Return once the client has gone."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 def _has_tag(if_none_match: str, etag: str) -> bool:

@@ -18,7 +18,7 @@ from functools import partial
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from server.answers import Answers
+from server.api.response_cache import ResponseCache
 from server.audio_engine import AudioEngine
 from server.blocks import Encoding
 from server.catalogue import describe_scene
@@ -83,7 +83,7 @@ class StreamHost:
     hrtfs: HrtfLibrary
     audio: AudioEngine
     settings: Settings
-    answers: Answers
+    responses: ResponseCache
     readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     places: dict[str, Place] = dataclasses.field(default_factory=dict)
