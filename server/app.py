@@ -12,9 +12,9 @@ from typing import get_args
 
 from fastapi import FastAPI
 
-from server.answers import Answers
 from server.api.drain_gate import DrainGate
 from server.api.page_files import PageFiles
+from server.api.response_cache import ResponseCache
 from server.api.strict_requests import StrictRequests
 from server.audio_engine import AudioEngine
 from server.calibration import calibrate
@@ -68,7 +68,15 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
         loaded = await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes
         heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
-        with Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers:
+        with (
+            Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers,
+            ResponseCache(
+                # One more than there are IR workers, which maps leave to what is cheap.
+                workers=settings.ir_workers + 1,
+                waiting=settings.max_waiting_requests,
+                is_urgent=lambda: workers.are_busy,
+            ) as responses,
+        ):
             audio = AudioEngine(
                 asyncio.get_running_loop().call_soon_threadsafe,
                 workers,
@@ -82,9 +90,8 @@ def create_app(
                 hrtfs=heads,
                 audio=audio,
                 settings=settings,
-                # One more than there are IR workers: a map must not hold up an IR.
-                answers=Answers(workers=settings.ir_workers + 1, waiting=settings.max_waiting_requests),
-                readiness=Readiness(drain, ThreadWatch((audio, workers.pool))),
+                responses=responses,
+                readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool))),
             )
             if settings.realtime:
                 become_prompt()

@@ -1,7 +1,6 @@
 """HTTP and WebSocket endpoints: they parse, hand over, and answer. Angles in degrees, positions in metres."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Annotated, Any
 
@@ -10,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response, WebSocket
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import FiniteFloat
 
+from server.api.response_cache import Compute, Kind
 from server.asyncapi import document
 from server.catalogue import describe_scene, playable_clips
 from server.core.entity_tags import content_tag
@@ -27,6 +27,8 @@ from server.impulse_response import (
 )
 from server.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
 from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
+from server.runtime.pace import Checkpoint
+from server.runtime.racing import StoppedError, run_until
 from server.streaming import Connection, StreamHost
 from server.telemetry import ServerCollector, exposition
 from server.web_socket import direct_way
@@ -35,6 +37,8 @@ from server.whole_field import WholeField
 MAX_MAP_SPACING_M = 20.0
 MAX_MAP_S = 120.0
 MAX_PLANNED = 16
+CLIENT_CLOSED_REQUEST = 499
+"""For the log alone: nobody is there to read it."""
 CACHE_CONTROL = "public, max-age=3600"
 """Entity tags outlive it: after an hour an unchanged answer costs a 304."""
 
@@ -109,7 +113,7 @@ async def impulse_response(
         request,
         query.etag(field, name),
         MEDIA_TYPES[name],
-        lambda: ImpulseResponse.compute(field, query).encode(name),
+        lambda _: ImpulseResponse.compute(field, query).encode(name),
     )
 
 
@@ -147,14 +151,14 @@ async def loudness(
         )
         raise RequestError("map_too_slow", problem, field="level")
 
-    def draw() -> bytes:
+    def draw(checkpoint: Checkpoint) -> bytes:
         whole = WholeField.through_kemar(field)
-        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m)
+        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m, checkpoint=checkpoint)
         return levels.to_png() if format == "png" else json.dumps(levels.to_json()).encode()
 
     parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
     media_type = "image/png" if format == "png" else "application/json"
-    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw)
+    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw, kind="map")
 
 
 @api.get("/scenes/{scene}/plan", response_model=PlanDocument)
@@ -187,10 +191,13 @@ async def plan(
     costs = _host(request).effect_costs.get(scene)
     # Until they are measured, this process measures its own once, and keeps to them.
     told = None if costs is None else {name: asdict(cost) for name, cost in costs.items()}
-    body = await _host(request).answers.get(
+    body = await _computed(
+        request,
         entity_tag(field, "plan", {**asdict(query), "scene": scene, "costs": told}, "json"),
-        lambda: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
+        lambda _: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
     )
+    if body is None:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
     # What it costs is of this host and of this start of the server: nothing but the body itself says so.
     headers = {"ETag": content_tag(body), "Cache-Control": "no-cache"}
     if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
@@ -233,13 +240,31 @@ def _levels(request: Request, scene: str) -> Levels:
         raise RequestError("unknown_scene", f"there is no scene {scene!r}", field="scene", status=404) from None
 
 
-async def _cached(request: Request, etag: str, media_type: str, compute: Callable[[], bytes]) -> Response:
-    """Answer 304 where the client has it already, and else compute in a worker thread."""
+async def _cached(request: Request, etag: str, media_type: str, compute: Compute, *, kind: Kind = "single") -> Response:
+    """Answer 304 where the client has it already, and else compute it, for as long as the client waits."""
     headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
     if _has_tag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    body = await _host(request).answers.get(etag, compute)
+    body = await _computed(request, etag, compute, kind=kind)
+    if body is None:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
     return Response(body, media_type=media_type, headers=headers)
+
+
+async def _computed(request: Request, etag: str, compute: Compute, *, kind: Kind = "single") -> bytes | None:
+    """The body kept or computed for as long as the client waits; None where it has gone."""
+    client = "" if request.client is None else request.client.host
+    computing = _host(request).responses.get(etag, compute, kind=kind, client=client)
+    try:
+        return await run_until(computing, _disconnected(request))
+    except StoppedError:
+        return None
+
+
+async def _disconnected(request: Request) -> None:
+    """Return once the client has gone."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 def _has_tag(if_none_match: str, etag: str) -> bool:

@@ -86,7 +86,7 @@ class Settings(BaseSettings):
     stall_timeout_s: Annotated[float, Field(gt=0)] = 15.0
     """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
-    """HTTP requests that may wait for a worker; one more is answered 503."""
+    """HTTP computations that may wait for a thread, equal requests as one; with one more, a client is answered 503."""
     drain_s: Annotated[float, Field(ge=2, le=3600)] = 8.0
     """How long the server may take to end once it is told to (SIGTERM, SIGINT): streams are told at once, requests may
     go on for 0.7 of it, and whatever has not ended by then is cut off."""

@@ -24,8 +24,8 @@ from typing import Final
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from server.answers import Answers
 from server.api.inflow import Allowance
+from server.api.response_cache import ResponseCache
 from server.api.stream_counts import StreamLedger
 from server.audio_engine import AudioEngine
 from server.blocks import Encoding
@@ -99,7 +99,7 @@ class StreamHost:
     hrtfs: HrtfLibrary
     audio: AudioEngine
     settings: Settings
-    answers: Answers
+    responses: ResponseCache
     readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     places: dict[str, Place] = dataclasses.field(default_factory=dict)
