@@ -32,7 +32,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle scenes table tables office container-test clean hard-cases fuzz mutants
+.PHONY: help serve test lint format bundle scenes table tables office container-test clean hard-cases fuzz mutants predictions
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
 
 help: ## show this list
@@ -85,6 +85,9 @@ mutants: $(VENV)/installed-dev ## remove each guard in a copy of the tree and sh
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh
+
+predictions: $(VENV)/installed-training ## what plans predict of effects beside what simulation finds, in ten rooms of extremes: some minutes
+	$(BIN)/python -m training.simulation.rooms_tried
 
 clean: ## remove .venv and caches; keeps runs/
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

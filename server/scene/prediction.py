@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.audibility import HEARD, ratio_in_jnd
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import axes_of
 from server.scene.effects import EffectName
@@ -222,6 +222,7 @@ class Prediction:
         the more so the fewer modes there are, of which a decay has as many as its bandwidth times its duration.
         """
         owner, whole = self.reach.owner, self.whole
+        within = bands_within(self.place.sample_rate)
         mirrored, held = whole.mirrored, whole.held
         mirrored_change = np.abs(np.sqrt(mirrored) - np.sqrt(left.mirrored))[:, owner]
         held_root = np.sqrt(held)[:, owner]
@@ -236,7 +237,7 @@ class Prediction:
             by_chance = amplitude * held_root + held_change * np.sqrt(direct + mirrored)
             before, without = direct + after, other_direct + other_after
             most = np.abs(before - without) + by_chance * chance
-            return np.asarray((most / np.minimum(before, without)).max(axis=-1))
+            return np.asarray((most / np.minimum(before, without))[..., :within].max(axis=-1))
 
         return power_to_db(1 + np.maximum(change(1.0), change(self._facing_gain)))
 
