@@ -70,4 +70,5 @@ def describe_scene(levels: Levels) -> SceneDescription:
         emitter=Place(position=start.emitter),
         level=field.level.name,
         levels=manifest.levels,
+        accepted_laws=manifest.accepted,
     )
