@@ -3,19 +3,23 @@
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError
 from contextlib import asynccontextmanager
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
 
 from fastapi import FastAPI
-from starlette.staticfiles import StaticFiles
 
 from server.answers import Answers
+from server.api.drain_gate import DrainGate
+from server.api.page_files import PageFiles
+from server.api.strict_requests import StrictRequests
 from server.audio_engine import AudioEngine
 from server.calibration import calibrate
 from server.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
+from server.core.entity_tags import fingerprint
 from server.effect_costs import measure_costs
 from server.field.levels import Levels
 from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
@@ -28,6 +32,10 @@ from server.problems import install_problems
 from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
 from server.rendering.warm_up import warm_up
 from server.routes import api, documents, health
+from server.runtime.drain import Drain
+from server.runtime.own_thread import run_in_own_thread
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
 from server.session import Session
 from server.settings import Settings
 from server.streaming import StreamHost
@@ -43,12 +51,18 @@ _logger = logging.getLogger(__name__)
 
 
 def create_app(
-    settings: Settings, *, scenes: Mapping[str, Levels] | None = None, hrtfs: HrtfLibrary | None = None
+    settings: Settings,
+    *,
+    scenes: Mapping[str, Levels] | None = None,
+    hrtfs: HrtfLibrary | None = None,
+    drain: Drain | None = None,
 ) -> FastAPI:
-    """`scenes` by id, and `hrtfs`, where the caller has loaded them already to see their errors first.
+    """`scenes` by id, and `hrtfs`, where the caller has loaded them already to see their errors first. `drain` is begun
+    by who ends the server.
 
     Otherwise they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError for an HRTF.
     """
+    drain = Drain(settings.drain_s) if drain is None else drain
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
@@ -70,15 +84,18 @@ def create_app(
                 settings=settings,
                 # One more than there are IR workers: a map must not hold up an IR.
                 answers=Answers(workers=settings.ir_workers + 1, waiting=settings.max_waiting_requests),
+                readiness=Readiness(drain, ThreadWatch((audio, workers.pool))),
             )
             if settings.realtime:
                 become_prompt()
             audio.start()
-            warming = asyncio.create_task(_become_ready(host))
+            tasks = [asyncio.create_task(_become_ready(host)), asyncio.create_task(host.readiness.watch.run())]
             try:
                 yield {"host": host}
             finally:
-                warming.cancel()
+                drain.begin()
+                for task in tasks:
+                    task.cancel()
                 await asyncio.to_thread(audio.stop)
                 collect_as_usual()
 
@@ -90,43 +107,52 @@ def create_app(
         docs_url="/docs",
         redoc_url=None,
     )
+    app.add_middleware(DrainGate, drain=drain)
     install_problems(app)
     app.include_router(health)
     app.include_router(documents)
     app.include_router(api)
-    app.mount("/", StaticFiles(directory=WEB, html=True, check_dir=False), name="web")
+    app.add_middleware(StrictRequests, routes=app.router.routes)
+    app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
 
 
 async def _become_ready(host: StreamHost) -> None:
     try:
-        await asyncio.to_thread(_warm_up, host)
+        await run_in_own_thread(partial(_warm_up, host), "nafir-warm-up")
     except Exception:  # whatever it is, the server stays up, and not ready, for an operator to look at
         _logger.exception("warm-up failed")
+        host.readiness.warm_up = "failed"
         return
     collect_rarely()
-    host.is_ready = True
+    host.readiness.warm_up = "done"
     _logger.info("ready: %s", ", ".join(host.scenes))
     # Nothing waits for these: whoever came first is served first.
     await asyncio.sleep(_COSTS_AFTER_S)
     breaks = Breaks(_COSTS_SHARE)
-    with ThreadPoolExecutor(1, "nafir-costs", initializer=become_background) as measuring:
-        try:
-            await asyncio.get_running_loop().run_in_executor(measuring, _measure_effects, host, breaks)
-        finally:
-            breaks.call_off()
+    try:
+        await run_in_own_thread(partial(_measure_effects, host, breaks), "nafir-costs")
+    except Exception:  # plans are made without costs, as they were until now
+        _logger.exception("what effects cost could not be measured: plans do not say")
+    finally:
+        breaks.call_off()
 
 
 def _measure_effects(host: StreamHost, breaks: Breaks) -> None:
     """See what effects cost here. Plans of streams opened before do not say."""
+    become_background()
     for scene, levels in host.scenes.items():
-        host.effect_costs[scene] = measure_costs(levels.default, rest=breaks.rest)
+        try:
+            host.effect_costs[scene] = measure_costs(levels.default, rest=breaks.rest)
+        except CancelledError:  # nobody waits any longer
+            return
 
 
 def _warm_up(host: StreamHost) -> None:
     """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render. And
     see how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
+    fingerprint()
     for scene, levels in host.scenes.items():
         host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)

@@ -21,6 +21,7 @@ from server.message import Message
 from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter, TextMessage
 from server.replies import EmitterAdded, EmitterRemoved, Error, Pong, ServerMessage, Welcome
 from server.settings import Settings
+from server.stream import PAUSE_AFTER_S
 from server.stream_codes import CLOSE_CODES, ERROR_CODES
 
 Object = dict[str, Any]
@@ -55,7 +56,12 @@ def _description() -> str:
 Control travels as JSON text, one object with a `type` per message; audio, and listener poses where wished, as binary
 messages whose first byte is their kind. Binary is little endian. Metres, radians, decibels, samples of the scene's
 rate; x east, y north, z up, yaw counter-clockwise from +x. f32 is IEEE 754 single with full scale 1, s16 two's
-complement with 32767 for full scale. Fields that are unknown are refused.
+complement with 32767 for full scale.
+
+**What either side does not know.** The server refuses fields and messages that this version does not have, by their
+name: ignored, a misspelt field would be a wish that nobody hears. Clients ignore unknown fields, messages and kinds of
+binary messages: a server may say more within a version. Whole numbers may be written with a fraction of zero (`1.0`).
+Of a `hello` the version is read first: another is answered `unsupported_protocol`, whatever else it says.
 
 **Hello first.** The first message is a `hello`, within {_default("hello_timeout_s"):g} s. A `welcome` answers it, and
 sound flows from then on; or an `error`, and the connection ends. A message has at most
@@ -69,11 +75,14 @@ newest pose of its direct sound and that of its reverberation, so that a client 
 
 **Flow control by acknowledgement.** At most `window` blocks (of the `welcome`) are sent that no `acknowledge` has told
 to have arrived; one stands for all blocks before it, so that every fourth block or so is enough. While the window is
-full, blocks are rendered and not sent: `sequence` has no gap then, and `sample_clock` jumps. A client whose answers
-pile up, since it does not read, is cut off.
+full, blocks are rendered and not sent: `sequence` has no gap then, and `sample_clock` jumps. Once it has been full for
+{PAUSE_AFTER_S:g} s, the stream stands still, its clock included, until an `acknowledge` makes room: it goes on where it
+was. After {_default("stall_timeout_s"):g} s the connection is closed (`stalled`). A client whose answers pile up, since
+it does not read, is cut off.
 
 **Errors.** A message that is refused changes nothing, and the stream goes on, unless it was the hello. An `error` that
-ends the connection is followed by a close frame whose reason is the error's code.
+ends the connection is followed by a close frame whose reason is the error's code. A server that is told to stop sends
+every stream the error `server_draining` and closes it with 1012: the client opens it again, there or elsewhere.
 
 **An exchange**
 
@@ -106,6 +115,10 @@ def _schemas() -> Object:
         schema_generator=_Draft7,
     )
     schemas: Object = generated["$defs"]
+    _, of_clients = models_json_schema([(each, "validation") for each in _CLIENT], schema_generator=_Draft7)
+    for name in schemas.keys() - of_clients["$defs"].keys():
+        # A client has to ignore what it does not know.
+        schemas[name].pop("additionalProperties", None)
     for each in _CLIENT:
         schema = schemas[each.__name__]
         schema["required"] = ["type", *schema.get("required", [])]

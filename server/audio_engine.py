@@ -34,13 +34,14 @@ from collections import Counter, deque
 from collections.abc import Callable
 from itertools import islice
 from operator import attrgetter
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from server.blocks_at_once import NUMBERS as NUMBERS_AT_ONCE
 from server.blocks_at_once import BlocksAtOnce
 from server.load import PERIOD_S, LoadControl, Reason, ir_share
 from server.priority import become_real_time
 from server.rendering.renderer import render_all
+from server.runtime.thread_watch import Watched
 from server.stream import Outgoing, Stream, StreamFailed
 from server.turns import Turns
 from server.workers import Workers
@@ -64,6 +65,7 @@ _PRESUMED_LOAD = 0.02
 _SWITCH_S = 0.0005
 """How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, one that is busy
 half of the time holds audio up for longer than blocks last."""
+_STOP_S = 1.0
 _FAILED = "a stream failed and is closed"
 _logger = logging.getLogger(__name__)
 
@@ -76,8 +78,11 @@ class AudioEngine:
 
     `workers` computes IRs; each stream has at most one request with it. Under load, those of one audio thread's streams
     take `ir_share` of a core, or less where rendering leaves less. `is_real_time` asks the system to schedule audio
-    threads before all others.
+    threads before all others. Its threads are watched (`server.runtime.thread_watch`).
     """
+
+    patience_s = 1.0
+    """How long a tick may take; it takes milliseconds."""
 
     def __init__(
         self,
@@ -103,11 +108,12 @@ class AudioEngine:
             thread.start()
 
     def stop(self) -> None:
-        """Return once the threads have ended, which takes one tick."""
+        """Return once the threads have ended, which takes one tick; of one that is stuck, without that."""
         for thread in self.threads:
             thread.stop()
+        until_s = time.monotonic() + _STOP_S
         for thread in self.threads:
-            thread.join()
+            thread.join(max(0.0, until_s - time.monotonic()))
         sys.setswitchinterval(self._switch_s_before)
 
     @property
@@ -137,6 +143,28 @@ class AudioEngine:
             self._share_workers()
             thread.close(stream)
 
+    def replace(self, dead: Watched) -> None:
+        """Start a thread in the place of one that died. Its streams go on there, unless it died at work on them: nobody
+        knows their state then, and they have failed."""
+        number, thread = next((number, each) for number, each in enumerate(self.threads) if each is dead)
+        successor = self.threads[number] = thread.successor()
+        for stream in self._streams_of(thread):
+            self._thread_of[stream] = successor
+            if thread.work_number is None:
+                successor.open(stream)
+            else:
+                stream.deliver([StreamFailed()])
+        self._share_workers()
+        successor.start()
+
+    def give_up(self, stuck: Watched) -> None:
+        """Tell the streams of a thread that is stuck that they have failed."""
+        for stream in self._streams_of(stuck):
+            stream.deliver([StreamFailed()])
+
+    def _streams_of(self, thread: Watched) -> list[Stream]:
+        return [stream for stream, its_thread in self._thread_of.items() if its_thread is thread]
+
     def _share_workers(self) -> None:
         """Have threads with streams keep as many of them busy as each other."""
         sharing = set(self._thread_of.values())
@@ -165,7 +193,8 @@ class AudioThread:
         self._is_real_time = is_real_time
         self._ir_share = ir_share
         self._time_s = time_s
-        self.steps: Counter[Reason] = Counter()
+        # All reasons from the start: whoever reads it on another thread must not find it growing.
+        self.steps: Counter[Reason] = Counter(dict.fromkeys(get_args(Reason), 0))
         """Times that streams were moved to other quality."""
         self._load = LoadControl()
         self._busy_s = 0.0
@@ -180,6 +209,8 @@ class AudioThread:
         """What was handed to the event loop."""
         self._has_arrived.set()
         self._is_stopping = False
+        self._ticks = 0
+        self._is_ticking = False
         self._thread = threading.Thread(target=self._run, name=f"nafir-audio-{number}", daemon=True)
 
     @property
@@ -187,16 +218,44 @@ class AudioThread:
         """How many blocks of a stream it renders together."""
         return self._at_once.count
 
+    @property
+    def name(self) -> str:
+        return self._thread.name
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether it has ended by itself."""
+        return self._thread.ident is not None and not (self._thread.is_alive() or self._is_stopping)
+
+    @property
+    def work_number(self) -> int | None:
+        """Which tick it is at; None between two. Of a thread that died, where it died."""
+        return self._ticks if self._is_ticking else None
+
     def start(self) -> None:
         self._thread.start()
+
+    def successor(self) -> "AudioThread":
+        """One without streams, that counts on."""
+        thread = AudioThread(
+            self._post,
+            self._workers,
+            number=self._number,
+            is_real_time=self._is_real_time,
+            ir_share=self._ir_share,
+            time_s=self._time_s,
+        )
+        thread.steps = self.steps
+        return thread
 
     def stop(self) -> None:
         self._is_stopping = True
         self._wake.set()
         self._has_arrived.set()
 
-    def join(self) -> None:
-        self._thread.join()
+    def join(self, timeout_s: float) -> None:
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
 
     def open(self, stream: Stream) -> None:
         stream.attach(wake=self._wake.set, time_s=self._time_s, turns=self.turns)
@@ -210,7 +269,7 @@ class AudioThread:
     def tick(self) -> float | None:
         """Heed what waits, render what is due, and hand over what was made.
 
-        Seconds until the next is due, None without streams.
+        Seconds until the next is due, None where no stream is to be rendered.
         """
         now_s = self._time_s()
         self._admit(now_s)
@@ -240,9 +299,8 @@ class AudioThread:
         if any(made.values()):
             self._has_arrived.clear()
             self._post(lambda: self._deliver(made))
-        if not self._streams:
-            return None
-        return min(stream.due_s for stream in self._streams) - self._time_s()
+        next_s = min((stream.due_s for stream in self._streams), default=math.inf)
+        return None if next_s == math.inf else next_s - self._time_s()
 
     def _due(self, now_s: float) -> dict[Stream, int]:
         """Whose blocks to render now, and how many: of all that are due those that are late soonest, as many as a tick
@@ -358,7 +416,11 @@ class AudioThread:
         if self._is_real_time and (reason := become_real_time()) is not None and self._number == 0:
             _logger.warning("audio threads run at ordinary priority: %s", reason)
         while not self._is_stopping:
-            self._rest(self.tick())
+            self._ticks += 1
+            self._is_ticking = True
+            wait_s = self.tick()
+            self._is_ticking = False
+            self._rest(wait_s)
 
     def _rest(self, wait_s: float | None) -> None:
         """Sleep until the next stream is due. Where there is no time for that, let the event loop have the core as long

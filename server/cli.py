@@ -3,6 +3,7 @@
 Errors a person can act on end the process with one line and exit code 2, as wrong usage does.
 """
 
+import contextlib
 import io
 import json
 import math
@@ -17,6 +18,8 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from server.bench import cli as bench
+from server.core.command_line import StrictTyper
+from server.core.files import require_figure, require_readable, require_writable
 from server.errors import NafirError, RequestError
 from server.health.cli import check
 from server.soak.cli import soak
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
     from server.render import RenderedEmitter
     from server.settings import Settings
 
-app = typer.Typer(
+app = StrictTyper(
     name="nafir",
     help="Hear how a place sounds while you move through it.",
     no_args_is_help=True,
@@ -71,9 +74,12 @@ def serve(
     import uvicorn
     from pydantic import ValidationError
 
+    from server.api import serving
     from server.app import create_app
     from server.catalogue import load_hrtfs, load_scenes
     from server.memory import give_back_large_arrays
+    from server.runtime.drain import Drain
+    from server.runtime.open_files import allow_connections
     from server.settings import Settings
 
     give_back_large_arrays()
@@ -82,29 +88,45 @@ def serve(
         settings = Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as exc:
         first = exc.errors()[0]
-        raise NafirError(f"setting {'.'.join(str(part) for part in first['loc'])}: {first['msg']}") from exc
-    scenes = load_scenes(settings.bundles)
-    if not scenes:
-        raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
-    hrtfs = load_hrtfs(settings.hrtfs, scenes)
-    if settings.port:
-        Console().print(
-            f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]http://{settings.host}:{settings.port}[/]",
-            highlight=False,
+        place = f"setting {'.'.join(str(part) for part in first['loc'])}: " if first["loc"] else ""
+        raise NafirError(f"{place}{first['msg'].removeprefix('Value error, ')}") from exc
+    allow_connections(settings.max_connections)
+    for name in ("clips", "hrtfs"):
+        for path in getattr(settings, name):
+            require_readable(path, name)
+    with contextlib.ExitStack() as opened:
+        # Before what takes time: a port that cannot be had is told of at once.
+        listeners = [opened.enter_context(listener) for listener in serving.bind(settings.host, settings.port)]
+        scenes = load_scenes(settings.bundles)
+        if not scenes:
+            raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
+        hrtfs = load_hrtfs(settings.hrtfs, scenes)
+        drain = Drain(settings.drain_s)
+        application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain)
+        url = serving.url(listeners[0], settings.host)
+        said = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
+        serving.serve(
+            uvicorn.Config(application, **server_options(settings)),
+            listeners,
+            drain,
+            on_start=lambda: Console().print(said, highlight=False),
         )
-    uvicorn.run(create_app(settings, scenes=scenes, hrtfs=hrtfs), **server_options(settings))
 
 
 def server_options(settings: "Settings") -> dict[str, Any]:
     """How uvicorn has to run the application."""
+    from server.api.connection_limits import ConnectionLimits
+    from server.api.http_protocol import limited_http
+
     return {
+        "http": limited_http(ConnectionLimits.of(settings)),
+        "timeout_keep_alive": settings.keep_alive_s,
         "host": settings.host,
         "port": settings.port,
         "loop": "auto",  # uvloop wherever it exists
         "ws": "server.web_socket:WebSocketProtocol",
         "ws_max_size": settings.max_frame_bytes,
         "ws_per_message_deflate": False,
-        "timeout_graceful_shutdown": 5,
     }
 
 
@@ -127,6 +149,7 @@ def ir(
     from server.scene.bundle import Bundle, find_bundle
 
     name = parse_format(output.suffix.removeprefix("."))
+    require_writable(output, "--output")
     if not math.isfinite(yaw_deg):
         raise RequestError("malformed_pose", "yaw-deg is not finite", field="yaw_deg")
     query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
@@ -195,6 +218,7 @@ def render(
 
     if output.suffix != ".wav":
         raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
+    require_writable(output, "--output")
     bundle = Bundle.load(find_bundle(scene))
     field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
     if duration_s is not None and not 1 / field.sample_rate <= duration_s <= MAX_RENDER_S:
@@ -272,6 +296,8 @@ def plan(
     from server.plan_table import print_plan
     from server.scene.bundle import Bundle, find_bundle
 
+    if figure is not None:
+        require_figure(figure, "--figure")
     query = PlanQuery(
         listener=None if listener is None else parse_position(listener, "listener"),
         yaw_deg=yaw_deg,

@@ -13,23 +13,29 @@ _BINS = _OCTAVES * _PER_OCTAVE
 
 class DurationHistogram:
     """Counts of durations on a logarithmic scale from a microsecond to a minute, to within 2.2 %; what lies outside
-    counts as the nearest end. One thread adds; any may read."""
+    counts as the nearest end. Their sum is kept in whole nanoseconds, so that it is the same in whatever order
+    histograms are merged. One thread adds; any may read."""
 
     def __init__(self) -> None:
         self.count = 0
-        self.total_s = 0.0
+        self._total_ns = 0
         self._bins = [0] * _BINS
+
+    @property
+    def total_s(self) -> float:
+        """Of all that were added."""
+        return self._total_ns / 1e9
 
     def add(self, duration_s: float, times: int = 1) -> None:
         place = int(math.log2(duration_s / _SHORTEST_S) * _PER_OCTAVE) if duration_s > _SHORTEST_S else 0
         self._bins[place if place < _BINS else _BINS - 1] += times
         self.count += times
-        self.total_s += times * duration_s
+        self._total_ns += times * round(max(0.0, duration_s) * 1e9)
 
     def merge(self, other: "DurationHistogram") -> None:
         """Add what another counted."""
         self.count += other.count
-        self.total_s += other.total_s
+        self._total_ns += other._total_ns
         self._bins = [mine + others for mine, others in zip(self._bins, other._bins, strict=True)]
 
     def cumulative(self) -> list[tuple[float, int]]:

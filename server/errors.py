@@ -21,14 +21,23 @@ class RequestError(NafirError):
     """A request that cannot be answered as asked.
 
     `code` is stable and machine-readable, `field` names the offending input where there is one, and `status` is the
-    HTTP status (a WebSocket client gets the code instead).
+    HTTP status (a WebSocket client gets the code instead). `retry_after_s` is when it is worth asking again.
     """
 
-    def __init__(self, code: str, message: str, *, field: str | None = None, status: int = 422) -> None:
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        *,
+        field: str | None = None,
+        status: int = 422,
+        retry_after_s: int | None = None,
+    ) -> None:
         super().__init__(message)
         self.code = code
         self.field = field
         self.status = status
+        self.retry_after_s = retry_after_s
 
 
 class FieldError(RequestError):

@@ -31,7 +31,8 @@ class LevelPoint(_Document):
     just-noticeable differences.
 
     An emitter gets `ir_rate_hz` responses a second at most, or one with every pose; of each, the first `frames` frames
-    are computed, or all; with `reuse`, poses near each other share them.
+    are computed, or all; with `reuse`, poses near each other share them. `architecture` is that of the level's field,
+    None where the scene has none.
     """
 
     name: str
@@ -51,7 +52,7 @@ class LevelPoint(_Document):
     yaws: int | None
     audible: float | None
     audible_floor: float | None
-    architecture: str
+    architecture: str | None
     rank: int | None
     phase: Phase
     frames: int | None
@@ -64,7 +65,7 @@ class LevelPoint(_Document):
         cls,
         level: QualityLevel,
         *,
-        architecture: str,
+        architecture: str | None,
         rank: int | None,
         ms_here: float | None = None,
         is_offered: bool = True,
@@ -113,9 +114,14 @@ class Frontier(_Document):
         points = []
         for name in levels.names:
             level = levels[name].level
-            file = fields[level.field]
+            file = fields.get(level.field)
             points.append(
-                LevelPoint.of(level, architecture=file.architecture, rank=file.rank, ms_here=ms_here.get(name))
+                LevelPoint.of(
+                    level,
+                    architecture=None if file is None else file.architecture,
+                    rank=None if file is None else file.rank,
+                    ms_here=ms_here.get(name),
+                )
             )
         points += [
             LevelPoint.of(point.level, architecture=point.architecture, rank=point.rank, is_offered=False)

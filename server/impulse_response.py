@@ -5,12 +5,10 @@ Metres; angles in degrees, since these are human edges. Samples are (channel, sa
 of a scene that one microphone heard there is one channel, and the head's yaw changes nothing.
 """
 
-import hashlib
 import io
 import json
 import math
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,6 +16,8 @@ import numpy.typing as npt
 import scipy.io.wavfile
 
 from server.acoustics.geometry import Vector3
+from server.core.entity_tags import computed_tag
+from server.core.numerals import DECIMAL, parse_decimal
 from server.errors import RequestError
 from server.field.field import AcousticField
 from server.whole_field import WholeField
@@ -27,14 +27,19 @@ IR_FORMATS: tuple[IrFormat, ...] = get_args(IrFormat)
 MEDIA_TYPES: dict[IrFormat, str] = {"wav": "audio/wav", "npy": "application/octet-stream", "json": "application/json"}
 
 
+POSITION_PATTERN = rf"^ *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *$"
+"""What `parse_position` takes, as a regular expression of JSON Schema."""
+
+
 def parse_position(text: str, field: str) -> Vector3:
-    """Three finite numbers between commas, metres. Raises RequestError malformed_pose naming `field`."""
+    """Three decimal numbers between commas, metres. Raises RequestError malformed_pose naming `field`."""
+    parts = text.split(",", 3)
+    if len(parts) != 3:
+        raise RequestError("malformed_pose", f"{field}: {text!r} is not three numbers x,y,z", field=field)
     try:
-        x, y, z = (float(part) for part in text.split(","))
+        x, y, z = map(parse_decimal, parts)
     except ValueError as exc:
-        raise RequestError("malformed_pose", f"{field}: {text!r} is not three numbers x,y,z", field=field) from exc
-    if not all(math.isfinite(coordinate) for coordinate in (x, y, z)):
-        raise RequestError("malformed_pose", f"{field}: {text!r} is not finite", field=field)
+        raise RequestError("malformed_pose", f"{field}: in x,y,z {exc}", field=field) from exc
     return (x, y, z)
 
 
@@ -60,17 +65,13 @@ class IrQuery:
         field.bundle.require_inside(self.emitter, "emitter")
 
     def etag(self, field: AcousticField, name: str) -> str:
-        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and the package's
-        version."""
+        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and what computes it."""
         return entity_tag(field, "impulse-response", asdict(self), name)
 
 
 def entity_tag(field: AcousticField, kind: str, parameters: dict[str, object], name: str) -> str:
     """Tag of whatever is computed from a field's bundle, its level and `parameters`, written in format `name`."""
-    canonical = json.dumps(
-        [version("nafir"), field.bundle.digest, field.level.name, kind, parameters, name], sort_keys=True
-    )
-    return f'"{hashlib.sha256(canonical.encode()).hexdigest()[:32]}"'
+    return computed_tag(field.bundle.digest, field.level.name, kind, parameters, name)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ metre.
 """
 
 import io
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +16,17 @@ from scipy.ndimage import distance_transform_edt
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import Vector3
 from server.field.field import AcousticField
+from server.scene.bundle import Bundle
 from server.whole_field import WholeField
 
 # Ears of two opposite heads face four ways.
 _YAWS = 2
 _CHUNK = 64
+MAX_POINTS = 2_000
+"""Of a map; a point costs milliseconds."""
+FINEST_M = 0.1
+_USUAL_M = 0.25
+_POINTS_ACROSS = 8
 _PIXELS_PER_METRE = 80
 _RANGE_DB = 30.0
 # Perceptually even, dark to bright, legible under dark and light drawings (a subset of the CAM02-UCS path of
@@ -69,6 +76,15 @@ class LoudnessMap:
         buffer = io.BytesIO()
         image.save(buffer, "PNG")
         return buffer.getvalue()
+
+
+def usual_spacing_m(bundle: Bundle) -> float:
+    """Between map points where none was asked for: 0.25 m; less in a small scene, so that at least eight points lie
+    across it, and more in a large one, so that MAX_POINTS suffice. Whole centimetres."""
+    low, high = np.asarray(bundle.manifest.bounds.minimum[:2]), np.asarray(bundle.manifest.bounds.maximum[:2])
+    fitting = max(FINEST_M, min(_USUAL_M, float((high - low).min()) / _POINTS_ACROSS))
+    affordable = math.sqrt(bundle.floor_plan.area_m2 / MAX_POINTS)
+    return math.ceil(100 * max(fitting, affordable) - 1e-9) / 100
 
 
 def loudness_map(

@@ -51,6 +51,10 @@ class SendWindow:
     def unacknowledged(self) -> int:
         return self.sent - self._acknowledged
 
+    @property
+    def is_full(self) -> bool:
+        return self.unacknowledged >= self.size
+
     def take_sequences(self, blocks: int) -> range:
         """The sequence numbers of so many blocks, or of the first of them for which the window has room."""
         first = self.sent

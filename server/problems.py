@@ -13,8 +13,11 @@ _POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "height_m"})
 _CODES = {404: "not_found", 405: "method_not_allowed"}
 
 
-def problem(status: int, code: str, detail: str, field: str | None = None) -> JSONResponse:
-    """`code` is for programs and does not change; `detail` is for people; `field` is the parameter at fault."""
+def problem(
+    status: int, code: str, detail: str, field: str | None = None, *, retry_after_s: int | None = None
+) -> JSONResponse:
+    """`code` is for programs and does not change; `detail` is for people; `field` is the parameter at fault.
+    `retry_after_s` is when it is worth asking again, where the fault passes."""
     return JSONResponse(
         {
             "type": "about:blank",
@@ -26,6 +29,7 @@ def problem(status: int, code: str, detail: str, field: str | None = None) -> JS
         },
         status_code=status,
         media_type="application/problem+json",
+        headers=None if retry_after_s is None else {"Retry-After": str(retry_after_s)},
     )
 
 
@@ -34,7 +38,7 @@ def install_problems(app: FastAPI) -> None:
 
     async def refused(_: Request, exc: Exception) -> JSONResponse:
         assert isinstance(exc, RequestError)
-        return problem(exc.status, exc.code, str(exc), exc.field)
+        return problem(exc.status, exc.code, str(exc), exc.field, retry_after_s=exc.retry_after_s)
 
     async def invalid(_: Request, exc: Exception) -> JSONResponse:
         assert isinstance(exc, RequestValidationError)

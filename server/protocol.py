@@ -8,9 +8,11 @@ Every type here parses and serialises itself, so the tests, the documentation an
 definition. What a client sends is validated here, once; a `RequestError` carries the code that goes back to it.
 """
 
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Iterable, Mapping
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, get_args
 
 from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -19,17 +21,18 @@ from server.acoustics import directivity
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose, Quaternion
 from server.blocks import DryBlock, Encoding
+from server.core.near_names import suggestion
 from server.errors import RequestError
 from server.layout import Layout
 from server.load import AUTO
-from server.message import Message, Position
+from server.message import WHOLE, Integer, Message, Position
 from server.scene.situation import Output
 
 PROTOCOL: Final = 2
 
 BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
-PoseId = Annotated[int, Field(ge=0, lt=2**32)]
+PoseId = Annotated[int, Field(ge=0, lt=2**32), WHOLE]
 Orientation = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 LevelName = Annotated[str, Field(max_length=256)]
 GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
@@ -79,17 +82,17 @@ class Hello(Message):
     or off whatever the plan would decide."""
 
     type: Literal["hello"] = "hello"
-    protocol: int
+    protocol: Integer
     scene: Annotated[str, Field(max_length=256)]
-    sample_rate: int | None = None
-    block_size: BlockSize = 256
+    sample_rate: Integer | None = None
+    block_size: Annotated[BlockSize, WHOLE] = 256
     encoding: Encoding = "f32"
     listener: ListenerStart | None = None
     hrtf: Annotated[str, Field(max_length=256)] | None = None
     level: LevelName = AUTO
     output: Output = "headphones"
     effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
-    buffer_blocks: Annotated[int, Field(ge=1, le=32)] = 8
+    buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
 
 
 class DirectivityPattern(Message):
@@ -225,14 +228,14 @@ class Acknowledge(Message):
     """Every block up to and including `sequence` has arrived."""
 
     type: Literal["acknowledge"] = "acknowledge"
-    sequence: Annotated[int, Field(ge=0, lt=2**32)]
+    sequence: Annotated[int, Field(ge=0, lt=2**32), WHOLE]
 
 
 class Ping(Message):
     """Asks for a pong at once, to measure the way there and back."""
 
     type: Literal["ping"] = "ping"
-    id: Annotated[int, Field(ge=0, lt=2**53)]  # what JavaScript counts exactly
+    id: Annotated[int, Field(ge=0, lt=2**53), WHOLE]  # what JavaScript counts exactly
 
 
 TextMessage = (
@@ -248,13 +251,17 @@ TextMessage = (
     | Ping
 )
 ClientMessage = TextMessage | DryBlock
+_FIELDS: Final[Mapping[str, Iterable[str]]] = {
+    str(each.model_fields["type"].default): each.model_fields for each in get_args(TextMessage)
+}
 _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(discriminator="type")])
 
 
 def parse_client_message(data: str | bytes) -> ClientMessage:
     """One message as it came off the socket: text or binary.
 
-    Raises RequestError with code malformed_message, unknown_message, malformed_pose, malformed_directivity or
+    Of a hello the version is read before all else, since other versions have other fields. Raises RequestError with
+    code unsupported_protocol, malformed_message, unknown_message, malformed_pose, malformed_directivity or
     malformed_block, naming the field at fault.
     """
     if isinstance(data, bytes):
@@ -262,7 +269,26 @@ def parse_client_message(data: str | bytes) -> ClientMessage:
     try:
         return _CLIENT.validate_json(data)
     except ValidationError as exc:
+        _require_version(data)
         raise _refusal(exc, is_tagged=True) from exc
+
+
+def _require_version(data: str) -> None:
+    """Raises RequestError for a hello of another version, or of none."""
+    try:
+        # Digits without end are no number that Python makes.
+        said = json.loads(data, parse_int=lambda digits: int(digits) if len(digits) < 20 else math.inf)
+    except (ValueError, RecursionError):
+        return
+    if not isinstance(said, dict) or said.get("type") != "hello":
+        return
+    version = said.get("protocol")
+    if isinstance(version, bool) or not isinstance(version, int | float) or version % 1 > 0:
+        problem = f"protocol: is to be the version, a whole number; this server speaks {PROTOCOL}"
+        raise RequestError("malformed_message", problem, field="protocol")
+    if version != PROTOCOL:
+        problem = f"this server speaks protocol {PROTOCOL}, not {version:g}"
+        raise RequestError("unsupported_protocol", problem, field="protocol")
 
 
 def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
@@ -278,4 +304,8 @@ def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
         code = "malformed_directivity"
     else:
         code = "malformed_message"
-    return RequestError(code, f"{field}: {first['msg']}" if field else str(first["msg"]), field=field)
+    reason = str(first["msg"])
+    if kind == "extra_forbidden":
+        known = _FIELDS.get(str(first["loc"][0]), ()) if len(place) == 1 else ()
+        reason = f"unknown field{suggestion(place[-1], known) if known else ''}"
+    return RequestError(code, f"{field}: {reason}" if field else reason, field=field)

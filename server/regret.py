@@ -129,7 +129,7 @@ class RegretRecord:
     def merge(self, other: "RegretRecord") -> None:
         self.checks += other.checks
         self.failures += other.failures
-        self._keep_worst(other.worst_jnd)
+        self._keep_worst(dict(other.worst_jnd))  # another thread may be adding to it
 
     def _keep_worst(self, by_parameter: Mapping[str, float]) -> None:
         for parameter, jnd in by_parameter.items():

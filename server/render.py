@@ -18,6 +18,7 @@ from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose, Quaternion
 from server.aim import Aim
+from server.core.numerals import parse_decimal
 from server.direct_sound import DirectSound
 from server.effects_in_force import EffectsInForce, as_asked
 from server.emitters import Emitter
@@ -166,12 +167,9 @@ def _check_header(columns: list[str], name: str) -> None:
 
 def _number(text: str, where: str) -> float:
     try:
-        number = float(text)
-    except ValueError:
-        raise PathError(f"{where}: {text.strip()!r} is not a number") from None
-    if not math.isfinite(number):
-        raise PathError(f"{where}: {text.strip()!r} is not finite")
-    return number
+        return parse_decimal(text)
+    except ValueError as exc:
+        raise PathError(f"{where}: {exc}") from exc
 
 
 def _pose(values: dict[str, float], where: str) -> Pose:

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, ValidationError
 
 from server.blocks import Encoding
 from server.durations import DurationHistogram
@@ -214,6 +214,18 @@ ServerMessage = Welcome | EmitterAdded | EmitterRemoved | LevelChanged | PlanCha
 _SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
 
 
-def parse_server_message(data: str) -> ServerMessage:
-    """A text message as a client receives it; raises pydantic.ValidationError."""
-    return _SERVER.validate_json(data)
+class UnknownMessage(Message):
+    """What a newer server says, and a client of this version ignores."""
+
+    type: str
+
+
+def parse_server_message(data: str) -> ServerMessage | UnknownMessage:
+    """A text message as a client receives it, which ignores fields that it does not know. Raises
+    pydantic.ValidationError for what no server says."""
+    try:
+        return _SERVER.validate_json(data, extra="ignore")
+    except ValidationError as exc:
+        if exc.errors()[0]["type"] != "union_tag_invalid":
+            raise
+        return UnknownMessage.model_validate_json(data, extra="ignore")

@@ -12,6 +12,7 @@ from pydantic import FiniteFloat
 
 from server.asyncapi import document
 from server.catalogue import describe_scene, playable_clips
+from server.core.entity_tags import content_tag
 from server.errors import RequestError
 from server.field.levels import Levels
 from server.frontier import Frontier
@@ -24,15 +25,14 @@ from server.impulse_response import (
     parse_format,
     parse_position,
 )
-from server.loudness import loudness_map
+from server.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
 from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
 from server.streaming import Connection, StreamHost
 from server.telemetry import ServerCollector, exposition
 from server.web_socket import direct_way
 from server.whole_field import WholeField
 
-MAX_MAP_POINTS = 2_000
-"""A point costs milliseconds."""
+MAX_MAP_SPACING_M = 20.0
 MAX_MAP_S = 120.0
 MAX_PLANNED = 16
 CACHE_CONTROL = "public, max-age=3600"
@@ -46,19 +46,17 @@ LevelText = Annotated[str | None, Query(description="quality level; by default t
 PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"])]
 
 
-@health.head("/livez", include_in_schema=False)
 @health.get("/livez")
 async def livez() -> dict[str, str]:
     """The process answers."""
     return {"status": "live"}
 
 
-@health.head("/readyz", include_in_schema=False)
 @health.get("/readyz")
 async def readyz(request: Request) -> dict[str, str]:
-    """Streams may be opened: everything is loaded and warmed up."""
-    if not _host(request).is_ready:
-        raise RequestError("not_ready", "the server is still warming up", status=503)
+    """Streams may be opened: everything is warmed up, all threads do their work, and the server is not told to stop."""
+    if (obstacle := _host(request).readiness.obstacle) is not None:
+        raise RequestError(obstacle.code, obstacle.message, status=503, retry_after_s=obstacle.retry_after_s)
     return {"status": "ready"}
 
 
@@ -121,7 +119,10 @@ async def loudness(
     scene: str,
     emitter: PositionText,
     height_m: Annotated[FiniteFloat, Query(description="of the listener's ears")] = 1.5,
-    spacing_m: Annotated[FiniteFloat, Query(ge=0.1, le=2, description="between map points")] = 0.25,
+    spacing_m: Annotated[
+        FiniteFloat | None,
+        Query(ge=FINEST_M, le=MAX_MAP_SPACING_M, description="between map points; by default as the scene's size asks"),
+    ] = None,
     level: LevelText = None,
     format: Annotated[str, Query(description="png or json")] = "png",  # noqa: A002  the parameter's name
 ) -> Response:
@@ -135,9 +136,10 @@ async def loudness(
     if not bounds.minimum[2] <= height_m <= bounds.maximum[2]:
         raise RequestError("position_out_of_bounds", f"height_m {height_m:g} is outside the scene", field="height_m")
 
+    spacing_m = usual_spacing_m(field.bundle) if spacing_m is None else spacing_m
     points = field.bundle.floor_plan.area_m2 / spacing_m**2
-    if points > MAX_MAP_POINTS:
-        raise RequestError("map_too_fine", f"more than {MAX_MAP_POINTS} points: widen spacing_m", field="spacing_m")
+    if points > MAX_POINTS:
+        raise RequestError("map_too_fine", f"more than {MAX_POINTS} points: widen spacing_m", field="spacing_m")
     offer = _host(request).offers.get(scene)
     if offer and points * offer.ms_here[field.level.name] > 1000 * MAX_MAP_S:
         problem = (
@@ -183,12 +185,17 @@ async def plan(
     field = _levels(request, scene).default
     query.check(field)
     costs = _host(request).effect_costs.get(scene)
-    return await _cached(
-        request,
-        entity_tag(field, "plan", asdict(query), "json"),
-        "application/json",
+    # Until they are measured, this process measures its own once, and keeps to them.
+    told = None if costs is None else {name: asdict(cost) for name, cost in costs.items()}
+    body = await _host(request).answers.get(
+        entity_tag(field, "plan", {**asdict(query), "scene": scene, "costs": told}, "json"),
         lambda: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
     )
+    # What it costs is of this host and of this start of the server: nothing but the body itself says so.
+    headers = {"ETag": content_tag(body), "Cache-Control": "no-cache"}
+    if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(body, media_type="application/json", headers=headers)
 
 
 @api.get("/clips")

@@ -2,12 +2,17 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from server.assets.names import named_by_stem
+from server.core.near_names import suggestion
+from server.core.numerals import parse_decimal, parse_integer
+
+_PREFIX = "NAFIR_"
 
 
 def _usable_cores() -> int:
@@ -33,7 +38,7 @@ NamedFiles = Annotated[Paths, AfterValidator(_require_different_names)]
 class Settings(BaseSettings):
     """Built once, at the edge, and handed down."""
 
-    model_config = SettingsConfigDict(env_prefix="NAFIR_", frozen=True)
+    model_config = SettingsConfigDict(env_prefix=_PREFIX, frozen=True)
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
@@ -65,5 +70,49 @@ class Settings(BaseSettings):
     """A longer WebSocket message is refused; one longer than `max_frame_bytes` closes the connection."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
     hello_timeout_s: Annotated[float, Field(gt=0)] = 10.0
+    request_timeout_s: Annotated[float, Field(gt=0)] = 10.0
+    """For a whole HTTP request to come, from the connection or from its first byte: half-sent requests are answered
+    408, connections that say nothing are closed."""
+    response_timeout_s: Annotated[float, Field(gt=0)] = 30.0
+    """For a client to take 64 KiB of a response, or what is left of it."""
+    keep_alive_s: Annotated[float, Field(gt=0)] = 5.0
+    """For the next request on a connection."""
+    max_headers_bytes: Annotated[int, Field(ge=1024)] = 32 * 1024
+    """Of all headers of a request together; of one, and of the request line, at most 8,000."""
+    max_body_bytes: Annotated[int, Field(ge=0, le=64 * 1024)] = 64 * 1024
+    """Of a request. No route has a use for one."""
+    max_connections: Annotated[int, Field(ge=1)] = 1024
+    """In all. When all are taken, who comes gets that on which nothing has been under way for longest; where there is
+    none such, health checks alone are answered."""
+    max_connections_per_address: Annotated[int, Field(ge=1)] = 256
+    """Of one IP address, or IPv6 network of 64 bits. Behind a proxy everybody comes from its address."""
+    max_silent: Annotated[int, Field(ge=1)] = 64
+    """WebSocket connections that may be open without a hello; one more ends that which has been silent for longest."""
+    stall_timeout_s: Annotated[float, Field(gt=0)] = 15.0
+    """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
     """HTTP requests that may wait for a worker; one more is answered 503."""
+    drain_s: Annotated[float, Field(ge=2, le=3600)] = 8.0
+    """How long the server may take to end once it is told to (SIGTERM, SIGINT): streams are told at once, requests may
+    go on for 0.7 of it, and whatever has not ended by then is cut off."""
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _read_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """By the grammar of every other number that comes as text, where the setting is one."""
+        annotation = cls.model_fields[info.field_name or ""].annotation
+        kinds = {annotation, *get_args(annotation)}
+        if isinstance(value, str) and kinds & {int, float}:
+            return parse_decimal(value) if float in kinds else parse_integer(value)
+        return value
+
+    @model_validator(mode="after")
+    def _knows_the_environment(self) -> Self:
+        """A misspelt variable would otherwise be a setting that stays as it is."""
+        known = [name.upper() for name in type(self).model_fields]
+        for variable in sorted(os.environ):
+            name = variable.upper().removeprefix(_PREFIX)
+            if variable.upper().startswith(_PREFIX) and name not in known:
+                problem = f"the environment has {variable}, which is no setting{suggestion(name, known, _PREFIX)}"
+                raise PydanticCustomError("unknown_setting", "{problem}", {"problem": problem})
+        return self

@@ -1,5 +1,8 @@
 """A session in time: when its blocks are due, what waits to go in, and how long things take.
 
+A stream whose window stays full is *paused*: nothing is rendered, its sample clock stands, and both go on where they
+were with the first acknowledgement that makes room.
+
 A `Stream` and its session belong to the audio thread that renders them; only `offer` may be called from any thread.
 """
 
@@ -11,6 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 from server.blocks import AudioBlock
 from server.durations import DurationHistogram
@@ -31,10 +35,14 @@ from server.turns import Turns
 from server.workers import Workers
 
 MAX_WAITING_MESSAGES = 256
+PAUSE_AFTER_S = 1.0
+"""How long a window may be full before nothing is rendered for it: a network that falters for less costs no sound but
+that which there was no room for."""
 _MAX_BEHIND_S = 0.5
 _LOAD_SMOOTHING = 0.02
 _COST_SMOOTHING = 0.2
 _logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 @dataclass(slots=True)
@@ -122,10 +130,14 @@ class Stream:
         self._time_s: Callable[[], float] = time.monotonic
         self._turns = Turns(1)
         self._messages: deque[tuple[float, ClientMessage]] = deque()
-        self._answers: deque[tuple[IrRequest, Future[_Computed]]] = deque()
-        self._plans: deque[Future[tuple[Plan, float]]] = deque()
+        # Outcomes and not the futures, which hold whom they call back: this stream.
+        self._answers: deque[tuple[IrRequest, _Computed | BaseException]] = deque()
+        self._plans: deque[tuple[Plan, float] | BaseException] = deque()
         self.regrets = RegretRecord()
-        self._checks: deque[Future[Regret]] = deque()
+        self._checks: deque[Regret | BaseException] = deque()
+        self._full_since_s: float | None = None
+        """Since when there has been no room in the window for a block."""
+        self._is_paused = False
         self._streams = 1
         """Of the audio thread."""
         self._next_check_s: float | None = FIRST_S
@@ -140,6 +152,12 @@ class Stream:
     def awaits_irs_since_s(self) -> float | None:
         """When impulse responses were called for that have not come."""
         return self._asked_s
+
+    @property
+    def stalled_s(self) -> float:
+        """For how long no block could be sent, since too many are unacknowledged; may be asked from any thread."""
+        since_s = self._full_since_s
+        return 0.0 if since_s is None else self._time_s() - since_s
 
     @property
     def deadline_s(self) -> float:
@@ -160,13 +178,15 @@ class Stream:
         self._messages.append((self._time_s(), message))
         self._brings_emitter |= isinstance(message, AddEmitter)
         # While one is computed, no other is asked for until its answer comes, and that wakes too.
-        if isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once:
+        asks = isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once
+        if asks or self._is_paused:  # which no block would wake
             self._wake()
         return True
 
     def start(self, origin_s: float) -> None:
-        """Block 0 plays at `origin_s`."""
-        self._clock = StreamClock(origin_s=origin_s, block_s=self.block_s, lead=self._lead)
+        """The next block, number 0 unless another thread has rendered some before, plays at `origin_s`."""
+        first_s = origin_s - self.next_block * self.block_s
+        self._clock = StreamClock(origin_s=first_s, block_s=self.block_s, lead=self._lead)
         self.due_s = self._clock.due_s(self.next_block)
 
     @property
@@ -177,7 +197,8 @@ class Stream:
     @property
     def has_news(self) -> bool:
         """Whether something waits that cannot wait for the next block: for an IR to be asked for, or for an answer."""
-        return bool(self._answers or self._plans or (self._messages and self._asks_at_once))
+        is_urgent = self._is_paused or self._asks_at_once
+        return bool(self._answers or self._plans or (self._messages and is_urgent))
 
     @property
     def _asks_at_once(self) -> bool:
@@ -206,13 +227,19 @@ class Stream:
             outgoing += refused
         while self._checks:
             self._take_regret(self._checks.popleft())
+        if self._full_since_s is not None and not self.session.window.is_full:
+            self._resume()
+        if not self._is_paused:
+            self._call_for_work(workers)
+        return outgoing
+
+    def _call_for_work(self, workers: Workers) -> None:
         self._check_plan(workers)
         # Who has not been heard yet waits for it; all others only for something better.
         if (wanted := self.session.take_plan_request()) is not None:
             plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
             plan.add_done_callback(self._keep_plan)
         self._ask(workers)
-        return outgoing
 
     def _ask(self, workers: Workers) -> None:
         """For the impulse responses of the newest poses, if it is its turn, or for the first of an emitter."""
@@ -278,11 +305,28 @@ class Stream:
             clock.slip(self.next_block, now_s)
         self.next_block += count
         self.due_s = clock.due_s(self.next_block)
+        if len(blocks) < count:
+            self._note_full(now_s)
         if self.next_block * self.block_s >= self._next_status_s:
             self._next_status_s += 1.0
             outgoing += self.session.complaints()
             outgoing.append(self._status(now_s))
         return outgoing
+
+    def _note_full(self, now_s: float) -> None:
+        if self._full_since_s is None:
+            self._full_since_s = now_s
+        elif now_s - self._full_since_s >= PAUSE_AFTER_S:
+            self._is_paused, self.due_s = True, math.inf
+            self.wants_turn, self._asked_s = False, None
+
+    def _resume(self) -> None:
+        """There is room again: the block that is next is due now, and not when it would have been."""
+        self._full_since_s = None
+        if self._is_paused:
+            self._is_paused = False
+            self.clock.slip(self.next_block, self._time_s())
+            self.due_s = self.clock.due_s(self.next_block)
 
     def _choose(self, message: SetLevel) -> list[ServerMessage]:
         try:
@@ -299,7 +343,8 @@ class Stream:
             self._asked_s = now_s
 
     def _keep_answer(self, request: IrRequest, answer: "Future[_Computed]") -> None:
-        self._answers.append((request, answer))  # on the worker's thread
+        outcome = _outcome(answer)
+        self._answers.append((request, outcome))  # on the worker's thread
         self._wake()
 
     def _check_plan(self, workers: Workers) -> None:
@@ -313,40 +358,40 @@ class Stream:
             regret.add_done_callback(self._keep_regret)
 
     def _keep_regret(self, regret: "Future[Regret]") -> None:
-        self._checks.append(regret)  # on the worker's thread; looked at with the next block
+        outcome = _outcome(regret)
+        self._checks.append(outcome)  # on the worker's thread; looked at with the next block
 
-    def _take_regret(self, answer: "Future[Regret]") -> None:
+    def _take_regret(self, regret: Regret | BaseException) -> None:
         clock_s = self.next_block * self.block_s
         self._next_check_s = clock_s + PERIOD_S
-        if (failure := answer.exception()) is not None:
-            _logger.error("a plan of effects could not be checked", exc_info=failure)
+        if isinstance(regret, BaseException):
+            _logger.error("a plan of effects could not be checked", exc_info=regret)
             return
-        regret = answer.result()
         self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self._streams)
         self.regrets.add(regret)
         self.session.learn(regret)
 
     def _keep_plan(self, plan: "Future[tuple[Plan, float]]") -> None:
-        self._plans.append(plan)  # on the worker's thread
+        outcome = _outcome(plan)
+        self._plans.append(outcome)  # on the worker's thread
         self._wake()
 
-    def _take_plan(self, answer: "Future[tuple[Plan, float]]") -> list[ServerMessage]:
-        if (failure := answer.exception()) is not None:
-            _logger.error("no plan of effects", exc_info=failure)
+    def _take_plan(self, planned: tuple[Plan, float] | BaseException) -> list[ServerMessage]:
+        if isinstance(planned, BaseException):
+            _logger.error("no plan of effects", exc_info=planned)
             return self.session.keep_effects()
-        plan, cpu_s = answer.result()
+        plan, cpu_s = planned
         self._plan_s = _smoothed(self._plan_s, cpu_s)
         return self.session.adopt(plan)
 
-    def _take_answer(self, request: IrRequest, answer: "Future[_Computed]") -> list[ServerMessage]:
+    def _take_answer(self, request: IrRequest, computed: "_Computed | BaseException") -> list[ServerMessage]:
         self._has_asked = False
         if self._asked_s is not None:
             self._longest_wait_s = max(self._longest_wait_s or 0.0, self._time_s() - self._asked_s)
             self._asked_s = None
-        if (failure := answer.exception()) is not None:
-            _logger.error("no impulse response for pose %d", request.pose_id, exc_info=failure)
+        if isinstance(computed, BaseException):
+            _logger.error("no impulse response for pose %d", request.pose_id, exc_info=computed)
             return self.session.give_up(request)
-        computed = answer.result()
         self.ir_times.add(computed.duration_s)
         self._request_s = _smoothed(self._request_s, computed.cpu_s)
         return self.session.accept(computed.response)
@@ -379,6 +424,12 @@ class _Computed:
     duration_s: float
     cpu_s: float
     """What the thread that computed it spent."""
+
+
+def _outcome(future: Future[T]) -> T | BaseException:
+    """What a future that is done has come to."""
+    failure = future.exception()
+    return future.result() if failure is None else failure
 
 
 def _smoothed(cost_s: float, newest_s: float) -> float:

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from typing import Final
 
-from server.streaming import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, TRY_AGAIN_LATER
+from server.streaming import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, SERVICE_RESTART, TRY_AGAIN_LATER
 
 ERROR_CODES: Final[Mapping[str, str]] = {
-    "not_ready": "the server is still warming up",
+    "not_ready": "the server is still warming up, or a thread of its own has failed; the message says which",
+    "server_draining": "the server is shutting down; open the stream again, there or elsewhere",
     "server_busy": "there are as many streams as there may be",
     "hello_expected": "the first message was no hello, or none came in time",
     "unexpected_hello": "a stream has one hello",
@@ -38,6 +39,7 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "field_failure": "no impulse response could be computed; the last ones stay in effect",
     "plan_failure": "no plan of effects could be made; what is on stays on",
     "reads_too_slowly": "the client does not read what it is sent",
+    "stalled": "the window has been full for too long, and nothing was acknowledged",
     "internal_error": "the stream failed, by a defect of the server",
 }
 
@@ -46,9 +48,9 @@ CLOSE_CODES: Final[Mapping[int, str]] = {
     1002: "a frame breaks RFC 6455",
     1007: "a text message is not UTF-8",
     1009: "a WebSocket message was longer than the server takes at all",
-    POLICY_VIOLATION: "the hello was refused or did not come, or the client reads too slowly",
+    POLICY_VIOLATION: "the hello was refused or did not come, or the client reads too slowly or acknowledges nothing",
     INTERNAL_ERROR: "the stream failed, by a defect of the server",
-    1012: "the server is shutting down",
-    TRY_AGAIN_LATER: "the server is still warming up, or has no free stream",
+    SERVICE_RESTART: "the server is shutting down",
+    TRY_AGAIN_LATER: "the server is not ready, or has no free stream",
 }
-"""1002, 1007, 1009 and 1012 are the web server's own."""
+"""1002, 1007 and 1009 are the web server's own."""

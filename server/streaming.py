@@ -3,7 +3,13 @@
 One `Connection` per client, living on the event loop. A reader passes what the client says to the audio thread; a
 sender passes on what the audio thread made. Nothing here grows without bound: messages to the audio thread are refused
 beyond `MAX_WAITING_MESSAGES`, audio beyond the window is never made, and a client that reads so slowly that its answers
-pile up is cut off, whether or not it ever reads again.
+pile up is cut off, whether or not it ever reads again. So is one that acknowledges nothing for `stall_timeout_s`.
+
+A connection takes one of the server's streams with a hello, and not before. Those without one are few: one too many
+ends that which has been silent for longest, so that nobody who speaks is kept out by those who do not.
+
+What ends a connection is returned, and not raised: an exception that a task keeps holds the frames that hold the task,
+and a session in them would wait for the collector.
 """
 
 import asyncio
@@ -14,11 +20,12 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from typing import Final
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.answers import Answers
+from server.api.stream_counts import StreamLedger
 from server.audio_engine import AudioEngine
 from server.blocks import Encoding
 from server.catalogue import describe_scene
@@ -31,15 +38,16 @@ from server.places import place_of
 from server.protocol import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
 from server.rendering.ingest import DryAudio
 from server.replies import Error, Pong, ServerMessage, Welcome
+from server.runtime.racing import StoppedError, run_until
+from server.runtime.readiness import Readiness
 from server.scene.planner import Costs
 from server.scene.situation import Place
 from server.session import Session
 from server.settings import Settings
 from server.stream import Outgoing, Stream, StreamFailed, TimedBlock
-from server.telemetry import StreamTotals
 from server.web_socket import DirectWay
 
-NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1000, 1008, 1011, 1013
+NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
 MAX_WAITING_ANSWERS = 256
 _GOODBYE_S = 1.0
 """Even closing waits for room in the socket, and a client that does not read makes none."""
@@ -61,13 +69,22 @@ def _first_blocks(outgoing: Iterable[Outgoing]) -> Iterator[TimedBlock]:
         yield each
 
 
-class ClosingError(Exception):
-    """The connection ends with this code, after an error message where there is one."""
+@dataclass(frozen=True)
+class Goodbye:
+    """The connection ends with this code, after an error message."""
 
-    def __init__(self, close_code: int, error: Error) -> None:
-        super().__init__(error.message)
-        self.close_code = close_code
-        self.error = error
+    close_code: int
+    error: Error
+
+
+_TOO_SLOW: Final = Goodbye(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
+_DRAINING: Final = Goodbye(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
+_BUSY: Final = Goodbye(TRY_AGAIN_LATER, Error(code="server_busy", message="the server has no free stream"))
+_FAILED: Final = Goodbye(INTERNAL_ERROR, Error(code="internal_error", message="the stream failed"))
+
+
+def _refused(refusal: RequestError) -> Goodbye:
+    return Goodbye(POLICY_VIOLATION, Error.from_refusal(refusal))
 
 
 @dataclass
@@ -82,15 +99,29 @@ class StreamHost:
     audio: AudioEngine
     settings: Settings
     answers: Answers
+    readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     places: dict[str, Place] = dataclasses.field(default_factory=dict)
     """What plans of effects are made for, by scene."""
     effect_costs: dict[str, Costs] = dataclasses.field(default_factory=dict)
     """By scene, once they were measured."""
-    past: StreamTotals = dataclasses.field(default_factory=StreamTotals)
-    """Of streams that have ended."""
-    is_ready: bool = False
+    ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
+    """What all streams have counted."""
     streams: int = 0
+    """Those open, and those being opened."""
+    silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
+    """How long connections without a hello are waited for; who came first is first."""
+
+    def is_full(self) -> bool:
+        return self.streams >= self.settings.max_streams
+
+    def await_hello(self, patience: asyncio.Timeout) -> None:
+        """Note that a connection has not spoken yet; where there are too many, wait for the first of them no more."""
+        self.silent[patience] = None
+        if len(self.silent) > self.settings.max_silent:
+            longest = next(iter(self.silent))
+            del self.silent[longest]
+            longest.reschedule(asyncio.get_running_loop().time())
 
 
 class Connection:
@@ -118,44 +149,68 @@ class Connection:
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
-        with contextlib.suppress(WebSocketDisconnect):
+        with contextlib.suppress(WebSocketDisconnect), self._host.readiness.drain.in_flight():
             await self._websocket.accept()
-            try:
-                await self._serve()
-            except ClosingError as closing:
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(_GOODBYE_S):
-                        await self._send_message(closing.error)
-                        await self._websocket.close(closing.close_code, closing.error.code)
+            goodbye = await self._serve_until_drained()
+            if goodbye is not None:
+                await self._say(goodbye)
 
-    async def _serve(self) -> None:
+    async def _say(self, goodbye: Goodbye) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_GOODBYE_S):
+                await self._send_message(goodbye.error)
+                await self._websocket.close(goodbye.close_code, goodbye.error.code)
+
+    async def _serve_until_drained(self) -> Goodbye | None:
+        drain = self._host.readiness.drain
+        if drain.has_begun:
+            return _DRAINING
+        try:
+            return await run_until(self._serve(), drain.begun())
+        except StoppedError:
+            return _DRAINING
+
+    async def _serve(self) -> Goodbye | None:
+        """Until the client has gone, which returns None, or is to be sent away."""
         host = self._host
-        if not host.is_ready:
-            raise ClosingError(TRY_AGAIN_LATER, Error(code="not_ready", message="the server is still warming up"))
-        if host.streams >= host.settings.max_streams:
-            raise ClosingError(TRY_AGAIN_LATER, Error(code="server_busy", message="the server has no free stream"))
+        if (obstacle := host.readiness.obstacle) is not None:
+            return Goodbye(TRY_AGAIN_LATER, Error(code="not_ready", message=obstacle.message))
+        if host.is_full():
+            return _BUSY
+        hello = await self._receive_hello()
+        if isinstance(hello, Goodbye):
+            return hello
+        if host.is_full():  # by now
+            return _BUSY
         host.streams += 1
         try:
-            hello = await self._receive_hello()
             stream = await self._open(hello)
-            await self._pump(stream, hello)
+            return stream if isinstance(stream, Goodbye) else await self._pump(stream, hello)
         finally:
             host.streams -= 1
 
-    async def _receive_hello(self) -> Hello:
+    async def _receive_hello(self) -> Hello | Goodbye:
+        host = self._host
         try:
-            async with asyncio.timeout(self._host.settings.hello_timeout_s):
-                message = self._parse(await self._receive())
-        except TimeoutError as exc:
-            raise ClosingError(POLICY_VIOLATION, Error(code="hello_expected", message="no hello came")) from exc
+            async with asyncio.timeout(host.settings.hello_timeout_s) as patience:
+                host.await_hello(patience)
+                try:
+                    first = await self._receive()
+                finally:
+                    host.silent.pop(patience, None)
+            if isinstance(first, bytes):
+                raise RequestError("hello_expected", "the first message is a hello, as JSON text, and not binary")
+            message = self._parse(first)
+        except TimeoutError:
+            return Goodbye(POLICY_VIOLATION, Error(code="hello_expected", message="no hello came in time"))
         except RequestError as refusal:
-            raise ClosingError(POLICY_VIOLATION, Error.from_refusal(refusal)) from refusal
+            return _refused(refusal)
         if not isinstance(message, Hello):
             error = Error(code="hello_expected", message=f"the first message is a hello, not {message.type}")
-            raise ClosingError(POLICY_VIOLATION, error)
+            return Goodbye(POLICY_VIOLATION, error)
         return message
 
-    async def _open(self, hello: Hello) -> Stream:
+    async def _open(self, hello: Hello) -> Stream | Goodbye:
         settings = self._host.settings
         levels = self._host.scenes.get(hello.scene)
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
@@ -170,7 +225,7 @@ class Connection:
             ladder = offer.ladder(hello.level, block_s=block_s)
             session = await asyncio.to_thread(self._open_session, hello, levels, hrtf, ladder.rung, window)
         except RequestError as refusal:
-            raise ClosingError(POLICY_VIOLATION, Error.from_refusal(refusal)) from refusal
+            return _refused(refusal)
         await self._send_message(
             Welcome(
                 session=uuid.uuid4().hex,
@@ -211,44 +266,48 @@ class Connection:
             costs=lambda: host.effect_costs.get(hello.scene, {}),
         )
 
-    async def _pump(self, stream: Stream, hello: Hello) -> None:
-        """Read and send until either ends or fails, or too much waits to be sent."""
+    async def _pump(self, stream: Stream, hello: Hello) -> Goodbye | None:
+        """Read and send until the client has gone or is to be sent away."""
         self._stream, self._encoding = stream, hello.encoding
+        self._host.ledger.open(stream)
         self._host.audio.open(stream)
         tasks = [
             asyncio.create_task(self._read_incoming(stream, hello)),
             asyncio.create_task(self._send_outgoing()),
-            asyncio.create_task(self._refuse_overflow()),
+            asyncio.create_task(self._watch(stream)),
         ]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._host.audio.close(stream)
-            self._host.past.add(stream)
+            self._host.ledger.close(stream)
+            self._stream = None
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
-        for task in done:
-            task.result()
+        # Where the client has gone, there is nobody to be told why it is sent away.
+        return None if any(task.result() is None for task in done) else next(iter(done)).result()
 
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
+        """Until the client has gone."""
         if self._way is not None:
-            self._way.listen(partial(self._hear, stream))
-        while True:
-            data = await self._receive()
-            self._is_taking_in = True
-            await self._take_in(data, stream, hello)
-            self._is_taking_in = False
+            self._way.listen(self._hear)
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                data = await self._receive()
+                self._is_taking_in = True
+                await self._take_in(data, stream, hello)
+                self._is_taking_in = False
 
-    def _hear(self, stream: Stream, data: str | bytes) -> bool:
+    def _hear(self, data: str | bytes) -> bool:
         """Take in what needs nothing but the audio thread, unless something that came before is not yet."""
-        if self._is_taking_in:
+        if self._is_taking_in or self._stream is None:
             return False
         try:
             message = self._parse(data)
             if isinstance(message, AddEmitter):
                 return False
-            self._pass_on(message, stream)
+            self._pass_on(message, self._stream)
         except RequestError as refusal:
             self._enqueue([Error.from_refusal(refusal)])
         return True
@@ -286,6 +345,8 @@ class Connection:
 
     def _deliver(self, outgoing: list[Outgoing]) -> None:
         """Send blocks at once where there is a short way and nothing waits to go before them."""
+        if self._stream is None:
+            return  # what was made before the audio thread knew that the connection ends
         blocks: list[bytes] = []
         if self._way is not None and not (self._outgoing or self._is_sending):
             now_s = self._time_s()
@@ -303,33 +364,40 @@ class Connection:
         self._outgoing += outgoing
         self._has_outgoing.set()
 
-    async def _refuse_overflow(self) -> None:
-        """Apart from the sender, which may be waiting for the very client that does not read."""
-        await self._is_overfull.wait()
-        raise ClosingError(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
+    async def _watch(self, stream: Stream) -> Goodbye:
+        """Until the client reads too slowly, or acknowledges nothing. Apart from the sender, which may be waiting for
+        the very client that does not read."""
+        patience_s = left_s = self._host.settings.stall_timeout_s
+        while left_s > 0:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(left_s):
+                    await self._is_overfull.wait()
+                    return _TOO_SLOW
+            left_s = patience_s - stream.stalled_s
+        message = f"no block was acknowledged for {patience_s:g} s, and there is no room for more"
+        return Goodbye(POLICY_VIOLATION, Error(code="stalled", message=message))
 
-    async def _send_outgoing(self) -> None:
-        """Send until cancelled, or until the stream cannot go on and the socket was closed for it."""
-        while True:
-            await self._has_outgoing.wait()
-            self._has_outgoing.clear()
-            self._is_sending = True
-            while self._outgoing:
-                match self._outgoing.popleft():
-                    case TimedBlock() as timed:
-                        await self._websocket.send_bytes(self._serialize(timed, self._time_s()))
-                    case StreamFailed():
-                        await self._send_message(Error(code="internal_error", message="the stream failed"))
-                        await self._websocket.close(INTERNAL_ERROR, "internal_error")
-                        return
-                    case message:
-                        await self._send_message(message)
-            self._is_sending = False
+    async def _send_outgoing(self) -> Goodbye | None:
+        """Until the client has gone, which returns None, or the stream cannot go on."""
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                await self._has_outgoing.wait()
+                self._has_outgoing.clear()
+                self._is_sending = True
+                while self._outgoing:
+                    match self._outgoing.popleft():
+                        case TimedBlock() as timed:
+                            await self._websocket.send_bytes(self._serialize(timed, self._time_s()))
+                        case StreamFailed():
+                            return _FAILED
+                        case message:
+                            await self._send_message(message)
+                self._is_sending = False
+        return None
 
     def _serialize(self, timed: TimedBlock, now_s: float) -> bytes:
         block = timed.block
-        if not block.is_late and now_s > timed.deadline_s:
-            assert self._stream is not None
+        if not block.is_late and now_s > timed.deadline_s and self._stream is not None:
             self._stream.blocks_late += 1
             block.is_late = True
         return block.serialize(self._encoding)

@@ -4,7 +4,7 @@ Nothing is counted for it: the figures are those that streams keep for their own
 """
 
 import platform
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import version
 from typing import Protocol
@@ -14,44 +14,18 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from server.api.stream_counts import StreamLedger, StreamTotals
 from server.audio_engine import AudioEngine
 from server.clips import ClipLibrary
 from server.durations import DurationHistogram
 from server.load import Offer
 from server.regret import RegretRecord
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
 from server.stream import Stream
 
 _SHORTEST_S, _LONGEST_S = 3e-5, 10.0
 """Bounds of what durations are told apart."""
-
-
-class StreamTotals:
-    """What several streams counted and timed, together."""
-
-    def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self.regrets = RegretRecord()
-        self.durations: defaultdict[str, DurationHistogram] = defaultdict(DurationHistogram)
-
-    def add(self, stream: Stream) -> None:
-        session = stream.session
-        self.counts["sent"] += session.window.sent
-        self.counts["late"] += stream.blocks_late
-        self.counts["dropped"] += session.blocks_dropped
-        self.counts["exchanges"] += session.ir_exchanges
-        self.counts["limited"] += session.blocks_limited
-        self.counts["silenced"] += session.renderer.samples_silenced
-        self.regrets.merge(stream.regrets)
-        self.durations["render"].merge(stream.render_times)
-        self.durations["lateness"].merge(stream.latenesses)
-        self.durations["ir"].merge(stream.ir_times)
-        self.durations["pose"].merge(stream.pose_times.durations)
-
-    def merge(self, other: "StreamTotals") -> None:
-        self.counts += other.counts
-        self.regrets.merge(other.regrets)
-        for name, durations in other.durations.items():
-            self.durations[name].merge(durations)
 
 
 class Host(Protocol):
@@ -67,10 +41,10 @@ class Host(Protocol):
     def offers(self) -> Mapping[str, Offer]: ...
 
     @property
-    def past(self) -> StreamTotals: ...
+    def ledger(self) -> StreamLedger: ...
 
     @property
-    def is_ready(self) -> bool: ...
+    def readiness(self) -> Readiness: ...
 
 
 class ServerCollector(Collector):
@@ -81,14 +55,16 @@ class ServerCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         streams = self._host.audio.streams
-        totals = StreamTotals()
-        totals.merge(self._host.past)
-        for stream in streams:
-            totals.add(stream)
+        totals = self._host.ledger.totals()
         yield InfoMetricFamily(
             "nafir_build", "What runs.", value={"version": version("nafir"), "python": platform.python_version()}
         )
-        yield GaugeMetricFamily("nafir_ready", "1 where streams may be opened.", value=self._host.is_ready)
+        readiness = self._host.readiness
+        is_ready = readiness.obstacle is None
+        yield GaugeMetricFamily("nafir_ready", "1 where streams may be opened.", value=is_ready)
+        is_draining = readiness.drain.has_begun
+        yield GaugeMetricFamily("nafir_draining", "1 where the server is shutting down.", value=is_draining)
+        yield from _threads(readiness.watch)
         yield from self._streams(streams)
         yield from self._blocks(totals)
         yield from _regrets(totals.regrets)
@@ -114,12 +90,12 @@ class ServerCollector(Collector):
         levels = Counter((stream.scene, stream.session.rung.level) for stream in streams)
         eased = Counter(stream.scene for stream in streams if stream.ladder.is_eased)
         by_level = GaugeMetricFamily("nafir_streams", "Open streams, by what they hear.", labels=["scene", "level"])
-        for scene, offer in self._host.offers.items():
+        for scene, offer in tuple(self._host.offers.items()):
             for level in offer.levels:
                 by_level.add_metric([scene, level.name], levels[scene, level.name])
         yield by_level
         below = GaugeMetricFamily("nafir_streams_eased", "Streams below the best quality for them.", labels=["scene"])
-        for scene in self._host.offers:
+        for scene in tuple(self._host.offers):
             below.add_metric([scene], eased[scene])
         yield below
 
@@ -167,10 +143,25 @@ class ServerCollector(Collector):
         costs = GaugeMetricFamily(
             "nafir_level_ir_seconds", "What an impulse response of a level took at start.", labels=["scene", "level"]
         )
-        for scene, offer in self._host.offers.items():
+        for scene, offer in tuple(self._host.offers.items()):
             for name, ms in offer.ms_here.items():
                 costs.add_metric([scene, name], ms / 1000)
         return costs
+
+
+def _threads(watch: ThreadWatch) -> Iterator[Metric]:
+    states = watch.states
+    healthy = GaugeMetricFamily(
+        "nafir_thread_healthy", "1 where a thread does its work, 0 where it is stuck or dead.", labels=["thread"]
+    )
+    restarts = CounterMetricFamily(
+        "nafir_thread_restarts", "Times that a thread died and was replaced: a fault wherever not 0.", labels=["thread"]
+    )
+    for name, state in states.items():
+        healthy.add_metric([name], state == "working")
+        restarts.add_metric([name], watch.restarts[name])
+    yield healthy
+    yield restarts
 
 
 def _regrets(record: RegretRecord) -> Iterator[Metric]:

@@ -7,15 +7,23 @@ message that comes, where none waits before it. ASGI allows such *extensions*: a
 scope, and does without where another server runs it.
 """
 
+import asyncio
+import logging
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
+from http import HTTPStatus
 from typing import Any, Final
 
+from uvicorn.config import Config
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from uvicorn.server import ServerState
 from websockets.exceptions import InvalidState
-from websockets.http11 import Request
+from websockets.http11 import Request, Response
 from websockets.protocol import CONNECTING, OPEN
+from websockets.server import ServerProtocol
 
+from server.api.seats import Seat
+from server.problems import problem
 from server.web_socket_frames import FrameCutter, header
 
 Hear = Callable[[str | bytes], bool]
@@ -69,19 +77,73 @@ def watched(
     return {**scope, "extensions": {**scope["extensions"], _EXTENSION: {"way": DirectWay(write, listen)}}}
 
 
+class _Handshake(ServerProtocol):
+    """The library's state of a connection, whose refusals to open it are problem documents."""
+
+    def reject(self, status: HTTPStatus | int, text: str) -> Response:
+        response = super().reject(status, text)
+        document = problem(status, "handshake_refused", text.strip() or HTTPStatus(status).phrase)
+        response.body = bytes(document.body)
+        for name in ("Content-Type", "Content-Length"):
+            del response.headers[name]
+            response.headers[name] = document.headers[name]
+        return response
+
+
 class WebSocketProtocol(WebSocketsSansIOProtocol):
     """For uvicorn, by `ws="server.web_socket:WebSocketProtocol"`, without extensions of the protocol's own: what is
     written here is neither compressed nor cut."""
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self.conn = _Handshake(max_size=config.ws_max_size, logger=logging.getLogger("uvicorn.error"))
 
     _hear: Hear | None = None
     _cutter: FrameCutter | None = None
     _has_failed = False
     """Whether the client broke the protocol, and was told so."""
+    _seat: Seat | None = None
+    _leave_room: Callable[[], None] | None = None
+    _closing_since_s: float | None = None
+
+    def take_seat(self, seat: Seat, leave_room: Callable[[], None]) -> None:
+        """That of the HTTP connection which became this. It is in use once the application listens; until then it is
+        another's who comes when there is no other."""
+        self._seat, self._leave_room = seat, leave_room
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._seat is not None and self._leave_room is not None:
+            self._seat.leave()
+            self._leave_room()
+        super().connection_lost(exc)
+
+    def end_if_overdue(self, now_s: float) -> None:
+        """Called now and then. A transport that closes first sends what waits, to which a client that does not read
+        never lets it come."""
+        if not self.transport.is_closing():
+            return
+        if self._closing_since_s is None:
+            self._closing_since_s = now_s
+        elif now_s - self._closing_since_s > self.close_timeout:
+            self.transport.abort()
 
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
         if not self.handshake_complete:  # as it is where the request was refused
             self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
+
+    def on_task_complete(self, task: asyncio.Task[None]) -> None:
+        """The application is done. It holds this protocol by the way, and is held by whom it has listen: with neither,
+        nothing of either waits for the collector."""
+        super().on_task_complete(task)
+        self._hear = None
+        self.scope["extensions"].pop(_EXTENSION, None)
 
     def data_received(self, data: bytes) -> None:
         if self._has_failed:
@@ -153,6 +215,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
 
     def _listen(self, hear: Hear) -> None:
         self._hear = hear
+        if self._seat is not None:
+            self._seat.use()
 
     def _write(self, payloads: Sequence[bytes]) -> bool:
         is_open = self.handshake_complete and not self.close_sent and not self.transport.is_closing()

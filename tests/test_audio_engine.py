@@ -3,6 +3,7 @@
 import os
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
-from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerPose
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
 from server.replies import EmitterAdded, Error, Status
-from server.stream import MAX_WAITING_MESSAGES, StreamFailed
+from server.runtime.thread_watch import ThreadWatch
+from server.stream import MAX_WAITING_MESSAGES, PAUSE_AFTER_S, StreamFailed
 from server.workers import Workers
 from tests.engine_stage import BLOCK_S, Clock, Patient, Stage, blocks, open_stream, spy_on_batches
+from tests.killing import kill, threads_may_die
 
 
 @pytest.fixture
@@ -345,3 +348,160 @@ def test_samples_that_are_no_audio_are_told_of_once_a_second_and_the_stream_goes
     assert (first.id, first.samples_gated, second.samples_gated) == ("voice", 1536, 1536)
     assert second.underruns == 1
     assert all(np.isfinite(item.block.samples).all() for item in blocks(delivered))
+
+
+def test_for_a_client_that_acknowledges_nothing_rendering_stops_soon(stage):
+    stream, delivered = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S + 0.1)
+    clock = stream.session.sample_clock
+    assert len(blocks(delivered)) == 10
+    assert stage.thread.tick() is None, "there is nothing to do until somebody says something"
+    stage.run(5.0)
+    assert stream.session.sample_clock == clock
+    assert 6.0 < stream.stalled_s < 6.3
+
+
+def test_a_stream_that_stood_still_goes_on_where_it_was(stage):
+    """Its blocks are due from now on, and none is late for what was before."""
+    stream, delivered = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S + 3.0)
+    clock = stream.session.sample_clock
+    delivered.clear()
+    assert stream.offer(Acknowledge(sequence=9))
+    assert stream.has_news
+    resumed_s = stage.clock.now_s
+    stage.run(5.5 * BLOCK_S)
+    sent = blocks(delivered)
+    assert [each.block.sequence for each in sent] == list(range(10, 10 + len(sent)))
+    assert [each.block.sample_clock for each in sent] == [clock + 256 * number for number in range(len(sent))]
+    assert 5 <= len(sent) <= 6
+    assert all(each.deadline_s > resumed_s for each in sent)
+    assert stream.stalled_s == 0
+
+
+def test_a_stream_that_stands_still_calls_for_no_responses(stage):
+    stream, _ = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S + 0.1)
+    stage.workers.work.clear()
+    stream.offer(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
+    stage.run(1.0)
+    assert stage.workers.work == []
+    stream.offer(Acknowledge(sequence=9))
+    stage.run(BLOCK_S)
+    assert stage.workers.work
+
+
+def test_a_short_stall_costs_only_what_there_was_no_room_for(stage):
+    stream, delivered = stage.open(window=10)
+    stage.run(10 * BLOCK_S + PAUSE_AFTER_S / 2)
+    delivered.clear()
+    stream.offer(Acknowledge(sequence=9))
+    stage.run(2.5 * BLOCK_S)
+    (first, *_) = blocks(delivered)
+    dropped = stream.session.blocks_dropped
+    assert (first.block.sequence, first.block.sample_clock) == (10, 256 * (10 + dropped))
+    assert dropped * BLOCK_S == pytest.approx(PAUSE_AFTER_S / 2, abs=6 * BLOCK_S)
+
+
+@pytest.fixture
+def running(field, filters):
+    """An engine with two threads that run, and a watch over them; opens a stream that plays, and gives what it is
+    delivered."""
+    with Workers(1) as workers:
+        engine = AudioEngine(lambda call: call(), workers, threads=2)
+        engine.start()
+
+        def opened():
+            delivered = []
+            clip = np.ones(64, np.float32)
+            hello = Hello(protocol=PROTOCOL, scene="flat")
+            stream = open_stream(
+                hello, field, filters, lambda _: clip, window=100_000, lead=8, deliver=delivered.extend
+            )
+            engine.open(stream)
+            add(stream)
+            return delivered
+
+        yield engine, ThreadWatch((engine,)), opened
+        engine.stop()
+
+
+def wait_until(condition):
+    until_s = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < until_s
+        time.sleep(0.005)
+
+
+@threads_may_die
+def test_streams_of_a_thread_that_died_between_two_ticks_go_on_where_they_were_on_another(running):
+    engine, watch, opened = running
+    streams = [opened() for _ in range(4)]
+    wait_until(lambda: all(len(blocks(delivered)) > 50 for delivered in streams))
+    dead = engine.threads[0]
+    dead.tick = lambda: 60.0  # so that it dies at rest
+    wait_until(lambda: dead.work_number is None)
+    kill(dead._thread)
+    dead._wake.set()
+    wait_until(lambda: dead.is_dead)
+    before = [len(blocks(delivered)) for delivered in streams]
+    watch.look()
+    wait_until(
+        lambda: all(len(blocks(delivered)) > count + 50 for delivered, count in zip(streams, before, strict=True))
+    )
+    for delivered in streams:
+        assert not any(isinstance(item, StreamFailed) for item in delivered)
+        sent = [item.block for item in blocks(delivered)]
+        assert [block.sequence for block in sent] == list(range(len(sent)))
+        assert [block.sample_clock for block in sent] == list(range(0, 256 * len(sent), 256))
+        assert sent[-1].samples.any()
+    assert watch.restarts == {"nafir-audio-0": 1}
+    # The pace is that of time again: what comes is due now, and not a minute ago or hence.
+    now_s = time.monotonic()
+    assert all(abs(stream.due_s - now_s) < 1 for stream in engine.streams)
+
+
+@threads_may_die
+def test_streams_that_a_thread_died_at_are_told_and_new_ones_are_served(running):
+    engine, watch, opened = running
+    at_work = [opened() for _ in range(4)]
+    wait_until(lambda: all(blocks(delivered) for delivered in at_work))
+    dead, elsewhere = engine.threads
+    dead.turns.deal = lambda _: sys.exit()  # which no boundary between streams holds back
+    wait_until(lambda: dead.is_dead)
+    watch.look()
+    told = [delivered for delivered in at_work if isinstance(delivered[-1], StreamFailed)]
+    assert len(told) == 2
+    assert engine.threads[1] is elsewhere
+    for stream in engine.streams[:1]:
+        engine.close(stream)
+    newcomers = [opened() for _ in range(4)]
+    wait_until(lambda: all(len(blocks(delivered)) > 20 for delivered in newcomers))
+
+
+def test_of_a_thread_that_is_stuck_the_streams_are_told_and_stopping_does_not_wait_for_it(running):
+    engine, watch, opened = running
+    streams = [opened() for _ in range(2)]
+    wait_until(lambda: all(blocks(delivered) for delivered in streams))
+    stuck, release = engine.threads[1], threading.Event()
+    stuck.turns.deal = lambda _: release.wait(30)
+    wait_until(lambda: not stuck._thread.is_alive() or stuck.work_number is not None)
+    number = stuck.work_number
+    wait_until(lambda: stuck.work_number == number)
+    for _ in range(11):
+        watch.look()
+    assert watch.stuck == ("nafir-audio-1",)
+    for _ in range(20):
+        watch.look()
+    assert [isinstance(delivered[-1], StreamFailed) for delivered in streams].count(True) == 1
+    began_s = time.monotonic()
+    engine.stop()
+    assert time.monotonic() - began_s < 5
+    release.set()
+
+
+def test_what_was_counted_stays_counted_when_a_thread_is_replaced(stage):
+    stage.thread.steps["load"] += 3
+    stage.engine.replace(stage.thread)
+    assert stage.engine.steps["load"] == 3
+    stage.engine.stop()

@@ -1,6 +1,7 @@
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -101,9 +102,12 @@ def test_ir_tells_programs_what_it_did(nafir, bundle, tmp_path):
         (("--listener", "1,2", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener"),
         (("--listener", "1,2,99", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener"),
         (("--listener", "1,2,1.5", "--emitter", "nan,3,1.5", "-o", "ir.wav"), "emitter"),
-        ((*PLACES, "--yaw-deg", "inf", "-o", "ir.wav"), "yaw-deg"),
+        ((*PLACES, "--yaw-deg", "inf", "-o", "ir.wav"), "--yaw-deg: 'inf' is not finite"),
+        ((*PLACES, "--yaw-deg", "0_1", "-o", "ir.wav"), "--yaw-deg: '0_1' is not a number"),
+        ((*PLACES, "--yaw-deg", "90", "--yaw-deg", "0", "-o", "ir.wav"), "--yaw-deg is given 2 times"),
+        (("--listener", "0_1,2,1.5", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener: in x,y,z '0_1'"),
         ((*PLACES, "-o", "ir.mp3"), "mp3"),
-        ((*PLACES, "-o", "no/such/folder/ir.wav"), "No such file"),
+        ((*PLACES, "-o", "no/such/folder/ir.wav"), "there is no folder"),
     ],
 )
 def test_ir_says_what_is_wrong_in_one_line(nafir, bundle, tmp_path, monkeypatch, arguments, word):
@@ -200,7 +204,7 @@ def test_render_says_what_is_wrong_in_one_line(nafir, bundle, tmp_path, monkeypa
     assert not (tmp_path / output).exists()
 
 
-@pytest.mark.parametrize("duration_s", ["0", "-1", "1e-9", "7201", "1e308", "inf", "nan"])
+@pytest.mark.parametrize("duration_s", ["0", "-1", "1e-9", "7201", "1e308"])
 def test_render_says_how_long_it_may_be(nafir, bundle, tmp_path, duration_s):
     path, output = tmp_path / "path.csv", tmp_path / "out.wav"
     path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
@@ -250,6 +254,45 @@ def test_a_damaged_bundle_leaves_no_traceback(bundle_copy):
     assert "codec.hop" in done.stderr
 
 
+def test_a_port_in_use_ends_serve_at_once_before_anything_is_loaded_and_nothing_is_said_to_be_served(
+    nafir, monkeypatch
+):
+    monkeypatch.setattr("server.catalogue.load_scenes", lambda _: pytest.fail("scenes are loaded"))
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        code, said, errors = nafir("serve", "--port", port)
+    check_error((code, said, errors), "port", str(port), "--port")
+    assert "serves" not in said
+
+
+@pytest.mark.parametrize("option", ["clip", "hrtf"])
+def test_serve_looks_at_the_files_it_is_given_before_anything_else(nafir, monkeypatch, tmp_path, option):
+    monkeypatch.setattr("server.catalogue.load_scenes", lambda _: pytest.fail("scenes are loaded"))
+    monkeypatch.setattr("server.api.serving.bind", lambda *_: pytest.fail("a port is bound"))
+    check_error(nafir("serve", "--port", 0, f"--{option}", tmp_path / "missing.x"), f"{option}s", "missing.x")
+
+
+@pytest.mark.parametrize("place", ["missing/out", "file/out", "."])
+@pytest.mark.parametrize("command", ["ir", "render", "plan", "check"])
+def test_what_cannot_be_written_is_refused_before_the_work(nafir, monkeypatch, tmp_path, command, place):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("server.scene.bundle.find_bundle", lambda _: pytest.fail("the work has begun"))
+    suffix = {"ir": ".wav", "render": ".wav", "plan": ".png", "check": ".png"}[command]
+    output = tmp_path / (f"{place}{suffix}" if place != "." else f"folder{suffix}")
+    if place == ".":
+        output.mkdir()
+    arguments = {
+        "ir": (*PLACES, "-o", output),
+        "render": ("--emitter", "knock@1,2,1.5", "--path", tmp_path / "file", "-o", output),
+        "plan": ("--figure", output),
+        "check": ("--figure", output),
+    }[command]
+    option = "--figure" if "--figure" in arguments else "--output"
+    check_error(nafir(command, "apartment", *arguments), option, "folder")
+
+
 def test_an_impossible_setting_is_named(nafir, monkeypatch):
     monkeypatch.setenv("NAFIR_IR_WORKERS", "none")
     check_error(nafir("serve"), "ir_workers")
@@ -267,18 +310,17 @@ def test_help_names_the_commands(nafir):
 
 
 def test_serve_serves_until_it_is_told_to_stop(bundle):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    environment = {**os.environ, "NAFIR_BUNDLES": str(bundle.folder)}
+    environment = {**os.environ, "NAFIR_BUNDLES": str(bundle.folder), "PYTHONUNBUFFERED": "1"}
     server = subprocess.Popen(
-        [*NAFIR, "serve", "--port", str(port)],
+        [*NAFIR, "serve", "--port", "0"],
         stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+        stderr=subprocess.DEVNULL,
         env=environment,
         text=True,
     )
     try:
+        # Told once it serves, with the port that it has.
+        port = int(re.search(r"http://127\.0\.0\.1:(\d+)", server.stdout.readline())[1])
         for _ in range(1_800):  # the first time ever, everything is compiled
             with contextlib.suppress(urllib.error.URLError):
                 urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=5).close()
@@ -288,6 +330,5 @@ def test_serve_serves_until_it_is_told_to_stop(bundle):
             assert "flat" in {scene["id"] for scene in json.load(answer)["scenes"]}
     finally:
         server.send_signal(signal.SIGTERM)
-        said, _ = server.communicate(timeout=30)
-    assert f"http://127.0.0.1:{port}" in said
-    assert "Traceback" not in said
+        server.communicate(timeout=30)
+    assert server.returncode == 0

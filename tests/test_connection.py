@@ -17,6 +17,8 @@ from server.load import Offer
 from server.places import place_of_field
 from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, Ping, RemoveEmitter
 from server.replies import Error, Status, parse_server_message
+from server.runtime.drain import Drain
+from server.runtime.readiness import Readiness
 from server.session import Session
 from server.settings import Settings
 from server.streaming import Connection, StreamHost
@@ -71,7 +73,7 @@ async def hosting(field, hrtfs, **settings):
             answers=Answers(workers=1, waiting=1),
             offers={"flat": Offer((field.level,), {field.level.name: 1.0})},
             places={"flat": place_of_field(field)},
-            is_ready=True,
+            readiness=Readiness(Drain(8.0), warm_up="done"),
         )
         audio.start()
         try:
@@ -208,7 +210,7 @@ def test_before_the_server_is_warm_a_client_is_told_to_come_back(field, hrtfs):
     async def scenario():
         socket = Socket()
         async with hosting(field, hrtfs) as host:
-            host.is_ready = False
+            host.readiness.warm_up = "under way"
             await Connection(socket, host).run()
         return socket
 
@@ -264,3 +266,166 @@ def test_a_stream_that_fails_is_closed_with_an_internal_error(field, hrtfs, monk
     socket = asyncio.run(scenario())
     assert socket.close_code == 1011
     assert [message.code for message in socket.sent if isinstance(message, Error)] == ["internal_error"]
+
+
+async def until(condition):
+    async with asyncio.timeout(5):
+        while not condition():  # noqa: ASYNC110  there is no event for it
+            await asyncio.sleep(0.005)
+
+
+def codes(socket):
+    return [message.code for message in socket.sent if isinstance(message, Error)]
+
+
+def test_who_says_nothing_takes_no_stream(field, hrtfs):
+    async def scenario():
+        silent, speaking = [Socket() for _ in range(5)], Socket()
+        async with hosting(field, hrtfs, max_streams=1) as host:
+            running = [asyncio.create_task(Connection(socket, host).run()) for socket in (*silent, speaking)]
+            await until(lambda: len(host.silent) == 6)
+            assert host.streams == 0
+            speaking.say(HELLO)
+            await listen_for_a_second(speaking)
+            for socket in silent:
+                await socket.close(1000, "")
+            await asyncio.gather(*running)
+            assert (host.streams, host.silent) == (0, {})
+        return speaking
+
+    assert codes(asyncio.run(scenario())) == []
+
+
+def test_no_more_streams_are_opened_at_once_than_there_may_be(field, hrtfs):
+    """Opening a session takes a while, in which others say hello."""
+
+    async def scenario():
+        sockets = [Socket() for _ in range(5)]
+        async with hosting(field, hrtfs, max_streams=2) as host:
+            running = [asyncio.create_task(Connection(socket, host).run()) for socket in sockets]
+            await until(lambda: len(host.silent) == 5)
+            for socket in sockets:
+                socket.say(HELLO)
+            await until(lambda: sum(socket.close_code is not None for socket in sockets) == 3)
+            await until(lambda: sum(not codes(socket) and bool(socket.sent) for socket in sockets) == 2)
+            assert host.streams == 2
+            for socket in sockets:
+                await socket.close(1000, "")
+            await asyncio.gather(*running)
+            assert host.streams == 0
+        return sockets
+
+    sockets = asyncio.run(scenario())
+    assert sorted(codes(socket) for socket in sockets) == [[], [], ["server_busy"], ["server_busy"], ["server_busy"]]
+
+
+@pytest.mark.parametrize("refused", [{"scene": "moon"}, {"protocol": 1}])
+def test_a_hello_that_is_refused_takes_no_stream(field, hrtfs, refused):
+    async def scenario():
+        refusing, speaking = Socket(), Socket()
+        async with hosting(field, hrtfs, max_streams=1) as host:
+            refusing.say(HELLO.model_copy(update=refused))
+            await Connection(refusing, host).run()
+            assert host.streams == 0
+            running = asyncio.create_task(Connection(speaking, host).run())
+            speaking.say(HELLO)
+            await listen_for_a_second(speaking)
+            await running
+        return refusing, speaking
+
+    refusing, speaking = asyncio.run(scenario())
+    assert refusing.close_code == 1008
+    assert codes(speaking) == []
+
+
+def test_of_too_many_who_say_nothing_the_first_is_sent_away(field, hrtfs):
+    async def scenario():
+        sockets = [Socket() for _ in range(4)]
+        async with hosting(field, hrtfs, max_silent=3) as host:
+            running = []
+            for socket in sockets:
+                running.append(asyncio.create_task(Connection(socket, host).run()))
+                await asyncio.sleep(0.01)
+            await asyncio.wait_for(running[0], 5)
+            assert len(host.silent) == 3
+            sockets[3].say(HELLO)
+            await asyncio.wait_for(sockets[3].has_sent.wait(), 5)
+            for socket in sockets:
+                await socket.close(1000, "")
+            await asyncio.gather(*running)
+        return sockets
+
+    sockets = asyncio.run(scenario())
+    assert [codes(socket) for socket in sockets] == [["hello_expected"], [], [], []]
+
+
+def test_a_client_that_acknowledges_nothing_is_closed_after_the_time_stated(field, hrtfs):
+    """It reads all it is sent, and asks."""
+
+    async def scenario():
+        socket = Socket()
+        async with hosting(field, hrtfs, stall_timeout_s=0.5) as host:
+            began_s = time.monotonic()
+            running = asyncio.create_task(Connection(socket, host).run())
+            socket.say(HELLO)
+            while not running.done():
+                socket.say(Ping(id=1))
+                await asyncio.sleep(0.05)
+            await running
+            assert host.streams == 0
+        return socket, time.monotonic() - began_s
+
+    socket, lasted_s = asyncio.run(scenario())
+    assert codes(socket) == ["stalled"]
+    assert socket.close_code == 1008
+    window_s = 40 * 256 / 24_000
+    assert 0.5 + window_s - 0.1 < lasted_s < 3.0
+
+
+def test_a_client_that_acknowledges_in_time_is_not_closed(field, hrtfs):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field, hrtfs, stall_timeout_s=0.3) as host:
+            running = asyncio.create_task(Connection(socket, host).run())
+            socket.say(HELLO)
+            await listen_for_a_second(socket)
+            await running
+        return socket
+
+    assert codes(asyncio.run(scenario())) == []
+
+
+def test_a_stream_is_told_when_the_server_ends_and_so_is_who_has_not_said_hello_and_who_comes_later(field, hrtfs):
+    async def scenario():
+        playing, silent, late = Socket(), Socket(), Socket()
+        async with hosting(field, hrtfs) as host:
+            running = [asyncio.create_task(Connection(socket, host).run()) for socket in (playing, silent)]
+            playing.say(HELLO)
+            await asyncio.wait_for(playing.has_sent.wait(), 5)
+            await asyncio.sleep(0.1)
+            await asyncio.wait_for(host.readiness.drain.settle(), 5)
+            assert all(task.done() for task in running)
+            assert not host.audio.streams
+            assert host.streams == 0
+            await asyncio.wait_for(Connection(late, host).run(), 5)
+        return playing, silent, late
+
+    for socket in asyncio.run(scenario()):
+        assert socket.close_code == 1012
+        assert socket.sent[-1].code == "server_draining"
+
+
+def test_a_client_that_does_not_read_keeps_the_server_from_ending_for_a_moment_only(field, hrtfs):
+    async def scenario():
+        socket = Socket()
+        async with hosting(field, hrtfs) as host:
+            running = asyncio.create_task(Connection(socket, host).run())
+            socket.say(HELLO)
+            await asyncio.wait_for(socket.has_sent.wait(), 5)
+            socket.reads.clear()
+            began_s = time.monotonic()
+            await host.readiness.drain.settle()
+            assert running.done()
+            return time.monotonic() - began_s
+
+    assert asyncio.run(scenario()) < 4

@@ -33,3 +33,9 @@ def test_merging_is_counting_both():
     one.merge(other)
     assert one.count == 100
     assert one.quantiles_s(0.3, 0.31) == pytest.approx([0.001, 0.1], rel=0.03)
+
+
+def test_a_sum_never_falls():
+    counted = histogram([0.5])
+    counted.add(-0.25)
+    assert counted.total_s == 0.5

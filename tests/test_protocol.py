@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from server.acoustics.directivity import CARDIOID, Cardioid, PolarPattern
 from server.acoustics.geometry import Pose
@@ -37,6 +38,7 @@ from server.replies import (
     LiveStatus,
     Pong,
     Status,
+    UnknownMessage,
     Welcome,
     parse_server_message,
 )
@@ -225,6 +227,75 @@ def test_bad_text_is_refused_with_a_code_and_the_field(text, code, field):
         parse_client_message(text)
     assert (refusal.value.code, refusal.value.field) == (code, field)
     assert str(refusal.value)
+
+
+@pytest.mark.parametrize("version", ["3", "1", "3.0", "-2", "0", "1e300", "9" * 5_000, "2.5e1"])
+@pytest.mark.parametrize("rest", ['"scene": "a", "spatial": {"order": 7}', '"block_size": "any"', '"scene": 1'])
+def test_a_hello_of_another_version_is_told_which_is_spoken_whatever_else_it_says(version, rest):
+    with pytest.raises(RequestError) as refusal:
+        parse_client_message(f'{{"type": "hello", {rest}, "protocol": {version}}}')
+    assert (refusal.value.code, refusal.value.field) == ("unsupported_protocol", "protocol")
+    assert "speaks protocol 2, not " in str(refusal.value)
+    assert len(str(refusal.value)) < 100
+
+
+@pytest.mark.parametrize(
+    "protocol", ["", '"protocol": "3",', '"protocol": true,', '"protocol": null,', '"protocol": 2.5,']
+)
+def test_a_hello_without_a_version_is_told_so_before_all_else(protocol):
+    with pytest.raises(RequestError) as refusal:
+        parse_client_message(f'{{"type": "hello", {protocol} "scene": 1, "spatial": true}}')
+    assert (refusal.value.code, refusal.value.field) == ("malformed_message", "protocol")
+    assert "speaks 2" in str(refusal.value)
+
+
+def test_an_unknown_field_of_this_version_is_refused_with_the_nearest_name():
+    with pytest.raises(RequestError, match=r"orientaton: unknown field; did you mean 'orientation'\?") as refusal:
+        parse_client_message('{"type": "listener", "pose_id": 1, "position": [1, 2, 3], "orientaton": [0, 0, 0, 1]}')
+    assert refusal.value.code == "malformed_message"
+    with pytest.raises(RequestError, match=r"scen: unknown field; did you mean 'scene'\?"):
+        parse_client_message('{"type": "hello", "protocol": 2, "scene": "a", "scen": "b"}')
+
+
+def integers(schema, whole):
+    """Where `whole`, the schema of everything, has integers, as the names that lead there."""
+    schema = whole["$defs"][schema["$ref"].rsplit("/", 1)[-1]] if "$ref" in schema else schema
+    for name, each in schema.get("properties", {}).items():
+        kinds = [each, *each.get("anyOf", ())]
+        if any(kind.get("type") == "integer" or 128 in kind.get("enum", ()) for kind in kinds):
+            yield (name,)
+        yield from ((name, *rest) for kind in kinds for rest in integers(kind, whole))
+
+
+@pytest.mark.parametrize("message", CLIENT_MESSAGES, ids=lambda m: m.type)
+def test_every_integer_may_be_written_with_a_fraction_of_zero(message):
+    schema = type(message).model_json_schema()
+    said = json.loads(message.serialize())
+    for name, *deeper in integers(schema, schema):
+        assert not deeper
+        if said[name] is not None:
+            written = json.dumps(said | {name: float(said[name])})
+            assert parse_client_message(written) == message
+            for wrong in (said[name] + 0.5, str(said[name]), True):
+                with pytest.raises(RequestError):
+                    parse_client_message(json.dumps(said | {name: wrong}))
+
+
+@pytest.mark.parametrize("message", SERVER_MESSAGES, ids=lambda m: m.type)
+def test_a_client_ignores_fields_that_a_newer_server_adds(message):
+    said = json.loads(message.serialize())
+    said |= {"unheard_of": {"a": 1}}
+    for each in said.values():
+        if isinstance(each, dict):
+            each["unheard_of"] = 1
+    assert parse_server_message(json.dumps(said)) == message
+
+
+def test_a_client_ignores_messages_that_a_newer_server_adds():
+    assert parse_server_message('{"type": "weather", "wind_m_s": 3}') == UnknownMessage(type="weather")
+    for broken in ("{}", '{"type": 1}', "?", '{"type": "pong"}'):
+        with pytest.raises(ValidationError):
+            parse_server_message(broken)
 
 
 @given(st.text())

@@ -1,5 +1,6 @@
 import io
 import json
+import re
 import threading
 import time
 
@@ -9,10 +10,12 @@ import soundfile
 from PIL import Image
 from starlette.testclient import TestClient
 
+from server import app
 from server.app import create_app
 from server.field.levels import Levels
 from server.impulse_response import ImpulseResponse, IrQuery
 from server.settings import Settings
+from tests.killing import kill, threads_may_die
 
 IR = "/v1/scenes/flat/impulse-response"
 PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
@@ -150,7 +153,7 @@ def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_a
     [
         ("/v1/scenes/moon", {}, 404, "unknown_scene", "scene"),
         ("/v1/scenes/moon/impulse-response", PLACES, 404, "unknown_scene", "scene"),
-        ("/v1/scenes/moon/loudness", PLACES, 404, "unknown_scene", "scene"),
+        ("/v1/scenes/moon/loudness", {"emitter": "6,3,1.5"}, 404, "unknown_scene", "scene"),
         (IR, {"listener": "1,2,1.5"}, 422, "malformed_pose", "emitter"),
         (IR, {**PLACES, "listener": "1,2"}, 422, "malformed_pose", "listener"),
         (IR, {**PLACES, "listener": "1,2,three"}, 422, "malformed_pose", "listener"),
@@ -246,3 +249,86 @@ def test_the_interface_describes_itself(client):
 @pytest.mark.parametrize("path", ["/livez", "/readyz"])
 def test_load_balancers_may_probe_with_head(client, path):
     assert client.head(path).status_code == 200
+
+
+def wait_for_status(client, path, status):
+    """The answer, and how many seconds it took until the status was that."""
+    began_s = time.monotonic()
+    while (answer := client.get(path)).status_code != status:
+        assert time.monotonic() - began_s < 10
+        time.sleep(0.02)
+    return answer, time.monotonic() - began_s
+
+
+def metric(client, name):
+    return float(re.search(rf"^{re.escape(name)} (.*)$", client.get("/metrics").text, re.MULTILINE)[1])
+
+
+@threads_may_die
+@pytest.mark.parametrize("group", ["audio", "ir"])
+def test_a_thread_that_dies_is_replaced_within_two_seconds_and_counted(client, group):
+    host = client.app_state["host"]
+    threads = (lambda: host.audio.threads) if group == "audio" else (lambda: host.readiness.watch._groups[1].threads)
+    dead = threads()[0]
+    restarts = f'nafir_thread_restarts_total{{thread="{dead.name}"}}'
+    assert metric(client, restarts) == 0
+    kill(dead._thread)
+    if group == "audio":
+        dead._wake.set()
+    began_s = time.monotonic()
+    while metric(client, restarts) == 0:
+        if group == "ir":  # a waiting worker dies with the next work, which is not lost
+            host.audio._workers.submit(int, kind="plan").result(timeout=5)
+        assert time.monotonic() - began_s < 2
+    assert dead not in threads()
+    assert metric(client, f'nafir_thread_healthy{{thread="{dead.name}"}}') == 1
+    assert client.get("/readyz").status_code == 200
+
+
+def test_a_thread_that_is_stuck_leaves_readiness_within_two_seconds_until_it_goes_on(client):
+    stuck, release = client.app_state["host"].audio.threads[0], threading.Event()
+    tick = stuck.tick
+    stuck.tick = lambda: release.wait(20) and tick()
+    stuck._wake.set()
+    answer, waited_s = wait_for_status(client, "/readyz", 503)
+    assert waited_s < 2
+    check_problem(answer, 503, "not_ready")
+    assert stuck.name in answer.json()["detail"]
+    assert int(answer.headers["retry-after"]) >= 1
+    assert metric(client, "nafir_ready") == 0
+    assert metric(client, f'nafir_thread_healthy{{thread="{stuck.name}"}}') == 0
+    with client.websocket_connect("/v1/stream") as stream:
+        assert json.loads(stream.receive_text())["code"] == "not_ready"
+    release.set()
+    wait_for_status(client, "/readyz", 200)
+
+
+def test_a_failed_warm_up_is_told_apart_from_one_under_way(field, hrtfs, caplog):
+    def broken(*_, **__):
+        raise RuntimeError("the field broke")
+
+    field.impulse_responses = broken
+    with TestClient(create_app(Settings(), scenes={"flat": Levels([field])}, hrtfs=hrtfs)) as client:
+        began_s = time.monotonic()
+        while "has failed" not in (detail := client.get("/readyz").json()["detail"]):
+            assert "still warming up" in detail
+            assert time.monotonic() - began_s < 180
+            time.sleep(0.05)
+    assert "the field broke" in caplog.text
+
+
+def test_effects_whose_cost_cannot_be_measured_leave_the_server_ready_and_the_log_says_why(
+    field, hrtfs, caplog, monkeypatch
+):
+    def broken(*_, **__):
+        raise RuntimeError("no clock")
+
+    monkeypatch.setattr(app, "measure_costs", broken)
+    monkeypatch.setattr(app, "_COSTS_AFTER_S", 0.0)
+    with TestClient(create_app(Settings(), scenes={"flat": Levels([field])}, hrtfs=hrtfs)) as client:
+        wait_until_ready(client)
+        began_s = time.monotonic()
+        while "no clock" not in caplog.text:
+            assert time.monotonic() - began_s < 10
+            time.sleep(0.02)
+        assert client.get("/readyz").status_code == 200

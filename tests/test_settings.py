@@ -1,4 +1,5 @@
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,11 @@ def test_the_environment_is_heeded_and_arguments_win(monkeypatch):
         ("AUDIO_THREADS", "0"),
         ("REALTIME", "perhaps"),
         ("HELLO_TIMEOUT_S", "soon"),
+        ("HELLO_TIMEOUT_S", "1_0"),
+        ("HELLO_TIMEOUT_S", "inf"),
+        ("HELLO_TIMEOUT_S", "٣"),
+        ("MAX_STREAMS", "6_4"),
+        ("MAX_STREAMS", "64.0"),
     ],
 )
 def test_impossible_settings_are_refused(monkeypatch, name, value):
@@ -58,3 +64,23 @@ def test_two_files_of_one_name_are_refused_and_both_named(monkeypatch, setting, 
     with pytest.raises(ValidationError, match=both):
         Settings()
     assert len(getattr(Settings(**{setting: (files[0], files[0])}), setting)) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("NAFIR_MAX_STREAM", "NAFIR_MAX_STREAM, which is no setting; did you mean 'NAFIR_MAX_STREAMS'?"),
+        ("nafir_prot", "nafir_prot, which is no setting; did you mean 'NAFIR_PORT'?"),
+        ("NAFIR_", "NAFIR_, which is no setting"),
+    ],
+)
+def test_a_variable_that_is_no_setting_is_refused(monkeypatch, name, message):
+    monkeypatch.setenv(name, "3")
+    with pytest.raises(ValidationError, match=re.escape(message)):
+        Settings()
+
+
+def test_other_variables_are_nobodys_business(monkeypatch):
+    monkeypatch.setenv("NAFIRISH", "3")
+    monkeypatch.setenv("MY_NAFIR_PORT", "3")
+    Settings()

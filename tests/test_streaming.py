@@ -220,12 +220,18 @@ def test_a_clip_that_cannot_be_decoded_says_why(ears):
             '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [99, 1, 1]}}',
             "position_out_of_bounds",
         ),
+        ('{"type": "hello", "protocol": 3, "scene": "flat", "spatial": true}', "unsupported_protocol"),
+        (b"", "hello_expected"),
+        (ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)).serialize_binary(), "hello_expected"),
+        (b"\xff" * 40, "hello_expected"),
         (None, "hello_expected"),
     ],
 )
 def test_a_bad_hello_is_answered_and_ends_the_connection(client, first, code):
     with client.websocket_connect("/v1/stream") as socket:
-        if first is not None:
+        if isinstance(first, bytes):
+            socket.send_bytes(first)
+        elif first is not None:
             socket.send_text(first)
         assert parse_server_message(socket.receive_text()).code == code
         with pytest.raises(WebSocketDisconnect) as closed:

@@ -2,14 +2,18 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from server.api.stream_counts import StreamLedger
 from server.audio_engine import AudioEngine
 from server.durations import DurationHistogram
 from server.field.levels import Levels
 from server.load import Offer
 from server.protocol import PROTOCOL, AddEmitter, Hello
+from server.runtime.drain import Drain
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
 from server.session import Session
 from server.stream import Stream
-from server.telemetry import ServerCollector, StreamTotals, exposition
+from server.telemetry import ServerCollector, exposition
 from tests.engine_stage import Patient
 
 BLOCK_S = 256 / 24_000
@@ -22,7 +26,8 @@ class Clips:
 class Host:
     def __init__(self, audio, offers):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
-        self.past, self.is_ready = StreamTotals(), True
+        self.ledger = StreamLedger()
+        self.readiness = Readiness(Drain(8.0), ThreadWatch((audio,)), warm_up="done")
 
 
 @pytest.fixture
@@ -44,6 +49,7 @@ def open_stream(host, field, filters):
         lead=1,
         deliver=lambda _: None,
     )
+    host.ledger.open(stream)
     host.audio.open(stream)
     return stream
 
@@ -80,7 +86,7 @@ def test_streams_are_counted_together_and_stay_counted_when_they_end(host, field
     assert told["nafir_streams_eased", ("scene", "flat")] == 1
     assert (told["nafir_blocks_sent_total",], told["nafir_blocks_late_total",]) == (10, 2)
     host.audio.close(streams[0])
-    host.past.add(streams[0])
+    host.ledger.close(streams[0])
     after = samples(host)
     assert after["nafir_streams", ("level", "standard"), ("scene", "flat")] == 1
     assert {name: value for name, value in after.items() if name[0].startswith("nafir_block")} == {
@@ -88,10 +94,11 @@ def test_streams_are_counted_together_and_stay_counted_when_they_end(host, field
     }
 
 
-def test_durations_are_buckets_that_contain_each_other(host):
+def test_durations_are_buckets_that_contain_each_other(host, field, filters):
     times_s = [1e-4, 2e-4, 2e-4, 0.03, 100.0]
+    stream = open_stream(host, field, filters)
     for time_s in times_s:
-        host.past.durations["render"].add(time_s)
+        stream.render_times.add(time_s)
     told = samples(host)
     counts = sorted(
         (float(dict(labels)["le"]), value)

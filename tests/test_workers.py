@@ -1,6 +1,9 @@
 """What is urgent is done first, and nothing is lost."""
 
+import gc
 import threading
+import time
+import weakref
 
 import pytest
 
@@ -65,3 +68,28 @@ def test_several_workers_do_everything_once():
         for number in range(300):
             workers.submit(done.append, number, kind=("plan", "response")[number % 2], is_urgent=number % 3 > 0)
     assert sorted(done) == list(range(300))
+
+
+def test_work_that_fails_is_let_go_of_at_once(workers):
+    """A traceback holds the frames that it passed through, and with them whatever they hold."""
+
+    class Asker:
+        pass
+
+    def fail(asker):
+        raise ValueError(asker)
+
+    asker = Asker()
+    reference = weakref.ref(asker)
+    gc.collect()
+    gc.disable()
+    try:
+        future = workers.submit(fail, asker, kind="plan")
+        assert isinstance(future.exception(5), ValueError)
+        del future, asker
+        until_s = time.monotonic() + 5
+        while reference() is not None and time.monotonic() < until_s:
+            time.sleep(0.01)  # the worker may still be about to leave
+        assert reference() is None
+    finally:
+        gc.enable()

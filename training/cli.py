@@ -10,13 +10,14 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from server.core.command_line import StrictTyper
 from server.errors import NafirError
 from training.evaluation import cli as evaluation
 from training.importers.cli import importing
 from training.options import Json, Seed
 from training.simulation import cli as simulation
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = StrictTyper(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(importing, name="import")
 app.command()(simulation.plan)
 
@@ -48,8 +49,10 @@ def simulate(
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from training.simulation.run import simulate as simulate_scene
 
-    ready = simulation.simulation_of(scene, seed, effects)
-    simulation.wide_console(stderr=True).print(simulation.plan_table(ready.plan))
+    console = simulation.wide_console(stderr=True)
+    with console.status("planning, and tracing the late sound that pairs may share"):
+        ready = simulation.simulation_of(scene, seed, effects)
+    simulation.print_plan(console, ready.scene, ready.plan)
     processes = workers or os.cpu_count() or 1
     with _progress() as progress:
         dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, simulation=ready)

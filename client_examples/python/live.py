@@ -62,7 +62,7 @@ def say(change: dict, sample_rate: int) -> None:
     at_s, rate_hz = change["sample_clock"] / sample_rate, change["ir_rate_hz"]
     pace = "with every pose" if rate_hz is None else f"at most {rate_hz:g} times a second"
     why = {"chosen": "as chosen", "load": "the server is under load", "recovered": "the server has recovered"}
-    print(f"{at_s:.2f} s: level {change['level']}, responses {pace}: {why[change['reason']]}")
+    print(f"{at_s:.2f} s: level {change['level']}, responses {pace}: {why.get(change['reason'], change['reason'])}")
 
 
 async def perform(arguments: argparse.Namespace) -> None:
@@ -88,6 +88,8 @@ async def perform(arguments: argparse.Namespace) -> None:
         while start is None or max(wet, default=0) < start + length:
             message = await socket.recv()
             if isinstance(message, bytes):
+                if message[:1] != b"\x01":
+                    continue  # no block, but a kind that a newer server knows
                 _, _, channels, sequence, clock, _, _, frames = WET.unpack_from(message)
                 if sequence % 4 == 3:
                     await socket.send(json.dumps({"type": "acknowledge", "sequence": sequence}))

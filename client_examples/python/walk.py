@@ -150,7 +150,7 @@ def say(change: dict, sample_rate: int) -> None:
     at_s, rate_hz = change["sample_clock"] / sample_rate, change["ir_rate_hz"]
     pace = "with every pose" if rate_hz is None else f"at most {rate_hz:g} times a second"
     why = {"chosen": "as chosen", "load": "the server is under load", "recovered": "the server has recovered"}
-    print(f"{at_s:.2f} s: level {change['level']}, responses {pace}: {why[change['reason']]}")
+    print(f"{at_s:.2f} s: level {change['level']}, responses {pace}: {why.get(change['reason'], change['reason'])}")
 
 
 async def send_poses(socket: ClientConnection, walk: Walk, poses: dict[int, Pose], sent_s: dict[int, float]) -> None:
@@ -199,6 +199,8 @@ async def listen(arguments: argparse.Namespace) -> None:
         while recording.samples_heard < arguments.seconds * recording.sample_rate:
             message = await socket.recv()
             if isinstance(message, bytes):
+                if message[:1] != b"\x01":
+                    continue  # no block, but a kind that a newer server knows
                 sequence, pose, reverberation_pose = recording.add(message)
                 direct_s.setdefault(pose, time.monotonic())
                 reverberation_s.setdefault(reverberation_pose, time.monotonic())

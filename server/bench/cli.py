@@ -1,4 +1,7 @@
-"""`nafir bench`: what things cost on this host. Medians of several rounds; run it on an idle machine."""
+"""`nafir bench`: what things cost on this host. Medians of several rounds; run it on an idle machine.
+
+Exit code 1 where a goal is not reached that the run was to reach, with a line on standard error that says why.
+"""
 
 import asyncio
 import time
@@ -10,10 +13,19 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from server.bench.report import print_json, print_measures, print_rows
+from server.bench.report import (
+    Judgement,
+    end_with,
+    missed,
+    print_json,
+    print_judgements,
+    print_measures,
+    print_rows,
+)
+from server.core.command_line import StrictTyper
 from server.errors import NafirError
 
-app = typer.Typer(help="Measure what things cost on this host.", no_args_is_help=True)
+app = StrictTyper(help="Measure what things cost on this host.", no_args_is_help=True)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
@@ -32,11 +44,14 @@ def field(
     from server.scene.bundle import Bundle, find_bundle
 
     measured = measure_levels(Levels.load(Bundle.load(find_bundle(scene))), rounds=rounds, poses=poses)
+    judgements = [Judgement(**row) for row in measured["summary"]]
     if as_json:
         print_json(measured)
-        return
-    print_rows(f"One impulse response of scene {measured['scene']}, {measured['ir_s']:g} s", measured["levels"])
-    print_rows("Goals", measured["summary"])
+    else:
+        print_measures("Host", measured["host"])
+        print_rows(f"One impulse response of scene {measured['scene']}, {measured['ir_s']:g} s", measured["levels"])
+        print_judgements("Goals", judgements)
+    end_with(missed(judgements))
 
 
 @app.command()
@@ -55,12 +70,14 @@ def convolver(
     plan = QUICK if quick else FULL
     with _progress(plan.steps) as advance:
         measured = measure_convolver(plan, advance)
+    judgements = [Judgement(**row) for row in measured["summary"]]
     if as_json:
         print_json(measured)
-        return
-    if measured["peer"] is None:
-        Console().print("pedalboard is not installed: there is nothing to compare with (pip install pedalboard)")
-    _print_convolver(measured)
+    else:
+        if measured["peer"] is None:
+            Console().print("pedalboard is not installed: there is nothing to compare with (pip install pedalboard)")
+        _print_convolver(measured, judgements)
+    end_with(missed(judgements))
 
 
 @app.command()
@@ -80,15 +97,18 @@ def stream(
     A search takes about five minutes for each number of emitters, a number of sessions one and a half. Every step is
     told as it ends; what Ctrl-C interrupts, prints what it has.
     """
-    from server.bench.sessions import Plan, measure_sessions
+    from server.bench.sessions import Plan, failures, measure_sessions
 
     counts = tuple(emitters) if emitters else Plan.emitters
     plan = Plan(emitters=counts, sessions=sessions, duration_s=duration_s, poses_per_s=poses_per_second)
     measured = measure_sessions(plan, _steps_told())
+    judgements = [Judgement(**row) for row in measured["summary"]]
     if as_json:
         print_json(measured)
     else:
-        _print_sessions(measured)
+        _print_sessions(measured, judgements)
+    interrupted = [] if measured["is_complete"] else ["it was interrupted"]
+    end_with([*missed(judgements), *failures(measured["cases"]), *interrupted])
 
 
 @app.command()
@@ -99,14 +119,17 @@ def effects(
     """What a plan of effects saves, and what it gets wrong, in six situations."""
     from server.bench.effects import SCENARIOS, measure_effects
     from server.bench.effects_table import markdown_table, terminal_rows
+    from server.bench.machine import describe_machine, instruction_set, processor
 
     with _progress(len(SCENARIOS)) as advance:
         measured = measure_effects(SCENARIOS, advance)
     if as_json:
-        print_json({"situations": measured})
+        print_json({"host": describe_machine(), "situations": measured})
     elif markdown:
         typer.echo(markdown_table(measured))
+        typer.echo(f"\n{processor()}, {instruction_set()}")
     else:
+        print_measures("Host", describe_machine())
         print_rows("Effects by plan, beside all of them and none", terminal_rows(measured))
 
 
@@ -123,12 +146,13 @@ def listen(
     from websockets.exceptions import WebSocketException
 
     from server.bench import listen as one_stream
+    from server.bench.machine import describe_machine
 
     try:
         measured = asyncio.run(one_stream.listen(url, scene, emitters, duration_s, poses_per_second))
     except (OSError, WebSocketException) as exc:
         raise NafirError(f"{url}: {exc}") from exc
-    _report(as_json, f"One stream of {url}", measured)
+    _report(as_json, f"One stream of {url}", {"listener_host": describe_machine(), **measured})
 
 
 def _steps_told() -> Callable[[str], None]:
@@ -153,7 +177,7 @@ def _report(as_json: bool, title: str, measured: dict[str, Any]) -> None:
         print_measures(title, measured)
 
 
-def _print_convolver(measured: dict[str, Any]) -> None:
+def _print_convolver(measured: dict[str, Any], judgements: list[Judgement]) -> None:
     print_measures("Host", measured["host"])
     cases = measured["cases"]
     title = "Source-seconds per CPU-second: ours, pedalboard's (peer), oaconvolve's (SciPy)"
@@ -173,16 +197,17 @@ def _print_convolver(measured: dict[str, Any]) -> None:
             **{name: measured[name] for name in ("threads_scale", "warm_start_s", "cold_start_s")},
         },
     )
-    print_rows("Goals", measured["summary"])
+    print_judgements("Goals", judgements)
 
 
-def _print_sessions(measured: dict[str, Any]) -> None:
+def _print_sessions(measured: dict[str, Any], judgements: list[Judgement]) -> None:
+    print_measures("Host", measured["host"])
     for case in measured["cases"]:
         rows = {name: value for name, value in case.items() if name not in {"emitters", "trials"}}
         again = {name: rows.pop(name) for name in case if name.startswith("with_")}
         for name, measures in {"": rows, **again}.items():
             print_measures(f"{case['emitters']} emitters {name}".replace("_", " "), measures)
-    print_rows("Goals", measured["summary"])
+    print_judgements("Goals", judgements)
 
 
 _CASE = {"block": "block_size", "ir s": "ir_s", "sources": "sources"}

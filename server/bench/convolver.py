@@ -5,13 +5,8 @@ At 48 kHz, with stereo IRs. The modules say what each measure means: `server.ben
 """
 
 import itertools
-import os
-import platform
-import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -19,8 +14,9 @@ import numpy as np
 
 from server.bench.endurance import measure_drift, threads_scale
 from server.bench.exchanges import fade_cost_ratio, splatter_db
+from server.bench.machine import describe_machine
 from server.bench.peers import Pedalboard, error_db, find_pedalboard, reference
-from server.bench.report import Goal, Judgement
+from server.bench.report import Goal, Judgement, show
 from server.bench.rooms import noise, room
 from server.bench.startup import cold_start_s, warm_start_s
 from server.bench.throughput import SAMPLE_RATE, Case, Rooms, measure_case
@@ -70,12 +66,14 @@ _ERROR = Goal("largest error of any case, dB", -120, -126, is_at_most=True)
 _SPLATTER = Goal("splatter above 4 kHz of a 997 Hz tone at 90 exchanges/s, dB", -95, -98, is_at_most=True)
 _DRIFT = Goal("growth of the error over 10 minutes, dB", 0, is_at_most=True)
 _WARM_START = Goal("fresh process to its first block, s", 1, is_at_most=True)
+_PEER_DB = -90.0
+"""Where pedalboard's error is larger, it does other work."""
 
 
 def measure_convolver(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
     """Everything in the plan; `advance` is called `plan.steps` times."""
     peer = find_pedalboard()
-    measured: dict[str, Any] = {"host": _describe_host(), "rounds": plan.rounds}
+    measured: dict[str, Any] = {"host": describe_machine(), "rounds": plan.rounds}
     measured["peer"] = None if peer is None else {"name": "pedalboard", "error_db": peer_error_db(peer)}
     cases = []
     for ir_samples, group in itertools.groupby(plan.cases, lambda case: case.ir_samples):
@@ -111,18 +109,46 @@ def measure_convolver(plan: Plan, advance: Advance = lambda _: None) -> dict[str
 
 
 def judge(measured: dict[str, Any]) -> list[Judgement]:
-    """Beside the goals, which are for 256-sample blocks and 1 s of IR; of the largest error, any case counts."""
+    """Beside the goals, which are for 256-sample blocks and 1 s of IR; of the largest error, any case counts. How fast
+    a convolver is counts only where what it plays is right."""
     typical = {case["sources"]: case for case in measured["cases"] if (case["block_size"], case["ir_s"]) == (256, 1)}
-    one, sixteen = typical.get(1, {}), typical.get(16, {})
+    error_db = np.max([case["max_error_db"] for case in measured["cases"]], initial=-np.inf)  # keeps what is no number
     return [
-        _RATIO_1.judge(one.get("ratio")),
-        _RATIO_16.judge(sixteen.get("ratio")),
-        _ERROR.judge(max(case["max_error_db"] for case in measured["cases"])),
+        _judge_ratio(_RATIO_1, typical.get(1), measured["peer"]),
+        _judge_ratio(_RATIO_16, typical.get(16), measured["peer"]),
+        _ERROR.judge(float(error_db)) if measured["cases"] else _ERROR.skip("there was no case"),
         _SPLATTER.judge(measured["splatter_db"]["90_hz"]),
-        _DRIFT.judge(measured["drift"]["drift_db"]),
-        _EVENNESS.judge(sixteen.get("worst_to_mean_block")),
+        _judge_drift(measured["drift"]),
+        _judge_evenness(typical.get(16)),
         _WARM_START.judge(measured["warm_start_s"]),
     ]
+
+
+def _judge_ratio(goal: Goal, case: dict[str, Any] | None, peer: dict[str, Any] | None) -> Judgement:
+    if case is None:
+        return goal.skip("not among the cases")
+    if peer is None:
+        return goal.skip("pedalboard is not installed")
+    failure = _wrong("its output", case["max_error_db"], _ERROR.limit)
+    return goal.judge(case["ratio"], failure=failure or _wrong("pedalboard's output", peer["error_db"], _PEER_DB))
+
+
+def _judge_evenness(case: dict[str, Any] | None) -> Judgement:
+    if case is None:
+        return _EVENNESS.skip("not among the cases")
+    failure = _wrong("its output", case["max_error_db"], _ERROR.limit)
+    return _EVENNESS.judge(case["worst_to_mean_block"], failure=failure)
+
+
+def _judge_drift(drift: dict[str, Any]) -> Judgement:
+    """What is wrong from the beginning does not drift either."""
+    failure = _wrong("the first second", drift["first_second_error_db"], _ERROR.limit)
+    return _DRIFT.judge(drift["drift_db"], failure=failure)
+
+
+def _wrong(what: str, error_db: float, limit_db: float) -> str | None:
+    """None where `what` is right, to `limit_db`."""
+    return None if error_db <= limit_db else f"{what} is off by {show(error_db)} dB, and may be by {show(limit_db)}"
 
 
 def peer_error_db(peer: ModuleType) -> float:
@@ -135,27 +161,3 @@ def peer_error_db(peer: ModuleType) -> float:
     expected = reference(dry, ir)
     gain = np.vdot(wet, expected) / np.vdot(expected, expected)
     return error_db(wet, gain * expected)
-
-
-def _describe_host() -> dict[str, Any]:
-    """What to tell with the figures; a load beyond a few tenths spoils them."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "python": platform.python_version(),
-        **{name: _version(name) for name in ("numpy", "scipy", "numba", "pedalboard")},
-    }
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    names = re.findall(r"^model name\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else []
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def _version(distribution: str) -> str | None:
-    try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return None

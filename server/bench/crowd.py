@@ -137,6 +137,7 @@ class Walker(asyncio.Protocol):
     def begin(self) -> None:
         """Count and time anew."""
         self.poses.times = DurationHistogram()
+        self.blocks = 0
         self.errors = []
 
     def close(self) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from server.bench.machine import describe_machine
 from server.bench.report import Goal
 from server.field.field import AcousticField
 from server.field.levels import Levels
@@ -16,7 +17,7 @@ from server.field.reuse import KEPT_BYTES
 
 Floats = npt.NDArray[np.float64]
 
-GOAL = Goal("ms_p50 of the default level", at_least=1.0, is_at_most=True)
+GOAL = Goal("ms_p50 of the default level", 1.0, is_at_most=True)
 
 _STEP_M = 0.1
 
@@ -40,6 +41,7 @@ def measure_levels(levels: Levels, *, rounds: int, poses: int) -> dict[str, Any]
     default = levels.default
     summaries = [{"name": name, **_summary(times_ms[name])} for name in levels]
     return {
+        "host": describe_machine(),
         "scene": levels.bundle.id,
         "ir_s": default.ir_samples / default.sample_rate,
         "rounds": rounds,

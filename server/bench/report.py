@@ -2,44 +2,79 @@
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+Reached = Literal["stretch", "goal"]
+
 
 @dataclass(frozen=True)
 class Goal:
-    """What a measure should be `at_least`, and better, `stretch`; for levels and times that means: at most."""
+    """What a measure should be at least, `limit`, and better, `stretch`; with `is_at_most`, at most."""
 
     measure: str
-    at_least: float
+    limit: float
     stretch: float | None = None
     is_at_most: bool = False
 
-    def judge(self, value: float | None) -> "Judgement":
-        """A value that could not be measured, None, reaches nothing."""
-        reached: Literal["stretch", "at_least"] | None = None
-        if value is not None:
-            if self._is_met(value, self.at_least):
-                reached = "at_least"
+    def judge(self, value: float | None, *, failure: str | None = None) -> "Judgement":
+        """`value` beside the goal. Where the run that measured it did not pass, `failure` says why, and nothing is
+        reached, whatever the value. Neither is it by None, which could not be measured, nor by what is not a number."""
+        reached: Reached | None = None
+        if failure is None and value is not None:
+            if self._is_met(value, self.limit):
+                reached = "goal"
             if self.stretch is not None and self._is_met(value, self.stretch):
                 reached = "stretch"
-        return Judgement(self.measure, value, self.at_least, self.stretch, reached)
+        reason = failure if failure is not None or reached is not None else self._missed(value)
+        return Judgement(self.measure, value, self.limit, self.stretch, self.is_at_most, reached, reason)
+
+    def skip(self, reason: str) -> "Judgement":
+        """For a run that was not asked for what this goal is about."""
+        return Judgement(self.measure, None, self.limit, self.stretch, self.is_at_most, None, reason, is_skipped=True)
 
     def _is_met(self, value: float, limit: float) -> bool:
         return value <= limit if self.is_at_most else value >= limit
 
+    def _missed(self, value: float | None) -> str:
+        if value is None:
+            return "could not be measured"
+        return f"is {show(value)}, and may be {'at most' if self.is_at_most else 'no less than'} {show(self.limit)}"
+
 
 @dataclass(frozen=True)
 class Judgement:
+    """A measure beside its goal; `reason` says why nothing was reached, None where something was."""
+
     measure: str
     value: float | None
-    at_least: float
+    limit: float
     stretch: float | None
-    reached: Literal["stretch", "at_least"] | None
+    is_at_most: bool
+    reached: Reached | None
+    reason: str | None
+    is_skipped: bool = False
+
+    @property
+    def is_missed(self) -> bool:
+        return self.reached is None and not self.is_skipped
+
+
+def missed(judgements: Iterable[Judgement]) -> list[str]:
+    """One line for each goal that was not reached, but for those that were skipped."""
+    return [f"{judgement.measure}: {judgement.reason}" for judgement in judgements if judgement.is_missed]
+
+
+def end_with(problems: Iterable[str]) -> None:
+    """Tell each problem on standard error. Raises typer.Exit with code 1 where there is any."""
+    if lines := list(problems):
+        for line in lines:
+            typer.echo(f"not reached: {line}", err=True)
+        raise typer.Exit(1)
 
 
 def print_json(measured: dict[str, Any]) -> None:
@@ -64,7 +99,20 @@ def print_rows(title: str, rows: Iterable[dict[str, Any]]) -> None:
 
 
 def print_judgements(title: str, judgements: Iterable[Judgement]) -> None:
-    print_rows(title, [asdict(judgement) for judgement in judgements])
+    """Limits with their direction: what may be at most 0.05 is not reached by more."""
+    print_rows(title, [_row(judgement) for judgement in judgements])
+
+
+def _row(judgement: Judgement) -> dict[str, object]:
+    sign = "≤" if judgement.is_at_most else "≥"
+    return {
+        "measure": judgement.measure,
+        "value": judgement.value,
+        "goal": f"{sign} {show(judgement.limit)}",
+        "stretch": None if judgement.stretch is None else f"{sign} {show(judgement.stretch)}",
+        "reached": judgement.reached or ("skipped" if judgement.is_skipped else "no"),
+        "why": judgement.reason,
+    }
 
 
 def show(value: object) -> str:

@@ -5,6 +5,8 @@ The scene costs next to nothing (`server.bench.scene`), the rest is what `nafir 
 48 kHz, impulse responses (IRs) of a second for each of the emitters, which play noise without end. Every listener sends
 30 poses a second unless told otherwise; direct paths follow each, and all IRs as fast as the core has time for them.
 
+- A run passes, and can reach a goal, where every session has a stream, hears what it is sent and sees its poses
+  followed, where there was no error, and where fewer than one block in a thousand was late.
 - A block is late where it reaches the socket later than a player needs it that keeps the usual 8 blocks in hand, or
   where it is never made. `late_share` is theirs of all blocks that were due.
 - `sessions`: the largest number with fewer late than one in a thousand; steps of a few seconds find it, to within 5 %,
@@ -37,6 +39,7 @@ from typing import IO, Any
 
 from server.bench.crowd import Crowd
 from server.bench.gauge import merged
+from server.bench.machine import describe_machine
 from server.bench.report import Goal, Judgement
 from server.bench.scene import IR_S, SAMPLE_RATE
 from server.errors import NafirError
@@ -44,6 +47,8 @@ from server.errors import NafirError
 _BLOCK_SIZE = 256
 _LATE_SHARE = 0.001
 _HOPELESS = 0.5
+_ON_THEIR_WAY = 64
+"""Blocks of a session that may be sent and not heard yet when a run ends."""
 _SETTLE_S = 2.0
 _LOOK_EVERY_S = 2.0
 _MOST = 512
@@ -91,6 +96,7 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
     finally:
         os.sched_setaffinity(0, usable)
     measured: dict[str, Any] = {
+        "host": describe_machine(),
         "block_size": _BLOCK_SIZE,
         "sample_rate": SAMPLE_RATE,
         "ir_s": IR_S,
@@ -105,12 +111,52 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
 
 
 def judge(cases: list[dict[str, Any]]) -> list[Judgement]:
-    """Beside the goals, which are for 16 emitters."""
-    sixteen: dict[str, Any] = next((case for case in cases if case["emitters"] == 16), {})
-    return [
-        _SESSIONS.judge(sixteen.get("sessions")),
-        _POSE_TO_AUDIO.judge(sixteen.get(_AT_GOAL, sixteen).get("pose_to_audio_ms", {}).get("p99")),
-    ]
+    """Beside the goals, which are for 16 emitters; only a run that passed reaches one."""
+    sixteen = next((case for case in cases if case["emitters"] == 16), None)
+    if sixteen is None:
+        return [goal.skip("needs 16 emitters") for goal in (_SESSIONS, _POSE_TO_AUDIO)]
+    return [_judge_sessions(sixteen), _judge_poses(sixteen.get(_AT_GOAL, sixteen))]
+
+
+def _judge_sessions(case: dict[str, Any]) -> Judgement:
+    reason = failure(case)
+    if reason is None and case["is_given"] and case["sessions"] < _SESSIONS.limit:
+        return _SESSIONS.skip(f"only {case['sessions']} were asked for")
+    return _SESSIONS.judge(case["sessions"], failure=reason)
+
+
+def _judge_poses(run: dict[str, Any]) -> Judgement:
+    reason = failure(run)
+    if reason is None and run["poses_per_s"] == 0:
+        return _POSE_TO_AUDIO.skip("nobody moves")
+    return _POSE_TO_AUDIO.judge(run.get("pose_to_audio_ms", {}).get("p99"), failure=reason)
+
+
+def failure(run: dict[str, Any]) -> str | None:
+    """Why a run did not pass; None where it did."""
+    if run["sessions"] == 0:
+        return "no number of sessions passed"
+    if run["errors"]:
+        return f"of {run['sessions']} sessions: {'; '.join(run['errors'])}"
+    if run["streams"] < run["sessions"]:
+        return f"only {run['streams']} of {run['sessions']} sessions had a stream"
+    if run["blocks_sent"] == 0:
+        return f"{run['sessions']} sessions were sent no block"
+    if run["late_share"] >= _LATE_SHARE:
+        missing = f", {run['blocks_missing']} never made" if run["blocks_missing"] else ""
+        late = f"of {run['sessions']} sessions {run['late_share']:.2%} of blocks were late{missing}"
+        return f"{late}; under {_LATE_SHARE:.1%} may be"
+    if run["blocks_heard"] < run["blocks_sent"] - _ON_THEIR_WAY * run["sessions"]:
+        return f"{run['sessions']} sessions heard {run['blocks_heard']} of {run['blocks_sent']} blocks"
+    if run["poses_per_s"] > 0 and run["pose_to_audio_ms"]["p99"] is None:
+        return f"no pose of {run['sessions']} sessions was followed"
+    return None
+
+
+def failures(cases: list[dict[str, Any]]) -> list[str]:
+    """One line for each case without a run that passed."""
+    found = [(case["emitters"], failure(case)) for case in cases]
+    return [f"{emitters} emitters: {reason}" for emitters, reason in found if reason is not None]
 
 
 async def find_most(passes: Callable[[int], Awaitable[bool]], *, most: int) -> int:
@@ -139,27 +185,23 @@ async def _measure(plan: Plan, port: int, advance: Advance, cases: list[dict[str
 
 async def _measure_case(plan: Plan, trial: "_Trial") -> dict[str, Any]:
     if plan.sessions is not None:
-        return await trial.run(plan.sessions, plan.duration_s)
+        return {**await trial.run(plan.sessions, plan.duration_s), "is_given": True}
 
     async def passes(sessions: int) -> bool:
         first = await trial.run(sessions, plan.step_s, until_failed=True)
-        if first["late_share"] > _HOPELESS or _is_good(first):
-            return _is_good(first)
-        return _is_good(await trial.run(sessions, plan.step_s, until_failed=True))
+        if first["late_share"] > _HOPELESS or failure(first) is None:
+            return failure(first) is None
+        return failure(await trial.run(sessions, plan.step_s, until_failed=True)) is None
 
     sessions = await find_most(passes, most=_MOST)
     while sessions > 0:
         confirmed = await trial.run(sessions, plan.duration_s, until_failed=True)
-        if _is_good(confirmed):
+        if failure(confirmed) is None:
             if trial.emitters == 16 and sessions > _GOAL:
                 confirmed[_AT_GOAL] = await trial.run(_GOAL, plan.duration_s)
-            return confirmed
+            return {**confirmed, "is_given": False}
         sessions -= max(1, sessions // 10)
-    return {"sessions": 0}
-
-
-def _is_good(measured: dict[str, Any]) -> bool:
-    return not measured["errors"] and measured["late_share"] < _LATE_SHARE
+    return {"sessions": 0, "is_given": False}
 
 
 class _Trial:
@@ -167,13 +209,15 @@ class _Trial:
 
     def __init__(self, port: int, emitters: int, poses_per_s: float, advance: Advance) -> None:
         self.crowd = Crowd(port, emitters=emitters, poses_per_s=poses_per_s)
+        self._poses_per_s = poses_per_s
         self.history: list[dict[str, Any]] = []
         self._url = f"http://127.0.0.1:{port}/bench"
         self.emitters = emitters
         self._advance = advance
 
     async def run(self, sessions: int, duration_s: float, *, until_failed: bool = False) -> dict[str, Any]:
-        """Where the server cannot even open that many streams or tell of them, `late_share` is 1."""
+        """Where the server cannot even open that many streams or tell of them, `late_share` is 1, and `errors` says
+        why."""
         try:
             measured = await self._run(sessions, duration_s, until_failed)
         except (OSError, TimeoutError) as exc:
@@ -197,9 +241,11 @@ class _Trial:
         due = sum(measured[name] for name in ("blocks_sent", "blocks_dropped", "blocks_missing"))
         return {
             "sessions": sessions,
+            "poses_per_s": self._poses_per_s,
             "late_share": min(1.0, _count_late(measured) / due) if due else 1.0,
             **measured,
             "client_pose_to_audio_ms": merged(walker.poses.times for walker in walkers),
+            "blocks_heard": sum(walker.blocks for walker in walkers),
             "client_load": client_load,
             "errors": sorted({error for walker in walkers for error in walker.errors}),
         }

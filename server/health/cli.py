@@ -8,6 +8,8 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from server.core.files import require_figure
+
 
 def check(
     scene: Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")],
@@ -23,6 +25,8 @@ def check(
     from server.health.report import reasons, table, to_json
     from server.scene.bundle import Bundle, find_bundle
 
+    if figure is not None:
+        require_figure(figure, "--figure")
     bundle = Bundle.load(find_bundle(scene))
     console = Console(stderr=True)
     health = check_bundle(

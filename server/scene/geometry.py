@@ -1,12 +1,12 @@
 """What a scene is made of: walls, openings and materials, as written in scene files and bundles."""
 
-import math
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FARTHEST_M, FloorPlan
+from server.scene.outline import faults_of
 
 Share = Annotated[float, Field(ge=0, le=1)]
 PerBand = Annotated[tuple[Share, ...], Field(min_length=len(OCTAVE_BANDS_HZ), max_length=len(OCTAVE_BANDS_HZ))]
@@ -15,9 +15,8 @@ Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan
 PlanPoint = tuple[Coordinate, Coordinate]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
-
-# Shorter ones are a corner written twice; geometry divides by the length of a wall.
-_SHORTEST_WALL_M = 0.001
+MOST_CORNERS = 256
+"""Whoever looks for ways round corners compares all of them with each other."""
 
 
 class Strict(BaseModel):
@@ -57,23 +56,17 @@ class Geometry(Strict):
     """A floor polygon, counter-clockwise and not crossing itself, extruded to `height_m`."""
 
     height_m: Annotated[float, Field(gt=0, le=FARTHEST_M, allow_inf_nan=False)]
-    corners: Annotated[tuple[PlanPoint, ...], Field(min_length=3)]
+    corners: Annotated[tuple[PlanPoint, ...], Field(min_length=3, max_length=MOST_CORNERS)]
     openings: tuple[Opening, ...] = ()
     materials: Materials
 
     @field_validator("corners")
     @classmethod
-    def _walls_have_a_length(cls, corners: tuple[PlanPoint, ...]) -> tuple[PlanPoint, ...]:
-        for index, corner in enumerate(corners):
-            if math.dist(corner, corners[index - 1]) < _SHORTEST_WALL_M:
-                raise ValueError(f"corner {index} is where the corner before it is")
+    def _make_a_polygon(cls, corners: tuple[PlanPoint, ...]) -> tuple[PlanPoint, ...]:
+        faults = faults_of(corners)
+        if faults:
+            raise ValueError("; ".join(faults))
         return corners
-
-    @model_validator(mode="after")
-    def _turns_counter_clockwise(self) -> "Geometry":
-        if self.floor_plan.area_m2 <= 0:
-            raise ValueError("corners must run counter-clockwise")
-        return self
 
     @property
     def floor_plan(self) -> FloorPlan:

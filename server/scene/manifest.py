@@ -26,6 +26,8 @@ ARRAYS_FILE = "arrays.npz"
 NO_FIELD = "none"
 """What the level of a scene without fields is of."""
 FORMAT_VERSION: Literal[2] = 2
+MOST_SAMPLES = 960_000
+"""Of a response: ten seconds at 96 kHz, forty at 24 kHz."""
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -77,7 +79,7 @@ class CodecParameters(Strict):
     sample_rate: Annotated[int, Field(ge=8000, le=96000)]
     n_fft: Annotated[int, Field(ge=64, le=4096)]
     hop: Annotated[int, Field(ge=16)]
-    samples: Annotated[int, Field(ge=256, le=960_000)]
+    samples: Annotated[int, Field(ge=256, le=MOST_SAMPLES)]
     lead_samples: Annotated[int, Field(ge=0)]
     known_frames: Annotated[int, Field(ge=0)]
     log_floor: Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -11,7 +11,7 @@ from server.acoustics.geometry import FloorPlan
 from server.scene.geometry import Geometry, PlanPoint
 
 # An opening that ends nearer to a wall than this ends on it.
-_TOUCH_M = 0.001
+ON_WALL_M = 0.001
 _LEAST_M2 = 0.001
 
 
@@ -56,7 +56,7 @@ def _wall_at(corners: Sequence[PlanPoint], point: PlanPoint) -> int | None:
     share = np.clip(np.sum((point - starts) * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
     distance_m = np.linalg.norm(starts + share[:, None] * along - point, axis=-1)
     nearest = int(np.argmin(distance_m))
-    return nearest if distance_m[nearest] < _TOUCH_M else None
+    return nearest if distance_m[nearest] < ON_WALL_M else None
 
 
 def _between(corners: Sequence[PlanPoint], first: int, last: int) -> list[PlanPoint]:

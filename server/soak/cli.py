@@ -9,7 +9,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 def soak(
     scene: Annotated[str, typer.Argument(help="Id of a bundled scene.")] = "apartment",
-    minutes: Annotated[float, typer.Option(min=0.1, help="How long.")] = 30.0,
+    minutes: Annotated[float, typer.Option(min=0.1, help="How long; memory is judged from 12 on.")] = 30.0,
     clients: Annotated[int, typer.Option(min=1, max=32, help="Hostile clients at any time.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Of all that they do.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
@@ -17,9 +17,9 @@ def soak(
     """Stream for a long time to clients that do what they should not, from a server of its own, and see what it does.
 
     Beside them a listener at rest compares every sample with an offline render in double precision. Exit code 1 where
-    something that has to hold does not.
+    something that has to hold does not, with the reason on standard error.
     """
-    from server.bench.report import print_json, print_measures, print_rows
+    from server.bench.report import Judgement, end_with, missed, print_json, print_judgements, print_measures
     from server.soak.run import Plan
     from server.soak.run import soak as run
 
@@ -27,12 +27,12 @@ def soak(
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=as_json) as progress:
         task = progress.add_task("", total=1.0)
         measured = run(Plan(scene, 60 * minutes, clients, seed), lambda share: progress.update(task, completed=share))
+    judgements = [Judgement(**row) for row in measured["summary"]]
     if as_json:
         print_json(measured)
     else:
         print_measures(
             f"{minutes:g} minutes of {scene}", {name: value for name, value in measured.items() if name != "summary"}
         )
-        print_rows("What has to hold", measured["summary"])
-    if any(judgement["reached"] is None for judgement in measured["summary"]):
-        raise typer.Exit(1)
+        print_judgements("What has to hold", judgements)
+    end_with(missed(judgements))

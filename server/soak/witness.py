@@ -35,11 +35,11 @@ class Errors:
     def drift_db(self) -> float:
         """By how much the worst of the last tenth is worse than the worst of the first."""
         tenth = max(1, len(self.db) // 10)
-        return max(self.db[-tenth:]) - max(self.db[:tenth]) if self.db else math.nan
+        return _worst(self.db[-tenth:]) - _worst(self.db[:tenth])
 
     @property
     def worst_db(self) -> float:
-        return max(self.db, default=math.nan)
+        return _worst(self.db)
 
 
 class Witness:
@@ -86,6 +86,11 @@ class Witness:
         if self._heard >= 2 * self._stretch_samples:
             self.errors.db.append(float(power_to_db(self._error_power / self._heard / self._power)))
             self._error_power, self._heard = 0.0, 0
+
+
+def _worst(errors_db: list[float]) -> float:
+    """Not a number where one of them is none, or there are none."""
+    return float(np.max(errors_db)) if errors_db else math.nan
 
 
 def _circular(clip: npt.NDArray[np.float64], response: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -77,7 +77,7 @@ export class Frontier extends EventTarget {
   /** What the server says when it changes what is heard. */
   changed({ level, reason, ir_rate_hz: rateHz }) {
     const pace = rateHz === null ? "" : `, at most ${+rateHz.toFixed(1)} responses a second`;
-    this.#told.unshift({ at: new Date(), text: `${level}${pace}: ${REASONS[reason]}` });
+    this.#told.unshift({ at: new Date(), text: `${level}${pace}: ${REASONS[reason] ?? reason}` });
     this.#told.length = Math.min(this.#told.length, KEPT);
     this.#changes.replaceChildren(
       ...this.#told.map(({ at, text }) => {

@@ -1,7 +1,7 @@
 // A live stream that keeps itself connected: it holds what the listener should hear (poses, emitters) and brings the server to it,
 // at first and again after every reconnect. Runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
 
-import { FLAG_LATE, message, parseBlock, serializePose } from "./wire.js";
+import { FLAG_LATE, isBlock, message, parseBlock, serializePose } from "./wire.js";
 
 const POSE_INTERVAL_MS = 12; // at most about 80 poses a second, the newest wins
 const ACKNOWLEDGE_EVERY = 4; // blocks
@@ -164,6 +164,7 @@ export class Stream {
 
   #receiveBlock(buffer) {
     this.#heardAt = now();
+    if (!isBlock(buffer)) return; // a newer server may say more
     const block = parseBlock(buffer);
     if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence));
     this.#listeners.block({ ...block, late: (block.flags & FLAG_LATE) !== 0 });

@@ -21,6 +21,9 @@ export function serializePose({ poseId, position, yaw }) {
   return buffer;
 }
 
+/** Whether a binary message is an audio block, and no kind that this version does not know. */
+export const isBlock = (buffer) => buffer.byteLength > 0 && new DataView(buffer).getUint8(0) === AUDIO_BLOCK;
+
 /**
  * Audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, left, right}; the ears are
  * Float32Array(frames), alike where there is one channel, the newest poses those of the direct sound and of what follows it.

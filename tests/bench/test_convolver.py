@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import sys
 
 import numpy as np
@@ -12,6 +13,7 @@ from server.bench import convolver, endurance, exchanges
 from server.bench.cli import app
 from server.bench.convolver import Plan, measure_convolver, peer_error_db
 from server.bench.peers import find_pedalboard
+from server.bench.report import Judgement
 from server.bench.throughput import Case
 from server.rendering.convolver import Convolver
 
@@ -30,8 +32,11 @@ TINY = Plan(
 def test_everything_is_measured_and_judged(monkeypatch):
     monkeypatch.setattr(convolver, "FULL", TINY)
     outcome = CliRunner().invoke(app, ["convolver", "--json"])
-    assert outcome.exit_code == 0, outcome.output
     measured = json.loads(outcome.stdout)
+    judgements = [Judgement(**row) for row in measured["summary"]]
+    assert (outcome.exit_code == 1) == any(judgement.is_missed for judgement in judgements)
+    assert measured["host"]["processor"]
+    assert measured["host"]["instruction_set"]
     assert len(measured["cases"]) == 2
     assert measured["splatter_db"]["90_hz"] < -95
     assert measured["fade_cost_ratio"]["2"] > 1
@@ -51,7 +56,7 @@ def test_a_person_sees_tables_and_that_there_is_no_peer(monkeypatch):
     monkeypatch.setattr(convolver, "QUICK", TINY)
     monkeypatch.setitem(sys.modules, "pedalboard", None)
     outcome = CliRunner().invoke(app, ["convolver", "--quick"])
-    assert outcome.exit_code == 0, outcome.output
+    assert outcome.exit_code == ("not reached" in outcome.stderr)
     said = " ".join(outcome.stdout.split())
     assert "pedalboard is not installed" in said
     assert "Goals" in said
@@ -106,6 +111,57 @@ def test_drift_is_seen(monkeypatch):
     measured = endurance.measure_drift(duration_s=120, ir_s=0.1)
     assert measured["drift_db"] > 10
     assert measured["first_second_error_db"] < -100 < measured["last_second_error_db"]
+
+
+def case_of(sources, **changes):
+    """What a case of the goals' finds that does well."""
+    fine = {"max_error_db": -130.0, "ratio": 99.0, "worst_to_mean_block": 1.1}
+    return {"block_size": 256, "ir_s": 1.0, "sources": sources, **fine, **changes}
+
+
+FINE = {
+    "cases": [case_of(1), case_of(16)],
+    "peer": {"error_db": -125.0},
+    "splatter_db": {"90_hz": -101.0},
+    "drift": {"first_second_error_db": -130.0, "drift_db": 0.0},
+    "warm_start_s": 0.3,
+}
+
+
+def cases(one=None, sixteen=None):
+    return {**FINE, "cases": [case_of(1, **(one or {})), case_of(16, **(sixteen or {}))]}
+
+
+def missed_of(measured):
+    return [judgement.measure.partition(",")[0] for judgement in convolver.judge(measured) if judgement.is_missed]
+
+
+SIXTEEN = ["ratio to pedalboard", "largest error of any case", "worst block / mean block"]
+
+
+@pytest.mark.parametrize(
+    ("measured", "missed"),
+    [
+        (FINE, []),
+        (cases(sixteen={"max_error_db": -60.0}), SIXTEEN),
+        (cases(one={"max_error_db": math.nan}), SIXTEEN[:2]),
+        (cases(sixteen={"max_error_db": math.nan}), SIXTEEN),
+        (cases(sixteen={"ratio": 10.0}), SIXTEEN[:1]),
+        ({**FINE, "peer": {"error_db": -20.0}}, SIXTEEN[:1] * 2),
+        ({**FINE, "drift": {"first_second_error_db": -3.0, "drift_db": 0.0}}, ["growth of the error over 10 minutes"]),
+        ({**FINE, "splatter_db": {"90_hz": math.nan}}, ["splatter above 4 kHz of a 997 Hz tone at 90 exchanges/s"]),
+    ],
+)
+def test_what_is_fast_and_wrong_reaches_no_goal(measured, missed):
+    """A convolver that plays something else, or no numbers at all, may be as fast and as even as it likes."""
+    assert missed_of(measured) == missed
+
+
+def test_goals_are_skipped_where_there_is_no_peer_and_no_such_case():
+    measured = {**FINE, "peer": None, "cases": [case_of(1, ratio=None)]}
+    assert missed_of(measured) == []
+    skipped = [judgement.measure for judgement in convolver.judge(measured) if judgement.is_skipped]
+    assert len(skipped) == 3
 
 
 @pytest.mark.parametrize("plan", [convolver.FULL, convolver.QUICK])

@@ -2,13 +2,17 @@
 
 import asyncio
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 from websockets.asyncio.server import serve
 
 from server.acoustics.geometry import Pose
+from server.bench.report import missed
 from server.blocks import AudioBlock
+from server.cli import app
 from server.clips import ClipLibrary
 from server.direct_sound import DirectSound
 from server.field.levels import Levels
@@ -23,11 +27,14 @@ from server.soak.witness import Errors, Witness
 from server.whole_field import kemar
 
 FINE = {
+    "duration_s": 1_800.0,
+    "blocks": 100_000,
+    "faults": 1_000,
     "samples_not_finite": 0,
     "crashes": 0,
     "faults_unanswered": 0,
     "memory_growth": 0.01,
-    "witness": {"worst_error_db": -120.0, "drift_db": 0.1},
+    "witness": {"seconds": 1_700, "worst_error_db": -120.0, "drift_db": 0.1},
     "silence_to_sound": 0.5,
 }
 
@@ -84,9 +91,14 @@ def test_drift_is_from_the_first_tenth_to_the_last():
     assert math.isnan(Errors().drift_db())
 
 
-def test_growth_leaves_out_what_fills_at_first():
-    assert _growth([1.0, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.1, 2.1]) == pytest.approx(0.05)
-    assert math.isnan(_growth([1.0] * 4))
+@pytest.mark.parametrize("errors_db", [[-120.0, math.nan, -120.0], [math.nan, -120.0], [-120.0, math.nan]])
+def test_a_stretch_that_is_not_a_number_is_not_passed_over(errors_db):
+    assert math.isnan(Errors(errors_db).worst_db)
+
+
+def test_growth_is_from_the_first_fifth_to_the_last():
+    assert _growth([1.99, 2.01, 2.2, 2.3, 2.2, 2.0, 2.0, 2.0, 2.09, 2.11]) == pytest.approx(0.05)
+    assert _growth([1.0] * 4) is None
 
 
 def test_what_holds_is_reached_and_what_does_not_is_not():
@@ -96,10 +108,46 @@ def test_what_holds_is_reached_and_what_does_not_is_not():
         "crashes": 1,
         "faults_unanswered": 1,
         "memory_growth": 0.06,
-        "witness": {"worst_error_db": math.nan, "drift_db": math.nan},
+        "witness": {"seconds": 1_700, "worst_error_db": math.nan, "drift_db": math.nan},
         "silence_to_sound": 1.1,
     }.items():
-        assert not all(judgement.reached for judgement in judge({**FINE, name: value}))
+        assert missed(judge({**FINE, name: value}))
+
+
+@pytest.mark.parametrize(
+    ("found", "goals"),
+    [
+        ({"blocks": 0}, {"samples not finite"}),
+        ({"faults": 0}, {"faults unanswered"}),
+        ({"memory_growth": None}, {"memory growth"}),
+        (
+            {"witness": {"seconds": 0, "worst_error_db": math.nan, "drift_db": math.nan}},
+            {"largest error of the witness, dB", "drift of the witness, dB"},
+        ),
+    ],
+)
+def test_what_nobody_tried_does_not_hold(found, goals):
+    assert {judgement.measure for judgement in judge({**FINE, **found}) if judgement.is_missed} == goals
+
+
+@pytest.mark.parametrize(("minutes", "is_judged"), [(1, False), (11.9, False), (12, True), (30, True)])
+def test_memory_is_judged_only_by_a_run_that_outlasts_the_filling_of_caches(minutes, is_judged):
+    judgements = judge({**FINE, "duration_s": 60 * minutes, "memory_growth": 0.2})
+    (growth,) = (judgement for judgement in judgements if judgement.measure == "memory growth")
+    assert growth.is_missed == is_judged
+    assert growth.is_skipped != is_judged
+    assert is_judged or "--minutes 12" in growth.reason
+
+
+@pytest.mark.parametrize("form", [["--json"], []])
+@pytest.mark.parametrize(("found", "code"), [({"duration_s": 60.0, "memory_growth": None}, 0), ({"crashes": 2}, 1)])
+def test_the_command_ends_with_code_1_where_something_does_not_hold(monkeypatch, form, found, code):
+    measured = {**FINE, **found}
+    summary = [asdict(judgement) for judgement in judge(measured)]
+    monkeypatch.setattr("server.soak.run.soak", lambda _plan, _advance: {**measured, "summary": summary})
+    outcome = CliRunner().invoke(app, ["soak", "--minutes", "1", *form])
+    assert outcome.exit_code == code, outcome.output
+    assert ("not reached: crashes: is 2" in outcome.stderr) == bool(code)
 
 
 def test_silence_costs_no_more_than_sound(levels):

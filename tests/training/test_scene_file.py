@@ -23,7 +23,7 @@ def changed(tiny_scene, tmp_path, old: str, new: str):
         ("rays = 500", "rays = 5", "simulation.rays"),
         ("duration_s = 0.25", "duration_s = inf", "simulation.duration_s"),
         ("absorption = [0.3,", "absorption = [1.3,", "geometry.materials.walls.absorption.0"),
-        ("[4.0, 0.0], [4.0, 3.0], [0.0, 3.0]", "[0.0, 3.0], [4.0, 3.0], [4.0, 0.0]", "geometry: "),
+        ("[4.0, 0.0], [4.0, 3.0], [0.0, 3.0]", "[0.0, 3.0], [4.0, 3.0], [4.0, 0.0]", "geometry.corners"),
         ("heights_m = [1.2, 1.8]", "heights_m = [1.8, 1.2]", "probes.heights_m"),
         ("heights_m = [1.2, 1.8]", "heights_m = [1.2, 2.8]", "probes.heights_m"),
         ("listener = [1.0,", "listener = [-1.0,", "start.listener"),
@@ -33,6 +33,27 @@ def changed(tiny_scene, tmp_path, old: str, new: str):
             '[[geometry.openings]]\nname = "none"\nstart = [4.0, 1.0]\nend = [6.0, 1.0]\n[geometry.materials.walls]',
             "geometry.openings.0",
         ),
+        ("[geometry.materials.floor]", "[geometry.materials.lawn]", "geometry.materials.floor"),
+        ("height_m = 2.5", "height_m = 250.0", "geometry.height_m: 250 m, and at most 200 m: is it in centimetres"),
+        ("[4.0, 0.0], [4.0, 3.0]", "[2000.0, 0.0], [2000.0, 3.0]", "geometry.corners: 2,000 m, and at most 1,000 m"),
+        ("[4.0, 0.0], [4.0, 3.0], [0.0, 3.0]", "[0.004, 0.0], [0.004, 0.003], [0.0, 0.003]", "is it in kilometres"),
+        ("[4.0, 3.0]", "[4.0, nan]", "geometry.corners.2.1"),
+        ("[4.0, 0.0], [4.0, 3.0]", "[4.0, 3.0], [4.0, 0.0]", "geometry.corners: edges 0 and 2 cross at (2, 1.5)"),
+        ("listener = [1.0, 1.0,", "listener = [1.0, 5.0,", "start.listener: (1, 5) is outside of the walls"),
+        ("emitter = [3.0, 2.0, 1.5]", "emitter = [3.0, 2.0, 15.0]", "start.emitter: its height, 15 m"),
+        ("emitter = [3.0, 2.0, 1.5]", "emitter = [3.0, 2.0, 1.5]\nlistener_yaw_deg = 1e9", "start.listener_yaw_deg"),
+        ("jitter_m = 0.2", "jitter_m = inf", "probes.jitter_m"),
+        ("jitter_m = 0.2", "jitter_m = 0.8", "jitter_m: must be at most half of spacing_m, 0.7"),
+        ("spacing_m = 1.4", "spacing_m = 1e-300", "probes.spacing_m"),
+        ("wall_clearance_m = 0.4", "wall_clearance_m = 1e-9", "probes.wall_clearance_m"),
+        ("heights_m = [1.2, 1.8]", "heights_m = [1.2, 2.49]", "probes.heights_m"),
+        ("duration_s = 0.25", "duration_s = 600.0", "simulation.duration_s: at most 120 s"),
+        ("duration_s = 0.25", "duration_s = 61.0", "duration_s: 61 s at 16000 Hz are 976,000 samples"),
+        ("sample_rate = 16000", "sample_rate = 48", "simulation.sample_rate"),
+        ("yaws = 4", "yaws = 1000000", "simulation.yaws"),
+        ("rays = 500", "rays = 1000000000000", "simulation.rays"),
+        ("arrival_directions = 6", "arrival_directions = 1000000", "simulation.arrival_directions"),
+        ("image_order = 2", "image_order = 60", "simulation.image_order"),
     ],
 )
 def test_errors_name_file_and_field(tiny_scene, tmp_path, old, new, field):
@@ -41,7 +62,7 @@ def test_errors_name_file_and_field(tiny_scene, tmp_path, old, new, field):
         SceneFile.read(path)
 
 
-@pytest.mark.parametrize("content", [b"id = ", b"\xff\xfe\x00"])
+@pytest.mark.parametrize("content", [b"id = ", b"\xff\xfe\x00", b"a = " + b"[" * 100_000, b"a = " + b"9" * 10_000])
 def test_what_is_not_toml_is_said_to_be_no_toml(tmp_path, content):
     path = tmp_path / "scene.toml"
     path.write_bytes(content)

@@ -3,7 +3,6 @@
 import math
 import multiprocessing
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 
+from server.bench.machine import processor
 from server.bounded_cache import BoundedCache
 from server.calibration import Listener
 from server.field.field import AcousticField
@@ -118,17 +118,8 @@ def cost_of(bundle: Bundle, level: QualityLevel, times: Times, memory_mb: float)
         ms_miss=float(np.median(times.miss)),
         storage_mb=len(bundle.models[file]) / 1e6,
         memory_mb=memory_mb + times.kept_mb,
-        host=_processor(),
+        host=processor(),
     )
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.machine())
 
 
 def memory_mb(folder: Path, levels: Sequence[str]) -> dict[str, float]:

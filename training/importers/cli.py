@@ -14,13 +14,14 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from server.core.command_line import StrictTyper
 from training.importers.receivers import Receivers
 from training.options import Json
 
 if TYPE_CHECKING:
     from training.responses import Measurement
 
-importing = typer.Typer(
+importing = StrictTyper(
     no_args_is_help=True, help="Import responses in the layout of SoundSpaces, MeshRIR, RAF or SOFA."
 )
 

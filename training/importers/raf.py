@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from server.core.numerals import parse_decimal
 from training.importers.audio import UnreadableError, read_response
 from training.importers.conditioning import SourceError
 from training.importers.report import ImportReport
@@ -63,9 +64,13 @@ def _position(values: tuple[float, ...]) -> _Vector:
 def _numbers(path: Path, count: int) -> tuple[float, ...]:
     """Raises UnreadableError for anything but `count` finite numbers."""
     try:
-        values = tuple(float(word) for word in path.read_text(encoding="utf-8").replace(",", " ").split())
-    except (OSError, ValueError) as exc:
+        words = path.read_text(encoding="utf-8").replace(",", " ").split()
+    except (OSError, UnicodeDecodeError) as exc:
         raise UnreadableError(f"{path.name} unreadable") from exc
-    if len(values) != count or not np.isfinite(values).all():
+    try:
+        values = tuple(map(parse_decimal, words))
+    except ValueError as exc:
+        raise UnreadableError(f"{path.name} has not {count} finite numbers") from exc
+    if len(values) != count:
         raise UnreadableError(f"{path.name} has not {count} finite numbers")
     return values

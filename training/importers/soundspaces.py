@@ -13,12 +13,13 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from server.core.numerals import parse_decimal, parse_integer
 from training.importers.audio import UnreadableError, read_response
 from training.importers.conditioning import SourceError
 from training.importers.report import ImportReport
 from training.responses import Measurement
 
-_PAIR = re.compile(r"\d+_\d+\.wav")
+_PAIR = re.compile(r"[0-9]+_[0-9]+\.wav")
 _Point = tuple[float, float, float]
 
 
@@ -80,11 +81,9 @@ def read_points(path: Path) -> dict[int, _Point]:
             continue
         try:
             index, x, y, z = line.split()
-            key, point = int(index), (float(x), float(y), float(z))
+            key, point = parse_integer(index), (parse_decimal(x), parse_decimal(y), parse_decimal(z))
         except ValueError as exc:
             raise SourceError(path, f"line {number}", f"{line!r} is not an index and three numbers") from exc
-        if not all(math.isfinite(value) for value in point):
-            raise SourceError(path, f"line {number}", "has numbers that are not finite")
         if key in points:
             raise SourceError(path, f"line {number}", f"index {key} is there twice")
         points[key] = point

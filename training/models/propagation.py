@@ -18,12 +18,16 @@ _Floats = npt.NDArray[np.float64]
 _TOUCH = 1e-6
 """Metres to the fourth power, of two products of sides: less is a line that grazes a corner, or rounding."""
 _FAR = 1e4
+_PENUMBRA_M = 0.05
+"""By how much a way round a corner is longer than the straight one where sight has fallen to 1 / e: half a wavelength
+at 3 kHz. Reflected sound does not change at once where the line of sight breaks, and levels may not step there."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """Shortest path from emitter to listener: `length`, by how much the emitter is higher, and sight (B, 1); unit
-    directions in plan in which it leaves the listener and the emitter (B, 2, 2)."""
+    """Shortest path from emitter to listener: `length`, by how much the emitter is higher, and sight (B, 1), 1 where
+    they see each other and falling to 0 behind a corner; unit directions in plan in which it leaves the listener and
+    the emitter (B, 2, 2)."""
 
     length: Tensor
     rise: Tensor
@@ -78,7 +82,7 @@ class Propagation(nn.Module):
     def _shortest(
         self, places: Tensor, across: Tensor, straight: Tensor, other: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Length in plan and sight (B, 1), and where the path goes from either end first (B, end, 2), of places in plan
+        """Length in plan, sight (B, 1), and where the path goes from either end first (B, end, 2), of places in plan
         (B, end, 2), which are `across` (B, 2) from each other, and `straight` (B, 1); `other` are the ends
         exchanged."""
         corners = self._bend_count * self._wall_count
@@ -91,9 +95,10 @@ class Propagation(nn.Module):
         reach = torch.where(crossed.amin(dim=-1) < -_TOUCH, _FAR, far)
         via = (reach[..., None] + self._between + reach.flip(1)[:, :, None]).amin(dim=-1)
         sight = ~self._is_crossed(columns[:, 0], across, of_walls)
+        shortest = torch.where(sight, straight, via.amin(dim=(1, 2))[:, None])
         return (
-            torch.where(sight, straight, via.amin(dim=(1, 2))[:, None]),
-            sight.to(places.dtype),
+            shortest,
+            torch.exp((straight - shortest) / _PENUMBRA_M),
             torch.where(sight[..., None], other, self._bends[via.argmin(dim=-1)]),
         )
 

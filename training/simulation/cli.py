@@ -13,12 +13,14 @@ from rich.table import Table
 from training.options import Seed
 
 if TYPE_CHECKING:
+    from training.scene_file import SceneFile
     from training.simulation.check import PlanCheck
     from training.simulation.pairs import PairSimulation
     from training.simulation.plan import SimulationPlan
 
 # A caption is wrapped to its table.
 _CHECK_WIDTH = 100
+_TAIL_RAYS_TRIED = 2_000
 
 Scene = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
 Effects = Annotated[
@@ -38,20 +40,26 @@ def wide_console(*, stderr: bool = False) -> Console:
 
 def simulation_of(scene: Path, seed: int, effects: str) -> "PairSimulation":
     """Ready, by a plan that says what it will cost on this host."""
-    from training.scene_file import SceneFile
-    from training.simulation.cost import with_costs
-    from training.simulation.plan import overrides_among
-    from training.simulation.planner import planner_of
+    from training.simulation.cost import is_brief, with_costs
     from training.simulation.run import prepared
 
+    read, decided = _decided(scene, seed, effects)
+    simulation = prepared(read, seed=seed, plan=decided)
+    return replace(simulation, plan=with_costs(simulation)) if is_brief(read) else simulation
+
+
+def _decided(scene: Path, seed: int, effects: str) -> "tuple[SceneFile, SimulationPlan]":
+    """What a scene calls for, at costs that nobody measured."""
+    from training.scene_file import SceneFile
+    from training.simulation.plan import overrides_among
+    from training.simulation.planner import planner_of
+    from training.simulation.size import SimulationSize
+
+    named = _named(effects)
     read = SceneFile.read(scene)
     planner = planner_of(read, seed)
-    if effects == "all":
-        plan = planner.everything
-    else:
-        plan = planner.plan(overrides_among({**read.effects, **_named(effects)}))
-    simulation = prepared(read, seed=seed, plan=plan)
-    return replace(simulation, plan=with_costs(simulation))
+    decided = planner.everything if effects == "all" else planner.plan(overrides_among({**read.effects, **named}))
+    return read, replace(decided, cost_s=60 * SimulationSize(read).core_minutes)
 
 
 def _named(effects: str) -> dict[str, bool]:
@@ -81,14 +89,19 @@ def plan(
 ) -> None:
     """What simulating a scene calls for, why, and what it will take."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    planned = simulation_of(scene, seed, effects).plan
+    from training.simulation.cost import is_brief, with_costs
+    from training.simulation.run import prepared
+
+    read, planned = _decided(scene, seed, effects)
+    if is_brief(read):
+        planned = with_costs(prepared(read, seed=seed, plan=planned, most_tail_rays=_TAIL_RAYS_TRIED))
     checked = None if check is None else _check(scene, planned, check, seed)
     if as_json:
         content = planned.to_json() if checked is None else {"plan": planned.to_json(), "check": checked.to_json()}
         typer.echo(json.dumps(content, indent=2))
         return
     console = wide_console()
-    console.print(plan_table(planned))
+    print_plan(console, read, planned)
     if checked is not None:
         console.print(_check_table(checked))
 
@@ -126,6 +139,16 @@ def _check_table(checked: "PlanCheck") -> Table:
     return table
 
 
+def print_plan(console: Console, scene: "SceneFile", plan: "SimulationPlan") -> None:
+    """The table, how much it comes to, and what the scene file will not get."""
+    from training.simulation.size import SimulationSize
+
+    console.print(plan_table(plan))
+    console.print(f"{SimulationSize(scene).extent} at most", highlight=False)
+    for note in plan.notes:
+        console.print(f"note: {note}", highlight=False)
+
+
 def plan_table(plan: "SimulationPlan") -> Table:
     table = Table(title=_summary(plan), title_justify="left", caption=_caption(plan), caption_justify="left")
     for column, justify in (("effect", "left"), ("", "left"), ("JND", "right"), ("of", "left"), ("s", "right")):
@@ -147,4 +170,8 @@ def _summary(plan: "SimulationPlan") -> str:
 
 
 def _caption(plan: "SimulationPlan") -> str:
-    return "" if plan.cost_s is None else f"about {plan.cost_s:.0f} s of one core, by short runs of its parts here"
+    if plan.cost_s is None:
+        return ""
+    measured = any(each.cost_s is not None for each in plan.decisions)
+    how = "by short runs of its parts here" if measured else "at most, by its numbers alone"
+    return f"about {plan.cost_s:,.0f} s of one core, {how}"

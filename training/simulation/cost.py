@@ -7,12 +7,16 @@ from time import thread_time
 import numpy as np
 
 from training.dataset import GEOMETRIC_ORDER
+from training.scene_file import SceneFile
 from training.simulation.pairs import PairSimulation
 from training.simulation.plan import SimulatedEffect, SimulationPlan
+from training.simulation.size import SimulationSize
 
 _RAYS_TRIED = 500
-_LISTENERS_TRIED = 4
+_LISTENERS_TRIED, _LISTENERS_TRACED = 4, 64
 _TIMES = 3
+# Of one core: whoever asks for a plan waits for what tells its cost.
+_LONGEST_TRIAL_S = 1.0
 
 
 def predicted_s(simulation: PairSimulation) -> float:
@@ -20,16 +24,26 @@ def predicted_s(simulation: PairSimulation) -> float:
     something was never compiled."""
     plan, probes = simulation.plan, len(simulation.probes)
     brief = replace(simulation, plan=replace(plan, rays=min(plan.rays, _RAYS_TRIED)))
-    everyone, few = np.arange(1, probes), np.arange(1, 1 + min(_LISTENERS_TRIED, probes - 1))
+    many, few = (np.arange(1, 1 + min(count, probes - 1)) for count in (_LISTENERS_TRACED, _LISTENERS_TRIED))
     for _ in brief.own(0, few[:1], 0):  # what serves all pairs is made with the first
         pass
-    tracing_s = _seconds(lambda: brief.energies(0, everyone, np.random.default_rng(0)))
+    many_traced_s = _seconds(lambda: brief.energies(0, many, np.random.default_rng(0)))
     few_traced_s = _seconds(lambda: brief.energies(0, few, np.random.default_rng(0)))
     taking_s = _seconds(lambda: list(brief.own(0, few, 0)))
-    pairs = probes * len(everyone) * (1 + simulation.scene.simulation.held_out_share)
+    # Each listener takes as long as any other.
+    per_listener_s = (many_traced_s - few_traced_s) / max(1, len(many) - len(few))
+    tracing_s = many_traced_s + per_listener_s * (probes - 1 - len(many))
+    pairs = probes * (probes - 1) * (1 + simulation.scene.simulation.held_out_share)
     # The second take is of the few that are held out.
     traced_s = probes * (tracing_s + few_traced_s) * plan.rays / max(brief.plan.rays, 1)
     return simulation.prepared_s + traced_s + pairs * max(0.0, taking_s - few_traced_s) / len(few)
+
+
+def is_brief(scene: SceneFile) -> bool:
+    """Whether short runs of the parts of its simulation are short."""
+    size = SimulationSize(scene)
+    rays = min(1.0, _RAYS_TRIED / scene.simulation.rays)
+    return size.tracing_s * rays + size.images_s + _LISTENERS_TRIED * size.synthesis_s < _LONGEST_TRIAL_S
 
 
 def with_costs(simulation: PairSimulation) -> SimulationPlan:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from time import process_time
+from time import process_time, thread_time
 
 import numpy as np
 import numpy.typing as npt
@@ -46,20 +46,30 @@ class PairSimulation:
 
     @classmethod
     def prepare(
-        cls, scene: SceneFile, probes: _Floats, yaws: _Floats, *, seed: int, plan: SimulationPlan
+        cls,
+        scene: SceneFile,
+        probes: _Floats,
+        yaws: _Floats,
+        *,
+        seed: int,
+        plan: SimulationPlan,
+        most_tail_rays: int | None = None,
     ) -> "PairSimulation":
+        """With `most_tail_rays` a tail is told from no more rays than that, to find out what all of them would take."""
         began_s = process_time()
         simulation = cls(scene, probes, yaws, seed, plan)
         if plan.tail_start_s is None:
             return simulation
         generators = [np.random.default_rng([seed, 3, take]) for take in range(len(TAKES))]
         with ThreadPoolExecutor(len(TAKES)) as pool:
-            traced = pool.map(partial(_tail_energy, scene, probes, plan), generators)
+            rays = min(plan.tail_rays, most_tail_rays or plan.tail_rays)
+            traced = pool.map(partial(_tail_energy, scene, probes, replace(plan, tail_rays=rays)), generators)
             synthesis = simulation._synthesis  # reads a head meanwhile
-            energies = np.stack(list(traced))
+            energies, seconds = zip(*traced, strict=True)
         noise = np.random.default_rng([seed, 4])
-        tail = draw_tail(synthesis, energies, start_s=plan.tail_start_s, rng=noise)
-        return replace(simulation, tail=tail, prepared_s=process_time() - began_s)
+        tail = draw_tail(synthesis, np.stack(energies), start_s=plan.tail_start_s, rng=noise)
+        of_the_rest_s = sum(seconds) * (plan.tail_rays / rays - 1)
+        return replace(simulation, tail=tail, prepared_s=process_time() - began_s + of_the_rest_s)
 
     def take(
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
@@ -132,8 +142,11 @@ class PairSimulation:
         return np.sqrt(1 - shared_power(times_s, self.plan.tail_start_s)).astype(np.float32)
 
 
-def _tail_energy(scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator) -> _Floats:
-    """(direction, band, bin) mean over pairs of probes all over the room."""
+def _tail_energy(
+    scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator
+) -> tuple[_Floats, float]:
+    """(direction, band, bin) mean over pairs of probes all over the room, and how many seconds of a core it took."""
+    began_s = thread_time()
     some = probes[np.unique(np.linspace(0, len(probes) - 1, _TAIL_PROBES).astype(int))]
     rays = -(-plan.tail_rays // len(some))
     means = [
@@ -142,4 +155,4 @@ def _tail_energy(scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: n
         .mean(axis=0, dtype=np.float64)
         for emitter, place in enumerate(some)
     ]
-    return np.asarray(np.mean(means, axis=0))
+    return np.asarray(np.mean(means, axis=0)), thread_time() - began_s

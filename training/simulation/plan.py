@@ -64,6 +64,8 @@ class SimulationPlan:
     decisions: tuple[SimulationDecision, ...] = ()
     cost_s: float | None = None
     """Seconds of one core that the whole simulation was predicted to take."""
+    notes: tuple[str, ...] = ()
+    """What the scene file asks for and will not get, in sentences."""
 
     @classmethod
     def everything(
@@ -75,7 +77,7 @@ class SimulationPlan:
     @property
     def settings(self) -> tuple[object, ...]:
         """What data depend on; two plans may agree on it for different reasons."""
-        return tuple(value for name, value in vars(self).items() if name not in {"decisions", "cost_s"})
+        return tuple(value for name, value in vars(self).items() if name not in {"decisions", "cost_s", "notes"})
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -87,4 +89,4 @@ class SimulationPlan:
             SimulationDecision(**{**decision, "name": SimulatedEffect(decision["name"])})
             for decision in content["decisions"]
         )
-        return cls(**{**content, "decisions": decisions})
+        return cls(**{**content, "decisions": decisions, "notes": tuple(content.get("notes", ()))})

@@ -8,13 +8,15 @@ from training.dataset import GEOMETRIC_ORDER
 from training.scene_file import SceneFile, SceneFileError
 from training.simulation.plan import Overrides, SimulatedEffect, SimulationDecision, SimulationPlan
 from training.simulation.predictions import Prediction, Predictions
-from training.simulation.shared_tail import FADE_S
+from training.simulation.size import SimulationSize
 
 THRESHOLD_JND = 0.25
 
 
 def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
-    """For the probes that a dataset of this seed has."""
+    """For the probes that a dataset of this seed has. Raises SceneFileError for a scene of which nobody could simulate
+    that much, or that is too large for its responses."""
+    SimulationSize(scene).require_reasonable()
     return SimulationPlanner(Predictions(scene, scene.probe_positions(seed)))
 
 
@@ -24,6 +26,7 @@ class SimulationPlanner:
     def __init__(self, predictions: Predictions) -> None:
         self._predictions = predictions
         self._settings = predictions.scene.simulation
+        self._refuse_what_is_too_far()
         self._by_order = {
             order: predictions.early_reflections(order)
             for order in range(GEOMETRIC_ORDER + 1, self._settings.image_order + 1)
@@ -41,12 +44,16 @@ class SimulationPlanner:
         predicted = self._predictions
         self._refuse_what_cannot_be(overrides)
         order, images = self._images(overrides)
+        late = predicted.late_reverberation()
+        has_rays = overrides.get(SimulatedEffect.LATE_REVERBERATION, late.change_jnd >= THRESHOLD_JND)
+        scattering = predicted.scattering(has_rays=has_rays)
+        scatters = overrides.get(SimulatedEffect.SCATTERING, scattering.change_jnd >= THRESHOLD_JND)
         decided = {
             SimulatedEffect.EARLY_REFLECTIONS: images,
-            SimulatedEffect.LATE_REVERBERATION: predicted.late_reverberation(),
-            SimulatedEffect.SCATTERING: predicted.scattering(),
-            SimulatedEffect.PER_SOURCE_TAIL: predicted.per_source_tail(),
-            SimulatedEffect.AIR_ABSORPTION: predicted.air_absorption(),
+            SimulatedEffect.LATE_REVERBERATION: late,
+            SimulatedEffect.SCATTERING: scattering,
+            SimulatedEffect.PER_SOURCE_TAIL: predicted.per_source_tail(has_rays=has_rays),
+            SimulatedEffect.AIR_ABSORPTION: predicted.air_absorption(has_rays=has_rays, scatters=scatters),
             SimulatedEffect.DIFFRACTION: predicted.diffraction(),
             SimulatedEffect.TRANSMISSION: predicted.transmission(),
             SimulatedEffect.DIRECTIVITY: Prediction(
@@ -57,12 +64,11 @@ class SimulationPlanner:
             name: overrides.get(name, prediction.change_jnd >= THRESHOLD_JND) for name, prediction in decided.items()
         }
         has_own_tails = is_on[SimulatedEffect.PER_SOURCE_TAIL]
-        ends_before_it = predicted.tail_start_s + FADE_S >= self._settings.duration_s
-        shares_tail = is_on[SimulatedEffect.LATE_REVERBERATION] and not has_own_tails and not ends_before_it
+        shares_tail = has_rays and not has_own_tails and not predicted.ends_before_tail
         rays = predicted.rays() if shares_tail else self._settings.rays
         return SimulationPlan(
             image_order=order,
-            rays=rays if is_on[SimulatedEffect.LATE_REVERBERATION] else 0,
+            rays=rays if has_rays else 0,
             tail_start_s=predicted.tail_start_s if shares_tail else None,
             tail_rays=self._settings.rays if shares_tail else 0,
             scattering=is_on[SimulatedEffect.SCATTERING],
@@ -73,6 +79,7 @@ class SimulationPlanner:
                 SimulationDecision(name, is_on[name], **vars(prediction), overridden=name in overrides)
                 for name, prediction in decided.items()
             ),
+            notes=predicted.notes(has_rays=has_rays),
         )
 
     def _images(self, overrides: Overrides) -> tuple[int, Prediction]:
@@ -86,6 +93,16 @@ class SimulationPlanner:
         largest = max(self._by_order.values(), key=lambda each: each.change_jnd)
         reason = "; ".join(f"{each.reason} ({each.change_jnd:.2f} JND)" for each in self._by_order.values())
         return order, Prediction(largest.change_jnd, largest.parameter, reason)
+
+    def _refuse_what_is_too_far(self) -> None:
+        longest_s, duration_s = self._predictions.longest_way_s, self._settings.duration_s
+        if longest_s >= duration_s:
+            needed_s = self._predictions.needed_s
+            also = f"; {needed_s:.2f} s would hold reverberation too" if needed_s < float("inf") else ""
+            raise SceneFileError(
+                f"{self._predictions.scene.id}: simulation.duration_s: sound needs up to {longest_s:.2f} s from one "
+                f"place to another, and a response ends after {duration_s:g} s{also}"
+            )
 
     def _refuse_what_cannot_be(self, overrides: Overrides) -> None:
         scene = self._predictions.scene

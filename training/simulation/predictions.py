@@ -1,5 +1,5 @@
-"""What leaving an effect out of a simulation would change, told from geometry and statistical acoustics before
-anything is simulated: in just-noticeable differences, with a reason in words.
+"""What leaving an effect out of a simulation would change, told from geometry, statistical acoustics and a trial of few
+rays before anything else is simulated: in just-noticeable differences, with a reason in words.
 
 Axes: (pair, band); metres. Power is squared pressure beside that of the direct sound at one metre.
 """
@@ -11,17 +11,22 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.audibility import HEARD
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.acoustics.transmission import transmission_loss_db, walls_between
+from server.scene.manifest import MOST_SAMPLES
 from training.dataset import SPEED_OF_SOUND
-from training.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.scene_file import SceneFile
 from training.simulation.diffuse_room import DiffuseRoom
+from training.simulation.neighbourhoods import receiver_radii
 from training.simulation.plan import SimulationPlan
-from training.simulation.rays import receiver_radii, surface_shares
+from training.simulation.rays import surface_shares
+from training.simulation.shared_tail import FADE_S
+from training.simulation.size import SimulationSize
 from training.simulation.tracing import RoomTracer
+from training.simulation.trial import Change, Trial
 
 _Floats = npt.NDArray[np.float64]
 
@@ -32,6 +37,8 @@ _RAY_VARIANCE = 1.1**2 - 1
 _CHORDS = 9 / 8
 _LEVEL_DB = HEARD["level"].amount
 _EMITTERS_TRIED = 16
+# Of sequences of walls, each by a receiver, and of paths round corners, each by a wall.
+_MOST_IMAGE_TESTS, _MOST_PATH_TESTS = 30_000_000, 20_000_000
 
 
 @dataclass(frozen=True)
@@ -58,17 +65,28 @@ class Predictions:
 
     @cached_property
     def longest_onset_s(self) -> float:
+        """From probe to probe."""
         return float(self._paths.length_m.max() / SPEED_OF_SOUND)
+
+    @cached_property
+    def longest_way_s(self) -> float:
+        """From probe to probe, or between the places that a visit starts at."""
+        start = self.scene.start
+        start_m = self.floor_plan.path_length_m(np.array(start.emitter), np.array(start.listener))
+        return max(self.longest_onset_s, float(start_m) / SPEED_OF_SOUND)
 
     @property
     def is_one_room(self) -> bool:
         """Whether from every place every other is seen."""
         return len(self.floor_plan.bend_corners) == 0
 
+    @cached_property
+    def trial(self) -> Trial:
+        return Trial(self.scene, self.probes)
+
     def late_reverberation(self) -> Prediction:
-        kept = self._direct_power.mean(axis=0) + self.room.reflected_power(1) - self.room.reflected_power(2)
-        change = _level_change_jnd(self.room.reflected_power(2), kept)
-        return Prediction(change, "level", "what follows the first reflections, by Eyring, beside what comes before it")
+        reason = "what rays bring in a trial: all but direct sound and mirrored first reflections"
+        return _told(self.trial.without_late(), reason)
 
     def early_reflections(self, order: int) -> Prediction:
         """Of mirrored paths by so many surfaces, at the pair that they matter most to: drawn from noise of the same
@@ -76,9 +94,12 @@ class Predictions:
         settings = self.scene.simulation
         everything = SimulationPlan.everything(settings.image_order, settings.rays)
         shares = []
-        for at in np.unique(np.linspace(0, len(self.probes) - 1, _EMITTERS_TRIED).astype(int)):
+        tests = SimulationSize(self.scene).sequences_of(order) * len(self.probes)
+        tried = int(np.clip(_MOST_IMAGE_TESTS / tests, 1, _EMITTERS_TRIED))
+        step = max(1, int(tests / _MOST_IMAGE_TESTS))
+        for at in np.unique(np.linspace(0, len(self.probes) - 1, tried).astype(int)):
             emitter = self.probes[at]
-            receivers = np.delete(self.probes, at, axis=0)
+            receivers = np.delete(self.probes, at, axis=0)[::step]
             tracer = RoomTracer.of(self.scene, everything, receivers, image_order=order, least_order=order)
             distance = np.linalg.norm(receivers - emitter, axis=-1)
             beside = distance[:, None] ** -2 + self.room.reflected_power(1)
@@ -92,39 +113,86 @@ class Predictions:
         reason = f"paths by {order} surfaces bring {100 * np.mean(shares):.0f} % of the energy on average"
         return Prediction(float(over_bands.max()) / HEARD["spectrum"].amount, "spectrum", reason)
 
-    def scattering(self) -> Prediction:
+    def scattering(self, *, has_rays: bool) -> Prediction:
+        if not has_rays:
+            return Prediction(0.0, "level", "no rays are traced that could scatter")
         share = surface_shares(self.scene.geometry)[1].max()
-        lost_db = -float(power_to_db(max(1 - share, 1e-6)))
-        reason = f"surfaces scatter up to {100 * share:.0f} % of what they reflect"
-        return Prediction(lost_db / _LEVEL_DB, "level", reason)
+        if not share:
+            return Prediction(0.0, "level", "surfaces mirror all that they reflect")
+        reason = f"surfaces scatter up to {100 * share:.0f} %, reflection after reflection; by a trial without it"
+        return _told(self.trial.without_scattering(), reason)
 
-    def air_absorption(self) -> Prediction:
-        dry = DiffuseRoom(self.scene.geometry, None, SPEED_OF_SOUND).reverberation_time_s
-        percent = 100 * float(np.max(dry / self.room.reverberation_time_s - 1))
-        reason = f"without air, reverberation would last up to {percent:.0f} % longer in an octave band"
-        return Prediction(percent / HEARD["t60"].amount, "t60", reason)
+    def air_absorption(self, *, has_rays: bool, scatters: bool) -> Prediction:
+        """Of what the plan has; of it all parameters, in trial."""
+        reason = "without the air's share reverberation lasts longer, by a trial"
+        if not has_rays:
+            reason = "on the way of direct sound and first reflections; nothing reverberates"
+        return _told(self.trial.without_air(has_rays=has_rays, scatters=scatters), reason)
 
-    def per_source_tail(self) -> Prediction:
+    def per_source_tail(self, *, has_rays: bool) -> Prediction:
+        if not has_rays:
+            return Prediction(0.0, "level", "no rays are traced, so there is no late tail")
+        if self.ends_before_tail:
+            return Prediction(0.0, "level", "responses end before all places sound alike")
+        one_for_all = self.trial.with_one_tail(self.tail_start_s)
         if not self.is_one_room:
             coupling = self._passage_m2 / (self._passage_m2 + self.room.surface_m2 * self.room.absorption / 2)
             change_db = -float(power_to_db(coupling).min())
             reason = "walls part the plan, and behind them late sound is another"
-            return Prediction(change_db / _LEVEL_DB, "level", reason)
-        start_s = self.tail_start_s
-        reflections = SPEED_OF_SOUND * start_s / self.room.mean_free_path_m
-        unmixed = float(((1 - self.room.scattering) ** reflections).max())
-        images = self.room.images_per_s(start_s) * HISTOGRAM_BIN_S
-        change_db = float(power_to_db(1 + unmixed / np.sqrt(images)))
+            by_coupling = Change(change_db / _LEVEL_DB, "level")
+            return _told(max(by_coupling, one_for_all, key=lambda each: each.jnd), reason)
         reason = (
-            f"in one room without corners to hide behind, places differ for {1e3 * start_s:.0f} ms "
-            "(Lindau et al. 2012); from then on one tail serves all pairs"
+            f"in one room without corners to hide behind, places differ for {1e3 * self.tail_start_s:.0f} ms "
+            "(Lindau et al. 2012), and from then on by this much, by a trial"
         )
-        return Prediction(change_db / _LEVEL_DB, "level", reason)
+        return _told(one_for_all, reason)
 
     @property
     def tail_start_s(self) -> float:
         """After emission, wherever the receiver is."""
         return self.room.mixing_time_s + self.longest_onset_s
+
+    @property
+    def ends_before_tail(self) -> bool:
+        return self.tail_start_s + FADE_S >= self.scene.simulation.duration_s
+
+    @property
+    def reverberation_s(self) -> tuple[float, float]:
+        """How long it lasts for 60 dB, in the octave band (Hz) in which it lasts longest; inf where it does not end in
+        a trial."""
+        audible = bands_within(self.scene.simulation.sample_rate)
+        times_s = np.nan_to_num(self.trial.reverberation_time_s[:audible], nan=np.inf)
+        longest = int(np.argmax(times_s))
+        return float(times_s[longest]), OCTAVE_BANDS_HZ[longest]
+
+    @property
+    def needed_s(self) -> float:
+        """Of a response that holds 60 dB of decay wherever the receiver is."""
+        return self.longest_way_s + self.reverberation_s[0]
+
+    def notes(self, *, has_rays: bool) -> tuple[str, ...]:
+        settings, notes = self.scene.simulation, []
+        lasts_s, centre_hz = self.reverberation_s
+        if has_rays and self.needed_s > settings.duration_s:
+            lasts = f"{lasts_s:.2g} s (T60 at {centre_hz:g} Hz)" if lasts_s < np.inf else "longer than was tried"
+            needed = f"; {self.needed_s:.2f} s would hold all of it" if lasts_s < np.inf else ""
+            notes.append(
+                f"simulation.duration_s: reverberation lasts {lasts}, and responses end after "
+                f"{settings.duration_s:g} s: reverberation times will read too short{needed}"
+            )
+            most_s = MOST_SAMPLES / settings.sample_rate
+            if most_s < self.needed_s < np.inf:
+                notes.append(
+                    f"a bundle holds {most_s:g} s at {settings.sample_rate} Hz, and more at lower sample rates"
+                )
+        above_hz = OCTAVE_BANDS_HZ[bands_within(settings.sample_rate) :]
+        if above_hz:
+            bands = " and ".join(f"{centre_hz:g} Hz" for centre_hz in above_hz)
+            notes.append(
+                f"simulation.sample_rate: the octave band of {bands} lies above half of {settings.sample_rate} Hz, and "
+                "what materials do there is not heard"
+            )
+        return tuple(notes)
 
     def diffraction(self) -> Prediction:
         paths = self._paths
@@ -166,17 +234,29 @@ class Predictions:
         rays = float(np.mean(crossings * self.room.volume_m3 / per_ray))
         return min(most, int(np.ceil(rays / 100)) * 100)
 
+    @cached_property
+    def _ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """(pair,) probes at either end: each couple once, or, where walls and probes are many, those of some."""
+        count = len(self.probes)
+        tried = int(_MOST_PATH_TESTS / (count * len(self.floor_plan.corners)))
+        if tried >= count:
+            first, second = np.triu_indices(count, 1)
+            return first, second
+        some = np.unique(np.linspace(0, count - 1, max(2, tried)).astype(np.int64))
+        first, second = np.repeat(some, count), np.tile(np.arange(count), len(some))
+        return first[first != second], second[first != second]
+
     @property
     def _pairs(self) -> tuple[_Floats, _Floats]:
-        """(pair, xyz) ends, each couple of probes once."""
-        first, second = np.triu_indices(len(self.probes), 1)
+        """(pair, xyz) ends."""
+        first, second = self._ends
         return self.probes[first], self.probes[second]
 
     @cached_property
     def _paths(self) -> SoundPaths:
         """(pair,) in the order of `_pairs`."""
-        finder = SoundPathFinder(self.floor_plan, SPEED_OF_SOUND)
-        found = [finder.find(self.probes[at], self.probes[at + 1 :]) for at in range(len(self.probes) - 1)]
+        finder, (first, second) = SoundPathFinder(self.floor_plan, SPEED_OF_SOUND), self._ends
+        found = [finder.find(self.probes[at], self.probes[second[first == at]]) for at in np.unique(first)]
         return SoundPaths(
             *(np.concatenate(parts) for parts in zip(*(vars(each).values() for each in found), strict=True))
         )
@@ -209,6 +289,10 @@ class Predictions:
             passage, area = self._passage_m2, self.room.surface_m2 * self.room.absorption / 2
             power[~self._paths.in_sight] *= passage / (passage + area)
         return power
+
+
+def _told(change: Change, reason: str) -> Prediction:
+    return Prediction(change.jnd, change.parameter, reason)
 
 
 def _level_change_jnd(more: _Floats, other: _Floats) -> float:

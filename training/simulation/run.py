@@ -20,10 +20,11 @@ from training.simulation.plan import SimulationPlan, overrides_among
 from training.simulation.planner import planner_of
 
 
-def prepared(scene: SceneFile, *, seed: int, plan: SimulationPlan) -> PairSimulation:
-    """The simulation of all pairs of the probes that a dataset of this seed has."""
+def prepared(scene: SceneFile, *, seed: int, plan: SimulationPlan, most_tail_rays: int | None = None) -> PairSimulation:
+    """The simulation of all pairs of the probes that a dataset of this seed has; `most_tail_rays` as in `prepare`."""
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
-    return PairSimulation.prepare(scene, scene.probe_positions(seed), yaws, seed=seed, plan=plan)
+    probes = scene.probe_positions(seed)
+    return PairSimulation.prepare(scene, probes, yaws, seed=seed, plan=plan, most_tail_rays=most_tail_rays)
 
 
 def simulate(

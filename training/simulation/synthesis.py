@@ -137,7 +137,7 @@ class BinauralSynthesis:
         independent of each other where they overlap, so that their powers add up, whatever they are multiplied by."""
         step = self._n_fft // 2
         frames = samples // step
-        heard = np.empty((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
+        heard = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
         for neighbours in (0, 1):  # only bands next to each other overlap
             noise = _unit_noise((len(directional), frames, step), rng)
             sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
@@ -145,6 +145,8 @@ class BinauralSynthesis:
             spectra = np.ascontiguousarray(rfft(sections).transpose(2, 1, 0))
             for band in range(neighbours, len(OCTAVE_BANDS_HZ), 2):
                 inside = np.flatnonzero(self._band_weights[band])
+                if not len(inside):
+                    continue  # the whole band lies above half the sample rate
                 within = slice(inside[0], inside[-1] + 1)
                 amplitudes = np.sqrt(directional[:, band]).astype(np.float32)
                 shape = np.sqrt(self._band_weights[band, within])[:, None, None]

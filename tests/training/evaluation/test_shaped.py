@@ -114,9 +114,9 @@ def test_orientations_that_are_asked_for_are_answered(room):
 
 @pytest.mark.parametrize("held_out_share", [0.1, 0.5])
 def test_it_is_the_best_answer_on_the_measured_office(tmp_path, held_out_share):
-    office = os.environ.get("NAFIR_MEASURED_OFFICE")
+    office = os.environ.get("MEASURED_OFFICE")
     if not office:
-        pytest.skip("NAFIR_MEASURED_OFFICE names no folder")
+        pytest.skip("MEASURED_OFFICE names no folder")
     report = ImportReport()
     rows = conditioned(read(Path(office), report), Conditioning(), report)
     ImportedDataset.write(tmp_path, rows, report, layout="meshrir", source=office, held_out_share=held_out_share)

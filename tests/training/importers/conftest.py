@@ -33,7 +33,7 @@ def wave(listener, emitter, yaw=None):
 @pytest.fixture
 def measured_office() -> Path:
     """The recordings themselves may not be handed on with this code."""
-    folder = os.environ.get("NAFIR_MEASURED_OFFICE")
+    folder = os.environ.get("MEASURED_OFFICE")
     if not folder:
-        pytest.skip("NAFIR_MEASURED_OFFICE names no folder")
+        pytest.skip("MEASURED_OFFICE names no folder")
     return Path(folder)

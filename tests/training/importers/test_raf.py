@@ -66,7 +66,9 @@ def test_a_loudspeaker_is_kept_the_way_it_first_faced(room):
     [
         ("rx_pos.txt", "1,2", "rx_pos.txt has not 3 finite numbers"),
         ("rx_pos.txt", "1,2,nan", "rx_pos.txt has not 3 finite numbers"),
-        ("rx_pos.txt", "here", "rx_pos.txt unreadable"),
+        ("rx_pos.txt", "here", "rx_pos.txt has not 3 finite numbers"),
+        ("rx_pos.txt", "1,2,0_3", "rx_pos.txt has not 3 finite numbers"),
+        ("rx_pos.txt", "1,2,٣", "rx_pos.txt has not 3 finite numbers"),
         ("rx_pos.txt", None, "rx_pos.txt unreadable"),
         ("tx_pos.txt", "0,0,0,1,2,3", "tx_pos.txt has not 7 finite numbers"),
         ("tx_pos.txt", "3.0,1.5,1.0,0,0,0,1", "tx_pos.txt does not begin with a unit quaternion"),

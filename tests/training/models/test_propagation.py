@@ -44,8 +44,28 @@ def test_sight_is_that_of_the_floor_plan(case):
     plan, listeners, emitters, path = case
     expected = plan.is_visible(listeners, emitters)
     # Single precision may differ where a corner is grazed.
-    assert np.mean((path.visible.numpy()[:, 0] > 0.5) != expected) < 1e-3
+    assert np.mean((path.visible.numpy()[:, 0] == 1) != expected) < 1e-3
     assert expected.all() == (plan is PLANS["shoebox"])
+
+
+def test_sight_fades_with_what_a_corner_adds_to_the_way(case):
+    """Reflected sound does not change at once where the straight line breaks."""
+    plan, listeners, emitters, path = case
+    excess_m = plan.path_length_m(emitters * (1, 1, 0), listeners * (1, 1, 0))
+    excess_m = excess_m - np.linalg.norm((emitters - listeners)[:, :2], axis=-1)
+    np.testing.assert_allclose(path.visible.numpy()[:, 0], np.exp(-excess_m / 0.05), atol=0.01)
+
+
+def test_no_step_of_a_millimetre_changes_sight_by_much():
+    """Past the corner of an L."""
+    plan = PLANS["L"]
+    across = np.linspace(2.1, 4.5, 2401, dtype=np.float32)
+    listeners = np.column_stack([np.full_like(across, 1.0), across, np.full_like(across, 1.5)])
+    emitters = np.tile(np.array([5.0, 1.0, 1.5], np.float32), (len(across), 1))
+    sight = Propagation(plan)(torch.from_numpy(listeners), torch.from_numpy(emitters)).visible.numpy()[:, 0]
+    assert sight.min() < 0.1
+    assert sight.max() == 1
+    assert np.abs(np.diff(sight)).max() < 0.02
 
 
 def test_directions_are_unit_vectors(case):
@@ -55,7 +75,7 @@ def test_directions_are_unit_vectors(case):
 
 def test_in_sight_they_point_at_each_other(case):
     _, listeners, emitters, path = case
-    seen = path.visible.numpy()[:, 0] > 0.5
+    seen = path.visible.numpy()[:, 0] == 1
     offset = (emitters - listeners)[seen, :2]
     straight = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
     far = np.linalg.norm(offset, axis=-1) > 0.1

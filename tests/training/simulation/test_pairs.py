@@ -75,10 +75,10 @@ def test_a_listener_hears_the_same_whoever_else_is_asked_for(box):
 
 
 def test_without_rays_nothing_is_traced_and_no_noise_drawn(box, monkeypatch):
+    plan = planner_of(box, 0).plan({SimulatedEffect.LATE_REVERBERATION: False, SimulatedEffect.EARLY_REFLECTIONS: True})
     monkeypatch.setattr(RayTracer, "trace", None)
     monkeypatch.setattr(BinauralSynthesis, "late", None)
     monkeypatch.setattr(pairs, "draw_tail", None)
-    plan = planner_of(box, 0).plan({SimulatedEffect.LATE_REVERBERATION: False, SimulatedEffect.EARLY_REFLECTIONS: True})
     energies, responses = taken(simulation_of(box, plan))
     assert not energies.any()
     assert responses.any()
@@ -92,8 +92,9 @@ def test_a_shared_tail_is_traced_once_and_rays_of_pairs_end_with_it(box, monkeyp
         traced_s.append(self.shape[-1] * HISTOGRAM_BIN_S)
         return trace(self, *arguments, **named)
 
+    plan = planner_of(box, 0).plan({})
     monkeypatch.setattr(RayTracer, "trace", counted)
-    simulation = simulation_of(box, planner_of(box, 0).plan({}))
+    simulation = simulation_of(box, plan)
     once = len(traced_s)
     assert once == len(TAKES) * len(simulation.probes)  # from all over the room, which has few probes
     taken(simulation)

@@ -1,0 +1,309 @@
+"""uvicorn's HTTP protocol with limits: what is too much never reaches the parser, and nothing stays open for ever.
+
+uvicorn's parser collects a request line and headers without a bound. Here every byte is measured first
+(`server.api.request_meter`), requests are parsed one at a time, and every connection has a seat (`server.api.seats`)
+that others may claim while nothing is under way on it. A look at all connections, twice a second, ends those that are
+overdue.
+"""
+
+import asyncio
+from functools import partial
+from typing import Any
+
+from uvicorn.config import Config
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.server import ServerState
+
+from server.api.connection_limits import HEALTH_PATHS, ConnectionLimits
+from server.api.request_meter import Refusal, RequestMeter
+from server.api.seats import Seat, Seats
+from server.problems import problem
+from server.web_socket import WebSocketProtocol
+
+_CHECK_EVERY_S = 0.5
+_LINGER_S = 2.0
+"""For so long a refused client may go on sending, unheard: a reset would take the answer from it."""
+_MOST_UNHEARD_BYTES = 1024 * 1024
+_MOST_WAITING_BYTES = 64 * 1024
+"""Of requests behind one that is not answered yet."""
+_PACE_BYTES = 64 * 1024
+"""Of a response, or all that is left of it, a client takes within `response_timeout_s`."""
+_RETRY_AFTER_S = 10
+_HEALTH = frozenset(path.encode() for path in HEALTH_PATHS)
+_MALFORMED = Refusal(400, "malformed_request", "that is not HTTP/1.1")
+_NO_ROOM = Refusal(503, "too_many_connections", "the server has no free connection: ask again later")
+
+
+def limited_http(limits: ConnectionLimits) -> Any:
+    """What uvicorn takes for `http`: a maker of protocols that share seats."""
+    return partial(HttpProtocol, room=Room(limits))
+
+
+class Room:
+    """What all connections of a server share."""
+
+    def __init__(self, limits: ConnectionLimits) -> None:
+        self.limits = limits
+        self.seats = Seats(limits)
+        self._connections: set[HttpProtocol | WebSocketProtocol] = set()
+        self._is_watching = False
+
+    def enter(self, connection: "HttpProtocol | WebSocketProtocol", loop: asyncio.AbstractEventLoop) -> None:
+        self._connections.add(connection)
+        if not self._is_watching:
+            self._is_watching = True
+            loop.call_later(_CHECK_EVERY_S, self._watch, loop)
+
+    def leave(self, connection: "HttpProtocol | WebSocketProtocol") -> None:
+        self._connections.discard(connection)
+
+    def _watch(self, loop: asyncio.AbstractEventLoop) -> None:
+        now_s = loop.time()
+        for connection in list(self._connections):
+            connection.end_if_overdue(now_s)
+        self._is_watching = bool(self._connections)
+        if self._is_watching:
+            loop.call_later(_CHECK_EVERY_S, self._watch, loop)
+
+
+class _RefusedError(Exception):
+    """Raised through the parser, which then takes no more."""
+
+
+class HttpProtocol(HttpToolsProtocol):
+    """A connection until it closes, or becomes a WebSocket's."""
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+        *,
+        room: Room,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._room = room
+        self._meter = RequestMeter(room.limits)
+        self._seat: Seat | None = None
+        self._refusal = _MALFORMED
+        """The answer to what the parser does not take."""
+        self._due_s: float | None = None
+        """When the request has to be whole, or a refused client is cut off."""
+        self._unsent: tuple[int, float] | None = None
+        """Bytes that wait to be taken by the client, and since when they are so many."""
+        self._waiting = bytearray()
+        """Requests behind the one that is not answered yet."""
+        self._unheard_bytes = 0
+        self._has_head = False
+        """Whether the parser has the head of the request under way."""
+        self._is_whole = False
+        """Whether it has all of it."""
+        self._is_last = False
+        """Whether nothing more is heard of the client."""
+        self._is_upgraded = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._seat = self._room.seats.take(self.client[0] if self.client else "", transport.abort)
+        if self._seat is None:
+            transport.abort()
+            return
+        self._due_s = self.loop.time() + self._room.limits.request_timeout_s
+        self._room.enter(self, self.loop)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._room.leave(self)
+        if self._seat is not None:
+            self._seat.leave()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        while data and not self._is_upgraded:
+            if self._is_last:
+                self._pass_over(data)
+                return
+            if self._is_whole:
+                self._keep(data)
+                return
+            data = self._read(data)
+
+    def pause_writing(self) -> None:
+        """The client does not take its response: its seat is another's who comes when there is no other."""
+        super().pause_writing()
+        if self._seat is not None:
+            self._seat.rest()
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._unsent = None
+        if self._seat is not None:
+            self._seat.use()
+
+    def end_if_overdue(self, now_s: float) -> None:
+        """Called now and then."""
+        unsent_bytes = self.transport.get_write_buffer_size()
+        if not unsent_bytes:
+            self._unsent = None
+        elif self._unsent is None or unsent_bytes <= self._unsent[0] - _PACE_BYTES:
+            self._unsent = unsent_bytes, now_s
+        elif now_s - self._unsent[1] > self._room.limits.response_timeout_s:
+            self.transport.abort()
+        if self._due_s is not None and now_s > self._due_s:
+            self._time_out()
+
+    # What the parser and uvicorn say.
+
+    def on_headers_complete(self) -> None:
+        if self._is_last:
+            raise _RefusedError  # behind a chunked body, which the parser has together with its end
+        self._has_head = True
+        refusal = self._judge_head()
+        if refusal is not None:
+            self._refusal = refusal
+            raise _RefusedError
+        super().on_headers_complete()
+        if self._is_upgrading:
+            return
+        assert self._seat is not None
+        self._seat.use()
+        if self._seat.is_reserve:
+            self.cycle.keep_alive = False
+
+    def on_message_complete(self) -> None:
+        super().on_message_complete()
+        if self._is_upgrading:
+            return
+        self._is_whole, self._due_s = True, None
+        if not self._meter.has_body:  # its end is the parser's secret, and so is what is behind it
+            self.cycle.keep_alive = False
+        self._is_last = not self.cycle.keep_alive
+        if self.cycle.response_complete:
+            self._begin_next()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        if self._is_whole:
+            self._begin_next()
+
+    def send_400_response(self, msg: str) -> None:  # noqa: ARG002  uvicorn says always the same
+        self._refuse(self._refusal)
+
+    def handle_websocket_upgrade(self) -> None:
+        seat, self._seat = self._seat, None
+        assert seat is not None
+        self._is_upgraded = True
+        super().handle_websocket_upgrade()
+        successor = self.transport.get_protocol()
+        assert isinstance(successor, WebSocketProtocol)
+        successor.take_seat(seat, partial(self._room.leave, successor))
+        self._room.leave(self)
+        self._room.enter(successor, self.loop)
+
+    @property
+    def _is_upgrading(self) -> bool:
+        return bool(self.parser.should_upgrade()) and self._should_upgrade()
+
+    # What becomes of what is heard.
+
+    def _read(self, data: bytes) -> bytes:
+        """What is left behind the part of the request that is parsed now."""
+        if self._due_s is None:
+            self._due_s = self.loop.time() + self._room.limits.request_timeout_s
+        measured = self._meter.measure(data)
+        if isinstance(measured, Refusal):
+            self._refuse(measured)
+            return b""
+        super().data_received(measured.part)
+        if not self._is_last and not self._is_upgraded and self._has_head != self._meter.has_head:
+            self._refuse(_MALFORMED)
+        if self._is_upgraded and measured.rest:
+            self.transport.get_protocol().data_received(measured.rest)  # type: ignore[attr-defined]
+        return measured.rest
+
+    def _judge_head(self) -> Refusal | None:
+        assert self._seat is not None
+        if self._seat.is_reserve and self.url.partition(b"?")[0] not in _HEALTH:
+            return _NO_ROOM
+        refusal = self._meter.expect_body(0)
+        for name, value in self.headers:
+            if name == b"content-length":
+                refusal = self._meter.expect_body(int(value))
+            elif name == b"transfer-encoding":
+                refusal = self._meter.expect_body(None)
+        if refusal is None and self.parser.should_upgrade() and not self._meter.has_body:
+            return Refusal(400, "malformed_request", "a request to upgrade has no body")
+        return refusal
+
+    def _begin_next(self) -> None:
+        """The request is answered, and all of it was heard."""
+        if self.transport.is_closing():
+            return
+        if self._is_last:
+            self._hang_up()
+            return
+        assert self._seat is not None
+        self._seat.rest()
+        self._is_whole = self._has_head = False
+        self._meter.begin()
+        waiting, self._waiting = bytes(self._waiting), bytearray()
+        self.data_received(waiting)
+
+    def _keep(self, data: bytes) -> None:
+        self._waiting += data
+        if len(self._waiting) > _MOST_WAITING_BYTES:
+            self._is_last, self._waiting = True, bytearray()
+            self.cycle.keep_alive = False
+
+    def _pass_over(self, data: bytes) -> None:
+        self._unheard_bytes += len(data)
+        if self._unheard_bytes > _MOST_UNHEARD_BYTES:
+            self.flow.pause_reading()
+
+    # How it ends.
+
+    def _time_out(self) -> None:
+        if self._is_last or self.transport.is_closing():
+            self.transport.abort()
+        elif self._meter.is_fresh:
+            self.transport.close()
+        else:
+            within = f"within {self._room.limits.request_timeout_s:g} s"
+            self._refuse(Refusal(408, "request_timeout", f"a request has to be whole {within}"))
+
+    def _refuse(self, refusal: Refusal) -> None:
+        """Answer with an error, and end the connection once the client has had time to see it."""
+        if self._is_last:
+            return
+        self._is_last = True
+        self._unset_keepalive_if_required()
+        if self.cycle is not None and not self.cycle.response_complete:
+            if self.cycle.response_started:
+                self.transport.abort()
+                return
+            # What the application would still say goes nowhere.
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        self.logger.info("%s is refused: %d %s", self.client, refusal.status, refusal.code)
+        self.transport.write(_answer(refusal, self.server_state.default_headers))
+        self._hang_up()
+
+    def _hang_up(self) -> None:
+        """Say nothing more, and hear nothing, until the client hangs up too or has had long enough."""
+        self._due_s = self.loop.time() + _LINGER_S
+        if self._seat is not None:
+            self._seat.rest()
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+        else:
+            self.transport.close()
+
+
+def _answer(refusal: Refusal, default_headers: list[tuple[bytes, bytes]]) -> bytes:
+    """A whole response."""
+    response = problem(refusal.status, refusal.code, refusal.detail)
+    response.headers["Connection"] = "close"
+    if refusal.status == 503:
+        response.headers["Retry-After"] = str(_RETRY_AFTER_S)
+    lines = [name + b": " + value for name, value in [*default_headers, *response.raw_headers]]
+    return b"\r\n".join([STATUS_LINE[refusal.status].rstrip(), *lines, b"", bytes(response.body)])

@@ -1,0 +1,51 @@
+"""The page's files: tags by content, and methods that are told truly."""
+
+import hashlib
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import anyio.to_thread
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.staticfiles import NotModifiedResponse, StaticFiles
+from starlette.types import Scope
+
+_ALLOW = {"Allow": "GET, HEAD, OPTIONS"}
+
+
+class PageFiles(StaticFiles):
+    """Starlette tags a file by its size and time of change, which two builds of one image may share while the bytes
+    differ; and it does not say which methods there are."""
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        if scope["method"] in {"GET", "HEAD"}:
+            return await super().get_response(path, scope)
+        _, found = await anyio.to_thread.run_sync(self.lookup_path, path)
+        if found is None:
+            raise HTTPException(status_code=404)
+        if scope["method"] == "OPTIONS":
+            return Response(status_code=204, headers=_ALLOW)
+        raise HTTPException(status_code=405, headers=_ALLOW)
+
+    def file_response(
+        self, full_path: Any, stat_result: os.stat_result, scope: Scope, status_code: int = 200
+    ) -> Response:
+        response = super().file_response(full_path, stat_result, _unconditional(scope), status_code)
+        response.headers["ETag"] = _tag(Path(full_path), stat_result.st_mtime_ns, stat_result.st_size)
+        had = Headers(scope=scope).get("if-none-match", "")
+        if response.headers["ETag"] in {tag.strip().removeprefix("W/") for tag in had.split(",")}:
+            return NotModifiedResponse(response.headers)
+        return response
+
+
+def _unconditional(scope: Scope) -> Scope:
+    conditions = {b"if-none-match", b"if-modified-since"}
+    return {**scope, "headers": [each for each in scope["headers"] if each[0].lower() not in conditions]}
+
+
+@lru_cache(maxsize=1024)
+def _tag(path: Path, mtime_ns: int, size: int) -> str:  # noqa: ARG001  a file that was changed is read again
+    return f'"{hashlib.sha256(path.read_bytes()).hexdigest()[:32]}"'

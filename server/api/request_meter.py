@@ -1,0 +1,120 @@
+"""The size of a request, counted before anything parses it. No I/O: bytes in, a verdict out."""
+
+from dataclasses import dataclass
+
+from server.api.connection_limits import ConnectionLimits
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a request gets an error for an answer, and its connection ends."""
+
+    status: int
+    code: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What to do with bytes that came."""
+
+    part: bytes
+    """For the parser: of this request's head, or of its body."""
+    rest: bytes = b""
+    """What is behind the end of the head, or of the body where its length is known."""
+
+
+class RequestMeter:
+    """Measures one request after the other on a connection: its head line by line, then its body.
+
+    Every byte is looked at once, whatever pieces it comes in.
+    """
+
+    def __init__(self, limits: ConnectionLimits) -> None:
+        self._limits = limits
+        self.begin()
+
+    def begin(self) -> None:
+        """Measure the next request."""
+        self.has_head = False
+        """Whether the empty line behind the headers has come."""
+        self.is_fresh = True
+        """Whether no byte of this request has come."""
+        self._line_bytes = 0
+        self._line_begin = b""
+        self._headers = self._headers_bytes = 0
+        self._has_request_line = False
+        self._body_bytes = 0
+        self._body_length: int | None = None
+
+    def expect_body(self, length: int | None) -> Refusal | None:
+        """The body has so many bytes, or is chunked and ends where the parser says so (None)."""
+        self._body_length = length
+        return self._too_large() if length is not None and length > self._limits.max_body_bytes else None
+
+    @property
+    def has_body(self) -> bool:
+        """Whether a body of known length is complete."""
+        return self._body_bytes == self._body_length
+
+    def measure(self, data: bytes) -> Measured | Refusal:
+        self.is_fresh = self.is_fresh and not data
+        return self._measure_body(data) if self.has_head else self._measure_head(data)
+
+    def _measure_body(self, data: bytes) -> Measured | Refusal:
+        """Chunks are counted as they are sent, with their framing and trailers."""
+        if self._body_length is not None:
+            data, rest = data[: self._body_length - self._body_bytes], data[self._body_length - self._body_bytes :]
+        else:
+            rest = b""
+        self._body_bytes += len(data)
+        return self._too_large() if self._body_bytes > self._limits.max_body_bytes else Measured(data, rest)
+
+    def _measure_head(self, data: bytes) -> Measured | Refusal:
+        at = 0
+        while (newline := data.find(b"\n", at)) >= 0:
+            refusal = self._lengthen(data[at:newline])
+            if refusal is not None:
+                return refusal
+            at = newline + 1
+            if self._end_line():
+                self.has_head = True
+                return Measured(data[:at], data[at:])
+        return self._lengthen(data[at:]) or Measured(data)
+
+    def _lengthen(self, piece: bytes) -> Refusal | None:
+        """Count more of the current line."""
+        if not self._line_bytes:
+            self._line_begin = piece[:1]
+        self._line_bytes += len(piece)
+        limits = self._limits
+        if not self._has_request_line:
+            if self._headers_bytes + self._line_bytes > limits.max_request_line_bytes:
+                detail = f"a request line has at most {limits.max_request_line_bytes} bytes"
+                return Refusal(414, "request_line_too_long", detail)
+            return None
+        if self._line_bytes > limits.max_header_bytes:
+            return Refusal(431, "header_too_long", f"a header has at most {limits.max_header_bytes} bytes")
+        if self._headers_bytes + self._line_bytes > limits.max_headers_bytes:
+            return Refusal(431, "headers_too_long", f"headers have at most {limits.max_headers_bytes} bytes together")
+        if self._line_bytes and self._headers >= limits.max_headers and self._line_begin != b"\r":
+            return Refusal(431, "too_many_headers", f"a request has at most {limits.max_headers} headers")
+        return None
+
+    def _end_line(self) -> bool:
+        """Whether the head ends with this line. Empty lines before the request line are skipped (RFC 9112, 2.2), and
+        count as part of it."""
+        is_empty = not self._line_bytes or (self._line_bytes == 1 and self._line_begin == b"\r")
+        line_bytes, self._line_bytes = self._line_bytes + 1, 0
+        if self._has_request_line:
+            self._headers += 1
+            self._headers_bytes += line_bytes
+            return is_empty
+        if is_empty:
+            self._headers_bytes += line_bytes
+        else:
+            self._has_request_line, self._headers_bytes = True, 0
+        return False
+
+    def _too_large(self) -> Refusal:
+        return Refusal(413, "body_too_large", f"a body has at most {self._limits.max_body_bytes} bytes")

@@ -1,0 +1,136 @@
+"""The web server's process: its socket is bound before anything is loaded, it says where it serves once it does, and it
+ends within a stated time of being told to.
+
+uvicorn's own end closes streams without a word after 0.1 s, and answers requests that take longer 500.
+"""
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import NoReturn
+
+import uvicorn
+
+from server.errors import NafirError
+from server.runtime.drain import Drain
+
+_BACKLOG = 2048
+_CUT_OFF_CODE = 1
+_CLOSING_SHARE = 0.05
+"""Of the time to drain, for connections to close that nothing is in flight on."""
+_OWN_THREADS = "nafir-"
+
+_logger = logging.getLogger(__name__)
+
+
+def bind(host: str, port: int) -> list[socket.socket]:
+    """Listening sockets, one for each address that `host` stands for; `port` 0 is one that is free, of all of them.
+
+    Whoever connects waits until the server takes it. Raises NafirError where an address cannot be had.
+    """
+    try:
+        found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, UnicodeError) as exc:
+        raise NafirError(f"host: {host!r} is no address of this machine ({exc}): give another with --host") from exc
+    listeners: list[socket.socket] = []
+    for family, _, _, _, address in dict.fromkeys(found):
+        chosen = listeners[0].getsockname()[1] if listeners else port
+        try:
+            listeners.append(_listening(family, (address[0], chosen, *address[2:])))
+        except OSError as exc:
+            for listener in listeners:
+                listener.close()
+            raise NafirError(_refusal(host, chosen, exc)) from exc
+    return listeners
+
+
+def _listening(family: int, address: tuple[object, ...]) -> socket.socket:
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        listener.bind(address)
+        # Two servers may be bound to one port as long as neither listens.
+        listener.listen(_BACKLOG)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def _refusal(host: str, port: int, exc: OSError) -> str:
+    reason = exc.strerror or str(exc)
+    return f"port: cannot listen at {host}:{port} ({reason}): give another with --port, or 0 for one that is free"
+
+
+def url(listener: socket.socket, host: str) -> str:
+    """Where a listening socket is reached that was bound to `host`."""
+    shown = f"[{host}]" if ":" in host else host
+    return f"http://{shown}:{listener.getsockname()[1]}"
+
+
+class Server(uvicorn.Server):
+    """uvicorn, which drains before it ends: at once where nothing is in flight, and within `drain.drain_s` for certain.
+
+    The first SIGTERM or SIGINT has it drain and end with exit code 0; a second one ends the process at once.
+    `on_start` is called when it serves.
+    """
+
+    def __init__(self, config: uvicorn.Config, drain: Drain, *, on_start: Callable[[], None] = lambda: None) -> None:
+        super().__init__(config)
+        self._drain = drain
+        self._on_start = on_start
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._is_told = False
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        self._loop = asyncio.get_running_loop()
+        await super().startup(sockets)
+        if self.started:
+            self._on_start()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:  # noqa: ARG002  as uvicorn has it
+        """In a signal handler, of the main thread."""
+        if self._is_told:
+            _end_process(128 + sig, f"{signal.Signals(sig).name} again: ended at once")
+        self._is_told = self.should_exit = True
+        end = threading.Timer(self._drain.drain_s, _cut_off, [self._drain.drain_s])
+        end.daemon = True
+        end.start()
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._drain.begin)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        _logger.info("draining: no new streams and requests, at most %g s left", self._drain.drain_s)
+        await self._drain.settle()
+        self.config.timeout_graceful_shutdown = self._drain.drain_s * _CLOSING_SHARE  # type: ignore[assignment]
+        await super().shutdown(sockets)
+
+
+def serve(
+    config: uvicorn.Config, listeners: Sequence[socket.socket], drain: Drain, on_start: Callable[[], None]
+) -> None:
+    """Serve until told to stop. Where a thread of the server's own cannot be stopped, as in the midst of compiling, the
+    process ends here, with exit code 0."""
+    Server(config, drain, on_start=on_start).run(sockets=list(listeners))
+    if any(thread.name.startswith(_OWN_THREADS) for thread in threading.enumerate()):
+        _end_process(0)
+
+
+def _cut_off(drain_s: float) -> NoReturn:
+    _end_process(_CUT_OFF_CODE, f"not everything had ended {drain_s:g} s after the server was told to stop: cut off")
+
+
+def _end_process(code: int, message: str = "") -> NoReturn:
+    """Without waiting for any thread."""
+    if message:
+        os.write(sys.stderr.fileno(), f"nafir: {message}\n".encode())
+    sys.stdout.flush()
+    os._exit(code)

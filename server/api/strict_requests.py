@@ -1,0 +1,121 @@
+"""What is true of every route alike, from what each declares: which methods it answers, and which query parameters it
+has.
+
+`HEAD` is `GET` without the body wherever there is `GET`. `OPTIONS` and the answer to a method that there is not say in
+`Allow` what there is. A parameter that a route does not have, or has once and gets twice, is refused and not ignored.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, get_args, get_origin
+from urllib.parse import parse_qsl
+
+from fastapi.routing import iter_route_contexts
+from starlette.responses import Response
+from starlette.routing import BaseRoute, Mount
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from server.core.near_names import suggestion
+from server.problems import problem
+
+
+@dataclass(frozen=True)
+class DeclaredRoute:
+    """`parameters` are those of the query, by name whether each may be repeated. A route without `methods` is a
+    WebSocket's."""
+
+    path: re.Pattern[str]
+    methods: frozenset[str]
+    parameters: dict[str, bool]
+
+
+def declared_routes(routes: Sequence[BaseRoute]) -> Iterator[DeclaredRoute]:
+    """Those with a path of their own: not what is mounted, which answers for itself."""
+    for context in iter_route_contexts(routes):
+        if isinstance(context.original_route, Mount):
+            continue
+        dependant = getattr(context, "dependant", None) if context.methods else None
+        fields = [] if dependant is None else dependant.query_params
+        parameters = {field.alias: _is_list(field.field_info.annotation) for field in fields}
+        yield DeclaredRoute(context.path_regex, frozenset(context.methods or ()), parameters)
+
+
+def _is_list(annotation: Any) -> bool:
+    return get_origin(annotation) is list or any(get_origin(each) is list for each in get_args(annotation))
+
+
+class StrictRequests:
+    """ASGI middleware over the application that has `routes`, which may still be added to until the first request."""
+
+    def __init__(self, app: ASGIApp, *, routes: Sequence[BaseRoute]) -> None:
+        self._app = app
+        self._routes = routes
+
+    @cached_property
+    def _declared(self) -> tuple[DeclaredRoute, ...]:
+        return tuple(declared_routes(self._routes))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        path = scope["path"].removeprefix(scope.get("root_path", ""))
+        found = [route for route in self._declared if route.path.match(path)]
+        if not found:
+            await self._app(scope, receive, send)
+            return
+        refusal = _refusal(scope, found)
+        if refusal is not None:
+            await refusal(scope, receive, send)
+        elif scope["method"] == "HEAD":
+            await self._app({**scope, "method": "GET"}, receive, _without_body(send))
+        else:
+            await self._app(scope, receive, send)
+
+
+def _refusal(scope: Scope, found: Sequence[DeclaredRoute]) -> Response | None:
+    """What is answered in place of the route, if anything."""
+    methods = set().union(*(route.methods for route in found))
+    if not methods:
+        refused = problem(426, "upgrade_required", "this is a WebSocket: connect with ws:// or wss://")
+        refused.headers["Upgrade"] = "websocket"
+        return refused
+    methods |= {"OPTIONS"} | ({"HEAD"} if "GET" in methods else set())
+    allow, method = {"Allow": ", ".join(sorted(methods))}, scope["method"]
+    if method == "OPTIONS":
+        return Response(status_code=204, headers=allow)
+    if method not in methods:
+        refused = problem(405, "method_not_allowed", f"{method} is none of {allow['Allow']}")
+        refused.headers.update(allow)
+        return refused
+    known: dict[str, bool] = {}
+    for route in found:
+        known |= route.parameters
+    return _refused_query(scope["query_string"].decode("latin-1"), known)
+
+
+def _refused_query(query: str, known: dict[str, bool]) -> Response | None:
+    given = Counter(name for name, _ in parse_qsl(query, keep_blank_values=True))
+    for name, times in given.items():
+        if name not in known:
+            detail = f"there is no parameter {name[:80]!r}{suggestion(name, known)}"
+            return problem(422, "unknown_parameter", detail, name[:80])
+        if times > 1 and not known[name]:
+            return problem(422, "doubled_parameter", f"{name} is given {times} times: give it once", name)
+    return None
+
+
+def _without_body(send: Send) -> Send:
+    """A response's start as it is, Content-Length included, and nothing after it."""
+
+    async def pass_on(message: Message) -> None:
+        if message["type"] == "http.response.body":
+            if message.get("more_body", False):
+                return
+            message = {"type": "http.response.body", "body": b"", "more_body": False}
+        await send(message)
+
+    return pass_on

@@ -1,0 +1,58 @@
+"""The machine that a bench ran on: figures say nothing without it."""
+
+import os
+import platform
+import re
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+from numba.core import config
+
+_INSTRUCTION_SETS = {
+    "avx512f": "AVX-512",
+    "avx2": "AVX2",
+    "avx": "AVX",
+    "sse4.2": "SSE4.2",
+    "sve": "SVE",
+    "neon": "NEON",
+}
+"""By the feature of LLVM's that means them, the widest of each family first."""
+
+
+def describe_machine() -> dict[str, Any]:
+    """What to tell with every figure; a load beyond a few tenths spoils them."""
+    return {
+        "processor": processor(),
+        "instruction_set": instruction_set(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "python": platform.python_version(),
+        **{name: _version(name) for name in ("numpy", "scipy", "numba", "pedalboard")},
+    }
+
+
+def processor() -> str:
+    """As it names itself."""
+    cpuinfo = Path("/proc/cpuinfo")
+    names = re.findall(r"^model name\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def instruction_set(features: str | None = None) -> str:
+    """The widest that compiled code uses, of LLVM's `features` ("+avx2,-avx512f,..."): by default the processor's, or
+    NUMBA_CPU_FEATURES where that is set."""
+    if features is None:
+        features = config.CPU_FEATURES
+    if features is None:
+        features = llvmlite.binding.get_host_cpu_features().flatten()
+    usable = {feature[1:] for feature in features.split(",") if feature.startswith("+")}
+    return next((name for feature, name in _INSTRUCTION_SETS.items() if feature in usable), platform.machine())
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,51 @@
+"""Files that a command is given, looked at before its work and not after it."""
+
+import importlib.util
+import os
+from pathlib import Path
+
+from server.errors import NafirError
+
+
+def require_readable(path: Path, option: str) -> None:
+    """Raises NafirError, naming `option`, for what is no file or may not be read."""
+    if not path.exists():
+        raise NafirError(f"{option}: {path}: there is no such file")
+    if path.is_dir():
+        raise NafirError(f"{option}: {path} is a folder, and a file is needed")
+    if not os.access(path, os.R_OK):
+        raise NafirError(f"{option}: {path} may not be read by this user")
+
+
+def require_writable(path: Path, option: str) -> None:
+    """Raises NafirError, naming `option`, where a file cannot be written to `path`. Makes and changes nothing."""
+    if path.is_dir():
+        raise NafirError(f"{option}: {path} is a folder: name a file in it")
+    _require_folder(path.parent, option)
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise NafirError(f"{option}: {path} may not be written by this user")
+
+
+def require_figure(path: Path, option: str) -> None:
+    """As `require_writable`, of a picture that matplotlib will draw. Raises NafirError, too, where that is not
+    installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise NafirError(f"{option}: needs matplotlib; pip install matplotlib, or leave {option} out")
+    require_writable(path, option)
+
+
+def require_writable_folder(path: Path, option: str) -> None:
+    """Raises NafirError, naming `option`, where `path` is no folder that can be written to, and cannot become one: it
+    and the folders it lies in may not exist yet. Makes and changes nothing."""
+    existing = next(each for each in (path, *path.absolute().parents) if each.exists())
+    if not existing.is_dir():
+        raise NafirError(f"{option}: {existing} is a file, and a folder is needed")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise NafirError(f"{option}: nothing may be written to {existing} by this user")
+
+
+def _require_folder(folder: Path, option: str) -> None:
+    if not folder.exists():
+        raise NafirError(f"{option}: there is no folder {folder}: make it first")
+    if not folder.is_dir():
+        raise NafirError(f"{option}: {folder} is no folder")

@@ -1,0 +1,48 @@
+"""How a number is written where people and programs write text: URLs, options, CSV, lists of points, the environment.
+
+Python's `float` and `int` take much more than people mean by a number: `0_1` is 1, Arabic digits count, `nan` and
+`infinity` are numbers. Here a number is ASCII digits with a sign, a point and an exponent, nothing else, and it is
+finite however it is written. Blanks around it are allowed.
+"""
+
+import math
+import re
+from typing import Final
+
+DECIMAL: Final = (
+    r"[+-]?([0-9]{1,40}(\.[0-9]{0,40})?|\.[0-9]{1,40})([eE](-[0-9]{1,3}|\+?([0-9]{1,2}|1[0-9]{2}|2[0-5][0-9])))?"
+)
+"""As a regular expression of JSON Schema, of what is finite in double precision however many of its forty digits there
+are: 10^260 and more have a place in no scene, and `parse_decimal` takes them all the same."""
+INTEGER: Final = r"[+-]?[0-9]{1,40}"
+
+_DECIMAL: Final = re.compile(r"[+-]?([0-9]{1,40}(\.[0-9]{0,40})?|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?")
+_INTEGER: Final = re.compile(INTEGER)
+_NOT_FINITE: Final = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE | re.ASCII)
+_UNBOUNDED: Final = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+def parse_decimal(text: str) -> float:
+    """A finite number. Raises ValueError with a reason that quotes the text."""
+    number = text.strip(" ")
+    if _DECIMAL.fullmatch(number) is None or math.isinf(float(number)):
+        raise ValueError(f"{_quoted(text)} is {_fault(number)}")
+    return float(number)
+
+
+def parse_integer(text: str) -> int:
+    """Raises ValueError with a reason that quotes the text."""
+    number = text.strip(" ")
+    if _INTEGER.fullmatch(number) is None:
+        raise ValueError(f"{_quoted(text)} is not a whole number")
+    return int(number)
+
+
+def _fault(number: str) -> str:
+    if _NOT_FINITE.fullmatch(number):
+        return "not finite"
+    return "too long or too large" if _UNBOUNDED.fullmatch(number) else "not a number"
+
+
+def _quoted(text: str) -> str:
+    return repr(text if len(text) <= 80 else f"{text[:80]}...")

@@ -1,0 +1,79 @@
+"""The orderly end of a server that was told to stop: it takes nothing new, tells its streams, finishes what is in
+flight, and has ended within a stated time.
+
+A `Drain` belongs to the event loop. Seconds are counted from its beginning.
+"""
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator
+
+_FOR_REQUESTS = 0.7
+"""Share of the time after which requests that are not answered yet are answered 503."""
+_FOR_ANSWERS = 0.85
+"""And after which nobody waits any longer for those answers to be read."""
+
+
+class Drain:
+    """Ends within `drain_s` of its beginning."""
+
+    def __init__(self, drain_s: float, *, time_s: Callable[[], float] = time.monotonic) -> None:
+        self.drain_s = drain_s
+        self._time_s = time_s
+        self._began_s: float | None = None
+        self._has_begun = asyncio.Event()
+        self._is_out_of_time = asyncio.Event()
+        self._in_flight = 0
+        self._is_idle = asyncio.Event()
+        self._is_idle.set()
+
+    @property
+    def has_begun(self) -> bool:
+        return self._has_begun.is_set()
+
+    @property
+    def retry_after_s(self) -> int:
+        """In how many whole seconds a server that takes this one's place can be expected at the earliest."""
+        passed_s = 0.0 if self._began_s is None else self._time_s() - self._began_s
+        return max(1, math.ceil(self.drain_s - passed_s))
+
+    def begin(self) -> None:
+        """From now on nothing new is taken. A second call changes nothing."""
+        if self._began_s is None:
+            self._began_s = self._time_s()
+            self._has_begun.set()
+
+    async def begun(self) -> None:
+        """Return once it has begun."""
+        await self._has_begun.wait()
+
+    async def out_of_time(self) -> None:
+        """Return once requests have had all the time that there is for them."""
+        await self._is_out_of_time.wait()
+
+    @contextlib.contextmanager
+    def in_flight(self) -> Iterator[None]:
+        """A request, or a stream, which the drain waits for."""
+        self._in_flight += 1
+        self._is_idle.clear()
+        try:
+            yield
+        finally:
+            self._in_flight -= 1
+            if not self._in_flight:
+                self._is_idle.set()
+
+    async def settle(self) -> None:
+        """Begin, and return as soon as nothing is in flight any more, or when there is no time left to wait."""
+        self.begin()
+        await self._wait_until_idle(_FOR_REQUESTS)
+        self._is_out_of_time.set()
+        await self._wait_until_idle(_FOR_ANSWERS)
+
+    async def _wait_until_idle(self, share: float) -> None:
+        assert self._began_s is not None
+        left_s = self._began_s + share * self.drain_s - self._time_s()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._is_idle.wait(), max(0.0, left_s))

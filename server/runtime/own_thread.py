@@ -1,0 +1,35 @@
+"""Long work on a thread of its own, which keeps no process from ending."""
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+async def run_in_own_thread(work: Callable[[], T], name: str) -> T:
+    """What `work` returns or raises. Cancelled, nobody waits for it any longer, and it goes on."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[T] = loop.create_future()
+
+    def settle(result: T | None, failure: BaseException | None) -> None:
+        if future.done():
+            return
+        if failure is None:
+            future.set_result(result)  # type: ignore[arg-type]
+        else:
+            future.set_exception(failure)
+
+    def run() -> None:
+        result, failure = None, None
+        try:
+            result = work()
+        except BaseException as exc:  # noqa: BLE001  whoever waits for the result has it raised
+            failure = exc if isinstance(exc, Exception) else RuntimeError(f"thread {name} was ended: {exc!r}")
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+            loop.call_soon_threadsafe(settle, result, failure)
+
+    threading.Thread(target=run, name=name, daemon=True).start()
+    return await future

@@ -1,0 +1,100 @@
+"""A server in a process of its own to attack, and the bystander beside it (`bystander.py` says how to use both)."""
+
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from server.scene.bundle import bundled_scenes
+
+_READY_S = 300.0
+"""The first time ever, everything is compiled."""
+_EXIT_S = 20.0
+
+
+def _load(name: str):
+    """Modules beside this one: with importlib's import mode the folder is not on the path."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+bystander = sys.modules.get("bystander") or _load("bystander")
+
+
+@contextmanager
+def _serving(**environment: str) -> Iterator[tuple[str, int]]:
+    """HOST:PORT and process id of `nafir serve` with NAFIR_ settings in its environment, once it is ready."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-c", "from server.cli import main; main()", "serve", "--port", str(port)]
+    with subprocess.Popen(command, env={**os.environ, **environment}, stdout=subprocess.DEVNULL) as process:
+        try:
+            _wait_until_ready(process, port)
+            yield f"127.0.0.1:{port}", process.pid
+        finally:
+            process.terminate()
+            try:
+                process.wait(_EXIT_S)
+            finally:
+                process.kill()
+
+
+def _wait_until_ready(process: subprocess.Popen, port: int) -> None:
+    until_s = time.monotonic() + _READY_S
+    while time.monotonic() < until_s:
+        assert process.poll() is None, "the server ended before it was ready"
+        try:
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=5).close()
+        except urllib.error.HTTPError as answer:
+            answer.close()
+        except OSError:
+            pass
+        else:
+            return
+        time.sleep(0.1)
+    raise AssertionError("the server never became ready")
+
+
+@pytest.fixture(scope="module")
+def attacked(request) -> Iterator[tuple[str, int]]:
+    """HOST:PORT and process id of a server with the module's ENVIRONMENT, where it has one."""
+    if not any(folder.name == bystander.SCENE for folder in bundled_scenes()):
+        pytest.skip(f"the {bystander.SCENE} is not bundled")
+    with _serving(**getattr(request.module, "ENVIRONMENT", {})) as server:
+        yield server
+
+
+@pytest.fixture
+def address(attacked) -> str:
+    return attacked[0]
+
+
+@pytest.fixture
+def server_pid(attacked) -> int:
+    return attacked[1]
+
+
+@pytest.fixture
+def endures(address, server_pid) -> Callable[[Callable[[], object]], object]:
+    """Runs an attack beside the bystander, fails where that was harmed, and returns what the attack did."""
+
+    def run(attack: Callable[[], object]) -> object:
+        result, harm = bystander.beside_bystander(address, server_pid, attack)
+        if not harm.is_none and harm.is_inconclusive:
+            result, harm = bystander.beside_bystander(address, server_pid, attack)
+        assert harm.is_none, f"{harm.late_beyond_rest:.2%} late beyond rest: {harm}"
+        return result
+
+    return run

@@ -1,0 +1,53 @@
+"""Clients that come, listen for a few blocks, and leave, some without a goodbye."""
+
+import asyncio
+import json
+import struct
+from itertools import count
+
+from websockets.asyncio.client import connect
+
+from server.blocks import AudioBlock
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+
+HELLO = Hello(protocol=PROTOCOL, scene="flat", buffer_blocks=2).serialize()
+_SEQUENCE = struct.Struct("<I")
+_SEQUENCE_AT = 4
+
+
+async def visit(address: str, *, blocks: int, emitters: int, is_aborted: bool = False) -> None:
+    """Hear so many blocks of so many emitters, walking; and leave with a goodbye, or drop the connection."""
+    async with connect(f"ws://{address}/v1/stream", compression=None, max_queue=None) as socket:
+        await socket.send(HELLO)
+        welcome = json.loads(await socket.recv())
+        assert welcome["type"] == "welcome", welcome
+        for number in range(emitters):
+            place = (6.0, 3.0 - 0.3 * number, 1.5)
+            await socket.send(AddEmitter(id=str(number), clip="woman-reading", position=place).serialize())
+        heard = 0
+        while heard < blocks:
+            message = await socket.recv()
+            if isinstance(message, str):
+                assert json.loads(message)["type"] != "error", message
+                continue
+            assert message[0] == AudioBlock.KIND
+            heard += 1
+            (sequence,) = _SEQUENCE.unpack_from(message, _SEQUENCE_AT)
+            await socket.send(Acknowledge(sequence=sequence).serialize())
+            pose = ListenerPose(pose_id=heard, position=(2.0 + 0.1 * (heard % 20), 2.5, 1.5))
+            await socket.send(pose.serialize_binary())
+        if is_aborted:
+            socket.transport.abort()
+
+
+async def churn(address: str, visits: int, *, at_once: int, blocks: int, emitters: int) -> None:
+    """So many visits, `at_once` at a time; every third is aborted."""
+    numbers = count()
+
+    async def visitor() -> None:
+        while (number := next(numbers)) < visits:
+            await visit(address, blocks=blocks, emitters=emitters, is_aborted=number % 3 == 2)
+
+    async with asyncio.TaskGroup() as group:
+        for _ in range(at_once):
+            group.create_task(visitor())

@@ -1,0 +1,176 @@
+"""How much a scene file asks for, told from its numbers alone: what nobody can wait for, or keep, is refused before
+anything is allocated."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.scene_file import SceneFile, SceneFileError
+
+MOST_PROBES = 2_000
+"""Each is heard from every other: four million pairs."""
+MOST_CELLS = 100_000
+"""Of the grid around the floor plan, most of which may lie outside of it."""
+MOST_DATASET_GB = 200.0
+MOST_MEMORY_GB = 8.0
+"""Of one emitter under way; there are as many at a time as workers."""
+MOST_CORE_MINUTES = 14 * 24 * 60.0
+MOST_WALL_SEQUENCES = 3_000_000
+"""Of walls that might mirror a path one after the other; each is tried for every emitter."""
+
+# Of a core of 2.5 GHz, measured; good to a factor of three, which is all that a refusal needs.
+_HIT_S, _WALL_S, _RECEIVER_S = 60e-9, 3e-9, 5e-9
+_SEQUENCE_S = 40e-9
+_SAMPLE_S, _HEADING_S = 12e-9, 2.5e-9
+# Beyond this, or this much absorption, numbers are likely in another unit.
+_LARGE_M = 100.0
+_LONG_S = 20.0
+
+
+@dataclass(frozen=True)
+class SimulationSize:
+    """Of everything that the scene file allows; a plan mostly gets along with less."""
+
+    scene: SceneFile
+
+    @cached_property
+    def probes(self) -> int:
+        """About."""
+        across = self.scene.geometry.floor_plan
+        box_m2 = math.prod(self.scene.plan_extent_m)
+        return max(3, round(self.scene.grid_cells * across.area_m2 / box_m2) + len(self.scene.geometry.openings))
+
+    @property
+    def pairs(self) -> int:
+        return self.probes * (self.probes - 1)
+
+    @property
+    def samples(self) -> int:
+        return self.scene.simulation.samples
+
+    @property
+    def _histogram(self) -> int:
+        """Energies of one pair."""
+        settings = self.scene.simulation
+        return settings.arrival_directions * len(OCTAVE_BANDS_HZ) * settings.histogram_bins
+
+    @property
+    def dataset_gb(self) -> float:
+        settings = self.scene.simulation
+        response = 2 * settings.yaws * self.samples * (1 + settings.held_out_share)
+        return 2 * self.pairs * (response + self._histogram) / 1e9
+
+    @property
+    def memory_gb(self) -> float:
+        """Of one emitter: energies twice in single precision, responses in half, and the synthesis of one response."""
+        settings = self.scene.simulation
+        ears = 2 * settings.yaws * self.samples
+        of_pair = 10 * self._histogram + 2 * ears
+        synthesis = 32 * settings.arrival_directions * self.samples + 24 * ears
+        return (self.probes * of_pair + synthesis + 24 * settings.rays) / 1e9
+
+    def sequences_of(self, order: int) -> float:
+        """Of up to so many walls that might mirror a path one after the other; an image is in front of half of them."""
+        walls = len(self.scene.geometry.corners)
+        return float(sum(walls * ((walls - 1) / 2) ** (reflections - 1) for reflections in range(1, order + 1)))
+
+    @property
+    def wall_sequences(self) -> float:
+        """Of all images of an emitter."""
+        return self.sequences_of(self.scene.simulation.image_order)
+
+    @property
+    def core_minutes(self) -> float:
+        return self.probes * (self.tracing_s + self.images_s + (self.probes - 1) * self.synthesis_s) / 60
+
+    @property
+    def tracing_s(self) -> float:
+        """Of one emitter."""
+        settings, geometry = self.scene.simulation, self.scene.geometry
+        hits = settings.rays * settings.duration_s * SPEED_OF_SOUND / self.mean_free_path_m
+        return hits * (_HIT_S + _WALL_S * len(geometry.corners) + _RECEIVER_S * self.probes)
+
+    @property
+    def images_s(self) -> float:
+        """Of one emitter."""
+        return self.wall_sequences * self.probes * _SEQUENCE_S * (self.scene.simulation.image_order > GEOMETRIC_ORDER)
+
+    @property
+    def synthesis_s(self) -> float:
+        """Of one pair."""
+        settings = self.scene.simulation
+        return settings.arrival_directions * self.samples * (_SAMPLE_S + _HEADING_S * settings.yaws)
+
+    @property
+    def mean_free_path_m(self) -> float:
+        """Four times volume over surface."""
+        plan = self.scene.geometry.floor_plan
+        around_m = sum(math.dist(*wall) for wall in plan.walls.tolist())
+        return 4 * plan.area_m2 * plan.height_m / (2 * plan.area_m2 + around_m * plan.height_m)
+
+    @property
+    def extent(self) -> str:
+        """In words, without time."""
+        return (
+            f"about {self.probes:,} probes, {self.pairs:,} pairs, {_rounded(self.dataset_gb)} GB of data and "
+            f"{_rounded(self.memory_gb)} GB of memory per worker"
+        )
+
+    def __str__(self) -> str:
+        minutes = self.core_minutes
+        takes = f"{_rounded(minutes)} minutes" if minutes < 24 * 60 else f"{minutes / (24 * 60):,.0f} days"
+        return f"{self.extent}, and up to {takes} of one core"
+
+    def require_reasonable(self) -> None:
+        """Raises SceneFileError for what is too much, with what would make it less."""
+        checks = (
+            (self.scene.grid_cells > MOST_CELLS, f"at most {MOST_CELLS:,} cells of a grid", "probes.spacing_m"),
+            (self.probes > MOST_PROBES, f"at most {MOST_PROBES:,} probes", "probes.spacing_m"),
+            (
+                self.wall_sequences > MOST_WALL_SEQUENCES,
+                f"{len(self.scene.geometry.corners)} walls in {self.wall_sequences:,.1g} orders",
+                "simulation.image_order",
+            ),
+            (self.memory_gb > MOST_MEMORY_GB, f"at most {MOST_MEMORY_GB:g} GB of memory", self._largest),
+            (self.dataset_gb > MOST_DATASET_GB, f"at most {MOST_DATASET_GB:g} GB of data", self._largest),
+            (self.core_minutes > MOST_CORE_MINUTES, "at most two weeks of one core", self._longest),
+        )
+        for is_too_much, limit, field in checks:
+            if is_too_much:
+                raise SceneFileError(f"{self.scene.id}: {field}: {limit}, and this is {self}{self._hint}")
+
+    @property
+    def _largest(self) -> str:
+        """The field that most of the data, or memory, is owed to."""
+        settings = self.scene.simulation
+        asked = {
+            "probes.spacing_m": self.probes / 100,
+            "simulation.yaws": settings.yaws / 12,
+            "simulation.arrival_directions": settings.arrival_directions / 24,
+            "simulation.duration_s": settings.duration_s,
+        }
+        return max(asked, key=lambda name: asked[name])
+
+    @property
+    def _longest(self) -> str:
+        """The field that most of the time is owed to."""
+        parts = {"simulation.rays": self.tracing_s, "simulation.image_order": self.images_s}
+        longest = max(parts, key=lambda name: parts[name])
+        return longest if parts[longest] > self.probes * self.synthesis_s else self._largest
+
+    @property
+    def _hint(self) -> str:
+        size_m = max(*self.scene.plan_extent_m, self.scene.geometry.height_m)
+        hints = []
+        if size_m > _LARGE_M:
+            hints.append(f"a room of {size_m:,.6g} m may be in centimetres")
+        if self.scene.simulation.duration_s > _LONG_S:
+            hints.append("duration_s is in seconds, not milliseconds")
+        return "".join(f"; {hint}" for hint in hints)
+
+
+def _rounded(value: float) -> str:
+    """To two digits, and no finer than hundredths."""
+    return f"{max(value, 0.01):.2g}" if value < 10 else f"{value:,.0f}"
