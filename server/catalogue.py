@@ -5,25 +5,31 @@ import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from server.assets.names import named_by_stem
 from server.clips import Clip, ClipLibrary, DecodeError
+from server.errors import BundleError
 from server.field.levels import Levels
 from server.hrtfs import HrtfLibrary
 from server.replies import Place, SceneDescription
-from server.scene.bundle import Bundle, bundled_scenes
+from server.scene.bundle import MANIFEST_FILE, Bundle, bundled_scenes
 
 _logger = logging.getLogger(__name__)
 
 
 def load_scenes(bundles: Iterable[Path]) -> dict[str, Levels]:
-    """Quality levels by scene id: the bundled scenes, and `bundles`, which win where an id is taken.
+    """Quality levels by scene id: the bundled scenes, and `bundles`, which win where one of those has the id.
 
-    Raises BundleError for the first bundle that is damaged.
+    Raises BundleError for the first bundle that is damaged, or has the id of another of `bundles`.
     """
-    scenes = {}
-    for folder in (*bundled_scenes(), *bundles):
+    shipped = [Bundle.load(folder) for folder in bundled_scenes()]
+    own: dict[str, Bundle] = {}
+    for folder in bundles:
         bundle = Bundle.load(folder)
-        scenes[bundle.id] = Levels.load(bundle)
-    return scenes
+        other = own.setdefault(bundle.id, bundle)
+        if other.folder.resolve() != folder.resolve():
+            problem = f"is {bundle.id!r}, and so is that of {other.folder}; leave one out, or change one"
+            raise BundleError(folder / MANIFEST_FILE, "id", problem)
+    return {bundle.id: Levels.load(bundle) for bundle in ({each.id: each for each in shipped} | own).values()}
 
 
 def load_hrtfs(files: Iterable[Path], scenes: Mapping[str, Levels]) -> HrtfLibrary:
@@ -32,8 +38,11 @@ def load_hrtfs(files: Iterable[Path], scenes: Mapping[str, Levels]) -> HrtfLibra
 
 
 def open_clips(scenes: Mapping[str, Levels], files: Iterable[Path]) -> dict[str, ClipLibrary]:
-    """Clips by scene id; scenes of one sample rate share a library, and files are named by their stem."""
-    named = {path.stem: path for path in files}
+    """Clips by scene id; scenes of one sample rate share a library, and files are named by their stem.
+
+    Raises ValueError for two of one stem.
+    """
+    named = named_by_stem(files)
     rates = {scene: levels.default.sample_rate for scene, levels in scenes.items()}
     by_rate = {rate: ClipLibrary(rate, named) for rate in set(rates.values())}
     return {scene: by_rate[rate] for scene, rate in rates.items()}

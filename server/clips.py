@@ -4,22 +4,24 @@ A clip is decoded once, to mono at the rate of the scene, and checked there: at 
 what is no audio is refused as a whole.
 """
 
+import logging
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
-import soundfile
 import soxr
 
+from server.assets.audio_file import AudioFileError, read_audio, to_mono
 from server.errors import NafirError, RequestError
 from server.rendering.ingest import LOUDEST, DryAudio
 
 FloatArray = npt.NDArray[np.float32]
+
+_logger = logging.getLogger(__name__)
 
 _BUNDLED = Path(__file__).parent / "clips_data"
 
@@ -51,29 +53,30 @@ class Clip:
     credit: str
 
 
-def decode(path: Path, sample_rate: int) -> DryAudio:
+def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAudio:
     """Read an audio file (wav, flac, ogg, and whatever else libsndfile reads) as mono at `sample_rate`.
 
-    Channels are averaged. Raises DecodeError.
+    Channels are averaged, or `channel`, counted from 0, is taken; where they cancel each other, the louder one. The
+    log warns of that, and of headers that lie. Raises DecodeError.
     """
     try:
-        content = BytesIO(path.read_bytes())  # without a name, so that the content alone decides what it is
-        samples, file_rate = soundfile.read(content, dtype="float32", always_2d=True)
-    except OSError as exc:
-        raise DecodeError(path.name, exc.strerror or str(exc)) from exc
-    except soundfile.LibsndfileError as exc:
-        raise DecodeError(path.name, f"not an audio file that can be read ({exc.error_string.rstrip('.')})") from exc
-    if samples.shape[0] == 0:
-        raise DecodeError(path.name, "it holds no samples")
-    # Before averaging and resampling, which would spread one bad sample over many.
-    is_bad = ~np.isfinite(samples).all(axis=1)
-    if is_bad.any():
-        raise DecodeError(path.name, f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
-    if (peak := np.abs(samples).max()) > LOUDEST:
-        raise DecodeError(path.name, f"its peak of {peak:.3g} is not audio, where full scale is 1")
-    mono: FloatArray = samples.mean(axis=1, dtype=np.float32)
-    if file_rate != sample_rate:
-        mono = soxr.resample(mono, file_rate, sample_rate, quality="VHQ")
+        recording = read_audio(path)
+        samples = recording.samples
+        if samples.shape[0] == 0:
+            raise AudioFileError("it holds no samples")
+        # Before averaging and resampling, which would spread one bad sample over many.
+        is_bad = ~np.isfinite(samples).all(axis=1)
+        if is_bad.any():
+            raise AudioFileError(f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
+        if (peak := np.abs(samples).max()) > LOUDEST:
+            raise AudioFileError(f"its peak of {peak:.3g} is not audio, where full scale is 1")
+        mono, downmix = to_mono(samples, channel)
+    except AudioFileError as exc:
+        raise DecodeError(path.name, str(exc)) from exc
+    for finding in filter(None, (recording.finding, downmix)):
+        _logger.warning("warning: %s: %s", path, finding)
+    if recording.sample_rate != sample_rate:
+        mono = soxr.resample(mono, recording.sample_rate, sample_rate, quality="VHQ")
         if mono.size == 0:
             raise DecodeError(path.name, f"too short to be heard at {sample_rate} Hz")
     return DryAudio(mono)
@@ -91,6 +94,8 @@ class ClipLibrary:
             self._labels: dict[str, dict[str, str]] = tomllib.load(stream)
         self._paths = {name: _BUNDLED / f"{name}.ogg" for name in self._labels}
         for name, path in (files or {}).items():
+            if name in self._paths:
+                _logger.warning("warning: %s takes the place of the bundled clip %r", path, name)
             self._paths[name] = path
             self._labels[name] = {"title": name, "credit": ""}
         self._decoded: dict[str, DryAudio] = {}

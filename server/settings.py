@@ -5,10 +5,11 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Self, get_args
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from server.assets.names import named_by_stem
 from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
 
@@ -26,8 +27,15 @@ def _split_paths(value: Any) -> Any:
     return tuple(part for part in value.split(os.pathsep) if part) if isinstance(value, str) else value
 
 
+def _require_different_names(files: tuple[Path, ...]) -> tuple[Path, ...]:
+    named_by_stem(files)
+    return files
+
+
 Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_split_paths)]
 """In the environment, separated as in PATH."""
+NamedFiles = Annotated[Paths, AfterValidator(_require_different_names)]
+"""Files that are offered by their stems, no two alike."""
 
 
 class Settings(BaseSettings):
@@ -39,9 +47,9 @@ class Settings(BaseSettings):
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     bundles: Paths = ()
     """Scene bundles to serve beside those that come with the package."""
-    clips: Paths = ()
+    clips: NamedFiles = ()
     """Audio files to offer as clips, named by their stem, beside those that come with the package."""
-    hrtfs: Paths = ()
+    hrtfs: NamedFiles = ()
     """SOFA files (SimpleFreeFieldHRIR) to offer as heads, named by their stem, beside KEMAR."""
 
     audio_threads: Annotated[int, Field(ge=1)] = _usable_cores()

@@ -235,6 +235,15 @@ def test_a_damaged_bundle_ends_serve_with_one_line_and_code_2(nafir, bundle_copy
     check_error(nafir("serve", "--bundle", bundle_copy, "--port", 0), *words)
 
 
+def test_two_files_or_scenes_of_one_name_do_not_start_and_both_are_named(nafir, bundle, bundle_copy):
+    for option, suffix in (("--hrtf", "sofa"), ("--clip", "wav")):
+        first, second = f"a/voice.{suffix}", f"b/voice.{suffix}"
+        check_error(nafir("serve", option, first, option, second, "--port", 0), first, second, "rename one")
+    folders = bundle.folder, bundle_copy
+    told = nafir("serve", "--bundle", folders[0], "--bundle", folders[1], "--port", 0)
+    check_error(told, *map(str, folders), "flat", "id")
+
+
 def test_a_damaged_bundle_leaves_no_traceback(bundle_copy):
     damage_manifest(bundle_copy)
     done = subprocess.run(

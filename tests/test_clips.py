@@ -34,6 +34,30 @@ def test_channels_are_averaged(tmp_path):
     np.testing.assert_allclose(decode(tmp_path / "a.wav", SAMPLE_RATE).samples, samples.mean(axis=1), atol=1e-7)
 
 
+def test_channels_that_cancel_give_the_louder_one_and_a_warning(tmp_path, caplog):
+    samples = noise(2, 4_000)
+    soundfile.write(tmp_path / "a.wav", np.column_stack([-0.5 * samples, 0.5 * samples]), SAMPLE_RATE, subtype="FLOAT")
+    decoded = decode(tmp_path / "a.wav", SAMPLE_RATE).samples
+    assert np.abs(decoded).max() == pytest.approx(0.5 * np.abs(samples).max(), rel=1e-6)
+    assert "a.wav: its 2 channels cancel each other" in caplog.text
+    asked = decode(tmp_path / "a.wav", SAMPLE_RATE, channel=1).samples
+    np.testing.assert_allclose(asked, 0.5 * samples, atol=1e-7)
+    with pytest.raises(DecodeError, match=r"a\.wav: it has no channel 3, only 2"):
+        decode(tmp_path / "a.wav", SAMPLE_RATE, channel=2)
+
+
+@pytest.mark.parametrize("declared", [0, 1_000])
+def test_a_header_that_tells_of_less_than_there_is_does_not_cut_the_clip(tmp_path, caplog, declared):
+    samples = noise(7, 48_000)
+    soundfile.write(tmp_path / "a.wav", samples, SAMPLE_RATE, subtype="PCM_16")
+    content = bytearray((tmp_path / "a.wav").read_bytes())
+    at = content.index(b"data") + 4
+    content[at : at + 4] = declared.to_bytes(4, "little")
+    (tmp_path / "a.wav").write_bytes(content)
+    np.testing.assert_allclose(decode(tmp_path / "a.wav", SAMPLE_RATE).samples, samples, atol=2**-15)
+    assert "48000 samples (2 s) were read" in caplog.text
+
+
 @pytest.mark.parametrize("file_rate", [8_000, 16_000, 44_100, 48_000])
 def test_resampling_keeps_a_tone_where_it_was(tmp_path, file_rate):
     def tone(rate):
@@ -138,12 +162,13 @@ def test_a_description_says_how_long_it_plays(tmp_path):
     assert clip.duration_s == pytest.approx(2, abs=1e-4)
 
 
-def test_a_users_file_wins_over_a_bundled_clip_of_that_name(tmp_path):
+def test_a_users_file_wins_over_a_bundled_clip_of_that_name_and_says_so(tmp_path, caplog):
     soundfile.write(tmp_path / "a.wav", noise(6, 100), SAMPLE_RATE, subtype="FLOAT")
     library = ClipLibrary(SAMPLE_RATE, {"trumpet": tmp_path / "a.wav"})
     np.testing.assert_allclose(library.load("trumpet").samples, noise(6, 100), atol=1e-7)
     assert library.describe("trumpet").credit == ""
     assert library.names == ClipLibrary(SAMPLE_RATE).names
+    assert "a.wav takes the place of the bundled clip 'trumpet'" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["absent", "", "../clips", "trumpet.ogg"])

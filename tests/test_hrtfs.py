@@ -1,4 +1,5 @@
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -34,3 +35,17 @@ def test_a_file_that_is_no_head_is_named(tmp_path):
     broken.write_bytes(b"\x89HDF and then nothing")
     with pytest.raises(NafirError, match=r"broken\.sofa"):
         HrtfLibrary([broken], [24_000])
+
+
+def test_two_heads_of_one_name_are_both_named(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        shutil.copy(KEMAR, tmp_path / folder / "subject_003.sofa")
+    with pytest.raises(ValueError, match=r"a/subject_003\.sofa and .*b/subject_003\.sofa would both be called"):
+        HrtfLibrary([tmp_path / "a" / "subject_003.sofa", tmp_path / "b" / "subject_003.sofa"], [24_000])
+
+
+def test_a_head_that_is_given_twice_is_one(tmp_path, monkeypatch):
+    shutil.copy(KEMAR, tmp_path / "bust.sofa")
+    monkeypatch.chdir(tmp_path)
+    assert HrtfLibrary([Path("bust.sofa"), tmp_path / "bust.sofa"], [24_000]).names == ("bust", "kemar")

@@ -54,6 +54,18 @@ def test_impossible_settings_are_refused(monkeypatch, name, value):
         Settings()
 
 
+@pytest.mark.parametrize(("setting", "suffix"), [("clips", "wav"), ("hrtfs", "sofa")])
+def test_two_files_of_one_name_are_refused_and_both_named(monkeypatch, setting, suffix):
+    files = f"a/voice.{suffix}", f"b/voice.{suffix}"
+    both = rf"a/voice\.{suffix} and b/voice\.{suffix} would both be called 'voice'"
+    with pytest.raises(ValidationError, match=both):
+        Settings(**{setting: files})
+    monkeypatch.setenv(f"NAFIR_{setting.upper()}", os.pathsep.join(files))
+    with pytest.raises(ValidationError, match=both):
+        Settings()
+    assert len(getattr(Settings(**{setting: (files[0], files[0])}), setting)) == 2
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -50,7 +50,11 @@ def read(path: Path | None, sample_rate: int) -> np.ndarray:
         samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
     except soundfile.LibsndfileError as exc:
         raise SystemExit(f"{path}: {exc.error_string}") from exc
-    return soxr.resample(samples.mean(axis=1), rate, sample_rate)
+    mono = samples.mean(axis=1)
+    energy = np.sum(samples**2, axis=0)
+    if samples.shape[1] * np.sum(mono**2) < 0.4 * energy.mean():  # of opposite phase, channels would cancel each other
+        mono = samples[:, np.argmax(energy)]
+    return soxr.resample(mono, rate, sample_rate)
 
 
 def say(change: dict, sample_rate: int) -> None:

@@ -99,8 +99,7 @@ def _offsets(sofa: SofaFile, measurements: int) -> _Floats:
     # Some files leave the distance at zero.
     source = sofa.points("SourcePosition", measurements, default="spherical", unknown_radius_m=1.0)
     listener = sofa.points("ListenerPosition", measurements, fallback=[0.0, 0.0, 0.0], default="cartesian")
-    offsets: _Floats = np.einsum("mx,mxa->ma", source - listener, sofa.frames("Listener", measurements))
-    return offsets
+    return np.asarray(np.einsum("mx,mxa->ma", source - listener, sofa.frames("Listener", measurements)))
 
 
 def _farthest(directions: _Floats, distance: _Floats) -> npt.NDArray[np.int64]:

@@ -39,7 +39,7 @@ def read(
         try:
             listener = _position(_numbers(path / "rx_pos.txt", 3))
             *orientation, x, y, z = _numbers(path / "tx_pos.txt", 7)
-            response, rate = read_response(path / "rir.wav", channels=1)
+            response, rate = read_response(path / "rir.wav", channels=1, report=report)
         except UnreadableError as exc:
             report.skip(path.name, str(exc))
             continue

@@ -56,7 +56,7 @@ def read(
             report.skip(name, "a point that points.txt does not have")
             continue
         try:
-            response, rate = read_response(path, channels=2)
+            response, rate = read_response(path, channels=2, report=report)
         except UnreadableError as exc:
             report.skip(name, str(exc))
             continue
