@@ -13,6 +13,7 @@ from typing import get_args
 from fastapi import FastAPI
 
 from server.api.drain_gate import DrainGate
+from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
 from server.api.response_cache import ResponseCache
 from server.api.strict_requests import StrictRequests
@@ -119,6 +120,7 @@ def create_app(
     app.include_router(health)
     app.include_router(documents)
     app.include_router(api)
+    install_openapi(app)
     app.add_middleware(StrictRequests, routes=app.router.routes)
     app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
@@ -159,7 +161,6 @@ def _warm_up(host: StreamHost) -> None:
     """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render. And
     see how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
-    fingerprint()
     for scene, levels in host.scenes.items():
         host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
@@ -178,3 +179,4 @@ def _warm_up(host: StreamHost) -> None:
             if (request := session.take_request()) is not None:
                 session.accept(compute_irs(levels, request, session.renderer))
             session.render_block()
+    fingerprint()

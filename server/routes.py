@@ -7,18 +7,21 @@ from typing import Annotated, Any
 import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response, WebSocket
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
-from pydantic import FiniteFloat
+from pydantic import BeforeValidator, Field
 
 from server.api.response_cache import Compute, Kind
 from server.asyncapi import document
 from server.catalogue import describe_scene, playable_clips
 from server.core.entity_tags import content_tag
+from server.core.numerals import parse_decimal
 from server.errors import RequestError
 from server.field.levels import Levels
 from server.frontier import Frontier
 from server.hrtfs import DEFAULT_HRTF
 from server.impulse_response import (
+    IR_FORMATS,
     MEDIA_TYPES,
+    POSITION_PATTERN,
     ImpulseResponse,
     IrQuery,
     entity_tag,
@@ -26,7 +29,7 @@ from server.impulse_response import (
     parse_position,
 )
 from server.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
-from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
+from server.plan_query import EFFECT_PATTERN, OUTPUTS, PlanDocument, PlanQuery, parse_effects, rounded
 from server.runtime.pace import Checkpoint
 from server.runtime.racing import StoppedError, run_until
 from server.streaming import Connection, StreamHost
@@ -46,8 +49,25 @@ api = APIRouter(prefix="/v1")
 health = APIRouter()
 documents = APIRouter(include_in_schema=False)
 
+_PLACE: dict[str, Any] = {"pattern": POSITION_PATTERN}
+
+
+def _between(low: float, high: float) -> dict[str, Any]:
+    """Bounds, told in the schema too: behind `Decimal`'s parser pydantic does not."""
+    return {"ge": low, "le": high, "json_schema_extra": {"minimum": low, "maximum": high}}
+
+
+Decimal = Annotated[float, BeforeValidator(lambda value: parse_decimal(value) if isinstance(value, str) else value)]
 LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
-PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"])]
+PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"], json_schema_extra=_PLACE)]
+YawDeg = Annotated[
+    Decimal, Query(**_between(-36_000, 36_000), description="of the head, counter-clockwise, 0 looks along +x")
+]
+EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
+_IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
+_IR_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
+_MAP_TYPES = {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
+_MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 
 
 @health.get("/livez")
@@ -94,15 +114,15 @@ async def frontier(request: Request, scene: str) -> Frontier:
     return Frontier.of(levels, {} if offer is None else offer.ms_here)
 
 
-@api.get("/scenes/{scene}/impulse-response", response_class=Response)
+@api.get("/scenes/{scene}/impulse-response", response_class=Response, responses={200: _IR_TYPES})
 async def impulse_response(
     request: Request,
     scene: str,
     listener: PositionText,
     emitter: PositionText,
-    yaw_deg: Annotated[FiniteFloat, Query(description="of the head, counter-clockwise, 0 looks along +x")] = 0.0,
+    yaw_deg: YawDeg = 0.0,
     level: LevelText = None,
-    format: Annotated[str, Query(description="wav, npy or json")] = "wav",  # noqa: A002  the parameter's name
+    format: Annotated[str, Query(description="wav, npy or json", json_schema_extra={"enum": [*IR_FORMATS]})] = "wav",  # noqa: A002  the parameter's name
 ) -> Response:
     """The impulse response between two places, as `nafir ir` writes it."""
     field = _levels(request, scene).choose(level)
@@ -117,18 +137,21 @@ async def impulse_response(
     )
 
 
-@api.get("/scenes/{scene}/loudness", response_class=Response)
+@api.get("/scenes/{scene}/loudness", response_class=Response, responses={200: _MAP_TYPES})
 async def loudness(
     request: Request,
     scene: str,
     emitter: PositionText,
-    height_m: Annotated[FiniteFloat, Query(description="of the listener's ears")] = 1.5,
+    height_m: Annotated[Decimal, Query(**_between(-1_000, 1_000), description="of the listener's ears")] = 1.5,
     spacing_m: Annotated[
-        FiniteFloat | None,
-        Query(ge=FINEST_M, le=MAX_MAP_SPACING_M, description="between map points; by default as the scene's size asks"),
+        Decimal | None,
+        Query(
+            **_between(FINEST_M, MAX_MAP_SPACING_M),
+            description="between map points; by default as the scene's size asks",
+        ),
     ] = None,
     level: LevelText = None,
-    format: Annotated[str, Query(description="png or json")] = "png",  # noqa: A002  the parameter's name
+    format: Annotated[str, Query(description="png or json", json_schema_extra={"enum": ["png", "json"]})] = "png",  # noqa: A002  the parameter's name
 ) -> Response:
     """How loud an emitter is at every place of the scene."""
     field = _levels(request, scene).choose(level)
@@ -165,13 +188,20 @@ async def loudness(
 async def plan(
     request: Request,
     scene: str,
-    listener: Annotated[str | None, Query(description="x,y,z in metres; by default where a visitor starts")] = None,
-    yaw_deg: Annotated[FiniteFloat, Query(description="of the head, counter-clockwise, 0 looks along +x")] = 0.0,
-    emitter: Annotated[list[str] | None, Query(description="x,y,z in metres; may be repeated")] = None,
+    listener: Annotated[
+        str | None, Query(description="x,y,z in metres; by default where a visitor starts", json_schema_extra=_PLACE)
+    ] = None,
+    yaw_deg: YawDeg = 0.0,
+    emitter: Annotated[
+        list[Annotated[str, Field(json_schema_extra=_PLACE)]] | None,
+        Query(description="x,y,z in metres; may be repeated", json_schema_extra={"maxItems": MAX_PLANNED}),
+    ] = None,
     walks: Annotated[bool, Query(description="the listener walks and turns the head")] = True,
     move: Annotated[bool, Query(description="the emitters move")] = False,
-    output: Annotated[str, Query(description="headphones or mono")] = "headphones",
-    effect: Annotated[list[str] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
+    output: Annotated[
+        str, Query(description="headphones or mono", json_schema_extra={"enum": [*OUTPUTS]})
+    ] = "headphones",
+    effect: Annotated[list[EffectText] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
 ) -> Response:
     """Which effects a situation calls for, why, and what they cost on this host."""
     emitters = emitter or []
