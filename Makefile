@@ -32,7 +32,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle scenes table tables office container-test clean hard-cases fuzz mutants predictions
+.PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
+.PHONY: mutants
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
 
 help: ## show this list
@@ -72,6 +73,9 @@ office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere
 	$(BIN)/nafir-train evaluate $(OFFICE)/bundle $(OFFICE)/data --record --markdown \
 		--methods nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear > $(OFFICE)/table.md
 	@cat $(OFFICE)/table.md
+
+own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kinds, and how long they ring beside other simulations: runs/own-scenes.md
+	$(BIN)/python -m training.own_scenes runs/own-scenes
 
 hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
 	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md
