@@ -105,9 +105,11 @@ def train(
     from training.runs import configure, minutes_of
     from training.train import train as train_field
 
+    lengths = {"--epochs": epochs, "--minutes": minutes, "--as-long-as": as_long_as}
+    given_lengths = [option for option, value in lengths.items() if value is not None]
+    if len(given_lengths) > 1:
+        raise typer.BadParameter("leave one out", param_hint=" and ".join(given_lengths))
     if as_long_as is not None:
-        if minutes is not None:
-            raise typer.BadParameter("says as much as --minutes; leave one out", param_hint="--as-long-as")
         minutes = minutes_of(as_long_as)
     given = {"epochs": epochs, "minutes": minutes, "patience": patience, "learning_rate": learning_rate}
     configuration = configure(

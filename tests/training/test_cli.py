@@ -174,3 +174,12 @@ def test_the_length_of_a_run_is_said_once(nafir_train, dataset, run, tmp_path):
     assert code == 2
     assert "leave one out" in err
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("lengths", [("--epochs", "2", "--minutes", "1"), ("--epochs", "2", "--as-long-as", "other")])
+def test_two_lengths_of_a_training_are_refused_by_name(nafir_train, tmp_path, lengths):
+    code, _, err = nafir_train("train", tmp_path, "-o", tmp_path / "run", *lengths)
+    assert code != 0
+    assert lengths[0] in err
+    assert lengths[2] in err
+    assert "leave one out" in err
