@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from server.core.files import require_writable_folder
 from server.errors import NafirError
 from training.evaluation import cli as evaluation
 from training.importers.cli import importing
@@ -174,6 +175,7 @@ def export(
     if not all(rank.strip().isdigit() and int(rank) > 0 for rank in ranks.split(",") if ranks):
         raise typer.BadParameter("takes whole numbers above zero, comma by comma", param_hint="--ranks")
     lower = [int(rank) for rank in ranks.split(",") if ranks]
+    require_writable_folder(output, "--output")
     for talkative in (None, "torch.onnx"):
         logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or (runs[0] if (runs[0] / FILE).is_file() else dataset_folder(runs[0])))
