@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from server.core.command_line import StrictTyper
+from server.core.files import require_writable_folder
 from server.errors import NafirError
 from training.evaluation import cli as evaluation
 from training.importers.cli import importing
@@ -197,6 +198,7 @@ def export(
         raise typer.BadParameter("takes whole numbers above zero, comma by comma", param_hint="--ranks")
     lower = [int(rank) for rank in ranks.split(",") if ranks]
     accepted = dict(_law_and_reason(entry) for entry in accept or ())
+    require_writable_folder(output, "--output")
     for talkative in (None, "torch.onnx"):
         logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or (runs[0] if (runs[0] / FILE).is_file() else dataset_folder(runs[0])))

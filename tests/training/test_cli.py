@@ -28,6 +28,12 @@ def nafir_train(monkeypatch, capfd):
         (("train", "{data}", "-o", "{run}"), "another configuration"),
         (("export", "{tmp}", "-o", "{tmp}/bundle"), "not a run folder"),
         (("export", "{run}", "--data", "{tmp}", "-o", "{tmp}/bundle"), "{tmp}"),
+        (("export", "{tmp}", "-o", "{scene}"), "--output"),
+        (("evaluate", "{tmp}", "{data}", "-o", "{tmp}/absent/x.json"), "--output: there is no folder"),
+        (("evaluate", "{tmp}", "{data}", "--figure", "{tmp}/absent/x.png"), "--figure: there is no folder"),
+        (("maps", "{tmp}", "{data}", "-o", "{tmp}/absent/x.png"), "--output: there is no folder"),
+        (("probe", "{tmp}", "{data}", "--figure", "{tmp}/absent/x.png"), "--figure: there is no folder"),
+        (("import", "sofa", "{scene}", "-o", "{scene}"), "--output"),
         (("evaluate", "{tmp}", "{data}"), "scene.json"),
         (("evaluate", "{bundle}", "{tmp}"), "{tmp}"),
     ],
@@ -74,8 +80,8 @@ def test_an_output_that_cannot_be_written_is_told_in_a_line(
     code, _, err = nafir_train(*(argument.format(**places) for argument in arguments))
     assert code == 2
     last = err.strip().splitlines()[-1]
-    assert last.startswith(f"nafir-train: {file}")
-    assert last.endswith("Not a directory")
+    assert last.startswith(tuple(f"nafir-train: {option}{file}" for option in ("", "--output: ", "--figure: ")))
+    assert last.endswith(("Not a directory", "is a file, and a folder is needed", "is no folder"))
     assert "Traceback" not in err
 
 
