@@ -12,6 +12,7 @@ from typing import get_args
 
 from fastapi import FastAPI
 
+from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
 from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
@@ -122,6 +123,7 @@ def create_app(
     app.include_router(api)
     install_openapi(app)
     app.add_middleware(StrictRequests, routes=app.router.routes)
+    app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))
     app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
 

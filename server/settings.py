@@ -32,6 +32,24 @@ def _require_different_names(files: tuple[Path, ...]) -> tuple[Path, ...]:
     return files
 
 
+def _split_names(value: Any) -> Any:
+    return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
+
+
+def _require_origin(value: str) -> str:
+    if not re.fullmatch(r"https?://[^/\s*]+/?", value):
+        raise PydanticCustomError(
+            "origin", "{value} is no origin: give scheme and host, as in https://example.org", {"value": repr(value)}
+        )
+    return value
+
+
+Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)]
+"""In the environment, separated by commas."""
+Origins = Annotated[
+    tuple[Annotated[str, AfterValidator(_require_origin)], ...], NoDecode, BeforeValidator(_split_names)
+]
+"""In the environment, separated by commas."""
 Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_split_paths)]
 """In the environment, separated as in PATH."""
 NamedFiles = Annotated[Paths, AfterValidator(_require_different_names)]
@@ -45,6 +63,10 @@ class Settings(BaseSettings):
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    allowed_hosts: Names = ()
+    """Names by which the server may be asked for, beside `host`, localhost and addresses in numbers; `*` is any."""
+    allowed_origins: Origins = ()
+    """Sites whose pages may use the server, as https://example.org; its own page may."""
     bundles: Paths = ()
     """Scene bundles to serve beside those that come with the package."""
     clips: NamedFiles = ()
