@@ -23,10 +23,13 @@ from training.importers.report import ImportReport
 FORMAT = 1
 FILE = "responses.h5"
 SAME_POINT_M = 1e-3
+_AT_ONCE = 2**22
+"""Samples that are looked at."""
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int64]
 _Booleans = npt.NDArray[np.bool_]
+_Generic = npt.NDArray[np.generic]
 _Responses = npt.NDArray[np.float32]
 
 
@@ -209,6 +212,7 @@ class ImportedDataset:
             rate = int(file.attrs.get("sample_rate", 0))
             if rate <= 0:
                 raise ResponsesError(path, "sample_rate", f"is {rate}")
+            _require_finite(path, file["responses"], rows["listener"], rows["emitter"])
             return cls(
                 folder,
                 str(file.attrs.get("layout", "")),
@@ -346,6 +350,18 @@ def _finite(responses: _Responses, path: Path) -> _Responses:
     if not np.isfinite(responses).all():
         raise ResponsesError(path, "responses", "hold samples that are not finite; simulate or import them anew")
     return responses
+
+
+def _require_finite(path: Path, responses: h5py.Dataset, listener: _Generic, emitter: _Generic) -> None:
+    """Raises ResponsesError that names the first row, and its ends, that holds what is no number. Reads a few rows at
+    a time."""
+    size = max(1, _AT_ONCE // (responses.shape[1] * responses.shape[2]))
+    for start in range(0, len(responses), size):
+        is_bad = ~np.isfinite(responses[start : start + size]).all(axis=(1, 2))
+        if is_bad.any():
+            row = start + int(np.argmax(is_bad))
+            ends = f"listener {listener[row].tolist()}, emitter {emitter[row].tolist()}"
+            raise ResponsesError(path, "responses", f"row {row} ({ends}) has samples that are not finite; import anew")
 
 
 def _array(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
