@@ -29,7 +29,7 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
-from server.errors import NafirError
+from training.dataset_check import DatasetError, require_finite_pairs
 from training.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation.plan import SimulationPlan
 from training.simulation.shared_tail import FADE_S, SharedTail
@@ -44,10 +44,6 @@ TAKES = ("reflected", "repeats")
 """The second is for the repeatability of the first."""
 # A wave's filters ring for less.
 _FILTER_S = 0.020
-
-
-class DatasetError(NafirError):
-    """A dataset folder that is missing, unfinished or of another format."""
 
 
 def own_duration_s(scene: SceneFile, plan: SimulationPlan) -> float:
@@ -125,7 +121,8 @@ class Dataset:
 
     @classmethod
     def open(cls, folder: Path, *, finished: bool = True) -> "Dataset":
-        """Raises DatasetError if the folder is no dataset or, with `finished`, if its simulation was cut short."""
+        """Raises DatasetError if the folder is no dataset or, with `finished`, if its simulation was cut short or its
+        arrays hold what cannot be (`training.dataset_check`)."""
         if (folder / "responses.h5").is_file():
             raise DatasetError(f"{folder}: holds measured responses; this takes a simulated scene")
         try:
@@ -151,7 +148,27 @@ class Dataset:
             raise DatasetError(f"{folder}: not a dataset folder: {exc}") from exc
         if finished and not done.all():
             raise DatasetError(f"{folder}: {np.sum(~done)} emitters are not simulated yet; run simulate again")
+        if finished:
+            dataset._require_sound()
         return dataset
+
+    def _require_sound(self) -> None:
+        path = self.folder / "pairs.h5"
+        for name, values, shape in (
+            ("probes", self.probes, (len(self.probes), 3)),
+            ("yaws", self.yaws, (self.scene.simulation.yaws,)),
+            ("held_out", self.held_out, (len(self.probes), len(self.probes))),
+        ):
+            if values.shape != shape or not np.isfinite(values).all():
+                raise DatasetError(f"{path}: {name}: has shape {values.shape}, expected {shape} of finite values")
+        samples = round(own_duration_s(self.scene, self.effects) * self.sample_rate)
+        try:
+            with h5py.File(path, "r") as file:
+                require_finite_pairs(
+                    path, file, probes=len(self.probes), yaws=len(self.yaws), samples=samples, takes=TAKES
+                )
+        except (OSError, KeyError, TypeError, ValueError) as exc:
+            raise DatasetError(f"{path}: cannot be read: {exc}") from exc
 
     @property
     def sample_rate(self) -> int:

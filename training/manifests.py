@@ -11,7 +11,7 @@ from server.scene.effects import EffectName
 from server.scene.geometry import Point
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
 from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
-from training.responses import ImportedDataset, SimulatedResponses
+from training.responses import ImportedDataset, ResponsesError, SimulatedResponses
 
 _MARGIN_M = 0.1
 _LEVELLED_ROWS = 500
@@ -89,7 +89,10 @@ def measured_manifest(responses: ImportedDataset, fields: Fields) -> Manifest:
 
 
 def _reference_level_db(responses: ImportedDataset) -> float:
-    """Median of what the direct sound has one metre from the emitter, were it to spread in the open."""
+    """Median of what the direct sound has one metre from the emitter, were it to spread in the open.
+
+    Raises ResponsesError where most responses are silent when it should arrive.
+    """
     rows = np.sort(np.random.default_rng(0).permutation(len(responses.yaw))[:_LEVELLED_ROWS])
     energies = []
     for row in rows:
@@ -97,7 +100,11 @@ def _reference_level_db(responses: ImportedDataset) -> float:
         direct = responses.read([row])[0, :, max(first, 0) : last].astype(np.float64)
         distance_m = np.linalg.norm(responses.emitter[row] - responses.listener[row])
         energies.append(np.square(direct).sum(axis=-1).mean() * distance_m**2)
-    return float(power_to_db(np.median(energies)))
+    median = float(np.median(energies))
+    if not median > 0:
+        problem = "are silent when distance has the direct sound arrive; import them anew: is the equipment late?"
+        raise ResponsesError(responses.file, "responses", problem)
+    return float(power_to_db(median))
 
 
 def _point(position: np.ndarray) -> Point:

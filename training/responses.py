@@ -23,10 +23,13 @@ from training.importers.report import ImportReport
 FORMAT = 1
 FILE = "responses.h5"
 SAME_POINT_M = 1e-3
+_AT_ONCE = 2**22
+"""Samples that are looked at."""
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int64]
 _Booleans = npt.NDArray[np.bool_]
+_Generic = npt.NDArray[np.generic]
 _Responses = npt.NDArray[np.float32]
 
 
@@ -213,6 +216,7 @@ class ImportedDataset:
             rate = int(file.attrs.get("sample_rate", 0))
             if rate <= 0:
                 raise ResponsesError(path, "sample_rate", f"is {rate}")
+            _require_finite(path, file["responses"], rows["listener"], rows["emitter"])
             return cls(
                 folder,
                 str(file.attrs.get("layout", "")),
@@ -253,46 +257,66 @@ class ImportedDataset:
             reasons = "; ".join(f"{skipped.count} {reason}" for reason, skipped in report.skipped.items())
             raise ResponsesError(Path(source), "responses", f"none could be read ({reasons or 'none found'})")
         _require_usable(first, 0, source)
+        is_new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        path, partial = folder / FILE, folder / "responses.partial"
-        listener, emitter, yaw = [], [], []
-        with h5py.File(partial, "w") as file:
-            channels, samples = first.response.shape
-            responses = file.create_dataset(
-                "responses",
-                (0, channels, 0),
-                np.float32,
-                maxshape=(None, channels, None),
-                chunks=(1, channels, samples),
-            )
-            for row, measurement in enumerate(chain([first], remaining)):
-                _require_usable(measurement, row, source)
-                channels, samples = measurement.response.shape
-                if measurement.sample_rate != first.sample_rate:
-                    problem = (
-                        f"{measurement.sample_rate} Hz in row {row} after {first.sample_rate} Hz; ask for one rate"
-                    )
-                    raise ResponsesError(Path(source), "sample_rate", problem)
-                if channels != len(first.response):
-                    problem = f"{channels} in row {row} after {len(first.response)}"
-                    raise ResponsesError(Path(source), "channels", problem)
-                responses.resize((row + 1, channels, max(samples, responses.shape[2])))
-                responses[row, :, :samples] = measurement.response
-                listener.append(measurement.listener)
-                emitter.append(measurement.emitter)
-                yaw.append(measurement.yaw)
-                report.read += 1
-            file["listener"], file["emitter"], file["yaw"] = np.array(listener), np.array(emitter), np.array(yaw)
-            file["held_out"] = choose_held_out(np.array(emitter), np.array(listener), held_out_share, seed)
-            file.attrs.update(
-                format=FORMAT,
-                sample_rate=first.sample_rate,
-                layout=layout,
-                source=source,
-                report=json.dumps(report.to_json()),
-            )
-        partial.replace(path)
+        partial = folder / "responses.partial"
+        try:
+            held_out = held_out_share, seed
+            _write_rows(partial, first, remaining, report, layout=layout, source=source, held_out=held_out)
+            partial.replace(folder / FILE)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            if is_new:
+                folder.rmdir()
+            raise
         return cls.open(folder)
+
+
+def _write_rows(
+    path: Path,
+    first: Measurement,
+    remaining: Iterable[Measurement],
+    report: ImportReport,
+    *,
+    layout: str,
+    source: str,
+    held_out: tuple[float, int],
+) -> None:
+    """A file of `first` and those that remain. `held_out` is the share, and the seed it is drawn by."""
+    listener, emitter, yaw = [], [], []
+    with h5py.File(path, "w") as file:
+        channels, samples = first.response.shape
+        responses = file.create_dataset(
+            "responses",
+            (0, channels, 0),
+            np.float32,
+            maxshape=(None, channels, None),
+            chunks=(1, channels, samples),
+        )
+        for row, measurement in enumerate(chain([first], remaining)):
+            _require_usable(measurement, row, source)
+            channels, samples = measurement.response.shape
+            if measurement.sample_rate != first.sample_rate:
+                problem = f"{measurement.sample_rate} Hz in row {row} after {first.sample_rate} Hz; ask for one rate"
+                raise ResponsesError(Path(source), "sample_rate", problem)
+            if channels != len(first.response):
+                problem = f"{channels} in row {row} after {len(first.response)}"
+                raise ResponsesError(Path(source), "channels", problem)
+            responses.resize((row + 1, channels, max(samples, responses.shape[2])))
+            responses[row, :, :samples] = measurement.response
+            listener.append(measurement.listener)
+            emitter.append(measurement.emitter)
+            yaw.append(measurement.yaw)
+            report.read += 1
+        file["listener"], file["emitter"], file["yaw"] = np.array(listener), np.array(emitter), np.array(yaw)
+        file["held_out"] = choose_held_out(np.array(emitter), np.array(listener), *held_out)
+        file.attrs.update(
+            format=FORMAT,
+            sample_rate=first.sample_rate,
+            layout=layout,
+            source=source,
+            report=json.dumps(report.to_json()),
+        )
 
 
 def open_responses(folder: Path) -> SimulatedResponses | ImportedDataset:
@@ -330,6 +354,18 @@ def _finite(responses: _Responses, path: Path) -> _Responses:
     if not np.isfinite(responses).all():
         raise ResponsesError(path, "responses", "hold samples that are not finite; simulate or import them anew")
     return responses
+
+
+def _require_finite(path: Path, responses: h5py.Dataset, listener: _Generic, emitter: _Generic) -> None:
+    """Raises ResponsesError that names the first row, and its ends, that holds what is no number. Reads a few rows at
+    a time."""
+    size = max(1, _AT_ONCE // (responses.shape[1] * responses.shape[2]))
+    for start in range(0, len(responses), size):
+        is_bad = ~np.isfinite(responses[start : start + size]).all(axis=(1, 2))
+        if is_bad.any():
+            row = start + int(np.argmax(is_bad))
+            ends = f"listener {listener[row].tolist()}, emitter {emitter[row].tolist()}"
+            raise ResponsesError(path, "responses", f"row {row} ({ends}) has samples that are not finite; import anew")
 
 
 def _array(path: Path, file: h5py.File, name: str) -> h5py.Dataset:

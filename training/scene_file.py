@@ -12,7 +12,8 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from server.errors import NafirError
 from server.scene.effects import EffectName
 from server.scene.geometry import Geometry, Strict
-from server.scene.manifest import MOST_SAMPLES, Air, Start
+from server.scene.limits import MOST_SAMPLES
+from server.scene.manifest import Air, Start
 from training.scene_openings import faults_of
 from training.simulation.plan import SimulatedEffect
 

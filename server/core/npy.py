@@ -47,7 +47,7 @@ class NpyHeader:
 
     @classmethod
     def read(cls, stream: IO[bytes]) -> "NpyHeader":
-        """Leaves the stream where the data begins. Raises NpyError; arrays of objects are refused."""
+        """Leaves the stream where the data begins. Raises NpyError; objects and records are refused."""
         start = stream.read(8)
         if len(start) < 8 or not start.startswith(_MAGIC) or start[6] not in {1, 2, 3}:
             raise NpyError("is no array file of NumPy's")
@@ -68,7 +68,7 @@ class NpyHeader:
             dtype = np.dtype(found["dtype"])
         except TypeError as exc:
             raise NpyError(f"holds {found['dtype']!r}, which is no type of numbers") from exc
-        if dtype.kind not in "biufc":
+        if dtype.kind not in "biufcSU":
             raise NpyError(f"holds {dtype}, not numbers")
         shape = tuple(int(size) for size in re.findall(r"\d+", found["shape"]))
         return cls(dtype, shape, found["fortran"] == "True", 8 + width + length)

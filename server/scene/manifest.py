@@ -21,13 +21,12 @@ from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from server.scene.effects import EffectName
 from server.scene.geometry import Finite, Geometry, Point, Strict
+from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 
 ARRAYS_FILE = "arrays.npz"
 NO_FIELD = "none"
 """What the level of a scene without fields is of."""
 FORMAT_VERSION: Literal[2] = 2
-MOST_SAMPLES = 960_000
-"""Of a response: ten seconds at 96 kHz, forty at 24 kHz."""
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -76,10 +75,10 @@ class CodecParameters(Strict):
     between two centres go linearly from one to the other.
     """
 
-    sample_rate: Annotated[int, Field(ge=8000, le=96000)]
+    sample_rate: Annotated[int, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
     n_fft: Annotated[int, Field(ge=64, le=4096)]
     hop: Annotated[int, Field(ge=16)]
-    samples: Annotated[int, Field(ge=256, le=MOST_SAMPLES)]
+    samples: Annotated[int, Field(ge=FEWEST_SAMPLES, le=MOST_SAMPLES)]
     lead_samples: Annotated[int, Field(ge=0)]
     known_frames: Annotated[int, Field(ge=0)]
     log_floor: Annotated[float, Field(gt=0, allow_inf_nan=False)]

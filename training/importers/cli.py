@@ -4,8 +4,9 @@ What reads them is imported where it is used: every command of `nafir-train` loa
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -16,10 +17,12 @@ from rich.progress import track
 
 from server.core.command_line import StrictTyper
 from server.core.files import require_writable_folder
+from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 from training.importers.receivers import Receivers
 from training.options import Json
 
 if TYPE_CHECKING:
+    from training.importers.conditioning import Conditioning
     from training.responses import Measurement
 
 importing = StrictTyper(
@@ -27,6 +30,15 @@ importing = StrictTyper(
 )
 
 _T = TypeVar("_T")
+_MOST_LATENCY_SAMPLES = 1_000_000
+
+
+class Axis(StrEnum):
+    """Of the floor: which way is up, no ear tells."""
+
+    X = "x"
+    Y = "y"
+
 
 Source = Annotated[Path, typer.Argument(help="Folder to read.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
@@ -34,23 +46,36 @@ HeldOut = Annotated[
     float, typer.Option("--held-out", min=0.0, max=0.9, help="Share of pairs that training never sees.")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Chooses the pairs held out.")]
-Latency = Annotated[int, typer.Option(help="Delay of the equipment to take off, samples at the source's rate.")]
-Rate = Annotated[int | None, typer.Option("--sample-rate", min=1, help="Resample to this; otherwise the rate is kept.")]
-Duration = Annotated[
-    float | None, typer.Option("--duration-s", min=0.001, help="Longest response; all of it otherwise.")
+Latency = Annotated[
+    int,
+    typer.Option(
+        min=-_MOST_LATENCY_SAMPLES,
+        max=_MOST_LATENCY_SAMPLES,
+        help="Delay of the equipment to take off, samples at the source's rate.",
+    ),
 ]
-
-
-@dataclass(frozen=True)
-class _Options:
-    """Those of every layout."""
-
-    held_out: float
-    seed: int
-    latency_samples: int
-    sample_rate: int | None
-    duration_s: float | None
-    as_json: bool
+Rate = Annotated[
+    int | None,
+    typer.Option(
+        "--sample-rate",
+        min=LOWEST_RATE_HZ,
+        max=HIGHEST_RATE_HZ,
+        help="Resample to this, Hz; otherwise the rate is kept.",
+    ),
+]
+Duration = Annotated[
+    float | None,
+    typer.Option(
+        "--duration-s", min=0.001, max=MOST_SAMPLES / LOWEST_RATE_HZ, help="Longest response; all of it otherwise."
+    ),
+]
+Scale = Annotated[
+    float,
+    typer.Option(min=1e-6, max=1e6, help="Multiplies positions: metres in their unit, 0.001 for millimetres."),
+]
+Mirror = Annotated[Axis | None, typer.Option(help="Axis whose coordinates change sign.")]
+SwapEars = Annotated[bool, typer.Option("--swap-ears", help="The second channel is the left ear.")]
+AcceptEars = Annotated[bool, typer.Option("--accept-ears", help="Import all the same where ears contradict positions.")]
 
 
 @importing.command("soundspaces")
@@ -63,32 +88,60 @@ def import_soundspaces(
     latency_samples: Latency = 0,
     sample_rate: Rate = None,
     duration_s: Duration = None,
+    position_scale: Scale = 1.0,
+    mirror: Mirror = None,
+    swap_ears: SwapEars = False,
+    accept_ears: AcceptEars = False,
     as_json: Json = False,
 ) -> None:
     """A scene of SoundSpaces 1.0: points.txt and <azimuth>/<receiver>_<source>.wav, binaural."""
     from training.importers.soundspaces import read
 
-    options = _Options(held_out, seed, latency_samples, sample_rate, duration_s, as_json)
-    _import("soundspaces", source, output, options, partial(read, points=points))
+    conditioning = _conditioning(
+        latency_samples, sample_rate, duration_s, position_scale, mirror, swap_ears=swap_ears, accept_ears=accept_ears
+    )
+    _import(
+        "soundspaces",
+        source,
+        output,
+        conditioning,
+        partial(read, points=points),
+        held_out=held_out,
+        seed=seed,
+        as_json=as_json,
+    )
 
 
 @importing.command("meshrir")
 def import_meshrir(
     source: Source,
     output: Output,
-    source_rate: Annotated[int, typer.Option(min=1, help="Rate of the arrays, which do not tell it.")] = 48_000,
+    source_rate: Annotated[
+        int, typer.Option(min=4_000, max=768_000, help="Rate of the arrays, which do not tell it.")
+    ] = 48_000,
     held_out: HeldOut = 0.1,
     seed: Seed = 0,
     latency_samples: Latency = 0,
     sample_rate: Rate = None,
     duration_s: Duration = None,
+    position_scale: Scale = 1.0,
+    mirror: Mirror = None,
     as_json: Json = False,
 ) -> None:
     """A room of MeshRIR: pos_mic.npy, pos_src.npy and ir_<microphone>.npy, one channel."""
     from training.importers.meshrir import read
 
-    options = _Options(held_out, seed, latency_samples, sample_rate, duration_s, as_json)
-    _import("meshrir", source, output, options, partial(read, source_rate=source_rate))
+    conditioning = _conditioning(latency_samples, sample_rate, duration_s, position_scale, mirror)
+    _import(
+        "meshrir",
+        source,
+        output,
+        conditioning,
+        partial(read, source_rate=source_rate),
+        held_out=held_out,
+        seed=seed,
+        as_json=as_json,
+    )
 
 
 @importing.command("raf")
@@ -100,13 +153,15 @@ def import_raf(
     latency_samples: Latency = 0,
     sample_rate: Rate = None,
     duration_s: Duration = None,
+    position_scale: Scale = 1.0,
+    mirror: Mirror = None,
     as_json: Json = False,
 ) -> None:
     """A room of Real Acoustic Fields: rir.wav, rx_pos.txt and tx_pos.txt in numbered folders, one channel."""
     from training.importers.raf import read
 
-    options = _Options(held_out, seed, latency_samples, sample_rate, duration_s, as_json)
-    _import("raf", source, output, options, read)
+    conditioning = _conditioning(latency_samples, sample_rate, duration_s, position_scale, mirror)
+    _import("raf", source, output, conditioning, read, held_out=held_out, seed=seed, as_json=as_json)
 
 
 @importing.command("sofa")
@@ -119,23 +174,58 @@ def import_sofa(
     latency_samples: Latency = 0,
     sample_rate: Rate = None,
     duration_s: Duration = None,
+    position_scale: Scale = 1.0,
+    mirror: Mirror = None,
+    swap_ears: SwapEars = False,
+    accept_ears: AcceptEars = False,
     as_json: Json = False,
 ) -> None:
     """A SOFA file of a room: SingleRoomSRIR, SingleRoomMIMOSRIR, MultiSpeakerBRIR, or binaural SimpleFreeFieldHRIR."""
     from training.importers.sofa import read
 
-    options = _Options(held_out, seed, latency_samples, sample_rate, duration_s, as_json)
-    _import("sofa", source, output, options, partial(read, receivers=receivers))
+    conditioning = _conditioning(
+        latency_samples, sample_rate, duration_s, position_scale, mirror, swap_ears=swap_ears, accept_ears=accept_ears
+    )
+    _import(
+        "sofa",
+        source,
+        output,
+        conditioning,
+        partial(read, receivers=receivers, asks_ears=not (swap_ears or accept_ears or mirror)),
+        held_out=held_out,
+        seed=seed,
+        as_json=as_json,
+    )
+
+
+def _conditioning(
+    latency_samples: int,
+    sample_rate: int | None,
+    duration_s: float | None,
+    position_scale: float,
+    mirror: Axis | None,
+    *,
+    swap_ears: bool = False,
+    accept_ears: bool = False,
+) -> "Conditioning":
+    from training.importers.conditioning import Conditioning
+
+    axis = None if mirror is None else mirror.value
+    return Conditioning(latency_samples, sample_rate, duration_s, position_scale, axis, swap_ears, accept_ears)
 
 
 def _import(
     layout: str,
     source: Path,
     output: Path,
-    options: _Options,
-    read: Callable[..., Iterator[tuple[str, "Measurement"]]],
+    conditioning: "Conditioning",
+    read: Callable[..., Generator[tuple[str, "Measurement"]]],
+    *,
+    held_out: float,
+    seed: int,
+    as_json: bool,
 ) -> None:
-    from training.importers.conditioning import Conditioning, SourceError, conditioned
+    from training.importers.conditioning import SourceError, conditioned, within_limits
     from training.importers.report import ImportReport
     from training.responses import ImportedDataset
 
@@ -148,19 +238,20 @@ def _import(
         return track(items, f"importing {layout}", console=console)
 
     report = ImportReport()
-    conditioning = Conditioning(options.latency_samples, options.sample_rate, options.duration_s)
-    measurements = conditioned(read(source, report, track=tracked), conditioning, report)
-    dataset = ImportedDataset.write(
-        output,
-        measurements,
-        report,
-        layout=layout,
-        source=str(source),
-        held_out_share=options.held_out,
-        seed=options.seed,
-    )
+    # Closed at once where it ends early: its progress would be drawn behind the message.
+    with closing(read(source, report, track=tracked)) as named:
+        measurements = conditioned(named, conditioning, report, source=source)
+        dataset = ImportedDataset.write(
+            output,
+            within_limits(measurements, source),
+            report,
+            layout=layout,
+            source=str(source),
+            held_out_share=held_out,
+            seed=seed,
+        )
     pairs, of_pairs = len(set(dataset.pair)), len(set(dataset.pair[dataset.held_out]))
-    if options.as_json:
+    if as_json:
         told = {
             "folder": str(output),
             "layout": layout,

@@ -5,24 +5,22 @@ Responses are `(channel, sample)`.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 import soxr
 
-from server.acoustics.decay import onset_sample
-from server.acoustics.decibels import power_to_db
 from server.errors import NafirError
-from training.dataset import SPEED_OF_SOUND
+from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
+from training.importers.evidence import ContradictionError, Evidence, ears_exchanged
 from training.importers.report import ImportReport
 from training.responses import Measurement
 
 NEAREST_M = 0.01
 """Closer, and an emitter is where the listener is: no field is asked for that."""
 
-_DIRECT_S = 0.0025
-_ASIDE = 0.5  # sine of the smallest angle from the median plane at which the ears are asked
-_TOLD_APART_DB = 1.0
+_Place = tuple[float, float, float]
 
 
 class SourceError(NafirError):
@@ -36,13 +34,20 @@ class SourceError(NafirError):
 class Conditioning:
     """latency_samples: delay of the measuring equipment at the source's rate, taken off the start (zeros are put
     before the start where it is negative). sample_rate: to resample to; None keeps the source's. duration_s: where
-    to end."""
+    to end. position_scale: metres in the source's unit of length. mirror: the axis whose coordinates change sign.
+    swap_ears: the source's second channel is the left ear. accept_ears: ears may contradict positions."""
 
     latency_samples: int = 0
     sample_rate: int | None = None
     duration_s: float | None = None
+    position_scale: float = 1.0
+    mirror: Literal["x", "y"] | None = None
+    swap_ears: bool = False
+    accept_ears: bool = False
 
     def applied(self, measurement: Measurement) -> Measurement:
+        if self.swap_ears:
+            measurement = ears_exchanged(measurement)
         response, rate = measurement.response, measurement.sample_rate
         if self.latency_samples >= 0:
             response = response[:, self.latency_samples :]
@@ -55,61 +60,90 @@ class Conditioning:
             response, rate = resampled.T * (rate / self.sample_rate), self.sample_rate
         if self.duration_s is not None:
             response = response[:, : round(self.duration_s * rate)]
-        return replace(measurement, response=np.asarray(response, dtype=np.float32), sample_rate=rate)
+        return replace(
+            measurement,
+            listener=self._place(measurement.listener),
+            emitter=self._place(measurement.emitter),
+            response=np.asarray(response, dtype=np.float32),
+            sample_rate=rate,
+        )
+
+    def _place(self, position: _Place) -> _Place:
+        if self.position_scale == 1.0 and self.mirror is None:
+            return position
+        x, y, z = (float(coordinate) * self.position_scale for coordinate in position)
+        return (-x if self.mirror == "x" else x), (-y if self.mirror == "y" else y), z
 
 
 def conditioned(
-    named: Iterable[tuple[str, Measurement]], conditioning: Conditioning, report: ImportReport
+    named: Iterable[tuple[str, Measurement]],
+    conditioning: Conditioning,
+    report: ImportReport,
+    *,
+    source: object = "source",
 ) -> Iterator[Measurement]:
-    """Measurements fit to be stored; those that are not are skipped with their name. When all are through, the report
-    tells when their direct sound arrives and, of two channels, whether they are those of ears in that order."""
-    arrivals: list[float] = []
-    ears: list[bool] = []
+    """Measurements fit to be stored; those that are not are skipped with their name.
+
+    When all are through, the report tells what they say of their positions (`training.importers.evidence`); raises
+    SourceError where the two contradict each other.
+    """
+    evidence = Evidence(conditioning.latency_samples, conditioning.accept_ears)
     for name, raw in named:
         measurement = conditioning.applied(raw)
-        response = measurement.response
-        distance = float(np.linalg.norm(np.subtract(measurement.emitter, measurement.listener)))
-        if not np.isfinite([*measurement.listener, *measurement.emitter, measurement.yaw]).all():
-            report.skip(name, "pose not finite")
-        elif distance < NEAREST_M:
-            report.skip(name, "emitter where the listener is")
-        elif response.shape[1] == 0:
-            report.skip(name, "empty")
-        elif not np.isfinite(response).all():
-            report.skip(name, "samples not finite")
-        elif not response.any(axis=-1).all():
-            report.skip(name, "silent")
-        else:
-            arrival_s = int(onset_sample(response).min()) / measurement.sample_rate
-            arrivals.append(1e3 * (arrival_s - distance / SPEED_OF_SOUND))
-            agrees = ears_agree(measurement)
-            if agrees is not None:
-                ears.append(agrees)
-            yield measurement
-    if arrivals:
-        early, middle, late = np.percentile(arrivals, [10, 50, 90])
-        report.note(
-            f"sound arrives {middle:.2f} ms (median; {early:.2f} to {late:.2f} for 80 %) after distance / 343 m/s"
-        )
-    if ears:
-        report.note(f"the ear turned to the emitter is the louder one in {np.mean(ears):.0%} of {len(ears)} responses")
+        reason = _unfit(measurement)
+        if reason is not None:
+            report.skip(name, reason)
+            continue
+        evidence.add(measurement, source_rate=raw.sample_rate)
+        yield measurement
+    try:
+        evidence.judge(report)
+    except ContradictionError as exc:
+        raise SourceError(source, exc.field, str(exc)) from exc
 
 
-def ears_agree(measurement: Measurement) -> bool | None:
-    """Whether the direct sound is louder at the ear that is turned to the emitter; None where that cannot be said:
-    one channel, an emitter near the median plane, or ears that are equally loud."""
-    if len(measurement.response) != 2:
-        return None
-    offset = np.subtract(measurement.emitter, measurement.listener)
-    to_left = float(-np.sin(measurement.yaw) * offset[0] + np.cos(measurement.yaw) * offset[1])
-    if abs(to_left) < _ASIDE * np.linalg.norm(offset):
-        return None
-    start = int(onset_sample(measurement.response).min())
-    head = measurement.response[:, start : start + round(_DIRECT_S * measurement.sample_rate)]
-    left_db, right_db = power_to_db(np.sum(np.square(head, dtype=np.float64), axis=-1))
-    if abs(left_db - right_db) < _TOLD_APART_DB:
-        return None
-    return bool((left_db > right_db) == (to_left > 0))
+def within_limits(measurements: Iterable[Measurement], source: object) -> Iterator[Measurement]:
+    """The measurements, as long as a bundle could hold them. Raises SourceError at the first that it could not, and at
+    the end where all are too short."""
+    longest = 0
+    for measurement in measurements:
+        samples, rate = measurement.response.shape[1], measurement.sample_rate
+        _require_rate(source, rate)
+        if samples > MOST_SAMPLES:
+            problem = (
+                f"have {samples} samples, and a bundle holds {MOST_SAMPLES}: give --duration-s "
+                f"{MOST_SAMPLES / rate:g} or less, or a lower --sample-rate"
+            )
+            raise SourceError(source, "responses", problem)
+        longest = max(longest, samples)
+        yield measurement
+    if 0 < longest < FEWEST_SAMPLES:
+        problem = f"have {longest} samples at most, and a bundle needs {FEWEST_SAMPLES}"
+        raise SourceError(source, "responses", f"{problem}: give a longer --duration-s, or a higher --sample-rate")
+
+
+def _unfit(measurement: Measurement) -> str | None:
+    """Why a measurement cannot be stored, if it cannot."""
+    response = measurement.response
+    if not np.isfinite([*measurement.listener, *measurement.emitter, measurement.yaw]).all():
+        return "pose not finite"
+    if np.linalg.norm(np.subtract(measurement.emitter, measurement.listener)) < NEAREST_M:
+        return "emitter where the listener is"
+    if response.shape[1] == 0:
+        return "empty"
+    if not np.isfinite(response).all():
+        return "samples not finite"
+    return None if response.any(axis=-1).all() else "silent"
+
+
+def _require_rate(source: object, rate: int) -> None:
+    if LOWEST_RATE_HZ <= rate <= HIGHEST_RATE_HZ:
+        return
+    problem = (
+        f"is {rate} Hz, and a bundle holds {LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ} Hz: "
+        f"give --sample-rate {LOWEST_RATE_HZ if rate < LOWEST_RATE_HZ else HIGHEST_RATE_HZ}, or another of these"
+    )
+    raise SourceError(source, "sample_rate", problem)
 
 
 def positions(path: object, field: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -5,12 +5,14 @@ sample). Koyama et al., "MeshRIR: a dataset of room impulse responses on meshed 
 https://www.sh01.org/MeshRIR/. The files say nothing of the rate, 48 kHz in the published sets.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from server.core.npy import NpyError, read_npy
 from training.importers.conditioning import SourceError, positions
 from training.importers.report import ImportReport
 from training.responses import Measurement
@@ -22,7 +24,7 @@ def read(
     *,
     source_rate: int = 48_000,
     track: Callable[[list[int]], Iterable[int]] = iter,
-) -> Iterator[tuple[str, Measurement]]:
+) -> Generator[tuple[str, Measurement]]:
     """Raises SourceError where the positions cannot be read; a microphone without a readable file is skipped."""
     microphones = positions(folder / "pos_mic.npy", "positions", _array(folder / "pos_mic.npy"))
     loudspeakers = positions(folder / "pos_src.npy", "positions", _array(folder / "pos_src.npy"))
@@ -44,17 +46,18 @@ def read(
             samples = response[np.newaxis].astype(np.float32)
             emitter = tuple(loudspeakers[loudspeaker])
             yield f"{path.name}[{loudspeaker}]", Measurement(listener, emitter, samples, source_rate)
-    strangers = {path.name for path in folder.glob("ir_*.npy")} - {
-        f"ir_{index}.npy" for index in range(len(microphones))
-    }
-    for name in sorted(strangers):
-        report.skip(name, "no such microphone in pos_mic.npy", len(loudspeakers))
+    read_here = {"pos_mic.npy", "pos_src.npy", *(f"ir_{index}.npy" for index in range(len(microphones)))}
+    for name in sorted({path.name for path in folder.iterdir()} - read_here):
+        if fnmatch(name, "ir_*.npy"):
+            report.skip(name, "no such microphone in pos_mic.npy", len(loudspeakers))
+        else:
+            report.skip(name, "not of this layout")
 
 
 def _array(path: Path) -> npt.NDArray[np.generic]:
     try:
-        return np.load(path, allow_pickle=False)
+        return read_npy(path)
     except FileNotFoundError as exc:
         raise SourceError(path, "file", "no such file") from exc
-    except (OSError, ValueError, EOFError) as exc:
+    except (OSError, NpyError) as exc:
         raise SourceError(path, "file", f"not a readable array ({exc})") from exc

@@ -6,7 +6,7 @@ Each folder of `data/` holds a response: `rir.wav`; `rx_pos.txt` "x,y,z" of the 
 y up, z left, a left-handed frame; x, z, y is the right-handed one used here, as in AVR's loader of these data.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +24,19 @@ _SAME_WAY = 0.999  # cosine of half the angle between orientations: 5 degrees
 
 def read(
     folder: Path, report: ImportReport, *, track: Callable[[list[Path]], Iterable[Path]] = iter
-) -> Iterator[tuple[str, Measurement]]:
+) -> Generator[tuple[str, Measurement]]:
     """Reads a room's folder, or its `data` folder.
 
     Fields know no orientation of emitters: of several that a loudspeaker had at one place, the first is kept.
     Raises SourceError for a folder without responses.
     """
     inside = folder / "data" if (folder / "data").is_dir() else folder
-    responses = sorted(path for path in inside.iterdir() if path.is_dir() and (path / "tx_pos.txt").exists())
+    entries = sorted(inside.iterdir())
+    responses = [path for path in entries if path.is_dir() and (path / "tx_pos.txt").exists()]
     if not responses:
         raise SourceError(inside, "responses", "no folder has a tx_pos.txt")
+    for path in sorted({*entries} - {*responses}):
+        report.skip(path.name, "a folder without tx_pos.txt" if path.is_dir() else "a file beside the folders")
     first_orientation: dict[tuple[int, ...], npt.NDArray[np.float64]] = {}
     for path in track(responses):
         try:

@@ -7,7 +7,7 @@ published files differ from their convention's defaults. Which channel is the le
 published files have it, or the sense of azimuth, wrong.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from server.rendering.sofa_file import SofaError, SofaFile, delay_rows
-from training.importers.conditioning import SourceError, ears_agree
+from training.importers.conditioning import SourceError
+from training.importers.evidence import ears_agree, ears_exchanged, remedy
 from training.importers.receivers import Receivers
 from training.importers.report import ImportReport
 from training.responses import Measurement
@@ -53,9 +54,11 @@ def read(
     report: ImportReport,
     *,
     receivers: Receivers | None = None,
+    asks_ears: bool = True,
     track: Callable[[list[int]], Iterable[int]] = iter,
-) -> Iterator[tuple[str, Measurement]]:
-    """receivers: instead of what the convention has them be.
+) -> Generator[tuple[str, Measurement]]:
+    """receivers: instead of what the convention has them be. asks_ears: whether ears that are the wrong way round are
+    exchanged.
 
     Raises SourceError for another convention, or variables that do not fit it.
     """
@@ -76,8 +79,8 @@ def read(
             for m, yaw in enumerate(np.arctan2(room.head[:, 1, 0], room.head[:, 0, 0]))
             for e in range(emitters)
         ]
-        if _swapped(path, [row for *_, row in rows], report):
-            rows = [(m, e, _ears_exchanged(row)) for m, e, row in rows]
+        if asks_ears and _swapped(path, [row for *_, row in rows], report):
+            rows = [(m, e, ears_exchanged(row)) for m, e, row in rows]
         pitch = np.arcsin(np.clip(room.head[:, 2, 0], -1.0, 1.0))
         for index in track(list(range(len(rows)))):
             m, e, row = rows[index]
@@ -122,20 +125,18 @@ def _room(sofa: SofaFile, receivers: Receivers | None) -> _Room:
 
 def _swapped(path: Path, rows: list[Measurement], report: ImportReport) -> bool:
     """Raises SourceError where the ears contradict each other."""
-    agreeing = [agrees for row in rows if np.isfinite(row.response).all() and (agrees := ears_agree(row)) is not None]
+    rows = [row for row in rows if np.isfinite(row.response).all()]
+    agreeing = [agrees for row in rows if (agrees := ears_agree(row)) is not None]
     if not agreeing:
         report.note("ears not told apart: no emitter to the side")
         return False
     share = float(np.mean(agreeing))
     if 0.25 < share < 0.75:
-        raise SourceError(path, "Data.IR", "its channels are not those of ears: neither is louder on its side")
+        told = "its channels are not those of ears: neither is louder on its side"
+        raise SourceError(path, "Data.IR", f"{told}; {remedy(rows)}")
     if share < 0.5:
         report.note("receivers exchanged: the first sounds like the right ear (or azimuth is stored clockwise)")
     return share < 0.5
-
-
-def _ears_exchanged(row: Measurement) -> Measurement:
-    return Measurement(row.listener, row.emitter, row.response[::-1], row.sample_rate, row.yaw)
 
 
 def _responses(sofa: SofaFile) -> npt.NDArray[np.float32]:

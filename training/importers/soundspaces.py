@@ -10,7 +10,7 @@ seen from above, so 90 is +x: yaw = 90 degrees - azimuth. Files that are empty o
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 
 from server.core.numerals import parse_decimal, parse_integer
@@ -29,22 +29,23 @@ def read(
     *,
     points: Path | None = None,
     track: Callable[[list[Path]], Iterable[Path]] = iter,
-) -> Iterator[tuple[str, Measurement]]:
+) -> Generator[tuple[str, Measurement]]:
     """Reads the scene folder that holds the azimuths. Without `points`, points.txt is looked for in it, and in the
     place it has in a SoundSpaces download (`metadata` beside `binaural_rirs`).
 
     Raises SourceError for missing or malformed points, or a folder without azimuths.
     """
     positions = read_points(points or _points_file(folder))
-    azimuths = sorted((path for path in folder.iterdir() if path.is_dir() and path.name.isdigit()), key=_azimuth)
-    if not azimuths:
-        raise SourceError(folder, "azimuths", "no folder is named by an azimuth in degrees")
+    azimuths = _azimuths(folder, report)
     by_azimuth: dict[Path, set[str]] = {}
     for azimuth in azimuths:
         names = {path.name for path in azimuth.iterdir()}
         by_azimuth[azimuth] = {name for name in names if _PAIR.fullmatch(name)}
         for name in sorted(names - by_azimuth[azimuth]):
             report.skip(f"{azimuth.name}/{name}", "not named <receiver>_<source>.wav")
+        for name in _doubled(by_azimuth[azimuth]):
+            by_azimuth[azimuth].remove(name)
+            report.skip(f"{azimuth.name}/{name}", "a pair that another file is named by too")
     everywhere = set().union(*by_azimuth.values())
     for azimuth, names in by_azimuth.items():
         for name in sorted(everywhere - names):
@@ -92,8 +93,45 @@ def read_points(path: Path) -> dict[int, _Point]:
     return points
 
 
-def _azimuth(folder: Path) -> int:
-    return int(folder.name)
+def _azimuths(folder: Path, report: ImportReport) -> list[Path]:
+    """Folders that are named by a heading in degrees, in its order, counted from 0 to 360. What else there is, the
+    report lists. Raises SourceError for no such folder, or two of one heading."""
+    found: dict[float, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if not path.is_dir():
+            if path.name != "points.txt":
+                report.skip(path.name, "a file beside the azimuths")
+            continue
+        try:
+            azimuth = _azimuth(path)
+        except ValueError:
+            inside = sum(1 for each in path.rglob("*") if each.is_file())
+            report.skip(f"{path.name}/", "in a folder that is not named by an azimuth in degrees", inside)
+            continue
+        other = found.setdefault(azimuth, path)
+        if other != path:
+            problem = f"{other.name!r} and {path.name!r} are one azimuth; leave one out"
+            raise SourceError(folder, "azimuths", problem)
+    if not found:
+        raise SourceError(folder, "azimuths", "no folder is named by an azimuth in degrees")
+    return [found[azimuth] for azimuth in sorted(found)]
+
+
+def _doubled(names: set[str]) -> list[str]:
+    """Names of pairs that a shorter name stands for already: `00_1.wav` beside `0_1.wav`."""
+    pairs: set[tuple[int, ...]] = set()
+    doubled = []
+    for name in sorted(names, key=lambda each: (len(each), each)):
+        pair = tuple(int(index) for index in name.removesuffix(".wav").split("_"))
+        if pair in pairs:
+            doubled.append(name)
+        pairs.add(pair)
+    return doubled
+
+
+def _azimuth(folder: Path) -> float:
+    """In degrees, from 0 up to 360. Raises ValueError."""
+    return parse_decimal(folder.name) % 360.0
 
 
 def _points_file(folder: Path) -> Path:

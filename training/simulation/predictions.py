@@ -16,7 +16,7 @@ from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.acoustics.transmission import transmission_loss_db, walls_between
-from server.scene.manifest import MOST_SAMPLES
+from server.scene.limits import MOST_SAMPLES
 from training.dataset import SPEED_OF_SOUND
 from training.scene_file import SceneFile
 from training.simulation.diffuse_room import DiffuseRoom

@@ -8,7 +8,8 @@ import soundfile
 from scipy.signal import freqz
 
 from tests.training.importers.conftest import RATE, wave
-from training.importers.conditioning import Conditioning, conditioned, ears_agree
+from training.importers.conditioning import Conditioning, conditioned
+from training.importers.evidence import ears_agree
 from training.importers.report import ImportReport
 from training.responses import Measurement
 
