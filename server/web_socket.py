@@ -22,6 +22,7 @@ from websockets.http11 import Request, Response
 from websockets.protocol import CONNECTING, OPEN
 from websockets.server import ServerProtocol
 
+from server.api.resetting import reset
 from server.api.seats import Seat
 from server.problems import problem
 from server.web_socket_frames import FrameCutter, header
@@ -131,7 +132,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self._closing_since_s is None:
             self._closing_since_s = now_s
         elif now_s - self._closing_since_s > self.close_timeout:
-            self.transport.abort()
+            reset(self.transport)
 
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
