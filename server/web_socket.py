@@ -38,6 +38,7 @@ from server.api.inflow import (
     message_cost,
     supersedes,
 )
+from server.api.resetting import reset
 from server.api.seats import Seat
 from server.problems import problem
 from server.web_socket_frames import Cut, FrameCutter, header
@@ -168,7 +169,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self._closing_since_s is None:
             self._closing_since_s = now_s
         elif now_s - self._closing_since_s > self.close_timeout:
-            self.transport.abort()
+            reset(self.transport)
 
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
