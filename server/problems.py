@@ -1,5 +1,6 @@
 """Errors of the HTTP interface: problem documents (RFC 9457) with the `code` and `field` of the WebSocket's errors."""
 
+from dataclasses import dataclass
 from http import HTTPStatus
 
 from fastapi import FastAPI, Request
@@ -13,6 +14,16 @@ _POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "height_m"})
 _STATUSES = {"position_out_of_bounds": 404, "unknown_level": 404, "map_too_fine": 409, "map_too_slow": 409}
 """Of what is well formed and asks for what there is not, or for too much: 422 is for what is malformed."""
 _CODES = {404: "not_found", 405: "method_not_allowed"}
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """What a request is answered before the application sees it: `status` of HTTP, `code` for programs, `detail` for
+    people."""
+
+    status: int
+    code: str
+    detail: str
 
 
 def problem(

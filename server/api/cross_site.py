@@ -21,22 +21,13 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.problems import problem
+from server.problems import Refusal, problem
 from server.settings import Settings
 
 _HEALTH = frozenset({"/livez", "/readyz"})
 _ANY = "*"
 _USUAL_PORTS = {"http": 80, "https": 443}
 _EXPOSED = ("ETag", "Retry-After")
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """`status` of HTTP, `code` for programs, `detail` for people."""
-
-    status: int
-    code: str
-    detail: str
 
 
 @dataclass(frozen=True)
