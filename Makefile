@@ -26,13 +26,17 @@ FUZZ_SECONDS ?= 60
 # Tests that watch the clock, and so have the machine to themselves.
 TIMED := tests/integration tests/bench/test_sessions.py tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
 
+# Tests that attack a server beside a listener for minutes.
+ATTACKS := $(addprefix tests/integration/attacks/test_,abandoned_work.py floods.py http_requests.py)
+
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle scenes table tables office container-test clean hard-cases fuzz mutants
+.PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
+.PHONY: mutants attacks
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
 
 help: ## show this list
@@ -43,7 +47,7 @@ serve: $(VENV)/installed-server ## install the server and open a scene at http:/
 
 test: lint ## install what tests need, then lint, check types and run every test
 	$(BIN)/pytest --numprocesses auto --dist loadfile $(TIMED:%=--ignore %)
-	$(BIN)/pytest $(TIMED)
+	$(BIN)/pytest $(TIMED) $(ATTACKS:%=--ignore %)
 
 lint: $(VENV)/installed-dev ## lint and check types
 	$(BIN)/ruff check .
@@ -73,6 +77,12 @@ office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere
 		--methods nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear > $(OFFICE)/table.md
 	@cat $(OFFICE)/table.md
 
+own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kinds, and how long they ring beside other simulations: runs/own-scenes.md
+	$(BIN)/python -m training.own_scenes runs/own-scenes
+
+attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
+	$(BIN)/pytest $(ATTACKS)
+
 hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
 	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md
 
@@ -85,6 +95,9 @@ mutants: $(VENV)/installed-dev ## remove each guard in a copy of the tree and sh
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh
+
+predictions: $(VENV)/installed-training ## what plans predict of effects beside what simulation finds, in ten rooms of extremes: some minutes
+	$(BIN)/python -m training.simulation.rooms_tried
 
 clean: ## remove .venv and caches; keeps runs/
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

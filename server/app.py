@@ -12,9 +12,11 @@ from typing import get_args
 
 from fastapi import FastAPI
 
-from server.answers import Answers
+from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
+from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
+from server.api.response_cache import ResponseCache
 from server.api.strict_requests import StrictRequests
 from server.audio_engine import AudioEngine
 from server.calibration import calibrate
@@ -68,7 +70,15 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
         loaded = await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes
         heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
-        with Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers:
+        with (
+            Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers,
+            ResponseCache(
+                # One more than there are IR workers, which maps leave to what is cheap.
+                workers=settings.ir_workers + 1,
+                waiting=settings.max_waiting_requests,
+                is_urgent=lambda: workers.are_busy,
+            ) as responses,
+        ):
             audio = AudioEngine(
                 asyncio.get_running_loop().call_soon_threadsafe,
                 workers,
@@ -82,9 +92,8 @@ def create_app(
                 hrtfs=heads,
                 audio=audio,
                 settings=settings,
-                # One more than there are IR workers: a map must not hold up an IR.
-                answers=Answers(workers=settings.ir_workers + 1, waiting=settings.max_waiting_requests),
-                readiness=Readiness(drain, ThreadWatch((audio, workers.pool))),
+                responses=responses,
+                readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool))),
             )
             if settings.realtime:
                 become_prompt()
@@ -112,7 +121,9 @@ def create_app(
     app.include_router(health)
     app.include_router(documents)
     app.include_router(api)
+    install_openapi(app)
     app.add_middleware(StrictRequests, routes=app.router.routes)
+    app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))
     app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
 
@@ -152,7 +163,6 @@ def _warm_up(host: StreamHost) -> None:
     """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render. And
     see how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
-    fingerprint()
     for scene, levels in host.scenes.items():
         host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
@@ -171,3 +181,4 @@ def _warm_up(host: StreamHost) -> None:
             if (request := session.take_request()) is not None:
                 session.accept(compute_irs(levels, request, session.renderer))
             session.render_block()
+    fingerprint()

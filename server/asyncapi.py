@@ -15,6 +15,7 @@ from typing import Any, Final, get_args
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue, models_json_schema
 from pydantic_core import core_schema
 
+from server.api.inflow import MOVES_PER_S, POSES_PER_S
 from server.blocks import AudioBlock, DryBlock
 from server.exchange import EXCHANGE
 from server.message import Message
@@ -79,6 +80,11 @@ full, blocks are rendered and not sent: `sequence` has no gap then, and `sample_
 {PAUSE_AFTER_S:g} s, the stream stands still, its clock included, until an `acknowledge` makes room: it goes on where it
 was. After {_default("stall_timeout_s"):g} s the connection is closed (`stalled`). A client whose answers pile up, since
 it does not read, is cut off.
+
+**Flow control of what clients say.** A client may say as much as a live block of 128 samples of each of its emitters,
+{POSES_PER_S:,} poses a second, an acknowledgement of every block and {MOVES_PER_S} moves a second of each emitter come
+to. Beyond that the server reads more slowly: nothing is lost, nothing is closed, and the rest waits with the client. Of
+poses of the listener that follow one another directly, only the newest may be read.
 
 **Errors.** A message that is refused changes nothing, and the stream goes on, unless it was the hello. An `error` that
 ends the connection is followed by a close frame whose reason is the error's code. A server that is told to stop sends

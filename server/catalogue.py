@@ -79,4 +79,5 @@ def describe_scene(levels: Levels) -> SceneDescription:
         emitter=Place(position=start.emitter),
         level=field.level.name,
         levels=manifest.levels,
+        accepted_laws=manifest.accepted,
     )

@@ -184,7 +184,8 @@ def render(
     path: Annotated[
         Path,
         typer.Option(
-            help="CSV: sample or time_s; x, y, z; qx, qy, qz, qw or yaw_deg; reverberation_sample where it is later."
+            help="CSV: sample or time_s; x, y, z; qx, qy, qz, qw or yaw_deg; reverberation_sample where it is later; "
+            "level where it changes."
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32.")],
@@ -212,8 +213,7 @@ def render(
     import scipy.io.wavfile
 
     from server.direct_sound import DirectSound
-    from server.field.field import AcousticField
-    from server.field.levels import require_level
+    from server.field.levels import Levels
     from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
     from server.render import MAX_RENDER_S, planned_effects, read_path
     from server.render import render as render_path
@@ -225,7 +225,8 @@ def render(
         raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
     require_writable(output, "--output")
     bundle = Bundle.load(find_bundle(scene))
-    field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
+    levels = Levels.load(bundle)
+    field = levels.choose(level)
     if duration_s is not None and not 1 / field.sample_rate <= duration_s <= MAX_RENDER_S:
         raise RequestError(
             "malformed_duration",
@@ -233,7 +234,7 @@ def render(
             field="duration_s",
         )
     emitters = [_read_emitter(text, field, loop=loop) for text in emitter]
-    points = read_path(path, field.sample_rate)
+    points = read_path(path, field.sample_rate, list(levels))
     for number, point in enumerate(points, start=1):
         field.bundle.require_inside(point.pose.position, f"path point {number}")
     length = None if duration_s is None else round(duration_s * field.sample_rate)
@@ -252,6 +253,7 @@ def render(
             length=length,
             progress=lambda done: progress.update(task, completed=done),
             planned=planned,
+            levels=levels,
         )
     elapsed_s = time.perf_counter() - started_s
     rendered_s = samples.shape[1] / field.sample_rate

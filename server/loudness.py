@@ -16,17 +16,19 @@ from scipy.ndimage import distance_transform_edt
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import Vector3
 from server.field.field import AcousticField
+from server.runtime.pace import Checkpoint, no_checkpoint
 from server.scene.bundle import Bundle
 from server.whole_field import WholeField
 
 # Ears of two opposite heads face four ways.
 _YAWS = 2
-_CHUNK = 64
 MAX_POINTS = 2_000
 """Of a map; a point costs milliseconds."""
 FINEST_M = 0.1
 _USUAL_M = 0.25
 _POINTS_ACROSS = 8
+_CHUNK = 4
+"""Cells between two checkpoints: some 15 ms of work."""
 _PIXELS_PER_METRE = 80
 _RANGE_DB = 30.0
 # Perceptually even, dark to bright, legible under dark and light drawings (a subset of the CAM02-UCS path of
@@ -88,9 +90,15 @@ def usual_spacing_m(bundle: Bundle) -> float:
 
 
 def loudness_map(
-    field: WholeField, emitter: Vector3, *, listener_height_m: float, spacing_m: float = 0.25
+    field: WholeField,
+    emitter: Vector3,
+    *,
+    listener_height_m: float,
+    spacing_m: float = 0.25,
+    checkpoint: Checkpoint = no_checkpoint,
 ) -> LoudnessMap:
-    """Asks the field for every cell in the floor plan, on a grid centred in the bounds; about a millisecond each."""
+    """Asks the field for every cell in the floor plan, on a grid centred in the bounds; some milliseconds each. Every
+    few cells it is at a `checkpoint`, and raises what that does."""
     bundle = field.bundle
     low, high = np.asarray(bundle.manifest.bounds.minimum[:2]), np.asarray(bundle.manifest.bounds.maximum[:2])
     columns, rows = np.maximum(1, np.floor((high - low) / spacing_m + 1e-6).astype(int))
@@ -100,8 +108,13 @@ def loudness_map(
     cells = np.stack([*np.meshgrid(x, y), np.full((rows, columns), listener_height_m)], axis=-1)
     inside = bundle.floor_plan.contains(cells)
     levels = np.full((rows, columns), np.nan)
-    reflected = _reflected_power(field.field, cells[inside], emitter)
-    whole = power_to_db(field.path_power(cells[inside], emitter) + reflected)
+    listeners = cells[inside]
+    whole = np.empty(len(listeners))
+    for start in range(0, len(listeners), _CHUNK):
+        checkpoint()
+        part = slice(start, start + _CHUNK)
+        power = field.path_power(listeners[part], emitter) + _reflected_power(field.field, listeners[part], emitter)
+        whole[part] = power_to_db(power)
     levels[inside] = whole - bundle.manifest.reference_level_db
     return LoudnessMap(levels, (float(x[0]), float(y[0])), spacing_m, listener_height_m)
 
@@ -113,9 +126,5 @@ def _reflected_power(
     says."""
     yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
     positions, heads = np.repeat(listeners, _YAWS, axis=0), np.tile(yaws, len(listeners))
-    power = np.empty(len(heads))
-    for start in range(0, len(heads), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        emitters = np.broadcast_to(emitter, positions[part].shape)
-        power[part] = field.energy(positions[part], emitters, heads[part]).mean(axis=-1)
+    power = field.energy(positions, np.broadcast_to(emitter, positions.shape), heads).mean(axis=-1)
     return np.asarray(power.reshape(-1, _YAWS).mean(axis=1))

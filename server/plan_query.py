@@ -21,6 +21,8 @@ from server.scene.plan import Decision, Plan
 from server.scene.planner import Costs, make_plan
 from server.scene.situation import WALKING_M_S, Emitter, Listener, Output, Situation
 
+EFFECT_PATTERN = f"^({'|'.join(EffectName)})=(on|off)$"
+"""What `parse_effects` takes, as a regular expression of JSON Schema."""
 OUTPUTS: tuple[Output, ...] = ("headphones", "mono")
 
 
@@ -119,12 +121,14 @@ class PlanQuery:
 
 
 def parse_effects(texts: Sequence[str]) -> dict[str, bool]:
-    """`NAME=on` or `NAME=off` of each. Raises RequestError `unknown_effect`."""
+    """`NAME=on` or `NAME=off` of each. Raises RequestError `unknown_effect`, and `doubled_effect` for a name twice."""
     effects = {}
     for text in texts:
         name, _, state = text.partition("=")
         if state not in {"on", "off"}:
             raise RequestError("unknown_effect", f"effect {text!r} is not NAME=on or NAME=off", field="effects")
+        if name in effects:
+            raise RequestError("doubled_effect", f"effect {name!r} is there twice", field="effect", status=409)
         effects[name] = state == "on"
     return effects
 

@@ -69,11 +69,11 @@ def become_prompt() -> bool:
     return not refused
 
 
-def become_background() -> None:
-    """Have the calling thread yield to ordinary ones."""
+def become_background(niceness: int = _NICENESS) -> None:
+    """Have the calling thread yield to ordinary ones, and to those of less `niceness`."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)  # 0 is the calling thread here, the process elsewhere
+            os.setpriority(os.PRIO_PROCESS, 0, niceness)  # 0 is the calling thread here, the process elsewhere
 
 
 class Breaks:

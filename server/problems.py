@@ -1,5 +1,6 @@
 """Errors of the HTTP interface: problem documents (RFC 9457) with the `code` and `field` of the WebSocket's errors."""
 
+from dataclasses import dataclass
 from http import HTTPStatus
 
 from fastapi import FastAPI, Request
@@ -10,7 +11,19 @@ from starlette.exceptions import HTTPException
 from server.errors import RequestError
 
 _POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "height_m"})
+_STATUSES = {"position_out_of_bounds": 404, "unknown_level": 404, "map_too_fine": 409, "map_too_slow": 409}
+"""Of what is well formed and asks for what there is not, or for too much: 422 is for what is malformed."""
 _CODES = {404: "not_found", 405: "method_not_allowed"}
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """What a request is answered before the application sees it: `status` of HTTP, `code` for programs, `detail` for
+    people."""
+
+    status: int
+    code: str
+    detail: str
 
 
 def problem(
@@ -38,14 +51,15 @@ def install_problems(app: FastAPI) -> None:
 
     async def refused(_: Request, exc: Exception) -> JSONResponse:
         assert isinstance(exc, RequestError)
-        return problem(exc.status, exc.code, str(exc), exc.field, retry_after_s=exc.retry_after_s)
+        status = _STATUSES.get(exc.code, exc.status)
+        return problem(status, exc.code, str(exc), exc.field, retry_after_s=exc.retry_after_s)
 
     async def invalid(_: Request, exc: Exception) -> JSONResponse:
         assert isinstance(exc, RequestValidationError)
         first = exc.errors()[0]
         field = str(first["loc"][-1])
         code = "malformed_pose" if field in _POSE_PARAMETERS else "malformed_request"
-        return problem(422, code, f"{field}: {first['msg']}", field)
+        return problem(422, code, f"{field}: {first['msg'].removeprefix('Value error, ')}", field)
 
     async def http(_: Request, exc: Exception) -> JSONResponse:
         assert isinstance(exc, HTTPException)

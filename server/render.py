@@ -7,7 +7,7 @@ the blocks that first applied them renders the same.
 
 import csv
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +42,7 @@ _LEAST_GAIN = 1e-6
 """A plan takes what is softer for this."""
 _CLOCKS = ("sample", "time_s")
 _REVERBERATION = "reverberation_sample"
+_LEVEL = "level"
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _YAW = ("yaw_deg",)
@@ -71,11 +72,13 @@ class RenderedEmitter:
 @dataclass(frozen=True)
 class PathPoint:
     """The listener's pose: that of the direct sound from `sample` on, and that of what follows it, the field's impulse
-    responses, from `reverberation_sample` on; with None, never, since another pose was faster."""
+    responses, from `reverberation_sample` on; with None, never, since another pose was faster. From then on responses
+    are of quality level `level`; with None, of the same as before."""
 
     sample: int
     pose: Pose
     reverberation_sample: int | None
+    level: str | None = None
 
     @classmethod
     def at(cls, sample: int, pose: Pose) -> "PathPoint":
@@ -83,12 +86,13 @@ class PathPoint:
         return cls(sample, pose, sample)
 
 
-def read_path(path: Path, sample_rate: int) -> list[PathPoint]:
+def read_path(path: Path, sample_rate: int, levels: Collection[str] | None = None) -> list[PathPoint]:
     """Read a CSV file with a header line, columns in any order.
 
     They are `sample` or `time_s`; `x`, `y`, `z` in metres; `qx`, `qy`, `qz`, `qw` or `yaw_deg` (counter-clockwise, 0
-    looks along +x); and, or else it is the same, `reverberation_sample`, empty for never. Neither clock goes back from
-    line to line, nor beyond `MAX_RENDER_S`. Raises PathError.
+    looks along +x); and, or else it is the same, `reverberation_sample`, empty for never; and `level`, one of `levels`
+    where those are given, empty for the same as before. Neither clock goes back from line to line, nor beyond
+    `MAX_RENDER_S`. Raises PathError.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -98,10 +102,12 @@ def read_path(path: Path, sample_rate: int) -> list[PathPoint]:
         raise PathError(f"{path.name}: {exc.strerror}") from exc
     except (UnicodeDecodeError, csv.Error) as exc:
         raise PathError(f"{path.name}: not a CSV file ({exc})") from exc
-    return list(_parse(lines, path.name, sample_rate))
+    return list(_parse(lines, path.name, sample_rate, levels))
 
 
-def _parse(lines: list[tuple[int, list[str]]], name: str, sample_rate: int) -> Iterator[PathPoint]:
+def _parse(
+    lines: list[tuple[int, list[str]]], name: str, sample_rate: int, levels: Collection[str] | None
+) -> Iterator[PathPoint]:
     columns = [column.strip() for column in lines[0][1]] if lines else []
     _check_header(columns, name)
     latest = dict.fromkeys((*_CLOCKS, _REVERBERATION), 0)
@@ -113,6 +119,10 @@ def _parse(lines: list[tuple[int, list[str]]], name: str, sample_rate: int) -> I
         if len(row) != len(columns):
             raise PathError(f"{where}: {len(row)} values for {len(columns)} columns")
         texts = dict(zip(columns, row, strict=True))
+        level = texts.pop(_LEVEL, "").strip() or None
+        if level is not None and levels is not None and level not in levels:
+            problem = f"the scene has no quality level {level!r}, only {', '.join(levels)}"
+            raise PathError(f"{where}, column '{_LEVEL}': {problem}")
         is_silent = _REVERBERATION in texts and not texts[_REVERBERATION].strip()
         if is_silent:
             del texts[_REVERBERATION]
@@ -127,7 +137,7 @@ def _parse(lines: list[tuple[int, list[str]]], name: str, sample_rate: int) -> I
         if reverberation is not None and reverberation < samples[clock]:
             raise PathError(f"{where}, column '{_REVERBERATION}': must not be before '{clock}'")
         points += 1
-        yield PathPoint(samples[clock], _pose(values, where), reverberation)
+        yield PathPoint(samples[clock], _pose(values, where), reverberation, level)
     if not points:
         raise PathError(f"{name}: no poses below the header line")
 
@@ -150,7 +160,7 @@ def _check_header(columns: list[str], name: str) -> None:
     if not any(columns):
         raise PathError(f"{where}: expected a header line such as sample,x,y,z,yaw_deg")
     for column in columns:
-        if column not in (*_CLOCKS, _REVERBERATION, *_POSITION, *_QUATERNION, *_YAW):
+        if column not in (*_CLOCKS, _REVERBERATION, *_POSITION, *_QUATERNION, *_YAW, _LEVEL):
             raise PathError(f"{where}: unknown column '{column}'")
         if columns.count(column) > 1:
             raise PathError(f"{where}: column '{column}' is there twice")
@@ -192,6 +202,7 @@ def render(
     length: int | None = None,
     progress: Callable[[float], None] | None = None,
     planned: PlannedEffects | None = None,
+    levels: Mapping[str, Field] | None = None,
 ) -> FloatArray:
     """What a listener on `path` (one point or more, by rising sample) hears of `emitters` (one or more): (channel,
     length), two ears or, from a mono loudspeaker, one channel.
@@ -199,20 +210,24 @@ def render(
     A point takes effect with the first block that begins at its sample or later, unless a later point does too. The
     emitters start where the path begins. `length` in samples defaults to the end of the path or of the longest clip,
     whichever is later, and the reverberation after it. `progress` is told the fraction done. Only the effects are
-    rendered that are `planned`, or all.
+    rendered that are `planned`, or all. Responses are those of `field` until a point names another of `levels`; for the
+    same samples as a stream's these are all that its scene has. Raises KeyError for a level that is none of them.
     """
     if not path or not emitters:
         raise ValueError("a render needs a path and an emitter")
+    fields = _fields(field, path, levels or {})
+    ir_samples = max(each.ir_samples for each in (field, *(levels or {}).values()))
     if length is None:
         last_start = max(path[-1].sample, path[0].sample + max(emitter.clip.size for emitter in emitters))
-        length = _block_at(last_start, block_size) * block_size + field.ir_samples
+        length = _block_at(last_start, block_size) * block_size + max(each.ir_samples for each in fields)
     direct = {_block_at(point.sample, block_size): point.pose for point in path}
     reverberation = {
-        _block_at(point.reverberation_sample, block_size): point.pose
-        for point in path
+        _block_at(point.reverberation_sample, block_size): (point.pose, each)
+        for point, each in zip(path, fields, strict=True)
         if point.reverberation_sample is not None
     }
-    walk = _Walk(field, direct_sound, emitters, path[0].pose, block_size, planned)
+    shares_tail = any(each.level.shared_tail for each in (field, *(levels or {}).values()))
+    walk = _Walk(fields[0], direct_sound, emitters, path[0].pose, block_size, planned, ir_samples, shares_tail)
     blocks = -(-length // block_size)
     output = np.empty((walk.renderer.outputs, blocks, block_size), np.float32)
     for block in range(blocks):
@@ -221,6 +236,15 @@ def render(
         if progress:
             progress((block + 1) / blocks)
     return output.reshape(len(output), -1)[:, :length]
+
+
+def _fields(field: Field, path: Sequence[PathPoint], levels: Mapping[str, Field]) -> list[Field]:
+    """What gives the responses of each point; `field` before any names a level."""
+    fields = []
+    for point in path:
+        field = field if point.level is None else levels[point.level]
+        fields.append(field)
+    return fields
 
 
 def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output: Output) -> PlannedEffects | None:
@@ -250,17 +274,21 @@ class _Walk:
         start: Pose,
         block_size: int,
         planned: PlannedEffects | None,
+        ir_samples: int,
+        shares_tail: bool,
     ) -> None:
+        """`ir_samples` at most has any response; `shares_tail` says whether emitters share a tail at any level."""
         self.renderer = direct_sound.renderer(
             block_size=block_size,
-            ir_samples=field.ir_samples,
+            ir_samples=ir_samples,
             sample_rate=field.sample_rate,
             max_emitters=len(emitters),
-            switches_tail=planned is not None,
+            switches_tail=planned is not None or shares_tail,
             outputs=1 if planned is not None and planned.output == "mono" else 2,
             has_head=planned is None or planned.shared.head,
         )
         self._field = field
+        self.renderer.share_tail(field.level.shared_tail)
         self._direct_sound = direct_sound
         self._effects = EffectsInForce(
             self.renderer,
@@ -284,8 +312,8 @@ class _Walk:
             if planned is not None:
                 planned.follow_emitter(name, emitter.pose, 0.0)
 
-    def go_on(self, direct: Pose | None, reverberation: Pose | None) -> None:
-        """What is heard from the next block on: direct sound and responses of these poses, or as before."""
+    def go_on(self, direct: Pose | None, reverberation: tuple[Pose, Field] | None) -> None:
+        """What is heard from the next block on: direct sound of this pose and responses of that, or as before."""
         if direct is not None:
             self._move(direct)
         self._plan()
@@ -294,7 +322,11 @@ class _Walk:
         if reverberation is not None:
             for emitter in self._emitters.values():
                 emitter.is_outdated = True
-            self._respond(reverberation)
+            pose, field = reverberation
+            is_other, self._field = field is not self._field, field
+            self._respond(pose)
+            if is_other:
+                self._effects.share_tail(field.level.shared_tail, self._emitters)
         elif self._effects.planned is not None and self._has_begun:
             self._respond(self._listener)
 
@@ -316,7 +348,7 @@ class _Walk:
         if request is not None:
             planned.accept(request.plan())
             self._effects.enforce(self._emitters)
-            self._effects.share_tail(False, self._emitters)
+            self._effects.share_tail(self._field.level.shared_tail, self._emitters)
 
     def _respond(self, listener: Pose) -> None:
         """Hand in the responses that are out of date."""

@@ -11,7 +11,7 @@ from server.load import Reason
 from server.message import Message, Position
 from server.protocol import PROTOCOL
 from server.scene.geometry import Opening
-from server.scene.manifest import Bounds, QualityLevel
+from server.scene.manifest import AcceptedLaw, Bounds, QualityLevel
 from server.scene.plan import Plan
 
 
@@ -24,7 +24,8 @@ class SceneDescription(Message):
     """What a client needs to know of a scene; `corners` is the floor plan, counter-clockwise, or where no walls are
     known the outline of the bounds. Of `channels` a scene has two ears or one microphone; a stream always has two.
 
-    `listener` and `emitter` are where to put a visitor and what he hears first.
+    `listener` and `emitter` are where to put a visitor and what he hears first. `accepted_laws` are those of
+    `nafir check` that the scene's fields break, with the reason why it is offered all the same.
     """
 
     id: str
@@ -43,6 +44,7 @@ class SceneDescription(Message):
     emitter: Place
     level: str
     levels: tuple[QualityLevel, ...]
+    accepted_laws: tuple[AcceptedLaw, ...]
 
 
 class Welcome(Message):

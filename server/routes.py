@@ -1,24 +1,27 @@
 """HTTP and WebSocket endpoints: they parse, hand over, and answer. Angles in degrees, positions in metres."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Annotated, Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response, WebSocket
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
-from pydantic import FiniteFloat
+from pydantic import BeforeValidator, Field
 
+from server.api.response_cache import Compute, Kind
 from server.asyncapi import document
 from server.catalogue import describe_scene, playable_clips
 from server.core.entity_tags import content_tag
+from server.core.numerals import parse_decimal
 from server.errors import RequestError
 from server.field.levels import Levels
 from server.frontier import Frontier
 from server.hrtfs import DEFAULT_HRTF
 from server.impulse_response import (
+    IR_FORMATS,
     MEDIA_TYPES,
+    POSITION_PATTERN,
     ImpulseResponse,
     IrQuery,
     entity_tag,
@@ -26,7 +29,9 @@ from server.impulse_response import (
     parse_position,
 )
 from server.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
-from server.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
+from server.plan_query import EFFECT_PATTERN, OUTPUTS, PlanDocument, PlanQuery, parse_effects, rounded
+from server.runtime.pace import Checkpoint
+from server.runtime.racing import StoppedError, run_until
 from server.streaming import Connection, StreamHost
 from server.telemetry import ServerCollector, exposition
 from server.web_socket import direct_way
@@ -35,6 +40,8 @@ from server.whole_field import WholeField
 MAX_MAP_SPACING_M = 20.0
 MAX_MAP_S = 120.0
 MAX_PLANNED = 16
+CLIENT_CLOSED_REQUEST = 499
+"""For the log alone: nobody is there to read it."""
 CACHE_CONTROL = "public, max-age=3600"
 """Entity tags outlive it: after an hour an unchanged answer costs a 304."""
 
@@ -42,8 +49,25 @@ api = APIRouter(prefix="/v1")
 health = APIRouter()
 documents = APIRouter(include_in_schema=False)
 
+_PLACE: dict[str, Any] = {"pattern": POSITION_PATTERN}
+
+
+def _between(low: float, high: float) -> dict[str, Any]:
+    """Bounds, told in the schema too: behind `Decimal`'s parser pydantic does not."""
+    return {"ge": low, "le": high, "json_schema_extra": {"minimum": low, "maximum": high}}
+
+
+Decimal = Annotated[float, BeforeValidator(lambda value: parse_decimal(value) if isinstance(value, str) else value)]
 LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
-PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"])]
+PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"], json_schema_extra=_PLACE)]
+YawDeg = Annotated[
+    Decimal, Query(**_between(-36_000, 36_000), description="of the head, counter-clockwise, 0 looks along +x")
+]
+EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
+_IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
+_IR_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
+_MAP_TYPES = {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
+_MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 
 
 @health.get("/livez")
@@ -90,15 +114,15 @@ async def frontier(request: Request, scene: str) -> Frontier:
     return Frontier.of(levels, {} if offer is None else offer.ms_here)
 
 
-@api.get("/scenes/{scene}/impulse-response", response_class=Response)
+@api.get("/scenes/{scene}/impulse-response", response_class=Response, responses={200: _IR_TYPES})
 async def impulse_response(
     request: Request,
     scene: str,
     listener: PositionText,
     emitter: PositionText,
-    yaw_deg: Annotated[FiniteFloat, Query(description="of the head, counter-clockwise, 0 looks along +x")] = 0.0,
+    yaw_deg: YawDeg = 0.0,
     level: LevelText = None,
-    format: Annotated[str, Query(description="wav, npy or json")] = "wav",  # noqa: A002  the parameter's name
+    format: Annotated[str, Query(description="wav, npy or json", json_schema_extra={"enum": [*IR_FORMATS]})] = "wav",  # noqa: A002  the parameter's name
 ) -> Response:
     """The impulse response between two places, as `nafir ir` writes it."""
     field = _levels(request, scene).choose(level)
@@ -109,22 +133,25 @@ async def impulse_response(
         request,
         query.etag(field, name),
         MEDIA_TYPES[name],
-        lambda: ImpulseResponse.compute(field, query).encode(name),
+        lambda _: ImpulseResponse.compute(field, query).encode(name),
     )
 
 
-@api.get("/scenes/{scene}/loudness", response_class=Response)
+@api.get("/scenes/{scene}/loudness", response_class=Response, responses={200: _MAP_TYPES})
 async def loudness(
     request: Request,
     scene: str,
     emitter: PositionText,
-    height_m: Annotated[FiniteFloat, Query(description="of the listener's ears")] = 1.5,
+    height_m: Annotated[Decimal, Query(**_between(-1_000, 1_000), description="of the listener's ears")] = 1.5,
     spacing_m: Annotated[
-        FiniteFloat | None,
-        Query(ge=FINEST_M, le=MAX_MAP_SPACING_M, description="between map points; by default as the scene's size asks"),
+        Decimal | None,
+        Query(
+            **_between(FINEST_M, MAX_MAP_SPACING_M),
+            description="between map points; by default as the scene's size asks",
+        ),
     ] = None,
     level: LevelText = None,
-    format: Annotated[str, Query(description="png or json")] = "png",  # noqa: A002  the parameter's name
+    format: Annotated[str, Query(description="png or json", json_schema_extra={"enum": ["png", "json"]})] = "png",  # noqa: A002  the parameter's name
 ) -> Response:
     """How loud an emitter is at every place of the scene."""
     field = _levels(request, scene).choose(level)
@@ -147,27 +174,34 @@ async def loudness(
         )
         raise RequestError("map_too_slow", problem, field="level")
 
-    def draw() -> bytes:
+    def draw(checkpoint: Checkpoint) -> bytes:
         whole = WholeField.through_kemar(field)
-        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m)
+        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m, checkpoint=checkpoint)
         return levels.to_png() if format == "png" else json.dumps(levels.to_json()).encode()
 
     parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
     media_type = "image/png" if format == "png" else "application/json"
-    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw)
+    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw, kind="map")
 
 
 @api.get("/scenes/{scene}/plan", response_model=PlanDocument)
 async def plan(
     request: Request,
     scene: str,
-    listener: Annotated[str | None, Query(description="x,y,z in metres; by default where a visitor starts")] = None,
-    yaw_deg: Annotated[FiniteFloat, Query(description="of the head, counter-clockwise, 0 looks along +x")] = 0.0,
-    emitter: Annotated[list[str] | None, Query(description="x,y,z in metres; may be repeated")] = None,
+    listener: Annotated[
+        str | None, Query(description="x,y,z in metres; by default where a visitor starts", json_schema_extra=_PLACE)
+    ] = None,
+    yaw_deg: YawDeg = 0.0,
+    emitter: Annotated[
+        list[Annotated[str, Field(json_schema_extra=_PLACE)]] | None,
+        Query(description="x,y,z in metres; may be repeated", json_schema_extra={"maxItems": MAX_PLANNED}),
+    ] = None,
     walks: Annotated[bool, Query(description="the listener walks and turns the head")] = True,
     move: Annotated[bool, Query(description="the emitters move")] = False,
-    output: Annotated[str, Query(description="headphones or mono")] = "headphones",
-    effect: Annotated[list[str] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
+    output: Annotated[
+        str, Query(description="headphones or mono", json_schema_extra={"enum": [*OUTPUTS]})
+    ] = "headphones",
+    effect: Annotated[list[EffectText] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
 ) -> Response:
     """Which effects a situation calls for, why, and what they cost on this host."""
     emitters = emitter or []
@@ -187,10 +221,13 @@ async def plan(
     costs = _host(request).effect_costs.get(scene)
     # Until they are measured, this process measures its own once, and keeps to them.
     told = None if costs is None else {name: asdict(cost) for name, cost in costs.items()}
-    body = await _host(request).answers.get(
+    body = await _computed(
+        request,
         entity_tag(field, "plan", {**asdict(query), "scene": scene, "costs": told}, "json"),
-        lambda: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
+        lambda _: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
     )
+    if body is None:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
     # What it costs is of this host and of this start of the server: nothing but the body itself says so.
     headers = {"ETag": content_tag(body), "Cache-Control": "no-cache"}
     if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
@@ -233,13 +270,31 @@ def _levels(request: Request, scene: str) -> Levels:
         raise RequestError("unknown_scene", f"there is no scene {scene!r}", field="scene", status=404) from None
 
 
-async def _cached(request: Request, etag: str, media_type: str, compute: Callable[[], bytes]) -> Response:
-    """Answer 304 where the client has it already, and else compute in a worker thread."""
+async def _cached(request: Request, etag: str, media_type: str, compute: Compute, *, kind: Kind = "single") -> Response:
+    """Answer 304 where the client has it already, and else compute it, for as long as the client waits."""
     headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
     if _has_tag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    body = await _host(request).answers.get(etag, compute)
+    body = await _computed(request, etag, compute, kind=kind)
+    if body is None:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
     return Response(body, media_type=media_type, headers=headers)
+
+
+async def _computed(request: Request, etag: str, compute: Compute, *, kind: Kind = "single") -> bytes | None:
+    """The body kept or computed for as long as the client waits; None where it has gone."""
+    client = "" if request.client is None else request.client.host
+    computing = _host(request).responses.get(etag, compute, kind=kind, client=client)
+    try:
+        return await run_until(computing, _disconnected(request))
+    except StoppedError:
+        return None
+
+
+async def _disconnected(request: Request) -> None:
+    """Return once the client has gone."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 def _has_tag(if_none_match: str, etag: str) -> bool:

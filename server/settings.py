@@ -1,6 +1,7 @@
 """What an operator can set: by argument, or by an environment variable that begins with NAFIR_."""
 
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Any, Self, get_args
 
@@ -13,6 +14,8 @@ from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
 
 _PREFIX = "NAFIR_"
+_SERVICE_LINK = re.compile(r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)|(\w+_)?PORT_\d+_(TCP|UDP|SCTP)(_\w+)?")
+"""What Kubernetes puts into every container about a service called nafir, behind the prefix."""
 
 
 def _usable_cores() -> int:
@@ -29,6 +32,24 @@ def _require_different_names(files: tuple[Path, ...]) -> tuple[Path, ...]:
     return files
 
 
+def _split_names(value: Any) -> Any:
+    return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
+
+
+def _require_origin(value: str) -> str:
+    if not re.fullmatch(r"https?://[^/\s*]+/?", value):
+        raise PydanticCustomError(
+            "origin", "{value} is no origin: give scheme and host, as in https://example.org", {"value": repr(value)}
+        )
+    return value
+
+
+Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)]
+"""In the environment, separated by commas."""
+Origins = Annotated[
+    tuple[Annotated[str, AfterValidator(_require_origin)], ...], NoDecode, BeforeValidator(_split_names)
+]
+"""In the environment, separated by commas."""
 Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_split_paths)]
 """In the environment, separated as in PATH."""
 NamedFiles = Annotated[Paths, AfterValidator(_require_different_names)]
@@ -42,6 +63,10 @@ class Settings(BaseSettings):
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    allowed_hosts: Names = ()
+    """Names by which the server may be asked for, beside `host`, localhost and addresses in numbers; `*` is any."""
+    allowed_origins: Origins = ()
+    """Sites whose pages may use the server, as https://example.org; its own page may."""
     bundles: Paths = ()
     """Scene bundles to serve beside those that come with the package."""
     clips: NamedFiles = ()
@@ -91,7 +116,7 @@ class Settings(BaseSettings):
     stall_timeout_s: Annotated[float, Field(gt=0)] = 15.0
     """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
-    """HTTP requests that may wait for a worker; one more is answered 503."""
+    """HTTP computations that may wait for a thread, equal requests as one; with one more, a client is answered 503."""
     drain_s: Annotated[float, Field(ge=2, le=3600)] = 8.0
     """How long the server may take to end once it is told to (SIGTERM, SIGINT): streams are told at once, requests may
     go on for 0.7 of it, and whatever has not ended by then is cut off."""
@@ -112,7 +137,9 @@ class Settings(BaseSettings):
         known = [name.upper() for name in type(self).model_fields]
         for variable in sorted(os.environ):
             name = variable.upper().removeprefix(_PREFIX)
-            if variable.upper().startswith(_PREFIX) and name not in known:
+            if not variable.upper().startswith(_PREFIX) or _SERVICE_LINK.fullmatch(name):
+                continue
+            if name not in known:
                 problem = f"the environment has {variable}, which is no setting{suggestion(name, known, _PREFIX)}"
                 raise PydanticCustomError("unknown_setting", "{problem}", {"problem": problem})
         return self

@@ -173,14 +173,29 @@ class Stream:
 
         What may call for an impulse response that can be asked for is looked at now, anything else with the next block.
         """
-        if len(self._messages) >= MAX_WAITING_MESSAGES:
-            return False
-        self._messages.append((self._time_s(), message))
+        if not self._replace_pose(message):
+            if len(self._messages) >= MAX_WAITING_MESSAGES:
+                return False
+            self._messages.append((self._time_s(), message))
         self._brings_emitter |= isinstance(message, AddEmitter)
         # While one is computed, no other is asked for until its answer comes, and that wakes too.
         asks = isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once
         if asks or self._is_paused:  # which no block would wake
             self._wake()
+        return True
+
+    def _replace_pose(self, message: ClientMessage) -> bool:
+        """Have a listener's pose take the place of an older one that came directly before it and still waits."""
+        if not (isinstance(message, ListenerPose) and self._messages):
+            return False
+        try:
+            _, last = self._messages[-1]
+            if not (isinstance(last, ListenerPose) and last.pose_id < message.pose_id):
+                return False
+            # Only here anything is appended: if the audio thread has taken it meanwhile, nothing is left at all.
+            self._messages[-1] = self._time_s(), message
+        except IndexError:
+            return False
         return True
 
     def start(self, origin_s: float) -> None:

@@ -24,7 +24,8 @@ from typing import Final
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from server.answers import Answers
+from server.api.inflow import Allowance
+from server.api.response_cache import ResponseCache
 from server.api.stream_counts import StreamLedger
 from server.audio_engine import AudioEngine
 from server.blocks import Encoding
@@ -98,7 +99,7 @@ class StreamHost:
     hrtfs: HrtfLibrary
     audio: AudioEngine
     settings: Settings
-    answers: Answers
+    responses: ResponseCache
     readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     places: dict[str, Place] = dataclasses.field(default_factory=dict)
@@ -291,6 +292,8 @@ class Connection:
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
         """Until the client has gone."""
         if self._way is not None:
+            emitters, rate = self._host.settings.max_emitters, self._host.scenes[hello.scene].default.sample_rate
+            self._way.allow(Allowance.of(emitters=emitters, sample_rate=rate))
             self._way.listen(self._hear)
         with contextlib.suppress(WebSocketDisconnect):
             while True:

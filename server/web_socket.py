@@ -5,6 +5,9 @@ of audio is most of what its listener costs beside rendering. A whole binary mes
 connection is open and its buffer has room: a header of a few bytes (RFC 6455, 5.2), and the transport; nor does a
 message that comes, where none waits before it. ASGI allows such *extensions*: an application finds this one in its
 scope, and does without where another server runs it.
+
+No client keeps others waiting: of what comes, a few frames are taken in at a time, between which others have their
+turn, and once a client has spent its budget (`server.api.inflow`) nothing is read from it for a while.
 """
 
 import asyncio
@@ -12,19 +15,33 @@ import logging
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
+from itertools import zip_longest
 from typing import Any, Final
 
+from uvicorn._types import ASGIReceiveEvent
 from uvicorn.config import Config
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
 from websockets.exceptions import InvalidState
+from websockets.frames import Frame
 from websockets.http11 import Request, Response
 from websockets.protocol import CONNECTING, OPEN
 from websockets.server import ServerProtocol
 
+from server.api.inflow import (
+    OTHER_FRAME_COST,
+    READ_COST,
+    SUPERSEDED_COST,
+    USUAL,
+    Allowance,
+    Budget,
+    message_cost,
+    supersedes,
+)
+from server.api.resetting import reset
 from server.api.seats import Seat
 from server.problems import problem
-from server.web_socket_frames import FrameCutter, header
+from server.web_socket_frames import Cut, FrameCutter, header
 
 Hear = Callable[[str | bytes], bool]
 """Takes a message in at once, or says False and has not: then it goes the way of all others."""
@@ -33,6 +50,16 @@ _EXTENSION: Final = "nafir.direct"
 _END_OF_REQUEST: Final = b"\r\n\r\n"
 _MOST_WAITING = 16
 """Messages that may wait for the application before its client is heard no more."""
+_FRAMES_AT_ONCE = 32
+"""Taken in before others have their turn: at most a millisecond."""
+_SHORTEST_WAIT_S = 0.01
+"""Once a budget is spent: more comes at once then, which costs less than many small pieces."""
+_MOST_FRAGMENTS = 64
+"""Of a message, that wait in pieces."""
+
+
+def _no_allowance(_: Allowance) -> None:
+    """Where a server has no budgets."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +69,10 @@ class DirectWay:
     write: Callable[[Sequence[bytes]], bool]
     """Sends binary messages at once, or says False and has not sent any."""
     listen: Callable[[Hear], None]
-    """From now on, whoever is given is told of messages before which none waits, if they come in one piece."""
+    """From now on, whoever is given is told of messages before which none waits, if they come in one piece; but not of
+    poses of the listener that a newer one follows directly."""
+    allow: Callable[[Allowance], None] = _no_allowance
+    """Has the client's budget fill at this rate."""
 
 
 def direct_way(scope: Mapping[str, Any]) -> DirectWay | None:
@@ -74,7 +104,7 @@ def watched(
 
         way.listen(hear_watched)
 
-    return {**scope, "extensions": {**scope["extensions"], _EXTENSION: {"way": DirectWay(write, listen)}}}
+    return {**scope, "extensions": {**scope["extensions"], _EXTENSION: {"way": DirectWay(write, listen, way.allow)}}}
 
 
 class _Handshake(ServerProtocol):
@@ -94,6 +124,19 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
     """For uvicorn, by `ws="server.web_socket:WebSocketProtocol"`, without extensions of the protocol's own: what is
     written here is neither compressed nor cut."""
 
+    _hear: Hear | None = None
+    _cutter: FrameCutter | None = None
+    _has_failed = False
+    """Whether the client broke the protocol, and was told so."""
+    _budget: Budget | None = None
+    _next_slice: asyncio.Handle | None = None
+    """When what waits is taken in, or reading goes on: until then nothing is read."""
+    _pong: bytes = b""
+    """The newest that there was no room to send."""
+    _seat: Seat | None = None
+    _leave_room: Callable[[], None] | None = None
+    _closing_since_s: float | None = None
+
     def __init__(
         self,
         config: Config,
@@ -103,14 +146,6 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
         self.conn = _Handshake(max_size=config.ws_max_size, logger=logging.getLogger("uvicorn.error"))
-
-    _hear: Hear | None = None
-    _cutter: FrameCutter | None = None
-    _has_failed = False
-    """Whether the client broke the protocol, and was told so."""
-    _seat: Seat | None = None
-    _leave_room: Callable[[], None] | None = None
-    _closing_since_s: float | None = None
 
     def take_seat(self, seat: Seat, leave_room: Callable[[], None]) -> None:
         """That of the HTTP connection which became this. It is in use once the application listens; until then it is
@@ -122,6 +157,9 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             self._seat.leave()
             self._leave_room()
         super().connection_lost(exc)
+        if self._next_slice is not None:
+            self._next_slice.cancel()
+            self._next_slice = None
 
     def end_if_overdue(self, now_s: float) -> None:
         """Called now and then. A transport that closes first sends what waits, to which a client that does not read
@@ -131,12 +169,12 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self._closing_since_s is None:
             self._closing_since_s = now_s
         elif now_s - self._closing_since_s > self.close_timeout:
-            self.transport.abort()
+            reset(self.transport)
 
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
         if not self.handshake_complete:  # as it is where the request was refused
-            self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen)}
+            self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen, self._allow)}
 
     def on_task_complete(self, task: asyncio.Task[None]) -> None:
         """The application is done. It holds this protocol by the way, and is held by whom it has listen: with neither,
@@ -156,13 +194,82 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             if is_request and self.handshake_initiated and not was_open:
                 self._cutter = FrameCutter(self.config.ws_max_size)
             return
+        self._spend(READ_COST, len(data))
+        if self._next_slice is None:
+            self._take_slice(data)
+        else:  # reading has been resumed by others
+            self._cutter.keep(data)
+            self.transport.pause_reading()
+
+    def _take_slice(self, data: bytes = b"") -> None:
+        """Take in a few frames, and see when to go on."""
+        assert self._cutter is not None
+        cuts = self._cutter.cut(data, most=_FRAMES_AT_ONCE)
         unheard: list[bytes] = []
-        for cut in self._cutter.cut(data):
+        for cut, then in zip_longest(cuts, cuts[1:]):
+            if self._is_superseded(cut, then):
+                self._spend(SUPERSEDED_COST)
+                continue
+            if cut.message is None:
+                self._spend(OTHER_FRAME_COST * cut.frames)
+            else:
+                self._spend(message_cost(cut.message, is_text=cut.is_text))
             # After the first that is not heard, all wait their turn.
             if unheard or cut.message is None or not self._is_heard(cut.message, is_text=cut.is_text):
                 unheard.append(cut.raw)
         if unheard:
             super().data_received(b"".join(unheard))
+        self._go_on_later()
+
+    def _go_on_later(self) -> None:
+        """Read no more where more waits, or the budget is spent."""
+        wait_s = 0.0 if self._budget is None else self._budget.wait_s
+        if self._cutter is None or not (self._cutter.has_more or wait_s):
+            return
+        self.transport.pause_reading()
+        if wait_s:
+            self._next_slice = self.loop.call_later(max(_SHORTEST_WAIT_S, wait_s), self._go_on)
+        else:
+            self._next_slice = self.loop.call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        self._next_slice = None
+        if self._has_failed or self.transport.is_closing():
+            return
+        if self.read_paused:  # until the application has taken in what waits
+            return
+        self._spend(0.0)
+        self._take_slice()
+        if self._next_slice is None and not self.read_paused and not self.transport.is_closing():
+            self.transport.resume_reading()
+
+    async def receive(self) -> ASGIReceiveEvent:
+        message = await self.queue.get()
+        if self.read_paused and self.queue.empty():
+            self.read_paused = False
+            if self._next_slice is None:
+                self._go_on()
+        return message
+
+    def _spend(self, messages: float, nbytes: int = 0) -> None:
+        now_s = self.loop.time()
+        if self._budget is None:
+            self._budget = Budget(USUAL, now_s)
+        self._budget.spend(messages, nbytes, now_s)
+
+    def _allow(self, allowance: Allowance) -> None:
+        self._budget = Budget(allowance, self.loop.time())
+
+    def _is_superseded(self, cut: Cut, then: Cut | None) -> bool:
+        if self._hear is None or cut.message is None or then is None or then.message is None:
+            return False
+        return cut.is_text == then.is_text and supersedes(then.message, cut.message)
+
+    def handle_cont(self, event: Frame) -> None:
+        """However small the pieces are in which a message comes, few of them wait."""
+        super().handle_cont(event)
+        if len(self.frames) > _MOST_FRAGMENTS:
+            self.frames = [b"".join(self.frames)]
 
     def send_receive_event_to_app(self) -> None:
         """uvicorn stops reading with every message, until the application has taken it in."""
@@ -173,7 +280,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
                 self.transport.close()
         if self.read_paused and self.queue.qsize() < _MOST_WAITING:
             self.read_paused = False
-            self.transport.resume_reading()
+            if self._next_slice is None:
+                self.transport.resume_reading()
 
     def handle_parser_exception(self) -> None:
         """uvicorn closes the connection at once, and a client that is still sending then meets a reset in place of the
@@ -199,8 +307,23 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             self.transport.resume_reading()
 
     def handle_ping(self) -> None:
-        if not self._has_failed:
+        """Of pings that came together the newest is answered, and of those that come while the client reads nothing the
+        newest once it does (RFC 6455, 5.5.3)."""
+        if self._has_failed:
+            return
+        if self.conn.state is not OPEN:
             super().handle_ping()
+        elif output := self.conn.data_to_send():
+            if self.writable.is_set():
+                self.transport.write(output[-1])
+            else:
+                self._pong = output[-1]
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        if self._pong and not self.close_sent and not self.transport.is_closing():
+            self.transport.write(self._pong)
+        self._pong = b""
 
     def _is_heard(self, message: bytes, *, is_text: bool) -> bool:
         if self._hear is None or self.close_sent or self.conn.state is not OPEN or not self.queue.empty():

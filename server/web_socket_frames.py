@@ -1,6 +1,7 @@
 """Frames of WebSocket messages as they lie on the wire (RFC 6455, 5.2), as far as messages come whole, in one frame."""
 
 import struct
+import sys
 from typing import Final, NamedTuple
 
 try:
@@ -31,6 +32,8 @@ class Cut(NamedTuple):
     raw: bytes
     message: bytes | None = None
     is_text: bool = False
+    frames: int = 1
+    """How many of them begin in it."""
 
 
 class FrameCutter:
@@ -48,14 +51,23 @@ class FrameCutter:
         """Bytes of a frame that is passed on in parts."""
         self._is_fragmented = False
         """Whether the rest of a message comes in frames of its own."""
+        self.has_more = False
+        """Whether whole frames may wait, since there were more than were to be cut."""
 
-    def cut(self, data: bytes) -> list[Cut]:
+    def keep(self, data: bytes) -> None:
+        """Have more wait for the next time."""
+        self._begun += data
+        self.has_more = True
+
+    def cut(self, data: bytes = b"", *, most: int = sys.maxsize) -> list[Cut]:
+        """Of what came before and `data`, so many frames at the most; others wait for the next time."""
         data = self._begun + data
         end = len(data)
         cuts = []
         passed, at = 0, min(self._to_come, end)
         self._to_come -= at
-        while end - at >= _SHORTEST_HEADER:
+        others = 0  # frames from `passed` on, none of which is a whole message
+        while most > 0 and end - at >= _SHORTEST_HEADER:
             first, second = data[at], data[at + 1]
             length, start = second & ~_MASKED, at + _SHORTEST_HEADER
             if is_long := length >= _SHORT:
@@ -69,15 +81,19 @@ class FrameCutter:
                 break
             if is_message and past <= end:
                 if at > passed:
-                    cuts.append(Cut(data[passed:at]))
+                    cuts.append(Cut(data[passed:at], frames=others))
                 message = apply_mask(data[start:past], data[start - _KEY_BYTES : start])
                 cuts.append(Cut(data[at:past], message, first == _WHOLE_TEXT))
-                passed = past
-            elif not first & _CONTROL:
-                self._is_fragmented = not first & _FINAL
+                passed, others = past, 0
+            else:
+                others += 1
+                if not first & _CONTROL:
+                    self._is_fragmented = not first & _FINAL
+            most -= 1
             at = min(past, end)
             self._to_come = past - at
         self._begun = data[at:]
+        self.has_more = most == 0 and at < end
         if at > passed:
-            cuts.append(Cut(data[passed:at]))
+            cuts.append(Cut(data[passed:at], frames=others))
         return cuts

@@ -119,6 +119,14 @@ def write_flat(folder: Path, manifest: Manifest) -> Bundle:
     return write_bundle(folder, manifest, {"arithmetic.onnx": arithmetic_graph(), "arrays.npz": noise.getvalue()})
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _name_of_test_client():
+    """Starlette's test client asks for this name."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NAFIR_ALLOWED_HOSTS", "testserver")
+        yield
+
+
 @pytest.fixture(scope="session")
 def bundle(tmp_path_factory) -> Bundle:
     return write_flat(tmp_path_factory.mktemp("scenes") / "flat", MANIFEST)

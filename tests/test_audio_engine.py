@@ -11,7 +11,7 @@ import pytest
 from server import audio_engine
 from server.audio_engine import PHASES, AudioEngine
 from server.blocks import DryBlock
-from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, MoveEmitter
 from server.replies import EmitterAdded, Error, Status
 from server.runtime.thread_watch import ThreadWatch
 from server.stream import MAX_WAITING_MESSAGES, PAUSE_AFTER_S, StreamFailed
@@ -286,10 +286,34 @@ def test_a_short_stall_is_made_up_for(stage):
 
 def test_messages_beyond_the_limit_are_refused_until_the_next_block(stage):
     stream, _ = stage.open()
-    accepted = [stream.offer(ListenerPose(pose_id=k + 1, position=(2.0, 2.0, 1.5))) for k in range(300)]
+    accepted = [stream.offer(Acknowledge(sequence=k)) for k in range(300)]
     assert accepted == [True] * MAX_WAITING_MESSAGES + [False] * (300 - MAX_WAITING_MESSAGES)
     stage.run(BLOCK_S)
-    assert stream.offer(ListenerPose(pose_id=900, position=(2.0, 2.0, 1.5)))
+    assert stream.offer(Acknowledge(sequence=900))
+
+
+def test_a_pose_takes_the_place_of_an_older_one_that_nobody_has_heard(stage):
+    """But not across anything else, and never of a newer one, which has to be refused."""
+    stream, delivered = stage.open()
+    stage.run(4 * BLOCK_S)
+
+    def say(*messages):
+        assert all(stream.offer(message) for message in messages)
+        delivered.clear()
+        stage.run(2 * BLOCK_S)
+        errors = [each.code for each in delivered if isinstance(each, Error)]
+        return errors, blocks(delivered)[-1].block.pose_id
+
+    poses = [ListenerPose(pose_id=number, position=(2.0, 2.0, 1.5)) for number in range(1, 1_001)]
+    assert say(*poses) == ([], 1_000)
+    assert stream.pose_times.durations.count == 1
+    later = [ListenerPose(pose_id=number, position=(2.0, 2.0, 1.5)) for number in (1_002, 1_001)]
+    assert say(*later) == (["stale_pose"], 1_002)
+    between = MoveEmitter(id="ghost", position=(2.0, 2.0, 1.5), pose_id=2_000)
+    assert say(poses[0].model_copy(update={"pose_id": 1_003}), between, later[0]) == (
+        ["unknown_emitter", "stale_pose"],
+        1_003,
+    )
 
 
 def test_the_real_threads_keep_time_and_stop(field, filters):

@@ -155,6 +155,14 @@ def test_render_of_a_level_is_that_levels(nafir, levels, filters, tmp_path):
     assert not np.array_equal(heard, standard)
 
 
+def test_render_names_the_row_of_a_level_that_there_is_not(nafir, levels, tmp_path):
+    path, output = tmp_path / "path.csv", tmp_path / "out.wav"
+    path.write_text("sample,level,x,y,z,yaw_deg\n0,rough,2,2,1.5,0\n256,luxurious,2,2,1.5,0\n")
+    result = nafir("render", levels.bundle.folder, "--emitter", "trumpet@6,3,1.5", "--path", path, "-o", output)
+    check_error(result, "line 3", "'luxurious'", "standard, rough")
+    assert not output.exists()
+
+
 def test_render_hears_through_the_head_it_is_given(nafir, bundle, tmp_path):
     path = tmp_path / "path.csv"
     path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n")

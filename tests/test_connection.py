@@ -8,7 +8,7 @@ from itertools import count
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from server.answers import Answers
+from server.api.response_cache import ResponseCache
 from server.audio_engine import AudioEngine
 from server.blocks import AudioBlock
 from server.catalogue import open_clips
@@ -62,7 +62,7 @@ class Socket:
 
 @asynccontextmanager
 async def hosting(field, hrtfs, **settings):
-    with Workers(1) as workers:
+    with Workers(1) as workers, ResponseCache(workers=1, waiting=1) as responses:
         audio = AudioEngine(asyncio.get_running_loop().call_soon_threadsafe, workers)
         host = StreamHost(
             scenes={"flat": Levels([field])},
@@ -70,7 +70,7 @@ async def hosting(field, hrtfs, **settings):
             hrtfs=hrtfs,
             audio=audio,
             settings=Settings(**settings),
-            answers=Answers(workers=1, waiting=1),
+            responses=responses,
             offers={"flat": Offer((field.level,), {field.level.name: 1.0})},
             places={"flat": place_of_field(field)},
             readiness=Readiness(Drain(8.0), warm_up="done"),

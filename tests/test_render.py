@@ -177,6 +177,42 @@ def test_nothing_sounds_before_the_path_begins_and_the_clip_begins_with_it(open_
     assert error_db(late[:, 5 * SIZE :], prompt[:, : 15 * SIZE]) < -120
 
 
+class OtherField(NoiseField):
+    """A level of its own: shorter, a tail for all, and another noise."""
+
+    ir_samples = 1_100
+    level = QualityLevel(name="other", field="noise", shared_tail=True)
+
+    def one(self, listener, emitter, yaw):
+        return super().one(listener, emitter, yaw + 10)
+
+
+def test_a_level_is_faded_to_with_the_reverberation_of_its_point_and_stays(open_hall):
+    emitter = RenderedEmitter(noise(15, 40 * SIZE), HERE)
+    levels = {"noise": FIELD, "other": OtherField()}
+    path = [point(0, 2.0), PathPoint(0, point(0, 2.0).pose, 10 * SIZE, "other"), point(20 * SIZE, 3.0)]
+    direct = [point(0, 2.0), point(20 * SIZE, 3.0)]
+    wet = render(FIELD, open_hall, [emitter], path, length=40 * SIZE, levels=levels).astype(float)
+    wet -= render(DEAD, open_hall, [emitter], direct, length=40 * SIZE)
+    expected = np.zeros(wet.shape)
+    for begin, end, field, x in ((-1, 10, FIELD, 2.0), (10, 20, levels["other"], 2.0), (20, 99, levels["other"], 3.0)):
+        ir = field.one(point(0, x).pose.position, HERE.position, 0.0).astype(float)
+        weight = np.zeros(100 * SIZE)
+        weight[max(begin, 0) * SIZE : (end + 1) * SIZE] = 1
+        if begin >= 0:
+            weight[begin * SIZE : (begin + 1) * SIZE] = raised_cosine(SIZE)
+        weight[end * SIZE : (end + 1) * SIZE] -= raised_cosine(SIZE)
+        heard_there = fftconvolve(emitter.clip[np.newaxis].astype(float), ir, axes=1)[:, : 40 * SIZE]
+        expected += weight[: 40 * SIZE] * heard_there
+    assert error_db(wet, expected) < -110
+
+
+def test_a_level_that_there_is_not_is_not_rendered(open_hall):
+    path = [PathPoint(0, HERE, 0, "fine")]
+    with pytest.raises(KeyError, match="fine"):
+        render(FIELD, open_hall, [RenderedEmitter(noise(11, 9), HERE)], path)
+
+
 @pytest.mark.parametrize("name", ["field", "mirrored_field", "field_at_nodes", "whole_at_nodes"])
 def test_a_live_session_replayed_is_equal_to_the_bit(name, filters, request):
     """Live: IRs arrive when they arrive, some poses are never heard. The replay gets what the blocks' headers say."""
@@ -286,6 +322,20 @@ def test_reads_when_the_reverberation_followed_if_it_did(write):
     path = write("sample,reverberation_sample,x,y,z,yaw_deg\n0,512,1,2,1.5,0\n256,,1,2,1.5,0\n256,512,1,2,1.5,0\n")
     points = read_path(path, SAMPLE_RATE)
     assert [(point.sample, point.reverberation_sample) for point in points] == [(0, 512), (256, None), (256, 512)]
+
+
+def test_reads_which_level_is_heard_where_one_is_named(write):
+    path = write("sample,level,x,y,z,yaw_deg\n0,,1,2,1.5,0\n256, rough ,1,2,1.5,0\n512,,1,2,1.5,0\n")
+    points = read_path(path, SAMPLE_RATE, ["fine", "rough"])
+    assert [point.level for point in points] == [None, "rough", None]
+
+
+def test_a_path_of_a_level_that_there_is_not_names_its_line(write):
+    path = write("sample,level,x,y,z,yaw_deg\n0,fine,1,2,1.5,0\n256,best,1,2,1.5,0\n")
+    with pytest.raises(PathError) as caught:
+        read_path(path, SAMPLE_RATE, ["fine", "rough"])
+    problem = "the scene has no quality level 'best', only fine, rough"
+    assert str(caught.value) == f"path.csv: line 3, column 'level': {problem}"
 
 
 YAW = "sample,x,y,z,yaw_deg\n"

@@ -84,3 +84,9 @@ def test_other_variables_are_nobodys_business(monkeypatch):
     monkeypatch.setenv("NAFIRISH", "3")
     monkeypatch.setenv("MY_NAFIR_PORT", "3")
     Settings()
+
+
+@pytest.mark.parametrize("name", ["NAFIR_SERVICE_HOST", "NAFIR_SERVICE_PORT_HTTP", "NAFIR_PORT_8000_TCP_ADDR"])
+def test_what_kubernetes_says_of_a_service_called_nafir_is_no_misspelt_setting(monkeypatch, name):
+    monkeypatch.setenv(name, "10.0.0.1")
+    assert Settings().port == 8000

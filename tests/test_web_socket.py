@@ -1,7 +1,9 @@
 """The short way out of a connection, on a server of its own: it says what ASGI would, in the same order."""
 
 import asyncio
+import time
 from contextlib import asynccontextmanager
+from itertools import pairwise
 
 import pytest
 import uvicorn
@@ -10,6 +12,8 @@ from websockets.client import ClientProtocol
 from websockets.frames import Frame, Opcode
 from websockets.uri import parse_uri
 
+from server.api.inflow import Allowance
+from server.protocol import ListenerPose
 from server.web_socket import DirectWay, direct_way, watched
 
 PROTOCOL = "server.web_socket:WebSocketProtocol"
@@ -283,3 +287,143 @@ def test_a_client_that_is_still_sending_learns_why_the_connection_closes(breach,
     assert asyncio.run(talk()).code == reason
     assert not heard
     assert not caplog.records
+
+
+def _binary_pose(number):
+    return ListenerPose(pose_id=number, position=(1.0, 2.0, 1.5)).serialize_binary()
+
+
+def _frames(*messages):
+    """As a client sends them, in one piece."""
+    return b"".join(
+        Frame(
+            Opcode.BINARY if isinstance(each, bytes) else Opcode.TEXT,
+            each if isinstance(each, bytes) else each.encode(),
+        ).serialize(mask=True)
+        for each in messages
+    )
+
+
+def hear_all(*messages, until, **options):
+    """What an application hears of messages that come in one piece, `until` the last of them."""
+    heard, is_open, is_over = [], asyncio.Event(), asyncio.Event()
+
+    async def listen(scope, _receive, send):
+        def hear(message):
+            heard.append(message)
+            if message == until:
+                is_over.set()
+            return True
+
+        direct_way(scope).listen(hear)
+        is_open.set()
+        await is_over.wait()
+        await send({"type": "websocket.close"})
+
+    async def talk():
+        async with serving(listen, **options) as address, connect(address, compression=None) as client:
+            await is_open.wait()
+            client.transport.write(_frames(*messages))
+            await asyncio.wait_for(client.wait_closed(), 10)
+
+    asyncio.run(talk())
+    return heard
+
+
+def test_a_pose_that_a_newer_one_follows_directly_is_not_heard():
+    poses = [_binary_pose(number) for number in range(1, 8)]
+    assert hear_all(*poses[:3], "a", *poses[3:5], b"\x03", poses[5], "end", until="end") == [
+        poses[2],
+        "a",
+        poses[4],
+        b"\x03",
+        poses[5],
+        "end",
+    ]
+
+
+def test_a_pose_that_an_older_one_follows_is_heard_and_so_is_that():
+    newer, older = _binary_pose(9), _binary_pose(8)
+    assert hear_all(newer, older, "end", until="end") == [newer, older, "end"]
+
+
+def test_however_much_comes_at_once_all_of_it_is_heard_in_order():
+    messages = [str(number) for number in range(3_000)]
+    assert hear_all(*messages, until="2999") == messages
+
+
+def test_between_a_few_messages_others_have_their_turn():
+    """A thousand that came at once are not heard in one go."""
+    heard, turns, is_open = [], [], asyncio.Event()
+
+    async def listen(scope, _receive, send):
+        direct_way(scope).listen(lambda message: not heard.append(message))
+        is_open.set()
+        while len(heard) < 1_000:
+            turns.append(len(heard))
+            await asyncio.sleep(0)
+        await send({"type": "websocket.close"})
+
+    async def talk():
+        async with serving(listen) as address, connect(address, compression=None) as client:
+            await is_open.wait()
+            client.transport.write(_frames(*map(str, range(1_000))))
+            await asyncio.wait_for(client.wait_closed(), 10)
+
+    asyncio.run(talk())
+    assert max(later - earlier for earlier, later in pairwise(turns)) <= 64
+
+
+def test_who_has_spent_its_budget_is_read_no_more_for_a_while_and_loses_nothing():
+    heard, is_open = [], asyncio.Event()
+    allowance = Allowance(messages_per_s=400, bytes_per_s=1e6)
+
+    async def listen(scope, _receive, send):
+        way = direct_way(scope)
+        way.allow(allowance)
+        way.listen(lambda message: not heard.append((time.monotonic(), message)))
+        is_open.set()
+        while len(heard) < 500:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        await send({"type": "websocket.close"})
+
+    async def talk():
+        async with serving(listen) as address, connect(address, compression=None) as client:
+            await is_open.wait()
+            for number in range(500):
+                await client.send(str(number))
+            await asyncio.wait_for(client.wait_closed(), 10)
+
+    asyncio.run(talk())
+    assert [message for _, message in heard] == list(map(str, range(500)))
+    lasted_s = heard[-1][0] - heard[0][0]
+    # Beyond the first 100, which a full budget holds, 400 a second; and reads cost too.
+    assert 0.8 < lasted_s < 3.0
+
+
+def test_of_pings_that_come_together_the_newest_is_answered():
+    """With what the standard has for it, and the connection goes on."""
+    pongs, is_open = [], asyncio.Event()
+
+    async def listen(_scope, receive, send):
+        is_open.set()
+        assert (await receive())["text"] == "end"
+        await send({"type": "websocket.send", "text": "end"})
+        await send({"type": "websocket.close"})
+
+    async def talk():
+        client = ClientProtocol(parse_uri("ws://127.0.0.1"))
+        client.send_request(client.connect())
+        async with serving(listen) as address:
+            reader, writer = await asyncio.open_connection(port=address.rpartition(":")[2], host="127.0.0.1")
+            writer.writelines(client.data_to_send())
+            client.receive_data(await reader.readuntil(b"\r\n\r\n"))
+            await is_open.wait()
+            pings = [Frame(Opcode.PING, bytes([number])).serialize(mask=True) for number in range(20)]
+            writer.write(b"".join(pings) + _frames("end"))
+            client.receive_data(await reader.read())
+            writer.close()
+        pongs.extend(event.data for event in client.events_received() if getattr(event, "opcode", None) is Opcode.PONG)
+
+    asyncio.run(talk())
+    assert pongs == [bytes([19])]

@@ -98,3 +98,19 @@ def test_what_is_not_masked_is_no_message():
 def test_headers_are_those_of_the_library(length):
     payload = bytes(length)
     assert header(length) + payload == Frame(Opcode.BINARY, payload).serialize(mask=False)
+
+
+@given(st.lists(FRAMES, max_size=6), st.integers(1, 4))
+def test_few_frames_at_a_time_are_the_same_frames(frames, most):
+    data, at_once, by_parts = sent(frames), FrameCutter(1 << 20), FrameCutter(1 << 20)
+    whole = at_once.cut(data)
+    parts = [by_parts.cut(data, most=most)]
+    while by_parts.has_more:
+        parts.append(by_parts.cut(most=most))
+    cuts = [cut for part in parts for cut in part]
+    assert b"".join(cut.raw for cut in cuts) == data
+    assert [cut.message for cut in cuts if cut.message is not None] == [
+        cut.message for cut in whole if cut.message is not None
+    ]
+    assert all(sum(cut.frames for cut in part) <= most for part in parts)
+    assert sum(cut.frames for cut in cuts) == sum(cut.frames for cut in whole) == len(frames)

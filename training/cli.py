@@ -4,18 +4,22 @@ import json
 import logging
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from server.core.command_line import StrictTyper
+from server.core.files import require_writable_folder
 from server.errors import NafirError
 from training.evaluation import cli as evaluation
 from training.importers.cli import importing
 from training.options import Json, Seed
 from training.simulation import cli as simulation
+
+if TYPE_CHECKING:
+    from training.responses import ResponseSet
 
 app = StrictTyper(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(importing, name="import")
@@ -56,6 +60,9 @@ def simulate(
     processes = workers or os.cpu_count() or 1
     with _progress() as progress:
         dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, simulation=ready)
+    from training.responses import SimulatedResponses
+
+    _tell_of(SimulatedResponses(dataset))
     trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
     typer.echo(f"{output}: {trained} pairs to train on and {held_out} held out, {len(dataset.yaws)} orientations each")
 
@@ -99,9 +106,11 @@ def train(
     from training.runs import configure, minutes_of
     from training.train import train as train_field
 
+    lengths = {"--epochs": epochs, "--minutes": minutes, "--as-long-as": as_long_as}
+    given_lengths = [option for option, value in lengths.items() if value is not None]
+    if len(given_lengths) > 1:
+        raise typer.BadParameter("leave one out", param_hint=" and ".join(given_lengths))
     if as_long_as is not None:
-        if minutes is not None:
-            raise typer.BadParameter("says as much as --minutes; leave one out", param_hint="--as-long-as")
         minutes = minutes_of(as_long_as)
     given = {"epochs": epochs, "minutes": minutes, "patience": patience, "learning_rate": learning_rate}
     configuration = configure(
@@ -114,8 +123,11 @@ def train(
         share=share,
         **{name: value for name, value in given.items() if value is not None},
     )
+    responses = open_responses(data)
+    if os.environ.get("RANK", "0") == "0":
+        _tell_of(responses)
     with _progress() as progress:
-        train_field(open_responses(data), output, configuration, progress)
+        train_field(responses, output, configuration, progress)
     typer.echo(f"{output}: {configuration.name} is trained")
 
 
@@ -164,6 +176,14 @@ def export(
     exact_tables: Annotated[
         bool, typer.Option("--exact-tables", help="Add every naf once more, with less arithmetic for the same numbers.")
     ] = False,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LAW=REASON",
+            help="Offer the scene although its fields break a law of nafir check, named as in nafir check --json; the "
+            "bundle keeps the reason. Once for each law.",
+        ),
+    ] = None,
 ) -> None:
     """Write finished runs as the fields of a scene bundle, after checking every graph against torch, and its health."""
     from training.export import PRECISIONS
@@ -177,16 +197,46 @@ def export(
     if not all(rank.strip().isdigit() and int(rank) > 0 for rank in ranks.split(",") if ranks):
         raise typer.BadParameter("takes whole numbers above zero, comma by comma", param_hint="--ranks")
     lower = [int(rank) for rank in ranks.split(",") if ranks]
+    accepted = dict(_law_and_reason(entry) for entry in accept or ())
+    require_writable_folder(output, "--output")
     for talkative in (None, "torch.onnx"):
         logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or (runs[0] if (runs[0] / FILE).is_file() else dataset_folder(runs[0])))
     with _progress() as progress:
         bundle = export_bundle(
-            responses, runs, output, precisions=chosen, ranks=lower, exact_tables=exact_tables, progress=progress
+            responses,
+            runs,
+            output,
+            precisions=chosen,
+            ranks=lower,
+            exact_tables=exact_tables,
+            accepted=accepted,
+            progress=progress,
         )
+    for entry in bundle.manifest.accepted:
+        typer.echo(f"{output}: breaks the law {entry.law}, accepted: {entry.reason}")
+    for name in accepted.keys() - {entry.law for entry in bundle.manifest.accepted}:
+        typer.echo(f"{output}: keeps the law {name}; there was nothing to accept")
     size = sum(path.stat().st_size for path in output.iterdir())
     fields = ", ".join(bundle.manifest.fields)
     typer.echo(f"{output}: scene {bundle.id}, {fields}, {size / 1e6:.1f} MB, digest {bundle.digest[:12]}")
+
+
+def _law_and_reason(entry: str) -> tuple[str, str]:
+    law, separator, reason = entry.partition("=")
+    if not separator:
+        raise typer.BadParameter(f"{entry!r}: is not LAW=REASON", param_hint="--accept")
+    return law.strip(), reason.strip()
+
+
+def _tell_of(responses: "ResponseSet") -> None:
+    """What a dataset is like, before anybody trains on it."""
+    from training.data_reference import health_of
+    from training.responses import SimulatedResponses
+
+    rays = responses.dataset.effects.rays if isinstance(responses, SimulatedResponses) else None
+    for line in health_of(responses).lines(rays):
+        typer.echo(f"{responses.file.parent}: {line}", err=True)
 
 
 for command in (evaluation.evaluate, evaluation.tabulate, evaluation.maps, evaluation.probe):

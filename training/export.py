@@ -3,7 +3,7 @@ before anything is written."""
 
 import io
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -20,9 +20,11 @@ from server.acoustics.codec import Codec
 from server.errors import NafirError
 from server.field.graph import INPUTS, OUTPUTS, RESPONSE
 from server.field.runtime import open_session
-from server.health.check import Effort, check
+from server.health.check import Effort, Health, check, check_fields
+from server.health.findings import LAWS
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import ARRAYS_FILE, CodecParameters, FieldFile, Manifest, QualityLevel
+from server.scene.manifest import ARRAYS_FILE, AcceptedLaw, CodecParameters, FieldFile, QualityLevel
+from training.data_reference import reference_of
 from training.evaluation.held_out import measured_pairs
 from training.evaluation.shaped import ShapedNearest
 from training.graphs import halve_weights, pose_by_pose, to_int8, to_onnx, with_weights
@@ -83,6 +85,7 @@ def export(
     precisions: Sequence[Precision] = ("float32",),
     ranks: Sequence[int] = (),
     exact_tables: bool = False,
+    accepted: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision; the first field is the
@@ -96,10 +99,15 @@ def export(
 
     Factorised fields of another width than the first one's have it in their names.
 
+    What fields do beside what their data do (`training.data_reference`) is checked before the noise is chosen.
+    `accepted` are reasons, by name of a law, to offer the scene although its fields break it; of those that they do
+    break the manifest keeps a record.
+
     Raises RunError for an unfinished run, ExportError for a graph that disagrees, for a dataset folder that is not of
-    `responses` or not measured and for fields of which only some hold the direct sound, and HealthError for fields that
-    break a law of `nafir check`: nothing is written.
+    `responses` or not measured, for fields of which only some hold the direct sound and for a law that does not exist
+    or that nobody may accept, and HealthError for fields that break a law of `nafir check`: nothing is written.
     """
+    accepting = _accepting(accepted or {})
     exported: list[_Exported] = []
     # All are opened, and told apart, before the first graph is made, which takes a while.
     opened = [(_opened(responses, place), place) for place in runs]
@@ -138,13 +146,38 @@ def export(
     described = Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
     if isinstance(responses, SimulatedResponses):
         manifest = simulated_manifest(responses, described, whole=whole)
-        if exported[0].architecture == "factorised":
-            with tempfile.TemporaryDirectory() as trial:
-                bundle = write_bundle(Path(trial), manifest, files)
-                files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
-        return _write_healthy(folder, manifest, files)
-    assert isinstance(responses, ImportedDataset)
-    return _write_healthy(folder, measured_manifest(responses, described), files)
+    else:
+        assert isinstance(responses, ImportedDataset)
+        manifest = measured_manifest(responses, described)
+    manifest = manifest.model_copy(update={"reference": reference_of(responses, manifest), "accepted": accepting})
+    with tempfile.TemporaryDirectory() as trial:
+        bundle = write_bundle(Path(trial), manifest, files)
+        found = check_fields(bundle, EFFORT)
+        found.health.require()
+        if isinstance(responses, SimulatedResponses) and exported[0].architecture == "factorised":
+            files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
+            bundle = write_bundle(Path(trial), manifest, files)
+        health = check(bundle, EFFORT, fields=found)
+        health.require()
+    return write_bundle(folder, manifest.model_copy(update={"accepted": _needed(accepting, health)}), files)
+
+
+def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
+    known = [law.name for law in LAWS if law.can_be_accepted]
+    for name, reason in reasons.items():
+        if name not in known:
+            raise ExportError(
+                f"accept: {name}: is no law that may be broken for a reason; those are {', '.join(known)}"
+            )
+        if not reason.strip():
+            raise ExportError(f"accept: {name}: needs a reason, which the bundle keeps")
+    return tuple(AcceptedLaw(law=name, reason=reason.strip()) for name, reason in reasons.items())
+
+
+def _needed(accepting: tuple[AcceptedLaw, ...], health: Health) -> tuple[AcceptedLaw, ...]:
+    """Of the laws that are accepted those that are broken."""
+    broken = {finding.law.name for finding in health.accepted}
+    return tuple(entry for entry in accepting if entry.law in broken)
 
 
 def _arrays(noise: npt.NDArray[np.float32]) -> bytes:
@@ -152,13 +185,6 @@ def _arrays(noise: npt.NDArray[np.float32]) -> bytes:
     arrays = io.BytesIO()
     np.savez(arrays, frozen_noise=noise)
     return arrays.getvalue()
-
-
-def _write_healthy(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> Bundle:
-    """Raises HealthError, and writes nothing, where a law is broken."""
-    with tempfile.TemporaryDirectory() as trial:
-        check(write_bundle(Path(trial), manifest, files), EFFORT).require()
-    return write_bundle(folder, manifest, files)
 
 
 def _opened(responses: ResponseSet, place: Path) -> Learner | ImportedDataset:

@@ -190,7 +190,11 @@ class ImportedDataset:
         """Raises ResponsesError if the folder holds no imported responses or damaged ones."""
         path = folder / FILE
         if not path.is_file():
-            raise ResponsesError(path, "file", "no such file; nafir-train import writes it")
+            raise ResponsesError(
+                path,
+                "file",
+                "no such file; nafir-train simulate SCENE.toml -o DATA or nafir-train import makes a dataset",
+            )
         try:
             file = h5py.File(path, "r")
         except OSError as exc:

@@ -2,10 +2,11 @@
 
 A run can be interrupted anywhere and goes on when it is started again; with the same seed and number of threads it ends
 at the same field as one that was not, where its length is given in epochs. Given in minutes, the length counts time
-spent computing, over all pieces.
+spent computing, over all pieces: steps and looks at what is held back, the last of which may end later.
 """
 
 import dataclasses
+import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -89,8 +90,9 @@ def load_learner(responses: ResponseSet, run: Path) -> Learner:
 
 @dataclass
 class _State:
-    """Where a run is: steps taken, seconds they took and, at the end, those of preparing; what the current round's
-    losses add up to, the smallest error on what is held back with the rounds since, and the field to keep so far."""
+    """Where a run is: steps taken, seconds that they and validation took and, at the end, those of preparing; what the
+    current round's losses add up to, the smallest error on what is held back with the rounds since, and the field to
+    keep so far."""
 
     step: int = 0
     epochs: float = 0.0
@@ -139,15 +141,14 @@ class _Loop:
             self._state = _State(bfloat16=self._choose_precision())
 
     def run_to_the_end(self, progress: Progress) -> None:
-        state, configuration = self._state, self._configuration
+        state = self._state
         if state.finished:
             return
         parallel = self._processes.parallel(self._learner.field)
-        timed = configuration.minutes is not None
-        total = _ROUNDS if timed else configuration.epochs
-        task = progress.add_task("training", total=total, completed=state.rounds)
+        task = progress.add_task("training", total=self._total(), completed=math.floor(self._measure()))
         writer = SummaryWriter(self._run / "tensorboard", purge_step=state.step) if self._processes.first else None
         saved_s = state.seconds
+        round_ends = self._next_round()
         batches = self._batches(state.step)
         try:
             while self._fraction() < 1 and not self._stopped():
@@ -156,13 +157,14 @@ class _Loop:
                 self._step(parallel, *next(batches), save=due)
                 saved_s = state.seconds if due else saved_s
                 (state.seconds,) = self._processes.agreed(state.seconds + time.perf_counter() - start)
-                ended = self._round_ended()
-                if ended:
+                if self._measure() >= round_ends:
                     summary = self._end_round(writer)
                     state.rounds += 1
                     self._save()
                     saved_s = state.seconds
-                    progress.update(task, advance=1, description=f"training  held back: {summary}")
+                    round_ends = self._next_round()
+                    done = math.floor(self._measure())
+                    progress.update(task, completed=done, description=f"training  held back: {summary}")
         finally:
             batches.close()
             if writer is not None:
@@ -180,10 +182,20 @@ class _Loop:
         patience = self._configuration.patience
         return patience is not None and self._state.stale >= patience
 
-    def _round_ended(self) -> bool:
+    def _measure(self) -> float:
+        """How far training is, in rounds of steps or of time."""
         if self._configuration.minutes is None:
-            return self._state.step % self._steps_per_epoch == 0
-        return self._fraction() >= min(1.0, (self._state.rounds + 1) / _ROUNDS)
+            return self._state.step / self._steps_per_epoch
+        return self._fraction() * _ROUNDS
+
+    def _next_round(self) -> int:
+        """The measure at which the current round ends: later than now, however long the last look at what is held back
+        took, so that every round trains."""
+        return min(math.floor(self._measure()) + 1, self._total())
+
+    def _total(self) -> int:
+        """Rounds there are at most."""
+        return self._configuration.epochs if self._configuration.minutes is None else _ROUNDS
 
     def _step(
         self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, save: bool
@@ -230,8 +242,10 @@ class _Loop:
     def _end_round(self, writer: SummaryWriter | None) -> str:
         """Looks at what is held back, remembers the field to keep, writes the logs; one line for people."""
         state = self._state
+        start = time.perf_counter()
         parts = self._validate() if self._processes.first else {}
-        (held_back,) = self._processes.agreed(sum(parts.values()))
+        seconds = state.seconds + time.perf_counter() - start
+        held_back, state.seconds = self._processes.agreed(sum(parts.values()), seconds)
         if not self._is_plausible(held_back):  # before it is kept, and saved
             raise self._diverged(f"the error on what is held back is {held_back:g} after step {state.step}")
         if held_back < state.best_loss:

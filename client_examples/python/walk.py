@@ -6,7 +6,8 @@
 Connects to a Nafir server, puts a clip where the scene suggests, walks from the scene's starting place through its
 openings towards the clip while looking around, and writes two files: the sound as it arrived, and the path as it was
 heard: every pose with the sample from which on the direct sound was of it, and the one from which on the reverberation
-was, which follows a little later and skips poses. Given to `nafir render`, that path makes the same sound again.
+was, which follows a little later and skips poses, and at which quality level. Given to `nafir render`, that path makes
+the same sound again.
 """
 
 import argparse
@@ -101,15 +102,18 @@ class Walk:
 
 @dataclass
 class Recording:
-    """Blocks by sample clock, and from which sample on each pose was heard."""
+    """Blocks by sample clock, and from which sample on each pose was heard, and each quality level."""
 
     sample_rate: int
+    levels: dict[int, str]
+    """Quality level by first sample."""
     start: int | None = None
     """Where the clip begins."""
     blocks: list[tuple[int, np.ndarray]] = field(default_factory=list)
     direct: dict[int, int] = field(default_factory=dict)
-    reverberation: dict[int, int] = field(default_factory=dict)
     """First sample by pose id."""
+    reverberation: dict[int, int] = field(default_factory=dict)
+    """Pose id by first sample."""
     late: int = 0
 
     @property
@@ -123,7 +127,8 @@ class Recording:
         self.late += bool(flags & 2)
         if self.start is not None:
             self.direct.setdefault(pose, clock)
-            self.reverberation.setdefault(reverberation_pose, clock)
+            if reverberation_pose != next(reversed(self.reverberation.values()), None):
+                self.reverberation[clock] = reverberation_pose
         return sequence, pose, reverberation_pose
 
     def samples(self) -> np.ndarray:
@@ -134,14 +139,28 @@ class Recording:
             samples[sample : sample + len(block)] = block
         return samples
 
-    def path(self) -> list[tuple[int, int, int | str]]:
-        """Pose id, sample of the direct sound, and of the reverberation or nothing, by rising sample."""
-        rows = []
-        for pose in sorted(self.direct.keys() | self.reverberation.keys()):
+    def change_level(self, level: str, sample: int) -> None:
+        """What is heard from a sample on."""
+        if level != next(reversed(self.levels.values())):  # or else only how often responses come has changed
+            self.levels[sample] = level
+
+    def path(self) -> list[tuple[int, int, int | str, str]]:
+        """Pose id, sample of the direct sound, and sample and level of the reverberation or nothing, by rising sample.
+
+        A pose whose reverberation was heard at two levels is there twice.
+        """
+        heard: dict[int, list[tuple[int, str]]] = {}
+        pose, level = None, ""
+        for sample in sorted(self.reverberation.keys() | self.levels.keys()):
+            pose, level = self.reverberation.get(sample, pose), self.levels.get(sample, level)
+            if pose is not None:
+                heard.setdefault(pose, []).append((sample, level))
+        rows: list[tuple[int, int, int | str, str]] = []
+        for pose in sorted(self.direct.keys() | heard.keys()):
             # A pose overtaken by a newer one within a block was never heard directly: written down with that one,
             # which comes later and counts.
             sample = self.direct.get(pose, min(at for newer, at in self.direct.items() if newer >= pose))
-            rows.append((pose, sample, self.reverberation.get(pose, "")))
+            rows += [(pose, sample, *reverberation) for reverberation in heard.get(pose, [("", "")])]
         return rows
 
 
@@ -185,7 +204,7 @@ async def listen(arguments: argparse.Namespace) -> None:
         print(f"level {welcome['level']}")
         scene = welcome["scene"]
         walk = Walk.through(scene, arguments.seconds)
-        recording = Recording(welcome["sample_rate"])
+        recording = Recording(welcome["sample_rate"], {0: welcome["level"]})
         # Before the clip, so that it begins with this pose and not with the scene's own.
         poses = {1: walk.pose_at(0)}
         await socket.send(poses[1].to_bytes(1))
@@ -212,6 +231,7 @@ async def listen(arguments: argparse.Namespace) -> None:
                 recording.start = event["sample_clock"]
                 walking = asyncio.create_task(send_poses(socket, walk, poses, sent_s))
             elif event["type"] == "level_changed":
+                recording.change_level(event["level"], event["sample_clock"])
                 say(event, recording.sample_rate)
             elif event["type"] == "error":
                 raise SystemExit(f"{event['code']}: {event['message']}")
@@ -228,7 +248,7 @@ async def listen(arguments: argparse.Namespace) -> None:
             )
     print(f"{recording.late} blocks late")
     print(
-        f"Render it again:\n  nafir render {arguments.scene} --level {welcome['level']} --effects all "
+        f"Render it again:\n  nafir render {arguments.scene} --effects all "
         f"--emitter {arguments.clip}@{x:g},{y:g},{z:g} --loop "
         f"--path {arguments.path} --duration-s {len(recording.samples()) / recording.sample_rate:.6f} -o again.wav"
     )
@@ -239,7 +259,7 @@ def write(arguments: argparse.Namespace, recording: Recording, poses: dict[int, 
     soundfile.write(arguments.output, samples, recording.sample_rate, subtype="FLOAT")
     with arguments.path.open("w", newline="") as stream:
         writer = csv.writer(stream)
-        writer.writerow(["sample", "reverberation_sample", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        writer.writerow(["sample", "reverberation_sample", "level", "x", "y", "z", "qx", "qy", "qz", "qw"])
         for pose_id, *clocks in path:
             writer.writerow([*clocks, *poses[pose_id].position, *poses[pose_id].orientation])
     print(f"{arguments.output}: {len(samples) / recording.sample_rate:.2f} s; {arguments.path}: {len(path)} poses")

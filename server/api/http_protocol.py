@@ -10,14 +10,17 @@ import asyncio
 from functools import partial
 from typing import Any
 
+from uvicorn._types import ASGI3Application
 from uvicorn.config import Config
-from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
 from server.api.connection_limits import HEALTH_PATHS, ConnectionLimits
-from server.api.request_meter import Refusal, RequestMeter
+from server.api.request_meter import RequestMeter
+from server.api.resetting import reset
 from server.api.seats import Seat, Seats
-from server.problems import problem
+from server.api.turn_taking import TurnTaking
+from server.problems import Refusal, problem
 from server.web_socket import WebSocketProtocol
 
 _CHECK_EVERY_S = 0.5
@@ -45,6 +48,7 @@ class Room:
     def __init__(self, limits: ConnectionLimits) -> None:
         self.limits = limits
         self.seats = Seats(limits)
+        self.turns = TurnTaking()
         self._connections: set[HttpProtocol | WebSocketProtocol] = set()
         self._is_watching = False
 
@@ -148,7 +152,7 @@ class HttpProtocol(HttpToolsProtocol):
         elif self._unsent is None or unsent_bytes <= self._unsent[0] - _PACE_BYTES:
             self._unsent = unsent_bytes, now_s
         elif now_s - self._unsent[1] > self._room.limits.response_timeout_s:
-            self.transport.abort()
+            reset(self.transport)
         if self._due_s is not None and now_s > self._due_s:
             self._time_out()
 
@@ -157,11 +161,11 @@ class HttpProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         if self._is_last:
             raise _RefusedError  # behind a chunked body, which the parser has together with its end
-        self._has_head = True
         refusal = self._judge_head()
         if refusal is not None:
             self._refusal = refusal
             raise _RefusedError
+        self._has_head = True
         super().on_headers_complete()
         if self._is_upgrading:
             return
@@ -204,6 +208,18 @@ class HttpProtocol(HttpToolsProtocol):
     def _is_upgrading(self) -> bool:
         return bool(self.parser.should_upgrade()) and self._should_upgrade()
 
+    def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
+        """In turn with others' requests, but for health checks."""
+        start = partial(super()._start_asgi_task, cycle, app)
+        if self._is_health_check:
+            start()
+        else:
+            self._room.turns.begin(self.loop, lambda: None if cycle.disconnected else start())
+
+    @property
+    def _is_health_check(self) -> bool:
+        return self.url.partition(b"?")[0] in _HEALTH
+
     # What becomes of what is heard.
 
     def _read(self, data: bytes) -> bytes:
@@ -223,7 +239,7 @@ class HttpProtocol(HttpToolsProtocol):
 
     def _judge_head(self) -> Refusal | None:
         assert self._seat is not None
-        if self._seat.is_reserve and self.url.partition(b"?")[0] not in _HEALTH:
+        if self._seat.is_reserve and not self._is_health_check:
             return _NO_ROOM
         refusal = self._meter.expect_body(0)
         for name, value in self.headers:
@@ -264,7 +280,7 @@ class HttpProtocol(HttpToolsProtocol):
 
     def _time_out(self) -> None:
         if self._is_last or self.transport.is_closing():
-            self.transport.abort()
+            reset(self.transport)
         elif self._meter.is_fresh:
             self.transport.close()
         else:
@@ -277,15 +293,16 @@ class HttpProtocol(HttpToolsProtocol):
             return
         self._is_last = True
         self._unset_keepalive_if_required()
-        if self.cycle is not None and not self.cycle.response_complete:
-            if self.cycle.response_started:
-                self.transport.abort()
-                return
+        if not self._has_head or not self.cycle.response_started:
+            self.logger.info("%s is refused: %d %s", self.client, refusal.status, refusal.code)
+            self.transport.write(_answer(refusal, self.server_state.default_headers))
+        elif not self.cycle.response_complete:
+            self.transport.abort()
+            return
+        if self._has_head:
             # What the application would still say goes nowhere.
             self.cycle.disconnected = True
             self.cycle.message_event.set()
-        self.logger.info("%s is refused: %d %s", self.client, refusal.status, refusal.code)
-        self.transport.write(_answer(refusal, self.server_state.default_headers))
         self._hang_up()
 
     def _hang_up(self) -> None:

@@ -3,15 +3,7 @@
 from dataclasses import dataclass
 
 from server.api.connection_limits import ConnectionLimits
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why a request gets an error for an answer, and its connection ends."""
-
-    status: int
-    code: str
-    detail: str
+from server.problems import Refusal
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ computed, once per quality level.
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,7 @@ from server.health.findings import (
 )
 from server.health.poses import EMITTER, LISTENER, YAW, Poses, corners, scattered
 from server.scene.bundle import Bundle
+from server.scene.manifest import Manifest
 from server.whole_field import WholeField, kemar
 
 Floats = npt.NDArray[np.float64]
@@ -95,7 +97,13 @@ class Health:
 
     @property
     def broken(self) -> tuple[Finding, ...]:
-        return tuple(finding for finding in self.findings if not finding.holds)
+        """Laws that do not hold, and that the scene's manifest does not accept."""
+        return tuple(finding for finding in self.findings if not finding.holds and finding.accepted is None)
+
+    @property
+    def accepted(self) -> tuple[Finding, ...]:
+        """Laws that do not hold, and that the manifest accepts."""
+        return tuple(finding for finding in self.findings if not finding.holds and finding.accepted is not None)
 
     def require(self) -> None:
         """Raises HealthError if a law is broken."""
@@ -106,7 +114,23 @@ class Health:
                 + (f" at {finding.where}" if finding.pose is not None else "")
                 for finding in self.broken
             )
-            raise HealthError(f"scene {self.scene} is not healthy: {problems}")
+            remedies = " ".join(f"{line}." for line in dict.fromkeys(advice(finding.law) for finding in self.broken))
+            raise HealthError(f"scene {self.scene} is not healthy: {problems}. {remedies}")
+
+
+def advice(law: Law) -> str:
+    """What to do about a broken law."""
+    if not law.can_be_accepted:
+        return f"{law.label}: a fault of the program, not of the scene; please report it"
+    return f"{law.label}: {law.remedy}; or, if the room does so, export with --accept {law.name}='why'"
+
+
+@dataclass(frozen=True)
+class FieldsHealth:
+    """What was found of a bundle's fields; `worst` (pose, 7) by field is where levels are to be tried."""
+
+    health: Health
+    worst: dict[str, Poses]
 
 
 def check(
@@ -115,30 +139,63 @@ def check(
     *,
     seed: int = 0,
     track: Callable[[Iterable[str]], Iterable[str]] = iter,
+    fields: FieldsHealth | None = None,
 ) -> Health:
     """All findings, fields first. `track` is given the names of fields and levels, and hands them on as they are done.
+    `fields` is what was found of the same fields already.
 
     Raises BundleError for a graph that does not fit the manifest.
     """
     started_s = time.perf_counter()
     effort = effort or Effort()
     levels = Levels.load(bundle)
+    fields = fields or _check_fields(bundle, levels, effort, seed, track)
+    findings: list[Finding] = []
+    for name in track([f"{_LEVEL}{name}" for name in levels]):
+        level = levels[name.removeprefix(_LEVEL)]
+        poses = fields.worst.get(level.level.field)
+        if poses is None:  # in a scene without a field
+            poses = scattered(bundle, effort.responses, seed)
+        findings += _check_level(level, poses)
+    found = (*fields.health.findings, *_with_reasons(bundle, findings))
+    return Health(bundle.id, found, fields.health.evidence, time.perf_counter() - started_s)
+
+
+def check_fields(bundle: Bundle, effort: Effort | None = None, *, seed: int = 0) -> FieldsHealth:
+    """What does not depend on how a field's answers are decoded: neither on a scene's noise nor on its levels."""
+    return _check_fields(bundle, Levels.load(bundle), effort or Effort(), seed, iter)
+
+
+def _check_fields(
+    bundle: Bundle,
+    levels: Levels,
+    effort: Effort,
+    seed: int,
+    track: Callable[[Iterable[str]], Iterable[str]],
+) -> FieldsHealth:
+    started_s = time.perf_counter()
     graphs = {level.level.field: level.graph for level in levels.values() if not isinstance(level, Silence)}
     findings: list[Finding] = []
     evidence: dict[str, FieldEvidence] = {}
     worst: dict[str, Poses] = {}
-    for name in track([*graphs, *(f"{_LEVEL}{name}" for name in levels)]):
-        if name in graphs:
-            affordable = _affordable(graphs[name], bundle, effort, seed)
-            of_field, evidence[name], poses = _check_field(bundle, graphs[name], affordable, seed)
-            worst[name] = poses[: affordable.responses]
-            findings += of_field
-        else:
-            level = levels[name.removeprefix(_LEVEL)]
-            if level.level.field not in worst:  # in a scene without a field
-                worst[level.level.field] = scattered(bundle, effort.responses, seed)
-            findings += _check_level(level, worst[level.level.field])
-    return Health(bundle.id, tuple(findings), evidence, time.perf_counter() - started_s)
+    for name in track(list(graphs)):
+        affordable = _affordable(graphs[name], bundle, effort, seed)
+        of_field, evidence[name], poses = _check_field(bundle, graphs[name], affordable, seed)
+        worst[name] = poses[: affordable.responses]
+        findings += of_field
+    found = tuple(_with_reasons(bundle, findings))
+    return FieldsHealth(Health(bundle.id, found, evidence, time.perf_counter() - started_s), worst)
+
+
+def _with_reasons(bundle: Bundle, findings: Iterable[Finding]) -> list[Finding]:
+    """With why the manifest accepts those that break a law."""
+    reasons = {entry.law: entry.reason for entry in bundle.manifest.accepted}
+    return [
+        finding
+        if finding.holds or not finding.law.can_be_accepted
+        else replace(finding, accepted=reasons.get(finding.law.name))
+        for finding in findings
+    ]
 
 
 def _affordable(graph: FieldGraph, bundle: Bundle, effort: Effort, seed: int) -> Effort:
@@ -162,13 +219,16 @@ def _check_field(
     at_corners, spread = corners(bundle), scattered(bundle, effort.scattered, seed)
     poses = np.concatenate([at_corners[:: max(1, len(at_corners) // (2 * effort.scattered))], spread])
     energies = predictions.energies(poses)
-    findings = [_worst(DECAY, graph.name, poses, laws.decay_rise_db(energies))]
-    excess_db = None
     manifest = bundle.manifest
+    windows = predictions.windows
+    usual_db = laws.usual_rises_db(manifest.reference, energies.shape[-1] - 1, windows.window_s)
+    findings = [_worst(DECAY, graph.name, poses, laws.decay_rise_db(energies, usual_db))]
+    excess_db = None
+    usual_excess_db = laws.usual_excess_db(manifest.reference)
     if (geometry := manifest.geometry) is not None:
 
         def above_law(some: Poses, found: Energies) -> Floats:
-            return laws.energy_excess_db(manifest, geometry, some, found)
+            return laws.energy_excess_db(manifest, geometry, some, found) - usual_excess_db
 
         excess_db = above_law(poses, energies)
         climbed, values = search.climb(
@@ -180,14 +240,17 @@ def _check_field(
         tried = np.concatenate([poses, climbed])
         findings.append(_worst(ENERGY, graph.name, tried, np.concatenate([excess_db, values])))
     steps = {
-        what: search.steepest(bundle, predictions.energies, _change, spread, moved, kept=effort.halved)
+        what: search.steepest(
+            bundle, predictions.energies, partial(_change, manifest), spread, moved, kept=effort.halved
+        )
         for what, moved in search.moves(spread, rng).items()
     }
     # Measured responses step from one place to the next, as they were measured; what is learned of them does not.
     is_recording = graph.gives_responses and manifest.direct_sound == "field"
     for what, (level, spectrum) in () if is_recording else _CONTINUITY.items():
         for law, change_db in ((level, laws.level_change_db), (spectrum, laws.spectral_change_db)):
-            values = change_db(steps[what].before, steps[what].after)
+            step = steps[what]
+            values = change_db(step.before, step.after) - laws.spreading_db(manifest, step.poses, step.moved)
             if len(values):
                 findings.append(_worst(law, graph.name, steps[what].poses, values, what))
     if not graph.gives_responses:
@@ -205,10 +268,12 @@ def _check_field(
     return findings, evidence, np.concatenate([worst, spread])
 
 
-def _change(before: Energies, after: Energies) -> Floats:
+def _change(manifest: Manifest, step: search.Steps) -> Floats:
     """In units of what is allowed, of level or spectrum, whichever is more."""
-    level = laws.level_change_db(before, after) / LEVEL_PER_CM.bound
-    return np.maximum(level, laws.spectral_change_db(before, after) / SPECTRUM_PER_CM.bound)
+    spreading_db = laws.spreading_db(manifest, step.poses, step.moved)
+    level = (laws.level_change_db(step.before, step.after) - spreading_db) / LEVEL_PER_CM.bound
+    spectrum = (laws.spectral_change_db(step.before, step.after) - spreading_db) / SPECTRUM_PER_CM.bound
+    return np.maximum(level, spectrum)
 
 
 def _check_level(field: AcousticField, poses: Poses) -> list[Finding]:

@@ -19,7 +19,8 @@ def check(
 ) -> None:
     """Check the numerical health of a scene bundle at its corners, all over it and at the worst poses a search finds.
 
-    Exit code 1 where a law is broken. Fields that take long are asked for fewer poses, in about a quarter of a minute.
+    Exit code 1 where a law is broken, unless the scene was exported with a reason to accept that. Fields that take long
+    are asked for fewer poses, in about a quarter of a minute.
     """
     from server.health.check import check as check_bundle
     from server.health.report import reasons, table, to_json

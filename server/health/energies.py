@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.codec import Codec
 from server.field.graph import FieldGraph, Spectrograms
 from server.health.poses import EMITTER, LISTENER, YAW, Poses
 
@@ -15,6 +16,26 @@ Energies = npt.NDArray[np.float64]
 
 WINDOW_S = 0.020
 _CHUNK = 16
+
+
+class Windows:
+    """Sorts a codec's spectrograms by octave band and window of time."""
+
+    def __init__(self, codec: Codec) -> None:
+        frequency = np.maximum(np.fft.rfftfreq(codec.n_fft, 1 / codec.sample_rate), 1.0)
+        nearest = np.argmin(np.abs(np.log2(frequency[:, None] / np.array(OCTAVE_BANDS_HZ))), axis=-1)
+        # Bins between DC and Nyquist stand for two.
+        weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
+        self._bands = (np.eye(len(OCTAVE_BANDS_HZ))[nearest] * weight[:, None]).T.astype(np.float32)
+        self._frames = max(1, round(WINDOW_S * codec.sample_rate / codec.hop))
+        self.count = -(-codec.frames // self._frames)
+        self.window_s = self._frames * codec.hop / codec.sample_rate
+
+    def energies(self, magnitude: npt.NDArray[np.floating]) -> Energies:
+        """(..., band, window) of magnitudes (..., frequency, frame)."""
+        in_bands = self._bands @ np.square(magnitude)
+        starts = np.arange(0, in_bands.shape[-1], self._frames)
+        return np.add.reduceat(in_bands.astype(np.float64), starts, axis=-1)
 
 
 class Predictions:
@@ -25,18 +46,11 @@ class Predictions:
         self.asked = 0
         self.faults = 0
         """Values that were not finite, so far."""
-        codec = graph.parameters.codec
-        frequency = np.maximum(np.fft.rfftfreq(codec.n_fft, 1 / codec.sample_rate), 1.0)
-        nearest = np.argmin(np.abs(np.log2(frequency[:, None] / np.array(OCTAVE_BANDS_HZ))), axis=-1)
-        # Bins between DC and Nyquist stand for two.
-        weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
-        self._bands = (np.eye(len(OCTAVE_BANDS_HZ))[nearest] * weight[:, None]).T.astype(np.float32)
-        self._frames = max(1, round(WINDOW_S * codec.sample_rate / codec.hop))
+        self.windows = Windows(graph.parameters.codec)
 
     def energies(self, poses: Poses) -> Energies:
         """NaN where the graph's outputs are not finite."""
-        windows = -(-self.graph.parameters.codec.frames // self._frames)
-        energies = np.empty((len(poses), self.graph.channels, len(OCTAVE_BANDS_HZ), windows))
+        energies = np.empty((len(poses), self.graph.channels, len(OCTAVE_BANDS_HZ), self.windows.count))
         for start in range(0, len(poses), _CHUNK):
             energies[start : start + _CHUNK] = self._energies(poses[start : start + _CHUNK])
         return energies
@@ -54,6 +68,4 @@ class Predictions:
         else:
             axis = self.graph.parameters.frame_axis
             magnitude = codec.magnitude(outputs[0] if axis is None else outputs[0] @ axis.spread())
-        in_bands = self._bands @ np.square(magnitude)
-        starts = np.arange(0, in_bands.shape[-1], self._frames)
-        return np.add.reduceat(in_bands.astype(np.float64), starts, axis=-1)
+        return self.windows.energies(magnitude)

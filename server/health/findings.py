@@ -20,8 +20,16 @@ class Law:
     unit: str
     bound: float
     reason: str
+    remedy: str = ""
+    """What whoever trained the field can do about it; nothing where the fault is the program's."""
+
+    @property
+    def can_be_accepted(self) -> bool:
+        """Whether a scene may be offered all the same, with a reason: never where the computation is at fault."""
+        return bool(self.remedy)
 
 
+_MORE_DATA = "place probes nearer to each other (probes.spacing_m), or train for longer (--epochs)"
 FINITE = Law(
     "finite", "answers that are not finite", "", 0.0, "one of them would stay in a convolver for a response's length"
 )
@@ -30,7 +38,9 @@ ENERGY = Law(
     "energy above what the walls let remain",
     "dB",
     0.0,
-    "walls absorb: beside a diffuse field, a corner has eight times the energy and the nearer ear twice",
+    "walls absorb: beside a diffuse field, a corner has eight times the energy and the nearer ear twice; or 3 dB more "
+    "than the loudest response that the field was trained on",
+    f"{_MORE_DATA}; of measured responses, import them with the gain that they were measured with",
 )
 PEAK = Law(
     "peak",
@@ -38,23 +48,36 @@ PEAK = Law(
     "",
     1 / NEAR_LIMIT_M,
     f"no reflection is louder than the direct sound can be, at {NEAR_LIMIT_M:g} m",
+    _MORE_DATA,
 )
 _TWO_JND = (
     "twice the just-noticeable difference of level (ISO 3382-1:2009, table A.1): no smaller move may be heard as a pop"
 )
 _ONE_REFLECTION = "as much as it makes when a reflection with half of a band's energy comes into sight"
-LEVEL_PER_CM = Law("level_per_cm", "change of level per centimetre", "dB", 2.0, _TWO_JND)
-LEVEL_PER_DEGREE = Law("level_per_degree", "change of level per degree of the head", "dB", 2.0, _TWO_JND)
-SPECTRUM_PER_CM = Law("spectrum_per_cm", "change of an octave band per centimetre", "dB", 3.0, _ONE_REFLECTION)
+_BESIDE_DISTANCE = "; where fields hold the direct sound, beside what it gains by coming nearer (20 lg r)"
+LEVEL_PER_CM = Law(
+    "level_per_cm", "change of level per centimetre", "dB", 2.0, f"{_TWO_JND}{_BESIDE_DISTANCE}", _MORE_DATA
+)
+LEVEL_PER_DEGREE = Law("level_per_degree", "change of level per degree of the head", "dB", 2.0, _TWO_JND, _MORE_DATA)
+SPECTRUM_PER_CM = Law(
+    "spectrum_per_cm",
+    "change of an octave band per centimetre",
+    "dB",
+    3.0,
+    f"{_ONE_REFLECTION}{_BESIDE_DISTANCE}",
+    _MORE_DATA,
+)
 SPECTRUM_PER_DEGREE = Law(
-    "spectrum_per_degree", "change of an octave band per degree of the head", "dB", 3.0, _ONE_REFLECTION
+    "spectrum_per_degree", "change of an octave band per degree of the head", "dB", 3.0, _ONE_REFLECTION, _MORE_DATA
 )
 DECAY = Law(
     "decay",
     "rise within 60 dB of decay",
     "dB",
     3.0,
-    "without a source, what is left of a sound does not grow; a doubled energy is a second event",
+    "without a source, what is left of a sound does not grow, but where the responses that the field learned from do: "
+    "between parallel walls, or where a corridor comes back; a doubled energy beside that is a second event",
+    "train for longer (--epochs); where simulated responses rise, more rays (simulation.rays) make late sound smoother",
 )
 BRANCH_CUT = Law(
     "branch_cut",
@@ -62,6 +85,7 @@ BRANCH_CUT = Law(
     "%",
     10.0,
     "3 % would be chance; a field whose bin centres were not taken off has 25 %, and what it predicts there is noise",
+    "train for longer (--epochs)",
 )
 REPEATABLE = Law(
     "repeatable", "difference of a rerun", "", 0.0, "the same request has the same answer, to the last bit"
@@ -80,6 +104,22 @@ ITERATED = Law(
     "dB",
     -50.0,
     "iterations from zero phase decide at bins where next to nothing is which way to turn; beneath what masks it",
+)
+
+
+LAWS = (
+    FINITE,
+    ENERGY,
+    PEAK,
+    LEVEL_PER_CM,
+    LEVEL_PER_DEGREE,
+    SPECTRUM_PER_CM,
+    SPECTRUM_PER_DEGREE,
+    DECAY,
+    BRANCH_CUT,
+    REPEATABLE,
+    BATCH,
+    DOUBLE,
 )
 
 
@@ -114,6 +154,8 @@ class Finding:
     pose: Poses | None = None
     moving: str | None = None
     """What moved: listener, emitter or yaw."""
+    accepted: str | None = None
+    """Why the scene is offered all the same, where the law is broken and the scene's manifest accepts that."""
 
     @property
     def holds(self) -> bool:

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.table import Table
 
-from server.health.check import Health
+from server.health.check import Health, advice
 from server.health.findings import Finding
 
 _MOVING = {"listener": "the listener moves", "emitter": "the emitter moves", "yaw": "the head turns"}
@@ -22,6 +22,8 @@ def table(health: Health) -> Table:
     rows.add_column("where")
     for finding in health.findings:
         mark = "[green]ok[/]" if finding.holds else "[bold red]broken[/]"
+        if not finding.holds and finding.accepted is not None:
+            mark = "[yellow]accepted[/]"
         law = finding.law
         rows.add_row(
             mark,
@@ -38,14 +40,19 @@ def table(health: Health) -> Table:
 def verdict(health: Health) -> str:
     count = len(health.findings)
     if not health.broken:
-        return f"healthy, {count} laws hold ({health.seconds:.0f} s)"
+        but = f", {len(health.accepted)} broken and accepted" if health.accepted else ""
+        return f"healthy, {count - len(health.accepted)} laws hold{but} ({health.seconds:.0f} s)"
     return f"not healthy, {len(health.broken)} of {count} laws are broken ({health.seconds:.0f} s)"
 
 
 def reasons(health: Health) -> list[str]:
-    """Why each law that is broken has the bound that it has."""
-    broken = {finding.law.label: finding.law.reason for finding in health.broken}
-    return [f"{label}: {reason}" for label, reason in broken.items()]
+    """Why each law that is broken has the bound that it has, and what to do; why others are accepted."""
+    broken = {finding.law.name: finding.law for finding in health.broken}
+    accepted = {finding.law.label: finding.accepted for finding in health.accepted}
+    return [
+        *(line for law in broken.values() for line in (f"{law.label}: {law.reason}", advice(law))),
+        *(f"{label}: accepted, {reason}" for label, reason in accepted.items()),
+    ]
 
 
 def to_json(health: Health) -> dict[str, Any]:
@@ -58,11 +65,13 @@ def to_json(health: Health) -> dict[str, Any]:
                 "law": finding.law.name,
                 "of": finding.of,
                 "holds": finding.holds,
+                "accepted": finding.accepted,
                 # JSON knows no infinity: silence differs by minus infinity from silence, and what is NaN has no value.
                 "value": finding.value if math.isfinite(finding.value) else None,
                 "bound": finding.law.bound,
                 "unit": finding.law.unit,
                 "reason": finding.law.reason,
+                "remedy": finding.law.remedy or None,
                 "poses": finding.poses,
                 "moving": finding.moving,
                 "pose": None if finding.pose is None else [round(float(part), 6) for part in finding.pose],

@@ -61,9 +61,10 @@ def moves(poses: Poses, rng: np.random.Generator) -> dict[str, Poses]:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Poses before a step (n, 7), with the energies before and after it."""
+    """Poses before a step and after it (n, 7), with the energies there."""
 
     poses: Poses
+    moved: Poses
     before: Energies
     after: Energies
 
@@ -71,7 +72,7 @@ class Steps:
 def steepest(
     bundle: Bundle,
     energies: Callable[[Poses], Energies],
-    change: Callable[[Energies, Energies], Floats],
+    change: Callable[[Steps], Floats],
     poses: Poses,
     moved: Poses,
     *,
@@ -85,16 +86,17 @@ def steepest(
         usable &= plan.is_visible(poses[:, part], moved[:, part])
     start, end = poses[usable], moved[usable]
     before, after = energies(start), energies(end)
-    order = np.argsort(-known(change(before, after)))[:kept]
+    order = np.argsort(-known(change(Steps(start, end, before, after))))[:kept]
     start, end, before, after = start[order], end[order], before[order], after[order]
     for _ in range(HALVINGS):
         middle = (start + end) / 2
         between = energies(middle)
-        is_first = known(change(before, between)) >= known(change(between, after))
+        halves = Steps(start, middle, before, between), Steps(middle, end, between, after)
+        is_first = np.greater_equal(*(known(change(half)) for half in halves))
         rows, cubes = is_first[:, None], is_first[:, None, None, None]
         start, before = np.where(rows, start, middle), np.where(cubes, before, between)
         end, after = np.where(rows, middle, end), np.where(cubes, between, after)
-    return Steps(start, before, after)
+    return Steps(start, end, before, after)
 
 
 def known(values: Floats) -> Floats:

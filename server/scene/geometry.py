@@ -31,7 +31,7 @@ class Material(Strict):
 
     absorption: PerBand
     scattering: PerBand
-    surface_mass_kg_m2: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    surface_mass_kg_m2: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
 
 
 class Materials(Strict):

@@ -228,6 +228,27 @@ class FrontierPoint(Strict):
     rank: Annotated[int, Field(ge=1)] | None = None
 
 
+class DataReference(Strict):
+    """What the responses that a scene's fields were trained on do themselves, as `nafir check` measures fields: where a
+    room's own responses rise, or are louder than a diffuse field could be, so may its fields.
+
+    `rises_db` are the greatest rises that end in each window of `window_s`, of all responses measured;
+    `energy_excess_db` is the most energy that any has, re what the walls let remain.
+    """
+
+    responses: Annotated[int, Field(ge=1)]
+    window_s: Positive
+    rises_db: Annotated[tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...], Field(max_length=65536)]
+    energy_excess_db: Finite | None = None
+
+
+class AcceptedLaw(Strict):
+    """A law of health that the fields break, and why whoever exported them offers them all the same."""
+
+    law: str
+    reason: Annotated[str, Field(min_length=1, max_length=1000)]
+
+
 class Manifest(Strict):
     """All of `scene.json`; `files` maps every other file of the bundle to its SHA-256."""
 
@@ -258,6 +279,9 @@ class Manifest(Strict):
     """Worth their time as the levels are, and so near one of them that they are not offered."""
     effects: Mapping[EffectName, bool] = Field(default_factory=dict)
     """On or off whatever the planner would decide; those that are not named are its to decide."""
+    reference: DataReference | None = None
+    """None where nothing is known of the responses that fields were trained on."""
+    accepted: tuple[AcceptedLaw, ...] = ()
     files: dict[FileName, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
 
     @field_validator("format_version", mode="before")

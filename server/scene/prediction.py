@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.audibility import HEARD, ratio_in_jnd
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import axes_of
 from server.scene.effects import EffectName
@@ -211,7 +211,7 @@ class Prediction:
             "level": power_to_db(direct + (early + late)[:, owner] + _SILENCE),
             "drr": ratio_in_jnd("drr", ratio_db(direct, (early + late)[:, owner])),
             "c50": ratio_in_jnd("c50", ratio_db(direct + early[:, owner], late[:, owner])),
-            "edt": self._decays.early_decay_s(energies),
+            "edt": self._decays.early_decay_s(self, energies),
         }
 
     def _spectral_change_db(self, left: Energies) -> Floats:
@@ -222,6 +222,7 @@ class Prediction:
         the more so the fewer modes there are, of which a decay has as many as its bandwidth times its duration.
         """
         owner, whole = self.reach.owner, self.whole
+        within = bands_within(self.place.sample_rate)
         mirrored, held = whole.mirrored, whole.held
         mirrored_change = np.abs(np.sqrt(mirrored) - np.sqrt(left.mirrored))[:, owner]
         held_root = np.sqrt(held)[:, owner]
@@ -236,7 +237,7 @@ class Prediction:
             by_chance = amplitude * held_root + held_change * np.sqrt(direct + mirrored)
             before, without = direct + after, other_direct + other_after
             most = np.abs(before - without) + by_chance * chance
-            return np.asarray((most / np.minimum(before, without)).max(axis=-1))
+            return np.asarray((most / np.minimum(before, without))[..., :within].max(axis=-1))
 
         return power_to_db(1 + np.maximum(change(1.0), change(self._facing_gain)))
 
@@ -295,7 +296,6 @@ class _Decays:
     """Energy decay curves of all emitters as everybody is now, over the times in which a decay is read; (e, time) each,
     `held` (e, band, time) and `mirrored` (m, time) for energies that are 1."""
 
-    prediction: "Prediction"
     time_s: Floats
     held: Floats
     direct: Floats
@@ -312,7 +312,6 @@ class _Decays:
         time_s = (longest @ prediction.shares)[:, None] * np.linspace(0, 1 / 6, _DECAY_POINTS)
         later_s = (paths.length_m - prediction.reach.paths.length_m[paths.owner]) / prediction.place.speed_of_sound
         return cls(
-            prediction,
             time_s,
             held=np.exp(-6 * np.log(10) * time_s[:, None] / longest[..., None]) * prediction.shares[:, None],
             direct=np.clip(1 - time_s / _DIRECT_S, 0, 1),
@@ -320,15 +319,15 @@ class _Decays:
             whose=(paths.owner == np.arange(len(longest))[:, None]).astype(np.float64),
         )
 
-    def early_decay_s(self, energies: Energies) -> Floats:
+    def early_decay_s(self, prediction: "Prediction", energies: Energies) -> Floats:
         """(v, e); 0 where the direct sound alone is the first 10 dB, or nothing decays."""
-        shares, paths = self.prediction.shares, self.prediction.mirrored
+        shares, paths = prediction.shares, prediction.mirrored
         count = len(self.time_s)
         curve = np.einsum("veb,ebt->vet", energies.held, self.held)
         curve += (energies.direct[:, :count] @ shares)[..., None] * self.direct
         if len(paths.owner):
             # All paths of an emitter in the proportion they have together.
-            energy = self.prediction.mirrored_energies([ALL_ON])[0] @ shares
+            energy = prediction.mirrored_energies([ALL_ON])[0] @ shares
             whole = self.whose @ energy
             steps = self.whose @ (energy[:, None] * self.mirrored) / np.maximum(whole, _SILENCE)[:, None]
             curve += (energies.mirrored @ shares)[..., None] * steps

@@ -5,7 +5,7 @@ it shows.
 - `crashes`: the server's end before its time, exceptions that nobody caught, and answers of 5xx but for 503, which says
   that there is too much to do.
 - `faults_unanswered`: messages that had to be refused and were not.
-- `memory_growth`: of the server's resident memory once its caches have filled, six minutes after it started: the median of
+- `memory_growth`: of the server's resident memory once its caches have filled, after six minutes: the median of
   the last fifth of the time after that over the median of the first. A run of less than twelve minutes leaves it out.
 - `drift_db`: see `server.soak.witness`. `silence_to_sound`: see `server.soak.silence`, measured when all else is over.
 - `blocks_late` are told, not judged: they say how busy the host was.

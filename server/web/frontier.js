@@ -5,8 +5,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT] = [296, 132];
-const MARGIN = { left: 26, right: 14, top: 12, bottom: 22 };
-const LETTER = 6.5; // width of one in a name
+const MARGIN = { left: 26, right: 38, top: 12, bottom: 22 };
 const KEPT = 3; // changes told
 const REASONS = {
   chosen: "as you chose",
@@ -52,7 +51,7 @@ export class Frontier extends EventTarget {
 
   /** Name of the level asked for, or "auto". */
   get chosen() {
-    return this.#choice.value;
+    return this.#choice.value || "auto";
   }
 
   show({ levels }) {
@@ -66,6 +65,11 @@ export class Frontier extends EventTarget {
     this.#choice.value = chosen;
     this.#choice.disabled = false;
     this.#draw();
+  }
+
+  /** There is nothing to show yet, and why. */
+  fail(reason) {
+    if (this.#levels.length === 0) this.#note.textContent = `not available: ${reason}`;
   }
 
   /** The level heard from now on; null while there is no stream. */
@@ -140,8 +144,8 @@ export class Frontier extends EventTarget {
 
   #floor(at) {
     draw("path", { class: "floor", d: `M${MARGIN.left} ${at.toFixed(1)}H${WIDTH - MARGIN.right}` }, this.#chart);
-    // Where errors are large costs are small: below the line, that corner is free.
-    draw("text", { x: MARGIN.left + 4, y: at + 12, class: "tick start" }, this.#chart, "floor");
+    // Beside the plot, where it covers no point.
+    draw("text", { x: WIDTH - MARGIN.right + 6, y: at + 3.5, class: "tick start floor-label" }, this.#chart, "floor");
   }
 
   #mark(level, x, y) {
@@ -164,11 +168,5 @@ export class Frontier extends EventTarget {
     draw("title", {}, mark, `${level.name}: error ${level.audible.toFixed(2)} JND${floor}${step}${bundled}${here}${unoffered}`);
     if (!level.is_offered) return;
     mark.addEventListener("click", () => this.#choose(level.name));
-    if (!isHeard) return;
-    const isLeft = at > WIDTH * 0.6;
-    const room = isLeft ? at - MARGIN.left : WIDTH - at;
-    if (level.name.length * LETTER + 12 > room) return; // it is above the chart in any case
-    // The line falls to the right: above its end there is room, and beside its beginning.
-    draw("text", { x: at + (isLeft ? 8 : 12), y: height - (isLeft ? 14 : 7), class: isLeft ? "name end" : "name" }, this.#chart, level.name);
   }
 }

@@ -7,10 +7,14 @@
 const QUANTUM = 128; // of the Web Audio API
 const RESERVE = 64; // kept back so that a buffer running dry ends in a fade and not in a click
 const WINDOW_S = 1; // over which the lowest fill is taken
-const MEMORY = 15; // windows without a dip before the buffer is shortened: jitter that comes rarely still comes
+const MEMORY = 15; // windows without a dip before the buffer is shortened a little: jitter that comes rarely still comes
+const SOON = 2; // windows before it is shortened of much more than that, as what came in a burst after a dropout
+const MUCH_S = 0.025;
 const AGAIN_S = 0.3; // after a splice that did not suffice
 const JUMP_S = 0.15; // above the headroom, as after a burst: half of it is skipped at once
 const HEADROOM_S = 0.05; // lowest fill aimed for on a quiet network
+const START_S = 0.05; // more than that at first: page, server and sound card are busiest while they start
+const STARTING = 3; // windows for which that is
 const RIPPLE_S = 0.015; // of the fill between the arrival of one block and the next
 const MAX_HEADROOM_S = 0.25;
 const SLACK_S = 0.012; // above the headroom before the buffer is shortened
@@ -38,12 +42,14 @@ export class JitterBuffer {
     this.written = 0;
     this.playing = false;
     this.started = false;
-    this.headroomS = HEADROOM_S;
+    this.headroomS = HEADROOM_S + START_S;
+    this.starting = STARTING;
+    this.isShortening = false;
     this.nextClock = null;
     this.marks = []; // {at, poseId, reverberationPoseId, fill}: where a newer pose becomes audible
     this.newestPose = -1;
     this.newestReverberationPose = -1;
-    this.dips = []; // lowest fill of each of the last windows
+    this.dips = []; // lowest fill of each of the last windows since playing began
     this.#openWindow();
   }
 
@@ -104,6 +110,7 @@ export class JitterBuffer {
       this.playing = true;
       this.started = true;
       this.read = this.written - this.target; // what came in one burst with it would only be delay
+      this.dips = [];
       this.#openWindow();
       this.#copy(left, right, frames);
       this.#ramp(left, right, FADE, 0, false);
@@ -151,24 +158,32 @@ export class JitterBuffer {
     right.fill(0, rest);
     this.playing = false;
     this.counters.underruns += 1;
-    this.#remember(0);
     this.headroomS = Math.min(MAX_HEADROOM_S, this.headroomS + GROWTH_S);
     return this.#heard(rest);
   }
 
   /** Samples to skip (positive) or repeat (negative) now that a window has ended; 0 leaves the buffer alone. */
   #correction() {
-    const headroom = this.headroomS * this.sampleRate;
     const { lowest } = this;
     this.#remember(lowest);
     this.#openWindow();
-    // Headroom won by a dropout is given back slowly.
+    // Headroom won by a dropout is given back slowly, that of the start at once.
+    if (this.starting > 0 && --this.starting === 0) this.#settle();
     this.headroomS = Math.max(HEADROOM_S, this.headroomS - 0.0002);
+    const headroom = this.headroomS * this.sampleRate;
     if (lowest < headroom / 2) return this.#bestLag(-1, headroom);
     if (lowest > headroom + JUMP_S * this.sampleRate) return Math.round((lowest - headroom) / 2);
     const slack = SLACK_S * this.sampleRate;
-    const excess = Math.min(...this.dips) - headroom;
-    return this.dips.length === MEMORY && excess > slack ? this.#bestLag(1, excess - slack / 2) : 0;
+    const excess = Math.min(lowest, ...this.dips) - headroom;
+    const isLasting = this.dips.length >= (excess > MUCH_S * this.sampleRate ? SOON : MEMORY);
+    this.isShortening = excess > slack && (this.isShortening || isLasting);
+    return this.isShortening ? this.#bestLag(1, excess - slack / 2) : 0;
+  }
+
+  /** The start is over, and what dipped meanwhile says nothing of what is to come. */
+  #settle() {
+    this.headroomS -= START_S;
+    this.dips = [];
   }
 
   #remember(dip) {

@@ -8,7 +8,8 @@ const MOST_BANDS = 10;
 const WIDTH = 1.25;
 const REACH = 1.5 * WIDTH; // of the spline, in grid steps
 const RIDGE = 1e-3;
-const FINE_M = 0.05;
+const FINEST_M = 0.05;
+const FINE_STEPS = 5; // of the fine grid to one of the coarse, where that is not finer still
 const NEARBY = [[0, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]];
 
 export function parseGrid({ levels_db: rows, origin, spacing_m: spacingM }) {
@@ -77,16 +78,17 @@ export class LoudnessField {
   constructor(grid, corners) {
     this.grid = grid;
     this.corners = corners;
+    this.fineM = Math.max(FINEST_M, grid.spacingM / FINE_STEPS);
     this.walls = edges(corners);
     const xs = corners.map(([x]) => x);
     const ys = corners.map(([, y]) => y);
     this.minimum = [Math.min(...xs), Math.min(...ys)];
-    this.columns = Math.round((Math.max(...xs) - this.minimum[0]) / FINE_M) + 1;
-    this.rows = Math.round((Math.max(...ys) - this.minimum[1]) / FINE_M) + 1;
+    this.columns = Math.round((Math.max(...xs) - this.minimum[0]) / this.fineM) + 1;
+    this.rows = Math.round((Math.max(...ys) - this.minimum[1]) / this.fineM) + 1;
     this.fine = new Float32Array(this.rows * this.columns);
     for (let row = 0; row < this.rows; row++) {
       for (let column = 0; column < this.columns; column++) {
-        const point = [this.minimum[0] + column * FINE_M, this.minimum[1] + row * FINE_M];
+        const point = [this.minimum[0] + column * this.fineM, this.minimum[1] + row * this.fineM];
         this.fine[row * this.columns + column] = this.#weighted(point);
       }
     }
@@ -119,7 +121,7 @@ export class LoudnessField {
   /** The point, or one a step away where it lies on a wall; null within a wall. */
   #stepInside([x, y]) {
     for (const [dx, dy] of NEARBY) {
-      const eye = [x + 0.3 * FINE_M * dx, y + 0.3 * FINE_M * dy];
+      const eye = [x + 0.3 * this.fineM * dx, y + 0.3 * this.fineM * dy];
       if (contains(this.corners, eye)) return eye;
     }
     return null;
@@ -146,8 +148,8 @@ export class LoudnessField {
 
   /** Level in dB at [x, y]; NaN outside the floor. */
   at([x, y]) {
-    const u = Math.min(this.columns - 1.001, Math.max(0, (x - this.minimum[0]) / FINE_M));
-    const v = Math.min(this.rows - 1.001, Math.max(0, (y - this.minimum[1]) / FINE_M));
+    const u = Math.min(this.columns - 1.001, Math.max(0, (x - this.minimum[0]) / this.fineM));
+    const v = Math.min(this.rows - 1.001, Math.max(0, (y - this.minimum[1]) / this.fineM));
     const [column, row] = [Math.floor(u), Math.floor(v)];
     const [s, t] = [u - column, v - row];
     const at = row * this.columns + column;
@@ -158,8 +160,8 @@ export class LoudnessField {
 
   /** The map as a canvas of `pixelsPerMetre`, row 0 north; `ramp(fraction)` gives [r, g, b] for 0 (quiet) to 1 (loud). */
   paint({ bottom, top, band: width }, ramp, pixelsPerMetre) {
-    const columns = Math.round((this.columns - 1) * FINE_M * pixelsPerMetre);
-    const rows = Math.round((this.rows - 1) * FINE_M * pixelsPerMetre);
+    const columns = Math.round((this.columns - 1) * this.fineM * pixelsPerMetre);
+    const rows = Math.round((this.rows - 1) * this.fineM * pixelsPerMetre);
     const canvas = document.createElement("canvas");
     [canvas.width, canvas.height] = [columns, rows];
     const context = canvas.getContext("2d");

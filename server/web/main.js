@@ -18,8 +18,7 @@ import { Walking } from "./walking.js";
 import { World } from "./world.js";
 
 const RETRY_MS = 2000;
-const MAP_SPACING_M = 0.25;
-const FINEST_MAP_M = 0.1; // that a server draws
+const LONGEST_RETRY_MS = 30_000;
 
 const find = (id) => document.getElementById(id);
 const epochNow = () => performance.timeOrigin + performance.now();
@@ -60,15 +59,35 @@ class Page {
       return;
     }
     if (wanted && chosen.id !== wanted) this.notices.show("scene", `There is no scene called “${wanted}”; this is ${chosen.name}.`);
-    const [scene, clips, frontier] = await Promise.all([
-      this.#untilAnswered(() => fetchScene(chosen.id)),
-      this.#untilAnswered(fetchClips),
-      this.#untilAnswered(() => fetchFrontier(chosen.id)),
-    ]);
+    this.#offer(scenes, chosen); // the way out, whatever becomes of this scene
+    const scene = await this.#untilAnswered(() => fetchScene(chosen.id));
+    this.#describe(scene);
+    const clips = (await fetchClips().catch(() => null)) ?? [];
     this.#setUp(scene, clips);
-    this.frontier.show(frontier);
-    this.#offer(scenes, scene);
+    if (clips.length === 0) this.#fill("clips", fetchClips, (found) => this.#gotClips(found));
+    this.#fill("frontier", () => fetchFrontier(scene.id), (frontier) => this.frontier.show(frontier));
     this.#setConnection("idle", "Ready");
+  }
+
+  /** Fills a part of the page that the rest can do without, and tries again later where that fails. */
+  async #fill(part, ask, show) {
+    for (let wait = RETRY_MS; ; wait = Math.min(2 * wait, LONGEST_RETRY_MS)) {
+      try {
+        show(await ask());
+        return;
+      } catch (error) {
+        if (part === "frontier") this.frontier.fail(error.message);
+        await pause(wait);
+      }
+    }
+  }
+
+  #gotClips(clips) {
+    if (clips.length === 0) throw new Error("no clip yet");
+    this.notices.clear("clips");
+    this.clips = clips;
+    this.sources.clips = clips;
+    if (this.world.emitters.size === 0) this.world.addEmitter({ clip: clips[0].name, position: this.scene.emitter.position });
   }
 
   async #untilAnswered(ask) {
@@ -85,20 +104,23 @@ class Page {
     }
   }
 
-  #offer(scenes, scene) {
-    const xs = scene.corners.map(([x]) => x);
-    const ys = scene.corners.map(([, y]) => y);
-    const size = [xs, ys].map((values) => +(Math.max(...values) - Math.min(...values)).toFixed(1));
-    find("scene-name").textContent = scene.name;
-    find("scene-size").textContent = `${size[0]} × ${size[1]} × ${+scene.height_m.toFixed(2)} m`;
-    document.documentElement.style.setProperty("--aspect", (size[0] / size[1]).toFixed(3));
-    document.title = `${scene.name} · Nafir`;
+  #offer(scenes, chosen) {
+    find("scene-name").textContent = chosen.name;
     if (scenes.length < 2) return;
     const choice = find("scene-choice");
-    choice.replaceChildren(...scenes.map(({ id, name }) => new Option(name, id, false, id === scene.id)));
+    choice.replaceChildren(...scenes.map(({ id, name }) => new Option(name, id, false, id === chosen.id)));
     choice.hidden = false;
     find("scene-name").hidden = true;
     choice.onchange = () => location.assign(`?scene=${encodeURIComponent(choice.value)}`);
+  }
+
+  #describe(scene) {
+    const xs = scene.corners.map(([x]) => x);
+    const ys = scene.corners.map(([, y]) => y);
+    const size = [xs, ys].map((values) => +(Math.max(...values) - Math.min(...values)).toFixed(1));
+    find("scene-size").textContent = `${size[0]} × ${size[1]} × ${+scene.height_m.toFixed(2)} m`;
+    document.documentElement.style.setProperty("--aspect", (size[0] / size[1]).toFixed(3));
+    document.title = `${scene.name} · Nafir`;
   }
 
   #setUp(scene, clips) {
@@ -147,7 +169,7 @@ class Page {
 
   #listenToSound() {
     this.player.addEventListener("report", ({ detail }) => {
-      if (!this.playing) return;
+      if (!this.playing || this.connection !== "live") return;
       this.steady = detail.playing;
       this.plan.glow(...this.panel.report(detail, this.ledger.summary(), this.reverberationLedger.summary()));
     });
@@ -234,12 +256,17 @@ class Page {
     await this.player.pause();
     if (this.playing) return;
     this.#tell("close");
+    this.#blank();
+    this.#setConnection("idle", "Paused");
+  }
+
+  /** No figure stays that is no longer so. */
+  #blank() {
     this.panel.rest();
     this.frontier.heard = this.level = null;
     this.rendered = null;
     this.effects.rest();
     this.plan.glow(0, 0);
-    this.#setConnection("idle", "Paused");
   }
 
   #setPlaying(playing) {
@@ -269,6 +296,7 @@ class Page {
     } else if (state === "waiting") {
       this.steady = false;
       this.#setConnection("waiting", "Reconnecting");
+      this.#blank();
       if (retryMs >= 1000) this.notices.show("connection", `The connection was lost. ${reason ?? ""} Trying again.`.replace("  ", " "));
     } else if (state === "refused") {
       this.notices.show("connection", reason, { lasting: true });
@@ -313,10 +341,7 @@ class Page {
     const known = this.grids.get(id);
     if (known?.key === key) return known.grid;
     const heightM = this.world.listener.position[2];
-    const { minimum, maximum } = this.scene.bounds;
-    const shorter = Math.min(maximum[0] - minimum[0], maximum[1] - minimum[1]);
-    const spacingM = Math.max(FINEST_MAP_M, Math.min(MAP_SPACING_M, shorter / 8));
-    const grid = parseGrid(await fetchLoudness(this.scene.id, { position, heightM, spacingM, signal }));
+    const grid = parseGrid(await fetchLoudness(this.scene.id, { position, heightM, signal }));
     this.grids.set(id, { key, grid });
     return grid;
   }

@@ -4,6 +4,8 @@
 import { colour, loudnessRamp } from "./palette.js";
 
 const WALL_M = 0.2;
+const STEPS_M = [1, 2, 5, 10, 20, 50, 100]; // between measures
+const LEAST_STEP = 30; // pixels
 const FADE_MS = 260;
 const FINEST_MAP = 200; // pixels per metre
 
@@ -167,7 +169,7 @@ export class Paper {
     context.lineWidth = 1;
     context.font = `500 ${view.width < 520 ? 10 : 11}px ${getComputedStyle(this.#canvas).fontFamily}`;
     const gap = view.wall + 3;
-    const step = view.scale < 30 ? 2 : 1;
+    const step = STEPS_M.find((metres) => metres * view.scale >= LEAST_STEP) ?? STEPS_M.at(-1);
     const line = (x0, y0, x1, y1) => {
       context.beginPath();
       context.moveTo(Math.round(x0) + 0.5, Math.round(y0) + 0.5);

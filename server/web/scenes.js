@@ -31,9 +31,9 @@ export const fetchScene = (id) => getJson(endpoint(`scenes/${encodeURIComponent(
 export const fetchFrontier = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}/frontier`));
 export const fetchClips = async () => (await getJson(endpoint("clips"))).clips;
 
-export function fetchLoudness(scene, { position, heightM, spacingM, signal }) {
+export function fetchLoudness(scene, { position, heightM, signal }) {
   const url = endpoint(`scenes/${encodeURIComponent(scene)}/loudness`);
-  const query = { emitter: position.map((value) => value.toFixed(3)).join(","), height_m: heightM, spacing_m: spacingM, format: "json" };
+  const query = { emitter: position.map((value) => value.toFixed(3)).join(","), height_m: heightM, format: "json" };
   for (const [key, value] of Object.entries(query)) url.searchParams.set(key, value);
   return getJson(url, { signal });
 }

@@ -35,6 +35,11 @@ export class Sources {
     this.#sync();
   }
 
+  set clips(clips) {
+    this.#clips = clips;
+    this.#sync();
+  }
+
   /** The first clip that nobody plays yet. */
   nextClip() {
     const played = new Set([...this.#world.emitters.values()].map(({ clip }) => clip));

@@ -162,6 +162,15 @@ def test_a_body_too_large_is_refused(pieces):
     assert problem_of(talk(*pieces)[0]) == (413, "body_too_large")
 
 
+def test_a_body_that_grows_too_large_after_the_answer_gets_no_second_one():
+    heard, took_s = talk(
+        get("/", b"Transfer-Encoding: chunked"), *[b"64\r\n" + b"x" * 100 + b"\r\n"] * 11, pause_s=0.05
+    )
+    assert heard.count(b"HTTP/1.1 ") == 1
+    assert heard.startswith(b"HTTP/1.1 200 ")
+    assert took_s < 3.5 + WITHIN_S
+
+
 def test_a_body_at_the_limit_is_taken():
     heard, _ = talk(get("/body", b"Content-Length: 1000", CLOSE, method="POST"), b"x" * 1000)
     assert heard.startswith(b"HTTP/1.1 200 ")

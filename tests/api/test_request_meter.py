@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.api.connection_limits import ConnectionLimits
-from server.api.request_meter import Measured, Refusal, RequestMeter
+from server.api.request_meter import Measured, RequestMeter
+from server.problems import Refusal
 from server.settings import Settings
 
 LIMITS = dataclasses.replace(

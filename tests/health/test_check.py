@@ -9,6 +9,8 @@ from typer.testing import CliRunner
 
 from server.cli import app
 from server.health.check import Effort, HealthError, check
+from server.scene.manifest import Bounds, Start
+from tests.damaged_field import write_damaged
 
 SMALL = Effort(scattered=24, halved=6, climbing=2, responses=3)
 
@@ -90,3 +92,40 @@ def test_the_command_fails_for_an_ill_scene_and_says_why(beyond):
     (ill,) = [entry for entry in document["findings"] if entry["law"] == "finite" and entry["of"] == "arithmetic"]
     assert ill["value"] > 0
     assert not ill["holds"]
+
+
+def near_an_emitter(bundle, folder, exponent):
+    """A measured field in a box of 20 cm, whose level follows distance to the power of minus `exponent`, as near as 2
+    cm."""
+    box = Bounds(minimum=(2.0, 2.0, 1.4), maximum=(2.2, 2.2, 1.6))
+    start = Start(listener=(2.0, 2.0, 1.5), emitter=(2.2, 2.2, 1.5))
+    changed = {"direct_sound": "field", "geometry": None, "bounds": box, "start": start, "image_order": 0}
+    steps = [
+        ("Sub", ["listener", "emitter"], "near_offset"),
+        ("Mul", ["near_offset", "near_offset"], "near_squares"),
+        ("ReduceSum", ["near_squares", "last_axis"], "near_square"),
+        ("Max", ["near_square", "nearest"], "near_square_at_least"),
+        ("Log", ["near_square_at_least"], "near_log_square"),
+        ("Mul", ["near_log_square", "factor"], "near_gain"),
+        ("Reshape", ["near_gain", "per_pose"], "near_gains"),
+        ("Add", ["healthy", "near_gains"], "log_magnitude"),
+    ]
+    constants = {
+        "last_axis": np.array([-1]),
+        "nearest": np.float32(0.02**2),
+        "factor": np.float32(-exponent / 2),
+        "per_pose": np.array([-1, 1, 1, 1]),
+    }
+    return write_damaged(bundle, folder, steps, constants, bundle.manifest.model_copy(update=changed))
+
+
+def test_a_measured_field_may_grow_towards_an_emitter_as_a_spherical_wave_does(bundle, tmp_path):
+    """Which is 3.5 dB within a centimetre at 2 to 3 cm; what grows faster still is refused."""
+    effort = Effort(scattered=600, halved=60, climbing=1, responses=1)
+    spherical = check(near_an_emitter(bundle, tmp_path / "spherical", 1), effort)
+    levels = [finding for finding in spherical.findings if finding.law.name == "level_per_cm"]
+    assert {finding.moving for finding in levels} == {"listener", "emitter"}
+    assert all(finding.holds for finding in levels)
+    assert spherical.evidence["arithmetic"].changes_db["listener"].max() > 2
+    steeper = check(near_an_emitter(bundle, tmp_path / "steeper", 2.5), effort)
+    assert "level_per_cm" in {finding.law.name for finding in steeper.broken}

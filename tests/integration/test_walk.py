@@ -1,12 +1,16 @@
+import csv
 import re
 import subprocess
 import sys
 import threading
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 from websockets.sync.server import serve
 
 from server.acoustics.decibels import amplitude_to_db
@@ -16,8 +20,11 @@ from server.clips import ClipLibrary
 from server.direct_sound import DirectSound
 from server.field.field import AcousticField
 from server.field.levels import Levels
+from server.protocol import SetLevel
 from server.render import RenderedEmitter, read_path, render
 from server.replies import EmitterAdded, Welcome
+from server.scene.bundle import write_bundle
+from server.scene.manifest import QualityLevel
 
 WALK = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "walk.py"
 
@@ -60,6 +67,69 @@ def test_the_command_that_a_walk_prints_renders_it_again(served, bundle, tmp_pat
     live, _ = soundfile.read(heard, dtype="float32")
     offline, _ = soundfile.read(again, dtype="float32")
     np.testing.assert_allclose(offline, live, atol=10 ** (-90 / 20) * np.abs(live).max())
+
+
+@pytest.fixture
+def levels(bundle, tmp_path):
+    """The scene's own, and a rougher one, whose emitters share a tail."""
+    rough = QualityLevel(name="rough", field="arithmetic", frames=8, shared_tail=True)
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    manifest = bundle.manifest.model_copy(update={"levels": (*bundle.manifest.levels, rough)})
+    return Levels.load(write_bundle(tmp_path / "scene", manifest, files))
+
+
+@contextmanager
+def changing(address, levels_by_pose):
+    """HOST:PORT of a way to a server on which a level is chosen after so many poses."""
+
+    def answer(socket, server):
+        try:
+            for message in server:
+                socket.send(message)
+        except ConnectionClosed:
+            pass
+
+    def relay(socket):
+        poses = 0
+        with connect(f"ws://{address}/v1/stream", compression=None, max_size=None) as server:
+            answering = threading.Thread(target=answer, args=(socket, server))
+            answering.start()
+            for message in socket:
+                server.send(message)
+                poses += isinstance(message, bytes)
+                if isinstance(message, bytes) and poses in levels_by_pose:
+                    server.send(SetLevel(level=levels_by_pose[poses]).serialize())
+        answering.join()
+
+    with serve(relay, "127.0.0.1", 0, compression=None, max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield "{}:{}".format(*server.socket.getsockname())
+        server.shutdown()
+        thread.join()
+
+
+def test_a_walk_whose_level_changes_is_rendered_again_by_the_command_it_prints(serving, levels, hrtfs, tmp_path):
+    heard, again = tmp_path / "heard.wav", tmp_path / "again.wav"
+    options = ("--scene", levels.bundle.id, "--clip", "trumpet", "--level", "standard", "--seconds", "3")
+    with serving(levels, hrtfs) as address, changing(address, {30: "rough", 60: "standard"}) as way:
+        done = walk(way, *options, "-o", str(heard))
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "path.csv").open(newline="") as stream:
+        named = [row["level"] for row in csv.DictReader(stream) if row["level"]]
+    assert [name for name, before in zip(named, [None, *named], strict=False) if name != before] == [
+        "standard",
+        "rough",
+        "standard",
+    ]
+    command = re.search(r"nafir (render .*)", done.stdout)[1].split()
+    command[command.index(levels.bundle.id)] = str(levels.bundle.folder)
+    command[command.index("again.wav")] = str(again)
+    run = [sys.executable, "-c", "from server.cli import main; main()", *command]
+    subprocess.run(run, check=True, capture_output=True, timeout=60)
+    live, _ = soundfile.read(heard, dtype="float32")
+    offline, _ = soundfile.read(again, dtype="float32")
+    np.testing.assert_array_equal(offline, live)
 
 
 def test_a_walk_where_there_is_no_such_scene_says_so(served, tmp_path):

@@ -13,7 +13,7 @@ page = visitor.page
 pytestmark = visitor.needs_browser
 
 
-SIMULATE = """async ({ seconds, skew, delays }) => {
+SIMULATE = """async ({ seconds, skew, delays, stalls = {} }) => {
   const { JitterBuffer } = await import(new URL("jitterbuffer.js", document.baseURI));
   const rate = 24_000;
   const buffer = new JitterBuffer({ sampleRate: rate });
@@ -22,11 +22,12 @@ SIMULATE = """async ({ seconds, skew, delays }) => {
   const heard = [];
   const fills = [];
   const underruns = [];
+  const targets = [];
   let sent = 0;
   for (let now = 0; now < seconds * rate; now += 128) {
     // The sender's clock runs `skew` fast; a block leaves when it is whole and comes in order after its delay.
     for (;;) {
-      const delay = delays.length ? delays[(sent / 256) % delays.length] : 0;
+      const delay = stalls[sent / 256] ?? (delays.length ? delays[(sent / 256) % delays.length] : 0);
       if ((sent + 256) / (1 + skew) + delay * rate > now) break;
       const left = Float32Array.from({ length: 256 }, (_, i) => tone(sent + i));
       buffer.push({ left, right: left.map((value) => -value), sampleClock: sent, poseId: sent / 256, late: false });
@@ -37,11 +38,13 @@ SIMULATE = """async ({ seconds, skew, delays }) => {
     for (const { poseId, offset } of buffer.pull(left, right)) heard.push([poseId, played.length + offset]);
     played.push(...left);
     fills.push(buffer.fill / rate);
+    targets.push(buffer.target / rate);
     underruns.push(buffer.counters.underruns);
   }
   let steepest = 0;
   for (let i = 1; i < played.length; i++) steepest = Math.max(steepest, Math.abs(played[i] - played[i - 1]));
-  return { played: played.slice(0, 3 * rate), heard, fills, underruns, steepest, counters: buffer.counters };
+  return { played: played.slice(-3 * rate), before: played.length - 3 * rate, counters: buffer.counters,
+    heard, fills, targets, underruns, steepest };
 }"""
 
 
@@ -52,17 +55,44 @@ def tone(samples: np.ndarray) -> np.ndarray:
 STEEPEST_TONE = 0.5 * 2 * math.pi * 220 / 24_000
 
 
-def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged(page):
+SETTLED_S = 10
+"""After which the larger buffer of a start has been given back."""
+QUANTA_PER_S = 24_000 / 128
+
+
+def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged_once_it_has_settled(page):
     run = page.evaluate(SIMULATE, {"seconds": 30, "skew": 0, "delays": []})
-    assert run["counters"]["underruns"] == run["counters"]["splices"] == 0
+    assert run["counters"]["underruns"] == 0
+    assert run["counters"]["splices"] > 0
+    assert run["steepest"] < 1.5 * STEEPEST_TONE
     # Pose n is heard with the first sample of block n, and so says where in the tone the output is.
     pose, at = run["heard"][-1]
     delay = at - 256 * pose
     assert 0.05 < delay / 24_000 < 0.1
-    assert all(at - 256 * pose == delay for pose, at in run["heard"][1:])
-    played = np.asarray(run["played"])
-    first = np.flatnonzero(played)[0] + 64  # past the fade-in
-    np.testing.assert_allclose(played[first:], tone(np.arange(first, len(played)) - delay), atol=1e-7)
+    assert all(at - 256 * pose == delay for pose, at in run["heard"] if at > SETTLED_S * 24_000)
+    played, first = np.asarray(run["played"]), run["before"]
+    np.testing.assert_allclose(played, tone(np.arange(first, first + len(played)) - delay), atol=1e-7)
+
+
+def test_a_stall_while_everything_starts_is_not_heard(page):
+    """A tenth of a second without a block, as where the page draws its map and the sound card opens."""
+    run = page.evaluate(SIMULATE, {"seconds": 14, "skew": 0, "delays": [], "stalls": {"20": 0.1, "60": 0.1}})
+    assert run["counters"]["underruns"] == 0
+    fills = np.asarray(run["fills"])[round(SETTLED_S * QUANTA_PER_S) :]
+    assert fills.mean() < run["targets"][-1] + 0.02
+
+
+@pytest.mark.parametrize(("block", "stall_s"), [(10, 0.15), (10, 0.6), (94, 0.3), (600, 0.15), (600, 0.6)])
+def test_after_a_dropout_the_buffer_comes_back_to_its_aim(page, block, stall_s):
+    """What stalled comes in a burst, and would be delay for as long as it is kept."""
+    # Blocks come in order: those after it wait for it.
+    run = page.evaluate(SIMULATE, {"seconds": 20, "skew": 0, "delays": [], "stalls": {str(block): stall_s}})
+    assert run["counters"]["underruns"] <= 1
+    later = round((block * 256 / 24_000 + stall_s + SETTLED_S) * QUANTA_PER_S)
+    fills, targets = np.asarray(run["fills"]), np.asarray(run["targets"])
+    assert len(fills) - later > 2 * QUANTA_PER_S
+    assert (fills - targets)[later:].mean() < 0.02
+    assert run["steepest"] < 1.5 * STEEPEST_TONE
 
 
 @pytest.mark.parametrize("skew", [1e-3, -1e-3])

@@ -72,6 +72,13 @@ def test_a_reverberant_room_calls_for_reflections_and_reverberation():
     assert {EffectName.EARLY_REFLECTIONS, EffectName.LATE_REVERBERATION} <= on(make_plan(situation(ROOM, at(4))))
 
 
+def test_bands_above_half_the_sample_rate_call_for_nothing():
+    """Air that takes a decibel a metre at 8 kHz, and at lower frequencies nothing."""
+    thick = replace(OPEN, air_db_per_m=np.array([0.0] * 6 + [1.0]))
+    plans = [make_plan(situation(replace(thick, sample_rate=rate), at(4))) for rate in (48_000, 11_025, 8_000)]
+    assert [plan.is_on(EffectName.AIR_ABSORPTION) for plan in plans] == [True, False, False]
+
+
 def test_air_is_called_for_from_the_distance_where_it_takes_a_decibel_at_8_khz():
     limit_m = 1.0 / AIR[-1]
     for share, is_on in ((0.9, False), (1.1, True)):

@@ -28,6 +28,12 @@ def nafir_train(monkeypatch, capfd):
         (("train", "{data}", "-o", "{run}"), "another configuration"),
         (("export", "{tmp}", "-o", "{tmp}/bundle"), "not a run folder"),
         (("export", "{run}", "--data", "{tmp}", "-o", "{tmp}/bundle"), "{tmp}"),
+        (("export", "{tmp}", "-o", "{scene}"), "--output"),
+        (("evaluate", "{tmp}", "{data}", "-o", "{tmp}/absent/x.json"), "--output: there is no folder"),
+        (("evaluate", "{tmp}", "{data}", "--figure", "{tmp}/absent/x.png"), "--figure: there is no folder"),
+        (("maps", "{tmp}", "{data}", "-o", "{tmp}/absent/x.png"), "--output: there is no folder"),
+        (("probe", "{tmp}", "{data}", "--figure", "{tmp}/absent/x.png"), "--figure: there is no folder"),
+        (("import", "sofa", "{scene}", "-o", "{scene}"), "--output"),
         (("evaluate", "{tmp}", "{data}"), "scene.json"),
         (("evaluate", "{bundle}", "{tmp}"), "{tmp}"),
     ],
@@ -74,8 +80,8 @@ def test_an_output_that_cannot_be_written_is_told_in_a_line(
     code, _, err = nafir_train(*(argument.format(**places) for argument in arguments))
     assert code == 2
     last = err.strip().splitlines()[-1]
-    assert last.startswith(f"nafir-train: {file}")
-    assert last.endswith("Not a directory")
+    assert last.startswith(tuple(f"nafir-train: {option}{file}" for option in ("", "--output: ", "--figure: ")))
+    assert last.endswith(("Not a directory", "is a file, and a folder is needed", "is no folder"))
     assert "Traceback" not in err
 
 
@@ -174,3 +180,12 @@ def test_the_length_of_a_run_is_said_once(nafir_train, dataset, run, tmp_path):
     assert code == 2
     assert "leave one out" in err
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("lengths", [("--epochs", "2", "--minutes", "1"), ("--epochs", "2", "--as-long-as", "other")])
+def test_two_lengths_of_a_training_are_refused_by_name(nafir_train, tmp_path, lengths):
+    code, _, err = nafir_train("train", tmp_path, "-o", tmp_path / "run", *lengths)
+    assert code != 0
+    assert lengths[0] in err
+    assert lengths[2] in err
+    assert "leave one out" in err

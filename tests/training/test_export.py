@@ -221,9 +221,15 @@ def test_all_of_them_are_heard(family):
     np.testing.assert_allclose(responses["naf-tables"], responses["naf"], atol=1e-3 * scale)
 
 
+def _accept_any_health(monkeypatch):
+    healthy = SimpleNamespace(require=lambda: None, accepted=())
+    monkeypatch.setattr(export_module, "check_fields", lambda *_: SimpleNamespace(health=healthy))
+    monkeypatch.setattr(export_module, "check", lambda *_, **__: healthy)
+
+
 def test_a_field_in_the_time_domain_gives_responses(dataset, time_domain_run, tmp_path, monkeypatch):
     # A few steps of training make no field that is smooth enough for the health check.
-    monkeypatch.setattr(export_module, "check", lambda *_: SimpleNamespace(require=lambda: None))
+    _accept_any_health(monkeypatch)
     bundle = export(SimulatedResponses(dataset), [time_domain_run], tmp_path / "bundle")
     assert list(bundle.manifest.fields) == ["naf-time-domain"]
     field = Levels.load(bundle).default
@@ -236,7 +242,7 @@ def test_a_field_in_the_time_domain_gives_responses(dataset, time_domain_run, tm
 
 
 def test_naf_of_whole_responses_holds_the_direct_sound(dataset, naf_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(export_module, "check", lambda *_: SimpleNamespace(require=lambda: None))
+    _accept_any_health(monkeypatch)
     responses = SimulatedResponses(dataset)
     configuration = Configuration.read(naf_run)
     whole = replace(configuration, recipe=replace(configuration.recipe, whole=True))

@@ -1,10 +1,13 @@
+from functools import partial
+
 import numpy as np
 import pytest
+from rich.progress import Progress
 
 from server.errors import FieldError
 from training import noise
-from training.frontier.accuracy import SampledPairs
-from training.noise import choose_noise
+from training.frontier.accuracy import SampledPairs, Scores
+from training.noise import choose_noise, race
 
 SCALES = (0.1, 1.0, 10.0)
 
@@ -60,14 +63,53 @@ def test_it_is_chosen_by_pairs_that_training_saw(tiny_bundle, dataset, monkeypat
 
 def test_a_noise_with_which_less_can_be_measured_is_not_taken(tiny_bundle, dataset, monkeypatch, draws):
     """However small the errors are that are left."""
-    answers = iter([(0.2, 0.1), (0.1, 0.5), (0.1, 0.4)])
-    monkeypatch.setattr(SampledPairs, "audible_of", lambda *_: next(answers))
-    assert choose_noise(tiny_bundle, dataset, seed=0) is draws[2]
+    answers = iter([(0.2, 0.1), (0.1, 0.5), (0.1, 0.4)] * 99)
+
+    def scores(_sample, _estimate, pairs):
+        missing, error = next(answers)
+        return Scores(np.full((len(pairs), 1), error), np.full(len(pairs), missing))
+
+    monkeypatch.setattr(noise, "_ROUND_PAIRS", noise._PAIRS)
+    monkeypatch.setattr(SampledPairs, "scores_of", scores)
+    chosen = choose_noise(tiny_bundle, dataset, seed=0)
+    assert chosen is draws[2]
+
+
+def test_the_race_ends_as_if_all_had_run_to_the_end_and_asks_for_less():
+    """Sixteen whose errors on a pair have much in common, and differ by chance beside that."""
+    asked = np.zeros(16, dtype=int)
+    found, best = [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        merits, pairs = rng.uniform(1.0, 1.3, 16), rng.uniform(0.5, 2.0, (80, 1))
+        errors = merits[:, None, None] * pairs + 0.05 * rng.standard_normal((16, 80, 5))
+
+        def scores(number, rows, errors=errors):
+            asked[number] += len(rows)
+            return Scores(errors[number, rows], np.zeros(len(rows)))
+
+        rounds = np.split(rng.permutation(80), 8)
+        found.append(race([partial(scores, number) for number in range(16)], rounds, Progress(disable=True)))
+        best.append(int(np.argmin(errors.mean(axis=(1, 2)))))
+    assert np.mean(np.equal(found, best)) >= 0.9
+    assert asked.sum() < 0.5 * 20 * 16 * 80
+
+
+def test_one_that_nothing_can_be_measured_of_is_out_of_the_race_at_once():
+    asked = []
+
+    def of(number, rows):
+        asked.append(number)
+        return Scores.unmeasurable(len(rows)) if number else Scores(np.ones((len(rows), 2)), np.zeros(len(rows)))
+
+    rounds = np.split(np.arange(40), 4)
+    assert race([partial(of, number) for number in range(3)], rounds, Progress(disable=True)) == 0
+    assert asked == [0, 1, 2]
 
 
 def test_a_field_without_finite_responses_is_left_to_the_health_check(tiny_bundle, dataset, monkeypatch, draws):
     def fail(*_):
         raise FieldError("no finite response")
 
-    monkeypatch.setattr(SampledPairs, "audible_of", fail)
+    monkeypatch.setattr(SampledPairs, "scores_of", fail)
     assert choose_noise(tiny_bundle, dataset, seed=0) is draws[0]

@@ -132,7 +132,7 @@ def test_an_import_of_nothing_says_why(tmp_path):
     report.skip("a.wav", "empty file")
     with pytest.raises(ResponsesError, match=r"responses: none could be read \(1 empty file\)"):
         ImportedDataset.write(tmp_path, [], report, layout="test", source="somewhere")
-    with pytest.raises(ResponsesError, match="no such file"):
+    with pytest.raises(ResponsesError, match=r"no such file; nafir-train simulate .* import"):
         ImportedDataset.open(tmp_path)
 
 

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -244,18 +245,56 @@ def test_every_variant_of_the_papers_network_learns(dataset, field, tmp_path):
     assert np.mean(training[-3:]) < 0.95 * training[0]
 
 
-def test_minutes_end_a_run_and_count_over_its_pieces(dataset, configuration, tmp_path):
+@pytest.fixture
+def keep_time(monkeypatch):
+    """Has a step and a look at a batch of what is held back take so many seconds; gives a list of those looks."""
+
+    def keep_time(*, step_s, look_s):
+        losses_of, clock, looks = FactorisedLearner.losses, SimpleNamespace(now_s=0.0), []
+
+        def slow(self, *given):
+            if torch.is_grad_enabled():
+                clock.now_s += step_s
+            else:
+                clock.now_s += look_s
+                looks.append(look_s)
+            return losses_of(self, *given)
+
+        monkeypatch.setattr(FactorisedLearner, "losses", slow)
+        monkeypatch.setattr(train_module, "time", SimpleNamespace(perf_counter=lambda: clock.now_s))
+        return looks
+
+    return keep_time
+
+
+def test_minutes_end_a_run_and_count_over_its_pieces(dataset, configuration, tmp_path, keep_time):
+    keep_time(step_s=0.0625, look_s=0.0)
     responses = SimulatedResponses(dataset)
-    timed = dataclasses.replace(configuration, minutes=1.5 / 60)
+    timed = dataclasses.replace(configuration, minutes=7.5 / 60)
     with pytest.raises(KeyboardInterrupt):
         train(responses, tmp_path, timed, Impatient(12))
-    with pytest.raises(RunError, match=r"of 0\.025 minutes"):
+    with pytest.raises(RunError, match=r"of 0\.125 minutes"):
         load_learner(responses, tmp_path)
     train(responses, tmp_path, timed, Progress(disable=True))
-    seconds = losses(tmp_path, "seconds")
-    assert len(seconds) == 20
-    np.testing.assert_allclose(seconds[:-1], 1.5 * np.arange(1, 20) / 20, atol=0.3)
-    assert 1.5 <= seconds[-1] < 2.5
+    np.testing.assert_allclose(losses(tmp_path, "seconds"), 7.5 * np.arange(1, 21) / 20, atol=0.0626)
+    assert losses(tmp_path, "seconds")[-1] >= 7.5
+
+
+@pytest.mark.parametrize(("look_s", "least_s"), [(0.5, 40), (4.0, 15)])
+def test_minutes_count_looks_at_what_is_held_back_and_every_round_trains(
+    dataset, configuration, tmp_path, keep_time, look_s, least_s
+):
+    """Rounds of 3 s, and a look that takes less than one, or more."""
+    looks = keep_time(step_s=0.25, look_s=look_s)
+    train(
+        SimulatedResponses(dataset), tmp_path, dataclasses.replace(configuration, minutes=1.0), Progress(disable=True)
+    )
+    state, logged_s = torch.load(tmp_path / CHECKPOINT, weights_only=False), losses(tmp_path, "seconds")
+    trained_s = 0.25 * state["step"]
+    assert state["seconds"] == pytest.approx(trained_s + sum(looks))
+    assert logged_s[-1] == pytest.approx(state["seconds"])
+    assert 60 <= state["seconds"] < 60 + 0.25 + sum(looks) / len(logged_s)
+    assert trained_s >= least_s
 
 
 def test_without_progress_on_what_is_held_back_a_run_stops_and_keeps_the_best(dataset, configuration, tmp_path):

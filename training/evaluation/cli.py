@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from server.core.files import require_figure, require_writable
 from training.options import Json, Seed
 
 
@@ -45,6 +46,10 @@ def evaluate(
     from training.evaluation.report import markdown, report
     from training.evaluation.run import evaluate_bundles
 
+    if output is not None:
+        require_writable(output, "--output")
+    if figure is not None:
+        require_figure(figure, "--figure")
     runs = [place for place in places[:-1] if (place / "run.json").is_file()]
     bundles = [Bundle.load(place) for place in places[:-1] if place not in runs]
     if record and (len(bundles) != 1 or runs or draws > 1):
@@ -119,6 +124,7 @@ def maps(
     from training.evaluation.held_out import open_held_out
     from training.evaluation.maps import draw_maps, map_emitters
 
+    require_figure(output, "--output")
     console = Console(stderr=True)
     field = Levels.load(Bundle.load(bundle)).choose(level)
     with open_held_out(data) as held_out:
@@ -154,6 +160,8 @@ def probe(
     from training.evaluation.probe_figure import draw_probe
     from training.probe import probe as probe_field
 
+    if figure is not None:
+        require_figure(figure, "--figure")
     console = Console(stderr=True)
     with open_held_out(data) as held_out:
         probing = probe_field(

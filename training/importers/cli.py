@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from server.core.command_line import StrictTyper
+from server.core.files import require_writable_folder
 from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 from training.importers.receivers import Receivers
 from training.options import Json
@@ -230,6 +231,7 @@ def _import(
 
     if not source.exists():
         raise SourceError(source, "source", "no such file or folder")
+    require_writable_folder(output, "--output")
     console = Console(stderr=True)
 
     def tracked(items: Sequence[_T]) -> Iterable[_T]:

@@ -10,17 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.codec import Codec
+from training.models.whole_transform import transform_at_once
 
 _MOMENTUM = 0.9
 
 
 def even_noise(codec: Codec, rng: np.random.Generator, *, iterations: int = 200) -> npt.NDArray[np.float32]:
     """(2, sample) independent noise signals of unit power for the two ears."""
-    signal = rng.standard_normal((2, codec.samples))
-    before = spectrogram = codec.transform(signal)
+    signal = rng.standard_normal((2, codec.samples)).astype(np.float32)
+    before = spectrogram = transform_at_once(codec, signal)
     for _ in range(iterations):
-        ahead = spectrogram + _MOMENTUM * (spectrogram - before)
-        signal = codec.synthesise(ahead / np.maximum(np.abs(ahead), 1e-9))
-        before, spectrogram = spectrogram, codec.transform(signal)
-    power = np.mean(np.abs(spectrogram) ** 2) / codec.window_energy
+        ahead = spectrogram + np.float32(_MOMENTUM) * (spectrogram - before)
+        ahead /= np.maximum(np.abs(ahead), np.float32(1e-9))
+        signal = codec.synthesise(ahead)
+        before, spectrogram = spectrogram, transform_at_once(codec, signal)
+    power = np.mean(np.abs(spectrogram) ** 2, dtype=np.float64) / codec.window_energy
     return (signal / np.sqrt(power)).astype(np.float32)

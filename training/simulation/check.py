@@ -79,7 +79,7 @@ def check_plan(
         once_s = process_time() - began
     seconds = dict.fromkeys(simulations, 0.0)
     measured: dict[str, list[RoomParameters]] = {name: [] for name in simulations}
-    geometry = _Geometric(scene, everything, probes, yaws)
+    geometry = GeometricResponses(scene, everything, probes, yaws)
     for emitter in track(np.unique(np.linspace(0, len(probes) - 1, emitters).astype(int)).tolist()):
         listeners = np.delete(np.arange(len(probes)), emitter)
         known = geometry.responses(emitter, listeners)
@@ -105,7 +105,7 @@ def check_plan(
     )
 
 
-class _Geometric:
+class GeometricResponses:
     """What datasets leave to geometry, at the orientations that are compared."""
 
     def __init__(self, scene: SceneFile, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:

@@ -125,7 +125,11 @@ class Harm:
         """The host was too busy for a calm listener even at rest, or others had much of it."""
         rests = self.before, self.after
         is_calm = all(not rest.late and rest.livez_worst_ms <= MOST_LIVEZ_MS / 2 for rest in rests)
-        return not is_calm or self.other_programs > _MOST_OTHER_PROGRAMS
+        return not is_calm or self.is_crowded
+
+    @property
+    def is_crowded(self) -> bool:
+        return self.other_programs > _MOST_OTHER_PROGRAMS
 
 
 @contextlib.contextmanager

@@ -88,12 +88,17 @@ def server_pid(attacked) -> int:
 
 @pytest.fixture
 def endures(address, server_pid) -> Callable[[Callable[[], object]], object]:
-    """Runs an attack beside the bystander, fails where that was harmed, and returns what the attack did."""
+    """Runs an attack beside the bystander, fails where that was harmed, and returns what the attack did.
+
+    Where other programs keep a processor busy, twice, the test is skipped: whose harm it was cannot be told.
+    """
 
     def run(attack: Callable[[], object]) -> object:
         result, harm = bystander.beside_bystander(address, server_pid, attack)
         if not harm.is_none and harm.is_inconclusive:
             result, harm = bystander.beside_bystander(address, server_pid, attack)
+        if not harm.is_none and harm.is_crowded:
+            pytest.skip(f"other programs kept {harm.other_programs:.1f} processors busy: nothing can be said of {harm}")
         assert harm.is_none, f"{harm.late_beyond_rest:.2%} late beyond rest: {harm}"
         return result
 

@@ -1,0 +1,86 @@
+"""The OpenAPI document, with what is true of every route: how it refuses, and what its tags are for."""
+
+from typing import Any, Final
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+Object = dict[str, Any]
+
+_REFUSED: Final[dict[str, str]] = {
+    "403": "The request comes from another site, or the server refuses it.",
+    "413": "The body is longer than the server takes.",
+    "414": "The URL is longer than the server takes.",
+    "421": "The server does not answer for this host name.",
+    "422": "A parameter is malformed, unknown, missing or there twice; `field` names it.",
+    "429": "More requests or connections than one address may have.",
+    "431": "The headers are longer than the server takes.",
+    "500": "The server failed to answer.",
+    "503": "The server is warming up, busy or shutting down.",
+}
+"""Whatever the route."""
+_OF_A_SCENE: Final = {"404": "There is no such scene, or the scene has no such place or level; `code` says which."}
+_OF_A_COMPUTATION: Final = {
+    "409": "Well formed, and more than this scene allows, or settings that contradict each other."
+}
+_PROBLEM: Final[Object] = {
+    "description": "A problem document (RFC 9457). `code` is for programs and does not change, `field` is at fault.",
+    "type": "object",
+    "required": ["type", "title", "status", "detail", "code", "field"],
+    "properties": {
+        "type": {"type": "string"},
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "detail": {"type": "string"},
+        "code": {"type": "string"},
+        "field": {"anyOf": [{"type": "string"}, {"type": "null"}]},
+    },
+}
+_TAGGED: Final = ("/impulse-response", "/loudness", "/plan")
+
+
+def install_openapi(app: FastAPI) -> None:
+    """Let the application describe itself by `describe`, once."""
+
+    def openapi() -> Object:
+        if app.openapi_schema is None:
+            app.openapi_schema = describe(app)
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]  # as FastAPI's documentation has it
+
+
+def describe(app: FastAPI) -> Object:
+    document: Object = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+    schemas = document.setdefault("components", {}).setdefault("schemas", {})
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)
+    schemas["Problem"] = _PROBLEM
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            for parameter in operation.get("parameters", ()):
+                parameter["schema"] = _without_null(parameter["schema"])
+            operation["responses"] |= _refusals(path)
+            if path.endswith(_TAGGED):
+                operation["responses"]["304"] = {"description": "The client has it already, by its `If-None-Match`."}
+    return document
+
+
+def _refusals(path: str) -> Object:
+    refused = dict(_REFUSED)
+    if "{scene}" in path:
+        refused |= _OF_A_SCENE
+    if path.endswith(_TAGGED):
+        refused |= _OF_A_COMPUTATION
+    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    responses: Object = {status: {"description": text, "content": content} for status, text in sorted(refused.items())}
+    responses["503"] |= {"headers": {"Retry-After": {"description": "Seconds.", "schema": {"type": "string"}}}}
+    return responses
+
+
+def _without_null(schema: Object) -> Object:
+    """A query has no null: a parameter that may be left out is left out."""
+    (*others,) = (each for each in schema.get("anyOf", ()) if each != {"type": "null"})
+    if len(others) != 1:
+        return schema
+    return {**{key: value for key, value in schema.items() if key != "anyOf"}, **others[0]}

@@ -1,0 +1,219 @@
+"""Bodies of HTTP responses that take time to compute: by few threads behind those of streams, and kept by entity tag,
+which says all there is to say of a body: what one client asks for, others will.
+
+Requests with one tag are one computation, which is cancelled when nobody waits for it any more. Of those that wait, one
+of each kind goes next in turns, and within a kind one of each client. Maps leave one thread to requests that are cheap.
+
+A `ResponseCache` belongs to the event loop; computations run on its threads.
+"""
+
+import asyncio
+import contextlib
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from functools import partial
+from typing import Literal, Self, get_args
+
+from server.bounded_cache import BoundedCache
+from server.errors import RequestError
+from server.priority import become_background
+from server.runtime.pace import Checkpoint, Pace
+from server.runtime.thread_pool import ThreadPool
+
+Kind = Literal["single", "map"]
+"""What takes milliseconds, and what takes seconds."""
+Compute = Callable[[Checkpoint], bytes]
+
+_MAX_BYTES = 32 * 1024 * 1024
+_NICENESS = 10
+"""Behind the workers of streams, which have 5."""
+_PATIENCE_S = 300.0
+"""The longest map takes two minutes, and longer behind streams."""
+_STOP_S = 1.0
+_FIRST_GUESS_S = {"single": 0.05, "map": 5.0}
+_SMOOTHING = 0.3
+_LONGEST_RETRY_S = 120
+_MOST_CLIENTS = 256
+
+
+class _Computation:
+    """What requests with one entity tag wait for."""
+
+    def __init__(self, etag: str, compute: Compute, kind: Kind, client: str) -> None:
+        self.etag = etag
+        self.compute = compute
+        self.kind: Kind = kind
+        self.client = client
+        """Who asked first."""
+        self.body: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+        self.waiters = 0
+        self.is_called_off = False
+
+
+class ResponseCache:
+    """Bodies are computed by `workers` threads, and at most `waiting` computations wait for one. `is_urgent` tells, on
+    any thread, whether streams want the processor; computations stand back then.
+
+    Leaving the context calls everything off.
+    """
+
+    def __init__(self, *, workers: int, waiting: int, is_urgent: Callable[[], bool] = lambda: False) -> None:
+        self.pool = ThreadPool(
+            workers, "nafir-http", initializer=partial(become_background, _NICENESS), patience_s=_PATIENCE_S
+        )
+        self._most_waiting = waiting
+        self._most_running = workers
+        self._most_maps = max(1, workers - 1)
+        self._is_urgent = is_urgent
+        self._bodies: BoundedCache[str, bytes] = BoundedCache(_MAX_BYTES)
+        self._by_tag: dict[str, _Computation] = {}
+        self._waiting: deque[_Computation] = deque()
+        self._running: list[_Computation] = []
+        self._turns: deque[Kind] = deque(get_args(Kind))
+        self._served: dict[tuple[Kind, str], int] = {}
+        """When each client had its last turn, in turns."""
+        self._turn = 0
+        self._takes_s: dict[str, float] = dict(_FIRST_GUESS_S)
+        """What a computation has taken of late, by kind."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for computation in (*self._waiting, *self._running):
+            computation.is_called_off = True
+        self._waiting.clear()
+        self.pool.stop(_STOP_S)
+
+    @property
+    def waiting(self) -> int:
+        """Computations that wait for a thread."""
+        return len(self._waiting)
+
+    @property
+    def retry_after_s(self) -> int:
+        """When there will be room, in whole seconds: what runs and waits takes about so long."""
+        pending_s = sum(self._takes_s[each.kind] for each in (*self._waiting, *self._running))
+        return min(_LONGEST_RETRY_S, max(1, math.ceil(pending_s / self._most_running)))
+
+    async def get(self, etag: str, compute: Compute, *, kind: Kind, client: str) -> bytes:
+        """The body kept or computed for a `client`, an address. Cancelled, the computation goes on for others who wait
+        for it, or ends. Raises RequestError server_busy where too many wait, and what `compute` raises."""
+        if (kept := self._bodies.get(etag)) is not None:
+            return kept
+        computation = self._by_tag.get(etag)
+        if computation is None:
+            computation = self._admit(_Computation(etag, compute, kind, client))
+        computation.waiters += 1
+        try:
+            return await asyncio.shield(computation.body)
+        finally:
+            computation.waiters -= 1
+            if not computation.waiters and not computation.body.done():
+                self._call_off(computation)
+
+    def _admit(self, computation: _Computation) -> _Computation:
+        """Where there is no room, the client that waits for most loses its newest, or this one is refused."""
+        is_full = len(self._waiting) >= self._most_waiting and not self._may_start(computation.kind)
+        if is_full and not self._make_room(computation.client):
+            raise self._busy()
+        self._by_tag[computation.etag] = computation
+        self._waiting.append(computation)
+        self._start()
+        return computation
+
+    def _make_room(self, client: str) -> bool:
+        counts = Counter(each.client for each in self._waiting)
+        greediest, most = max(counts.items(), key=lambda item: item[1])
+        if most <= counts[client] + 1:
+            return False
+        newest = next(each for each in reversed(self._waiting) if each.client == greediest)
+        self._forget(newest)
+        self._waiting.remove(newest)
+        newest.body.set_exception(self._busy())
+        return True
+
+    def _busy(self) -> RequestError:
+        return RequestError(
+            "server_busy",
+            "too many requests wait for an answer: ask again later",
+            status=503,
+            retry_after_s=self.retry_after_s,
+        )
+
+    def _call_off(self, computation: _Computation) -> None:
+        computation.is_called_off = True
+        self._forget(computation)
+        if computation in self._waiting:
+            self._waiting.remove(computation)
+
+    def _forget(self, computation: _Computation) -> None:
+        """Who asks for the same from now on has it computed anew."""
+        if self._by_tag.get(computation.etag) is computation:
+            del self._by_tag[computation.etag]
+
+    def _may_start(self, kind: Kind) -> bool:
+        maps = sum(each.kind == "map" for each in self._running)
+        return len(self._running) < self._most_running and (kind != "map" or maps < self._most_maps)
+
+    def _start(self) -> None:
+        while (computation := self._choose()) is not None:
+            self._waiting.remove(computation)
+            self._running.append(computation)
+            self.pool.submit(partial(self._run, computation, asyncio.get_running_loop()))
+
+    def _choose(self) -> _Computation | None:
+        """Of the kind that has waited longest for its turn, one of the client that has."""
+        for kind in tuple(self._turns):
+            waiting = [each for each in self._waiting if each.kind == kind]
+            if not waiting or not self._may_start(kind):
+                continue
+            self._turns.remove(kind)
+            self._turns.append(kind)
+            chosen = min(waiting, key=lambda each: self._served.get((each.kind, each.client), -1))
+            if len(self._served) >= _MOST_CLIENTS:
+                self._served.clear()
+            self._turn += 1
+            self._served[kind, chosen.client] = self._turn
+            return chosen
+        return None
+
+    def _run(self, computation: _Computation, loop: asyncio.AbstractEventLoop) -> None:
+        """On a thread of the pool."""
+        began_s = time.monotonic()
+        pace = Pace(is_urgent=self._is_urgent, is_wanted=lambda: not computation.is_called_off)
+        body, failure = b"", None
+        try:
+            pace()
+            body = computation.compute(pace)
+        except (Exception, CancelledError) as exc:  # noqa: BLE001  whoever waits for the body has it raised
+            failure = exc
+        except BaseException as exc:  # noqa: BLE001
+            failure = RuntimeError(f"the computation was ended: {exc!r}")
+        _post(loop, partial(self._settle, computation, body, failure, time.monotonic() - began_s))
+        # What comes next is no less behind than what comes within.
+        pace.rest()
+        _post(loop, partial(self._free, computation))
+
+    def _settle(self, computation: _Computation, body: bytes, failure: BaseException | None, took_s: float) -> None:
+        self._forget(computation)
+        if computation.body.done() or computation.is_called_off:
+            return
+        if failure is not None:
+            computation.body.set_exception(failure)
+            return
+        self._takes_s[computation.kind] += _SMOOTHING * (took_s - self._takes_s[computation.kind])
+        self._bodies.put(computation.etag, body, len(body))
+        computation.body.set_result(body)
+
+    def _free(self, computation: _Computation) -> None:
+        self._running.remove(computation)
+        self._start()
+
+
+def _post(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+        loop.call_soon_threadsafe(call)

@@ -1,0 +1,44 @@
+"""What /openapi.json says of the server holds: schemathesis asks it by the document, and judges the answers."""
+
+import json
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+
+
+def schemathesis(address, folder, *, config=""):
+    """Ends by itself; with a seed, so that what fails fails again."""
+    (folder / "schemathesis.toml").write_text(config)
+    return subprocess.run(
+        [
+            *(sys.executable, "-m", "schemathesis.cli", "run", f"http://{address}/openapi.json"),
+            *("--checks", "all", "--seed", "1", "--max-examples", "10", "--no-color"),
+        ],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("config", ["", '[parameters]\n"path.scene" = "flat"\n'], ids=["any scene", "a scene there is"])
+def test_the_server_is_as_its_document_says(served, tmp_path, config):
+    ran = schemathesis(served, tmp_path, config=config)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "10 selected / 10 total" in ran.stdout
+
+
+def test_every_refusal_is_told_with_its_type(served):
+    with urllib.request.urlopen(f"http://{served}/openapi.json", timeout=10) as answer:
+        document = json.load(answer)
+    operations = [each for path in document["paths"].values() for each in path.values()]
+    assert len(operations) == 10
+    for operation in operations:
+        responses = operation["responses"]
+        assert {"403", "413", "414", "422", "431", "500", "503"} <= set(responses)
+        for status, response in responses.items():
+            if status[0] in "45":
+                assert set(response["content"]) == {"application/problem+json"}

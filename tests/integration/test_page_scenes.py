@@ -1,0 +1,77 @@
+"""No part of the page that fails takes the page with it, nor the menu that leads to other scenes."""
+
+import re
+
+import pytest
+
+from server.scene.bundle import bundled_scenes
+from tests import visitor
+from tests.visitor import start
+
+browser = visitor.browser
+server = visitor.server
+pytestmark = visitor.needs_browser
+
+SCENES = [folder.name for folder in bundled_scenes()]
+
+
+@pytest.fixture
+def context(browser):
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    yield context
+    context.close()
+
+
+def open_scene(context, server, scene):
+    page = context.new_page()
+    page.goto(f"{server}/?scene={scene}")
+    page.evaluate("nafir.ready")
+    return page
+
+
+BROKEN = {
+    "an error": {"status": 500, "body": "Internal Server Error"},
+    "a document of another kind": {"json": {"unexpected": True}},
+    "no JSON": {"body": "<html>", "content_type": "text/html"},
+}
+
+
+@pytest.mark.parametrize("answer", BROKEN.values(), ids=BROKEN.keys())
+@pytest.mark.parametrize("part", ["frontier", "loudness", "clips"])
+def test_a_part_that_fails_leaves_the_rest_as_it_is(context, server, part, answer):
+    context.route(re.compile(rf"/v1/.*{part}"), lambda route: route.fulfill(**answer))
+    page = open_scene(context, server, SCENES[0])
+    assert page.locator("#scene-choice").is_visible()
+    assert page.locator("#marks .listener").is_visible()
+    page.click("#play")
+    page.wait_for_function("nafir.state().connection === 'live'", timeout=20_000)
+    assert page.locator("#connection-text").inner_text() == "Live"
+
+
+def test_clips_and_frontier_appear_once_the_server_answers(context, server):
+    failing = {"is": True}
+
+    def fail_at_first(route):
+        if failing["is"]:
+            route.fulfill(status=503, json={"detail": "not now"})
+        else:
+            route.continue_()
+
+    context.route(re.compile("/v1/(clips|.*frontier)"), fail_at_first)
+    page = open_scene(context, server, SCENES[0])
+    page.wait_for_function("document.getElementById('level-note').textContent.includes('not now')")
+    failing["is"] = False
+    page.wait_for_function("nafir.state().emitters.length === 1", timeout=20_000)
+    page.wait_for_function("!document.getElementById('level-choice').disabled", timeout=20_000)
+
+
+def test_a_scene_that_cannot_be_had_leaves_the_menu_that_leads_out(context, server):
+    broken, sound = SCENES[:2]
+    context.route(f"**/v1/scenes/{broken}", lambda route: route.fulfill(status=500, body=""))
+    page = context.new_page()
+    page.goto(f"{server}/?scene={broken}")
+    page.locator("#scene-choice").wait_for()
+    with page.expect_navigation():
+        page.select_option("#scene-choice", sound)
+    page.evaluate("nafir.ready")
+    start(page)
