@@ -22,6 +22,7 @@ from server.core.command_line import StrictTyper
 from server.core.files import require_figure, require_readable, require_writable
 from server.errors import NafirError, RequestError
 from server.health.cli import check
+from server.rendering.partitions import BLOCK_SIZES, is_block_size
 from server.soak.cli import soak
 
 if TYPE_CHECKING:
@@ -188,7 +189,9 @@ def render(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32.")],
-    block_size: Annotated[int, typer.Option(help="Poses take effect at multiples of it, samples.", min=16)] = 256,
+    block_size: Annotated[
+        int, typer.Option(help=f"Poses take effect at multiples of it, samples: {BLOCK_SIZES}.")
+    ] = 256,
     level: Level = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
     hrtf: Annotated[
@@ -216,6 +219,8 @@ def render(
     from server.render import render as render_path
     from server.scene.bundle import Bundle, find_bundle
 
+    if not is_block_size(block_size):
+        raise NafirError(f"--block-size: {block_size} is not {BLOCK_SIZES}")
     if output.suffix != ".wav":
         raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
     require_writable(output, "--output")

@@ -252,6 +252,44 @@ def test_two_files_or_scenes_of_one_name_do_not_start_and_both_are_named(nafir, 
     check_error(told, *map(str, folders), "flat", "id")
 
 
+@pytest.mark.parametrize("size", [-480, 0, 16, 17, 48, 100, 441, 8_208, 1_000_000])
+def test_block_sizes_that_no_renderer_takes_are_refused_with_those_that_it_does(nafir, bundle, tmp_path, size):
+    path = tmp_path / "path.csv"
+    path.write_text("sample,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
+    arguments = "--emitter", "trumpet@6,3,1.5", "--path", path, "-o", tmp_path / "out.wav"
+    told = nafir("render", bundle.folder, *arguments, "--block-size", size)
+    check_error(told, "--block-size", str(size), "a multiple of 16 from 64 to 8192")
+
+
+def test_render_takes_the_block_size_of_engines(nafir, bundle, tmp_path):
+    path = tmp_path / "path.csv"
+    path.write_text("sample,x,y,z,yaw_deg\n0,2,2,1.5,0\n")
+    rendered = []
+    for size in (480, 256):
+        output = tmp_path / f"{size}.wav"
+        arguments = (
+            "--emitter",
+            "trumpet@6,3,1.5",
+            "--path",
+            path,
+            "--effects",
+            "all",
+            "--duration-s",
+            "1",
+            "-o",
+            output,
+        )
+        assert nafir("render", bundle.folder, *arguments, "--block-size", size)[0] == 0
+        rendered.append(soundfile.read(output)[0])
+    assert rendered[0].shape == rendered[1].shape
+    assert np.abs(rendered[0] - rendered[1]).max() < 1e-4 * np.abs(rendered[1]).max()
+
+
+def test_help_says_which_block_sizes_a_render_takes(nafir):
+    said = re.sub(r"[^\w.,:-]+", " ", nafir("render", "--help")[1])
+    assert "a multiple of 16 from 64 to 8192" in said
+
+
 def test_a_damaged_bundle_leaves_no_traceback(bundle_copy):
     damage_manifest(bundle_copy)
     done = subprocess.run(

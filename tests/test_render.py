@@ -429,3 +429,41 @@ def test_a_file_that_is_no_csv_says_so(write, content):
 def test_a_path_file_that_is_absent_says_so(tmp_path):
     with pytest.raises(PathError, match=r"absent\.csv: No such file"):
         read_path(tmp_path / "absent.csv", SAMPLE_RATE)
+
+
+@pytest.mark.parametrize("size", [80, 240, 480, 960, 1024])
+def test_every_block_size_that_is_allowed_agrees_with_convolution(open_hall, size):
+    """480 is what engines use; nothing of it is a power of two."""
+    emitter = RenderedEmitter(noise(3, 9_000), THERE)
+    path = [point(0, 1.0)]
+    wet = reverberation(open_hall, [emitter], path, block_size=size)
+    expected = heard(emitter, path[0], wet.shape[1])
+    short = min(wet.shape[1], expected.shape[1])
+    error = np.abs(wet[:, :short] - expected[:, :short]).max() / np.abs(expected).max()
+    assert 20 * np.log10(error) < -100
+
+
+def test_poses_take_effect_at_multiples_of_the_block_size(open_hall):
+    """A pose of sample 4,000 is heard from 4,320 on with blocks of 480, and what came before is the same."""
+    emitter = RenderedEmitter(noise(3, 9_000), THERE)
+    stays, turns = [point(0, 1.0)], [point(0, 1.0), point(4_000, 1.0, 1.0)]
+    first, second = (render(FIELD, open_hall, [emitter], path, block_size=480, length=9_000) for path in (stays, turns))
+    differs = np.flatnonzero(np.any(first != second, axis=0))
+    assert 4_320 <= differs[0] < 4_320 + 16
+
+
+def test_what_moves_is_heard_alike_whatever_the_block_size(open_hall):
+    """Fades are as long as blocks, so what is far from a change is the same."""
+    emitter = RenderedEmitter(noise(3, 12_000), THERE)
+    path = [point(0, 1.0), point(3_840, 1.2)]
+    odd, even = (render(FIELD, open_hall, [emitter], path, block_size=size, length=12_000) for size in (480, 256))
+    for stretch in (slice(0, 3_840), slice(10_000, 12_000)):
+        error = np.abs(odd[:, stretch] - even[:, stretch]).max() / np.abs(even).max()
+        assert 20 * np.log10(error) < -80
+
+
+@pytest.mark.parametrize("size", [16, 17, 48, 100, 441, 8_208, 1_000_000])
+def test_other_block_sizes_are_refused(open_hall, size):
+    emitter = RenderedEmitter(noise(3, 100), THERE)
+    with pytest.raises(ValueError, match="block_size is a multiple of 16 from 64 to 8192, not"):
+        render(FIELD, open_hall, [emitter], [point(0, 1.0)], block_size=size)

@@ -54,10 +54,11 @@ class PartitionedIr:
 class Convolver:
     """`sources` mono inputs, each with its own IR of `channels` channels (1 or 2), mixed into one output.
 
-    `block_size` is a power of two from 64 on. With `shared_tail` the last stage convolves one mix of all sources with
-    one tail, that of the first source that has any, each source at the level of its own: later than twice the longest
-    partition, tails differ little but in level. It makes many sources cheaper. With `switches_tail` it begins without,
-    and `share_tail` has it share its tail or not: fades like those of an exchange lead from one to the other.
+    `block_size` is a power of two from 64 on or, with `any_size` and in NumPy alone, any that a renderer takes. With
+    `shared_tail` the last stage convolves one mix of all sources with one tail, that of the first source that has any,
+    each source at the level of its own: later than twice the longest partition, tails differ little but in level. It
+    makes many sources cheaper. With `switches_tail` it begins without, and `share_tail` has it share its tail or not:
+    fades like those of an exchange lead from one to the other.
 
     One thread at a time may use it, except `prepare`, which any thread may call. Raises ValueError for sizes it cannot
     have.
@@ -73,10 +74,12 @@ class Convolver:
         shared_tail: bool = False,
         switches_tail: bool = False,
         is_compiled: bool = HAS_NUMBA,
+        any_size: bool = False,
     ) -> None:
+        is_compiled = is_compiled and not any_size
         if sources < 1 or channels not in {1, 2}:
             raise ValueError("a convolver has at least 1 source, and 1 or 2 channels")
-        self._partitioning = Partitioning(block_size, ir_samples)
+        self._partitioning = Partitioning(block_size, ir_samples, any_size)
         stages = self._partitioning.stages
         # A tail that starts with the IR is no tail.
         self._has_shared_tail = (shared_tail or switches_tail) and len(stages) > 1

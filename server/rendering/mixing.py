@@ -15,6 +15,7 @@ from server.compiled import HAS_NUMBA
 from server.rendering.convolver import Convolver, FloatArray
 from server.rendering.direct_path import DirectPath
 from server.rendering.fade import raised_cosine
+from server.rendering.partitions import is_power_of_two
 from server.rendering.sources import ClipPlayer, Source
 
 if HAS_NUMBA:
@@ -28,9 +29,11 @@ def is_read_by_compiled_code(source: Source) -> TypeGuard[ClipPlayer]:
 
 
 class Mixer:
-    """`gain` and `send` are (2, slot): in effect, and wanted. A slot that does not play adds nothing new."""
+    """`gain` and `send` are (2, slot): in effect, and wanted. A slot that does not play adds nothing new. `is_compiled`
+    says whether compiled code mixes it, which convolves blocks of a power of two alone."""
 
     def __init__(self, *, channels: int, slots: int, block_size: int, direct: DirectPath | None) -> None:
+        self.is_compiled = HAS_NUMBA and is_power_of_two(block_size)
         self.channels = channels
         self.slots = slots
         self.direct = direct
@@ -46,7 +49,7 @@ class Mixer:
         self._followed: dict[int, FloatArray] = {}
         self.output = np.zeros((channels, block_size), np.float32)
         self.fade_in = raised_cosine(block_size)
-        if HAS_NUMBA:
+        if self.is_compiled:
             self.direct_state = Reference(direct.state) if direct is not None else None
             self.record = record_of(self)
             self.address = int(self.record.ctypes.data)
@@ -54,7 +57,7 @@ class Mixer:
     def connect(self, convolver: Convolver | None) -> None:
         """Send to a convolver of as many sources and channels from the next block on, or to none."""
         self.convolver = convolver
-        if HAS_NUMBA:
+        if self.is_compiled:
             enter_convolver(self.record, None if convolver is None else convolver.compiled)
 
     def take_slot(self) -> int | None:
@@ -87,7 +90,7 @@ class Mixer:
     def play(self, slot: int, source: Source) -> None:
         """Have a slot play what a source makes, from the next block on. Compiled code reads clips by itself."""
         self.plays[slot] = 1
-        if is_read_by_compiled_code(source):
+        if self.is_compiled and is_read_by_compiled_code(source):
             self.clip[slot] = source.clip.ctypes.data
             self.clip_samples[slot], self.clip_at[slot], self.clip_loops[slot] = source.clip.size, 0, source.loop
             self._clips[slot] = source.clip  # alive as long as it is played
@@ -114,7 +117,7 @@ class Mixer:
         """Have a slot fall silent."""
         self.plays[slot] = 0
         self.dry[slot] = 0
-        if HAS_NUMBA and self.convolver is not None:
+        if self.is_compiled and self.convolver is not None:
             self.convolver.compiled.input[slot] = 0
         self.clip[slot] = 0
         self._clips.pop(slot, None)
@@ -140,7 +143,7 @@ class Mixer:
 
 
 def mix(mixer: Mixer) -> None:
-    """The next block, in its `output`, without a compiler."""
+    """The next block, in its `output`, without compiled code."""
     plays = mixer.plays.astype(bool)
     mixer.dry[~plays] = 0
     mixer.dry *= _ramp(mixer.gain, mixer.fade_in)

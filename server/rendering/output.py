@@ -50,7 +50,7 @@ def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer], int]]) -> list[li
         mixer.fill()
     for mixer in mixers:
         mixer.follow()
-    if not HAS_NUMBA:
+    if not all(mixer.is_compiled for mixer in mixers):
         return [[_mix(output, mixed) for _ in range(count)] for output, mixed, count in listeners]
     if not listeners:
         return []

@@ -12,12 +12,24 @@ from functools import cached_property
 
 _GROWTH = 4
 _STAGES = 3
-SMALLEST_BLOCK = 64
+SMALLEST_BLOCK, LARGEST_BLOCK, BLOCK_STEP = 64, 8192, 16
+BLOCK_SIZES = f"a multiple of {BLOCK_STEP} from {SMALLEST_BLOCK} to {LARGEST_BLOCK}"
+"""What a renderer takes. Of powers of two compiled code convolves; of others, 480 for one, NumPy does, which is slower
+and no path for what has to be in time."""
 TURNS = 4
 """A source's filter is read once in so many windows, and multiplied for all of them (`server.rendering.products`);
 the source's number modulo TURNS says when."""
 NEAR = TURNS - 1
 """First partitions of a stage, which lie by themselves: they are multiplied in the windows between, too."""
+
+
+def is_power_of_two(block_size: int) -> bool:
+    return block_size > 0 and not block_size & (block_size - 1)
+
+
+def is_block_size(block_size: int) -> bool:
+    """Whether a renderer takes it: see `BLOCK_SIZES`."""
+    return SMALLEST_BLOCK <= block_size <= LARGEST_BLOCK and block_size % BLOCK_STEP == 0
 
 
 @dataclass(frozen=True)
@@ -36,13 +48,17 @@ class Stage:
 
 @dataclass(frozen=True)
 class Partitioning:
-    """The stages of a convolver: b, 4 b and 16 b, as many of them as the longest IR needs."""
+    """The stages of a convolver: b, 4 b and 16 b, as many of them as the longest IR needs. With `any_size`, b need not
+    be a power of two."""
 
     block_size: int
     ir_samples: int
+    any_size: bool = False
 
     def __post_init__(self) -> None:
-        if self.block_size < SMALLEST_BLOCK or self.block_size & (self.block_size - 1):
+        if self.any_size and not is_block_size(self.block_size):
+            raise ValueError(f"block_size is {BLOCK_SIZES}, not {self.block_size}")
+        if not self.any_size and (self.block_size < SMALLEST_BLOCK or not is_power_of_two(self.block_size)):
             raise ValueError(f"block_size is a power of two from {SMALLEST_BLOCK} on, not {self.block_size}")
         if self.ir_samples < 1:
             raise ValueError("ir_samples must be at least 1")

@@ -33,6 +33,7 @@ from server.rendering.ingest import require_gain
 from server.rendering.mixer_set import MixerSet
 from server.rendering.mixing import Mixer, is_read_by_compiled_code
 from server.rendering.output import Output, Rendered, mix_all
+from server.rendering.partitions import BLOCK_SIZES, is_block_size, is_power_of_two
 from server.rendering.sources import Source
 
 
@@ -68,7 +69,8 @@ class Renderer:
 
     `filters` are the head that direct paths are heard through, at `sample_rate`; without them there are only IRs, which
     then carry the direct sound too. `air_db_per_m` (7,) is what air absorbs per octave band. With a `ceiling` no sample
-    of the output is beyond it (`server.rendering.limiter`). `has_head` says whether to begin with a head.
+    of the output is beyond it (`server.rendering.limiter`). `has_head` says whether to begin with a head. Raises
+    ValueError for a `block_size` that is none of `BLOCK_SIZES`.
 
     One thread at a time may use it, except `prepare` and `prepare_hearing`, which one other thread may call meanwhile.
     """
@@ -89,6 +91,8 @@ class Renderer:
         outputs: int = 2,
         has_head: bool = True,
     ) -> None:
+        if not is_block_size(block_size):
+            raise ValueError(f"block_size is {BLOCK_SIZES}, not {block_size}")
         self.block_size = block_size
         self.ir_samples = ir_samples
         self.max_emitters = max_emitters
@@ -116,6 +120,7 @@ class Renderer:
                 ir_samples=ir_samples,
                 shared_tail=shared_tail,
                 switches_tail=switches_tail,
+                any_size=not is_power_of_two(block_size),
             )
 
         self._mixers = MixerSet(slots=slots, block_size=block_size, new_direct=direct_of, new_convolver=convolver_of)
@@ -138,7 +143,7 @@ class Renderer:
         """Whether several blocks may be rendered in one call: nothing has to be looked after between them."""
         return (
             self._mixers.rests
-            and all(mixer.plays_by_itself for mixer in self._mixers)
+            and all(mixer.is_compiled and mixer.plays_by_itself for mixer in self._mixers)
             and all(emitter.has_played or is_read_by_compiled_code(emitter.source) for emitter in self._changed)
         )
 
