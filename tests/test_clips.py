@@ -1,5 +1,6 @@
 """Clips: what is decoded is what was written, and what cannot be played says why."""
 
+import logging
 import threading
 from pathlib import Path
 
@@ -35,6 +36,7 @@ def test_channels_are_averaged(tmp_path):
 
 
 def test_channels_that_cancel_give_the_louder_one_and_a_warning(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     samples = noise(2, 4_000)
     soundfile.write(tmp_path / "a.wav", np.column_stack([-0.5 * samples, 0.5 * samples]), SAMPLE_RATE, subtype="FLOAT")
     decoded = decode(tmp_path / "a.wav", SAMPLE_RATE).samples
@@ -48,6 +50,7 @@ def test_channels_that_cancel_give_the_louder_one_and_a_warning(tmp_path, caplog
 
 @pytest.mark.parametrize("declared", [0, 1_000])
 def test_a_header_that_tells_of_less_than_there_is_does_not_cut_the_clip(tmp_path, caplog, declared):
+    caplog.set_level(logging.INFO)
     samples = noise(7, 48_000)
     soundfile.write(tmp_path / "a.wav", samples, SAMPLE_RATE, subtype="PCM_16")
     content = bytearray((tmp_path / "a.wav").read_bytes())
@@ -163,6 +166,7 @@ def test_a_description_says_how_long_it_plays(tmp_path):
 
 
 def test_a_users_file_wins_over_a_bundled_clip_of_that_name_and_says_so(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     soundfile.write(tmp_path / "a.wav", noise(6, 100), SAMPLE_RATE, subtype="FLOAT")
     library = ClipLibrary(SAMPLE_RATE, {"trumpet": tmp_path / "a.wav"})
     np.testing.assert_allclose(library.load("trumpet").samples, noise(6, 100), atol=1e-7)

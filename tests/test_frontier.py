@@ -73,7 +73,7 @@ def test_over_http_with_the_cost_here_once_the_server_is_ready(levels, hrtfs):
         for path in ("impulse-response?listener=1,2,1.5&", "loudness?"):
             refused = client.get(f"/v1/scenes/flat/{path}emitter=6,3,1.5&level=best")
             assert (refused.status_code, refused.json()["code"], refused.json()["field"]) == (
-                422,
+                404,
                 "unknown_level",
                 "level",
             )
@@ -86,5 +86,5 @@ def test_a_map_that_would_take_too_long_is_refused(levels, hrtfs):
             pass
         client.app_state["host"].offers["flat"].ms_here["good"] = 5_000.0
         slow = client.get("/v1/scenes/flat/loudness?emitter=6,3,1.5&format=json&spacing_m=0.5&level=good")
-        assert (slow.status_code, slow.json()["code"]) == (422, "map_too_slow")
+        assert (slow.status_code, slow.json()["code"]) == (409, "map_too_slow")
         assert client.get("/v1/scenes/flat/loudness?emitter=6,3,1.5&format=json&spacing_m=2&level=fast").is_success

@@ -172,6 +172,7 @@ def welcome(bounds):
         emitter=Place(position=(2.0, 1.0, 1.0)),
         level="",
         levels=(),
+        accepted_laws=(),
     )
     return Welcome(
         protocol=PROTOCOL,

@@ -20,9 +20,8 @@ from server.scene.limits import MOST_SAMPLES
 from training.dataset import SPEED_OF_SOUND
 from training.scene_file import SceneFile
 from training.simulation.diffuse_room import DiffuseRoom
-from training.simulation.neighbourhoods import receiver_radii
 from training.simulation.plan import SimulationPlan
-from training.simulation.rays import surface_shares
+from training.simulation.rays import receiver_radii, surface_shares
 from training.simulation.shared_tail import FADE_S
 from training.simulation.size import SimulationSize
 from training.simulation.tracing import RoomTracer

@@ -6,8 +6,7 @@ pressure at one metre. Surfaces are numbered walls 0, floor 1, ceiling 2.
 Where a ray hits, the scattered share of its energy is sent to every receiver in sight by Lambert's law ("diffuse
 rain": Schroeder, "Physically based real-time auralization of interactive virtual environments", 2011, sec. 5.3.3), and
 the ray goes on either way: mirrored with probability 1 - s, or scattered with probability s. Mirrored energy is
-counted where a ray crosses a sphere around the receiver, by the length of its way through it; so is late scattered
-energy, where that sphere is large enough (`training.simulation.neighbourhoods`).
+counted where a ray crosses a sphere around the receiver, by the length of its way through it.
 
 Scattering differs between bands, and so does the chance of every way. Each ray is drawn for one band and counts in all,
 weighted by the balance heuristic over the bands it might have been drawn for (Wilkie et al., "Hero wavelength spectral
@@ -25,11 +24,11 @@ from server.acoustics.geometry import FloorPlan
 from server.scene.geometry import Geometry
 from training.dataset import SPEED_OF_SOUND
 from training.scene_file import HISTOGRAM_BIN_S
-from training.simulation.neighbourhoods import EXCESS_STEP_M, Neighbourhoods
 
 _Floats = npt.NDArray[np.float64]
 
 _BANDS = len(OCTAVE_BANDS_HZ)
+_LARGEST_RADIUS_M = 0.4
 # Of two crossings this near to each other the one is of the wall that the ray comes from.
 _OVERLAP = 1e-9
 # Fewer rays are followed as their energy falls, each for more: their number falls with this power of the energy.
@@ -55,10 +54,11 @@ def surface_shares(geometry: Geometry) -> tuple[_Floats, _Floats]:
     return reflected, np.array([surface.scattering for surface in surfaces])
 
 
-def surface_m2(plan: FloorPlan) -> float:
-    """Of walls, floor and ceiling."""
-    around_m = float(np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1).sum())
-    return around_m * plan.height_m + 2 * plan.area_m2
+def receiver_radii(plan: FloorPlan, receivers: _Floats) -> _Floats:
+    """(receiver,) of the spheres that count rays: one that reached into a wall would miss a part of them."""
+    heights = receivers[:, 2]
+    clearance = np.minimum(plan.wall_distance_m(receivers), np.minimum(heights, plan.height_m - heights))
+    return np.asarray(np.minimum(clearance, _LARGEST_RADIUS_M))
 
 
 class RayTracer:
@@ -80,7 +80,7 @@ class RayTracer:
         self._blocking = not _is_convex(plan)
         self._reflected, self._scattered = surface_shares(geometry)
         self._receivers = np.ascontiguousarray(receivers, dtype=np.float64)
-        self._around = Neighbourhoods.around(plan, self._receivers, surface_m2(plan))
+        self._radii = receiver_radii(plan, self._receivers)
         self._image_order = image_order
         self._directions = len(arrival_directions)
         self._nearest = _nearest_directions(arrival_directions)
@@ -104,10 +104,7 @@ class RayTracer:
             np.asarray(emitter, dtype=np.float64),
             sphere_directions(rays) @ turn,
             self._receivers,
-            self._around.radii_m,
-            self._around.volumes_m3,
-            self._around.gathers,
-            self._around.size_at,
+            self._radii,
             self._nearest,
             HISTOGRAM_BIN_S * SPEED_OF_SOUND,
             self._image_order,
@@ -144,23 +141,6 @@ def _cell(x, y, z):
     return min(int((u + 1) * half), _TABLE - 1), min(int((v + 1) * half), _TABLE - 1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_hidden(corners, ax, ay, bx, by):
-    """Whether a wall stands between two points of a plan."""
-    for wall in range(len(corners)):
-        cx, cy = corners[wall, 0], corners[wall, 1]
-        following = (wall + 1) % len(corners)
-        ex, ey = corners[following, 0] - cx, corners[following, 1] - cy
-        a_side, b_side = ex * (ay - cy) - ey * (ax - cx), ex * (by - cy) - ey * (bx - cx)
-        if a_side * b_side >= 0.0:
-            continue
-        dx, dy = bx - ax, by - ay
-        start, end = dx * (cy - ay) - dy * (cx - ax), dx * (cy + ey - ay) - dy * (cx + ex - ax)
-        if start * end < 0.0:
-            return True
-    return False
-
-
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "reassoc", "nsz"})
 def _trace(
     corners,
@@ -172,9 +152,6 @@ def _trace(
     directions,
     receivers,
     radii,
-    volumes,
-    gathers,
-    size_at,
     nearest,
     bin_m,
     image_order,
@@ -198,15 +175,6 @@ def _trace(
     hit_side, offset_x, offset_y = np.empty(walls), np.empty(walls + 1), np.empty(walls + 1)
     kept, chance, weight = np.empty(_BANDS), np.empty(_BANDS), np.empty(_BANDS)
     scale = 1.0 / rays
-    # What counts for each receiver as a ray leaves a surface: the size of its sphere.
-    away_m, sizes, last_step = np.empty(len(receivers)), np.zeros(len(receivers), np.int64), len(size_at) - 1
-    for receiver in range(len(receivers)):
-        to_x, to_y, to_z = (
-            receivers[receiver, 0] - emitter[0],
-            receivers[receiver, 1] - emitter[1],
-            receivers[receiver, 2] - emitter[2],
-        )
-        away_m[receiver] = math.sqrt(to_x * to_x + to_y * to_y + to_z * to_z)
 
     for ray in range(rays):
         px, py, pz = emitter[0], emitter[1], emitter[2]
@@ -216,7 +184,6 @@ def _trace(
         weight[:] = scale
         thinned, travelled_m, reflections, last = 1.0, 0.0, 0, -1
         was_scattered, is_mirrored = False, True  # at any reflection; at the last one
-        sizes[:] = 0
         while True:
             # The nearest wall that faces the ray, or the floor or the ceiling.
             length, surface, hit = np.inf, -1, -1
@@ -239,11 +206,8 @@ def _trace(
                 break  # out through a corner, by rounding
 
             # Receivers have had scattered energy when it was scattered, images are to bring the first mirrored paths.
-            if was_scattered or reflections > image_order:
+            if is_mirrored and (was_scattered or reflections > image_order):
                 for receiver in range(len(receivers)):
-                    size = sizes[receiver]
-                    if not (is_mirrored or gathers[receiver, size]):
-                        continue
                     to_x, to_y, to_z = (
                         receivers[receiver, 0] - px,
                         receivers[receiver, 1] - py,
@@ -251,29 +215,17 @@ def _trace(
                     )
                     closest = to_x * dx + to_y * dy + to_z * dz
                     beside = to_x * to_x + to_y * to_y + to_z * to_z - closest * closest
-                    radius = radii[receiver, size]
-                    if beside >= radius * radius:
-                        continue
-                    half_chord = math.sqrt(radius * radius - beside)
-                    begin, end = max(closest - half_chord, 0.0), min(closest + half_chord, length)
-                    if end <= begin:
-                        continue
-                    at = 0.5 * (begin + end)
-                    if size > 0:
-                        # One point speaks for the chord: of when it is heard, and of what is in sight of it.
-                        at = begin + rng.random() * (end - begin)
-                        if blocking and _is_hidden(
-                            corners, px + at * dx, py + at * dy, receivers[receiver, 0], receivers[receiver, 1]
-                        ):
-                            continue
-                    into_bin = int((travelled_m + at) / bin_m)
-                    if into_bin < bins:
-                        # 4 pi r**2 at one metre, times the chord over the volume.
-                        gain = 4 * math.pi * (end - begin) / volumes[receiver, size]
-                        row, column = _cell(-dx, -dy, -dz)
-                        target = energy[receiver, into_bin, nearest[row, column]]
-                        for band in range(_BANDS):
-                            target[band] += gain * weight[band]
+                    radius = radii[receiver]
+                    if beside < radius * radius and 0.0 < closest < length:
+                        into_bin = int((travelled_m + closest) / bin_m)
+                        if into_bin < bins:
+                            chord = 2 * math.sqrt(radius * radius - beside)
+                            # 4 pi r**2 at one metre, times the chord over the volume of the sphere.
+                            gain = 3 * chord / (radius * radius * radius)
+                            row, column = _cell(-dx, -dy, -dz)
+                            target = energy[receiver, into_bin, nearest[row, column]]
+                            for band in range(_BANDS):
+                                target[band] += gain * weight[band]
 
             px, py, pz = px + length * dx, py + length * dy, pz + length * dz
             travelled_m += length
@@ -295,12 +247,7 @@ def _trace(
                     hit_side[hit] = 0.0
             for band in range(_BANDS):
                 weight[band] *= reflected[surface, band]
-            for receiver in range(len(receivers)):
-                step = int((travelled_m - away_m[receiver]) / EXCESS_STEP_M)
-                sizes[receiver] = size_at[min(max(step, 0), last_step)]
             for receiver in range(int(rng.random() * _EVERY), len(receivers), _EVERY):
-                if gathers[receiver, sizes[receiver]]:
-                    continue
                 to_x, to_y, to_z = receivers[receiver, 0] - px, receivers[receiver, 1] - py, receivers[receiver, 2] - pz
                 out = to_x * nx + to_y * ny + to_z * nz
                 if out <= 0.0:
