@@ -38,7 +38,7 @@ def test_every_refusal_is_told_with_its_type(served):
     assert len(operations) == 10
     for operation in operations:
         responses = operation["responses"]
-        assert {"403", "413", "414", "422", "431", "500", "503"} <= set(responses)
+        assert {"400", "403", "413", "414", "422", "431", "500", "503"} <= set(responses)
         for status, response in responses.items():
             if status[0] in "45":
                 assert set(response["content"]) == {"application/problem+json"}
