@@ -21,14 +21,14 @@ def load_scenes(bundles: Iterable[Path]) -> dict[str, Levels]:
 
     Raises BundleError for the first bundle that is damaged, or has the id of another of `bundles`.
     """
-    shipped = [Bundle.load(folder) for folder in bundled_scenes()]
-    own: dict[str, Bundle] = {}
+    own: dict[str, Bundle] = {}  # read first: what is wrong with them is told before the others' graphs are read
     for folder in bundles:
         bundle = Bundle.load(folder)
         other = own.setdefault(bundle.id, bundle)
         if other.folder.resolve() != folder.resolve():
             problem = f"is {bundle.id!r}, and so is that of {other.folder}; leave one out, or change one"
             raise BundleError(folder / MANIFEST_FILE, "id", problem)
+    shipped = [Bundle.load(folder) for folder in bundled_scenes()]
     return {bundle.id: Levels.load(bundle) for bundle in ({each.id: each for each in shipped} | own).values()}
 
 

@@ -18,8 +18,8 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from server.bench import cli as bench
-from server.core.command_line import StrictTyper
-from server.core.files import require_figure, require_readable, require_writable
+from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
+from server.core.files import require_readable
 from server.errors import NafirError, RequestError
 from server.health.cli import check
 from server.rendering.partitions import BLOCK_SIZES, is_block_size
@@ -136,7 +136,9 @@ def ir(
     scene: Scene,
     listener: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
     emitter: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .wav, .npy or .json.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="File to write: .wav, .npy or .json.", callback=writable_file)
+    ],
     yaw_deg: Annotated[
         float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
     ] = 0.0,
@@ -150,7 +152,6 @@ def ir(
     from server.scene.bundle import Bundle, find_bundle
 
     name = parse_format(output.suffix.removeprefix("."))
-    require_writable(output, "--output")
     if not math.isfinite(yaw_deg):
         raise RequestError("malformed_pose", "yaw-deg is not finite", field="yaw_deg")
     query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
@@ -188,7 +189,7 @@ def render(
             "level where it changes."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32.", callback=writable_file)],
     block_size: Annotated[
         int, typer.Option(help=f"Poses take effect at multiples of it, samples: {BLOCK_SIZES}.")
     ] = 256,
@@ -223,7 +224,13 @@ def render(
         raise NafirError(f"--block-size: {block_size} is not {BLOCK_SIZES}")
     if output.suffix != ".wav":
         raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
-    require_writable(output, "--output")
+    require_at_most_one({"--mono": mono, "--hrtf": hrtf is not None})
+    names = {name.strip() for name in effects.split(",")}
+    require_at_most_one({"--mono": mono, f"--effects {effects}": "hrtf" in names})
+    if hrtf is not None and not names & {"all", "plan", "hrtf"}:
+        raise NafirError(
+            f"--hrtf and --effects {effects} contradict each other: add hrtf to the effects, or leave one out"
+        )
     bundle = Bundle.load(find_bundle(scene))
     levels = Levels.load(bundle)
     field = levels.choose(level)
@@ -235,6 +242,11 @@ def render(
         )
     emitters = [_read_emitter(text, field, loop=loop) for text in emitter]
     points = read_path(path, field.sample_rate, list(levels))
+    if level is not None and points[0].level not in {None, level}:
+        raise NafirError(
+            f"--level {level} and --path contradict each other: the path begins at level {points[0].level}; "
+            "leave --level out"
+        )
     for number, point in enumerate(points, start=1):
         field.bundle.require_inside(point.pose.position, f"path point {number}")
     length = None if duration_s is None else round(duration_s * field.sample_rate)
@@ -292,7 +304,9 @@ def plan(
     effect: Annotated[
         list[str] | None, typer.Option(help="Switch an effect on or off; repeatable.", metavar="NAME=on|off")
     ] = None,
-    figure: Annotated[Path | None, typer.Option(help="Draw it to this file, too: .png or .svg.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw it to this file, too: .png or .svg.", callback=figure_file)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Which effects a situation calls for, why, and what they cost on this host."""
@@ -303,8 +317,6 @@ def plan(
     from server.plan_table import print_plan
     from server.scene.bundle import Bundle, find_bundle
 
-    if figure is not None:
-        require_figure(figure, "--figure")
     query = PlanQuery(
         listener=None if listener is None else parse_position(listener, "listener"),
         yaw_deg=yaw_deg,

@@ -21,6 +21,7 @@ from server.acoustics import directivity
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose, Quaternion
 from server.blocks import DryBlock, Encoding
+from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.near_names import suggestion
 from server.errors import RequestError
 from server.layout import Layout
@@ -260,17 +261,30 @@ _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(dis
 def parse_client_message(data: str | bytes) -> ClientMessage:
     """One message as it came off the socket: text or binary.
 
-    Of a hello the version is read before all else, since other versions have other fields. Raises RequestError with
+    Of a hello the version is read before all else, since other versions have other fields. A key that is there twice is
+    refused, in whichever object. Raises RequestError with
     code unsupported_protocol, malformed_message, unknown_message, malformed_pose, malformed_directivity or
     malformed_block, naming the field at fault.
     """
     if isinstance(data, bytes):
         return DryBlock.parse(data) if data[:1] == bytes([DryBlock.KIND]) else ListenerPose.parse_binary(data)
     try:
-        return _CLIENT.validate_json(data)
+        message = _CLIENT.validate_json(data)
     except ValidationError as exc:
         _require_version(data)
         raise _refusal(exc, is_tagged=True) from exc
+    # Every key has a colon: where there are no more of those than fields, no key is there twice. Nearly all messages
+    # are known by that, at a hundredth of what reading them once more would take.
+    if data.count(":") > len(message.model_fields_set):
+        _require_distinct_keys(data)
+    return message
+
+
+def _require_distinct_keys(data: str) -> None:
+    try:
+        require_distinct_keys(data)
+    except DoubledKeyError as exc:
+        raise RequestError("malformed_message", str(exc), field=exc.key) from exc
 
 
 def _require_version(data: str) -> None:

@@ -53,15 +53,15 @@ _PLACE: dict[str, Any] = {"pattern": POSITION_PATTERN}
 
 
 def _between(low: float, high: float) -> dict[str, Any]:
-    """Bounds, told in the schema too: behind `Decimal`'s parser pydantic does not."""
+    """Bounds, told in the schema too: behind `Number`'s parser pydantic does not."""
     return {"ge": low, "le": high, "json_schema_extra": {"minimum": low, "maximum": high}}
 
 
-Decimal = Annotated[float, BeforeValidator(lambda value: parse_decimal(value) if isinstance(value, str) else value)]
+Number = Annotated[float, BeforeValidator(lambda value: parse_decimal(value) if isinstance(value, str) else value)]
 LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
 PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"], json_schema_extra=_PLACE)]
 YawDeg = Annotated[
-    Decimal, Query(**_between(-36_000, 36_000), description="of the head, counter-clockwise, 0 looks along +x")
+    Number, Query(**_between(-36_000, 36_000), description="of the head, counter-clockwise, 0 looks along +x")
 ]
 EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
 _IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
@@ -142,9 +142,9 @@ async def loudness(
     request: Request,
     scene: str,
     emitter: PositionText,
-    height_m: Annotated[Decimal, Query(**_between(-1_000, 1_000), description="of the listener's ears")] = 1.5,
+    height_m: Annotated[Number, Query(**_between(-1_000, 1_000), description="of the listener's ears")] = 1.5,
     spacing_m: Annotated[
-        Decimal | None,
+        Number | None,
         Query(
             **_between(FINEST_M, MAX_MAP_SPACING_M),
             description="between map points; by default as the scene's size asks",

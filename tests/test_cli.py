@@ -339,6 +339,33 @@ def test_what_cannot_be_written_is_refused_before_the_work(nafir, monkeypatch, t
     check_error(nafir(command, "apartment", *arguments), option, "folder")
 
 
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--mono", "--hrtf", "head.sofa"), ("--mono", "--hrtf")),
+        (("--mono", "--effects", "hrtf,late_reverberation"), ("--mono", "--effects")),
+        (("--hrtf", "head.sofa", "--effects", "late_reverberation"), ("--hrtf", "--effects")),
+        (("--level", "rough"), ("--level", "--path")),
+    ],
+)
+def test_options_of_a_render_that_contradict_each_other_are_both_named(nafir, levels, tmp_path, options, named):
+    path, output = tmp_path / "path.csv", tmp_path / "out.wav"
+    path.write_text("sample,x,y,z,yaw_deg,level\n0,4,2,1.5,0,standard\n")
+    arguments = ("--emitter", "trumpet@6,3,1.5", "--path", path, "-o", output)
+    check_error(nafir("render", levels.bundle.folder, *arguments, *options), *named, "leave")
+    assert not output.exists()
+
+
+def test_two_forms_of_one_answer_are_refused(nafir, monkeypatch):
+    monkeypatch.setattr("server.bench.effects.measure_effects", lambda *_: pytest.fail("it measures"))
+    check_error(nafir("bench", "effects", "--json", "--markdown"), "--json", "--markdown", "leave one out")
+
+
+def test_serve_reads_the_bundles_it_is_given_before_those_that_come_with_it(nafir, monkeypatch, tmp_path):
+    monkeypatch.setattr("server.catalogue.bundled_scenes", lambda: pytest.fail("bundled scenes are read"))
+    check_error(nafir("serve", "--port", 0, "--bundle", tmp_path / "missing"), "missing")
+
+
 def test_an_impossible_setting_is_named(nafir, monkeypatch):
     monkeypatch.setenv("NAFIR_IR_WORKERS", "none")
     check_error(nafir("serve"), "ir_workers")

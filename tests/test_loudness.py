@@ -4,11 +4,15 @@ import io
 
 import numpy as np
 import pytest
+import sofar
 from numpy.testing import assert_allclose
 from PIL import Image
 
+from server.acoustics.decibels import power_to_db
 from server.loudness import LoudnessMap, loudness_map
-from server.whole_field import WholeField
+from server.rendering.hrtf import KEMAR
+from server.rendering.sphere import solid_angles
+from server.whole_field import WholeField, diffuse_energy, kemar
 
 
 @pytest.fixture
@@ -75,3 +79,19 @@ def test_walls_are_cut_out_sharply_and_do_not_bleed():
 def test_json_has_no_numbers_outside_the_room():
     chart = LoudnessMap(np.array([[np.nan, -3.0]]), (0.0, 0.0), 0.5, 1.5)
     assert chart.to_json()["levels_db"] == [[None, -3.0]]
+
+
+def test_white_sound_up_to_12_khz_is_as_loud_through_a_head_as_without_one_and_what_is_above_as_the_head_has_it():
+    """By the measured responses as they are stored, at 44.1 kHz."""
+    stored = sofar.read_sofa(str(KEMAR), verify=False, verbose=False)
+    responses, rate_hz = stored.Data_IR, float(stored.Data_SamplingRate)
+    azimuth, elevation = np.radians(stored.SourcePosition[:, :2]).T
+    directions = np.stack([np.cos(elevation) * part for part in (np.cos(azimuth), np.sin(azimuth))], axis=-1)
+    weights = solid_angles(np.column_stack([directions, np.sin(elevation)]))
+    spectrum = np.einsum("d,def->f", weights, np.abs(np.fft.rfft(responses)) ** 2)
+    is_above = np.fft.rfftfreq(responses.shape[-1], 1 / rate_hz) > 12_000
+    above = spectrum[is_above].sum() / spectrum[~is_above].sum()
+    in_24_khz, in_48_khz = (power_to_db(diffuse_energy(kemar(rate)).sum()) for rate in (24_000, 48_000))
+    assert in_24_khz == pytest.approx(0.0, abs=0.1)
+    assert in_48_khz == pytest.approx(power_to_db((1 + above) / 2), abs=0.15)
+    assert in_48_khz == pytest.approx(-2.7, abs=0.1)

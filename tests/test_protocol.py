@@ -370,3 +370,34 @@ def test_messages_are_plain_json():
         "message": "b",
         "field": None,
     }
+
+
+DOUBLED = {
+    "a value twice": ('{"type": "ping", "id": 1, "id": 2}', "id"),
+    "the same value twice": ('{"type": "ping", "id": 1, "id": 1}', "id"),
+    "a type twice": ('{"type": "ping", "type": "ping", "id": 1}', "type"),
+    "by an escape": ('{"type": "ping", "id": 1, "\\u0069d": 2}', "id"),
+    "blanks before the colon": ('{"type": "ping", "id" : 1, "id"\n: 2}', "id"),
+    "within": ('{"type": "set_effects", "effects": {"hrtf": true, "hrtf": false}}', "hrtf"),
+}
+
+
+@pytest.mark.parametrize(("text", "key"), DOUBLED.values(), ids=DOUBLED)
+def test_a_key_that_is_there_twice_is_refused_by_name(text, key):
+    with pytest.raises(RequestError, match=f"^{key} is there twice") as refusal:
+        parse_client_message(text)
+    assert (refusal.value.code, refusal.value.field) == ("malformed_message", key)
+
+
+def test_colons_and_keys_in_values_are_no_doubled_keys():
+    text = '{"type": "add_emitter", "id": "a:b \\"id\\": 1", "clip": "x:y", "position": [1, 2, 3]}'
+    assert parse_client_message(text).id == 'a:b "id": 1'
+    effects = '{"type": "set_effects", "effects": {"hrtf": true, "air_absorption": false}}'
+    assert parse_client_message(effects).effects == {"hrtf": True, "air_absorption": False}
+
+
+def test_a_message_without_doubled_keys_is_read_once(monkeypatch):
+    """What poses cost: `JSON` a second time would nearly double it."""
+    monkeypatch.setattr("server.protocol.require_distinct_keys", lambda _: pytest.fail("it is read twice"))
+    pose = ListenerPose(pose_id=1, position=(1, 2, 3), orientation=(0, 0, 0, 1))
+    assert parse_client_message(pose.model_dump_json(exclude_none=True)) == pose

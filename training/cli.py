@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,8 +11,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from server.core.command_line import StrictTyper
-from server.core.files import require_writable_folder
+from server.core.command_line import StrictTyper, require_at_most_one, writable_folder
+from server.core.files import require_matplotlib, require_writable
+from server.core.numerals import parse_integer
 from server.errors import NafirError
 from training.evaluation import cli as evaluation
 from training.importers.cli import importing
@@ -25,7 +27,7 @@ app = StrictTyper(no_args_is_help=True, add_completion=False, pretty_exceptions_
 app.add_typer(importing, name="import")
 app.command()(simulation.plan)
 
-Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
+Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)]
 
 
 def _progress() -> Progress:
@@ -107,9 +109,7 @@ def train(
     from training.train import train as train_field
 
     lengths = {"--epochs": epochs, "--minutes": minutes, "--as-long-as": as_long_as}
-    given_lengths = [option for option, value in lengths.items() if value is not None]
-    if len(given_lengths) > 1:
-        raise typer.BadParameter("leave one out", param_hint=" and ".join(given_lengths))
+    require_at_most_one({option: value is not None for option, value in lengths.items()})
     if as_long_as is not None:
         minutes = minutes_of(as_long_as)
     given = {"epochs": epochs, "minutes": minutes, "patience": patience, "learning_rate": learning_rate}
@@ -194,11 +194,8 @@ def export(
     chosen = [known for name in precision.split(",") for known in PRECISIONS if known == name.strip()]
     if len(chosen) != len(precision.split(",")):
         raise typer.BadParameter(f"knows {', '.join(PRECISIONS)}", param_hint="--precision")
-    if not all(rank.strip().isdigit() and int(rank) > 0 for rank in ranks.split(",") if ranks):
-        raise typer.BadParameter("takes whole numbers above zero, comma by comma", param_hint="--ranks")
-    lower = [int(rank) for rank in ranks.split(",") if ranks]
-    accepted = dict(_law_and_reason(entry) for entry in accept or ())
-    require_writable_folder(output, "--output")
+    lower = [_rank(text) for text in ranks.split(",") if ranks]
+    accepted = _accepted(accept or ())
     for talkative in (None, "torch.onnx"):
         logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or (runs[0] if (runs[0] / FILE).is_file() else dataset_folder(runs[0])))
@@ -220,6 +217,26 @@ def export(
     size = sum(path.stat().st_size for path in output.iterdir())
     fields = ", ".join(bundle.manifest.fields)
     typer.echo(f"{output}: scene {bundle.id}, {fields}, {size / 1e6:.1f} MB, digest {bundle.digest[:12]}")
+
+
+def _rank(text: str) -> int:
+    try:
+        rank = parse_integer(text)
+    except ValueError as exc:
+        raise NafirError(f"--ranks: {exc}") from exc
+    if rank < 1:
+        raise NafirError(f"--ranks: {rank} is not above zero")
+    return rank
+
+
+def _accepted(entries: Sequence[str]) -> dict[str, str]:
+    """Reasons by law. Raises NafirError for a law that is named twice."""
+    accepted: dict[str, str] = {}
+    for law, reason in map(_law_and_reason, entries):
+        if law in accepted:
+            raise NafirError(f"--accept: two reasons for {law}: give one")
+        accepted[law] = reason
+    return accepted
 
 
 def _law_and_reason(entry: str) -> tuple[str, str]:
@@ -247,7 +264,10 @@ for command in (evaluation.evaluate, evaluation.tabulate, evaluation.maps, evalu
 def frontier(
     bundle: Annotated[Path, typer.Argument(help="Scene bundle; its fields are swept.")],
     data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's fields were trained on.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for frontier.json and frontier.png.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for frontier.json and frontier.png.", callback=writable_folder),
+    ],
     pairs: Annotated[int, typer.Option(min=2, help="Held-out pairs to measure.")] = 40,
     yaws: Annotated[int, typer.Option(min=1, help="Head orientations of each.")] = 3,
     walk_s: Annotated[float, typer.Option(min=10, help="Seconds of the walk that costs are measured on.")] = 300.0,
@@ -259,7 +279,7 @@ def frontier(
     as_json: Json = False,
 ) -> None:
     """Measure accuracy against time for everything a bundle could offer. Run again after an interruption to go on."""
-    from server.scene.bundle import Bundle
+    from server.scene.bundle import MANIFEST_FILE, Bundle
     from training.dataset import Dataset
     from training.frontier.candidates import candidates
     from training.frontier.figure import draw_frontier
@@ -267,6 +287,9 @@ def frontier(
     from training.frontier.sweep import record as record_frontier
     from training.frontier.table import report
 
+    require_matplotlib("--output")
+    if record:
+        require_writable(bundle / MANIFEST_FILE, "--record")
     loaded = Bundle.load(bundle)
     effort = Effort(pairs=pairs, yaws=yaws, walk_s=walk_s, default_ms=default_ms, seed=seed)
     levels = candidates(loaded, phases_of, reuse_of or ())

@@ -104,8 +104,9 @@ def export(
     break the manifest keeps a record.
 
     Raises RunError for an unfinished run, ExportError for a graph that disagrees, for a dataset folder that is not of
-    `responses` or not measured, for fields of which only some hold the direct sound and for a law that does not exist
-    or that nobody may accept, and HealthError for fields that break a law of `nafir check`: nothing is written.
+    `responses` or not measured, for fields of which only some hold the direct sound, for ranks, tables or precisions
+    that none of the fields has, and for a law that does not exist or that nobody may accept, and HealthError for
+    fields that break a law of `nafir check`: nothing is written.
     """
     accepting = _accepting(accepted or {})
     exported: list[_Exported] = []
@@ -114,6 +115,7 @@ def export(
     usual_width = next((field.field.width for field, _ in opened if isinstance(field, FactorisedLearner)), 0)
     _require_different([_name_of(field, place, usual_width) for field, place in opened])
     whole = _hold_direct_sound([field for field, _ in opened])
+    _require_used([field for field, _ in opened], precisions, ranks, exact_tables=exact_tables)
     for field, place in opened:
         if isinstance(field, ImportedDataset):
             exported.append(_shaped(field))
@@ -216,6 +218,22 @@ def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
     if any(holding) and not all(holding):
         raise ExportError("naf-whole holds the direct sound, other fields leave it out: export it to its own bundle")
     return all(holding)
+
+
+def _require_used(
+    fields: Sequence[Learner | ImportedDataset],
+    precisions: Sequence[Precision],
+    ranks: Sequence[int],
+    *,
+    exact_tables: bool,
+) -> None:
+    """Raises ExportError for what is asked for and none of the fields has."""
+    if ranks and not any(isinstance(field, FactorisedLearner) for field in fields):
+        raise ExportError("ranks: none of the runs is a factorised field, which alone has them; leave it out")
+    if exact_tables and not any(isinstance(field, NafLearner) for field in fields):
+        raise ExportError("exact-tables: none of the runs is a naf, which alone has them; leave it out")
+    if list(precisions) != ["float32"] and all(isinstance(field, ImportedDataset) for field in fields):
+        raise ExportError("precision: measured responses themselves are kept in float32 alone; leave it out")
 
 
 def _require_different(names: list[str]) -> None:

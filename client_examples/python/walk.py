@@ -7,7 +7,7 @@ Connects to a Nafir server, puts a clip where the scene suggests, walks from the
 openings towards the clip while looking around, and writes two files: the sound as it arrived, and the path as it was
 heard: every pose with the sample from which on the direct sound was of it, and the one from which on the reverberation
 was, which follows a little later and skips poses, and at which quality level. Given to `nafir render`, that path makes
-the same sound again, within -70 dB of its peak where the level changed, and sample for sample where it did not.
+the same sound again, sample for sample.
 """
 
 import argparse
@@ -45,8 +45,7 @@ EFFECTS = [
     "per_source_tail",
     "head_rotation",
 ]
-"""All of them, so that an offline render is the same sample for sample; where the level changed, within -70 dB of
-the peak; a game leaves them to the server's plan."""
+"""All of them, so that an offline render is the same sample for sample; a game leaves them to the server's plan."""
 
 
 def as_float32(numbers: tuple[float, ...]) -> tuple[float, ...]:

@@ -9,6 +9,7 @@ keep such pages out, on HTTP requests and WebSocket upgrades alike:
 - **Origin.** A browser says from which site a page came (RFC 6454; Fetch, `Sec-Fetch-Site`). The server's own page and
   sites that the operator named may use it. Programs that are no browsers send no origin, and may.
 
+A header that decides this may be there once: a proxy in front and this server could each believe another of two.
 Health checks are answered whatever they say: they tell nothing and cost nothing.
 """
 
@@ -19,6 +20,7 @@ from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.problems import Refusal, problem
@@ -28,6 +30,11 @@ _HEALTH = frozenset({"/livez", "/readyz"})
 _ANY = "*"
 _USUAL_PORTS = {"http": 80, "https": 443}
 _EXPOSED = ("ETag", "Retry-After")
+_METHODS = ("GET", "HEAD")
+_HEADERS = ("If-None-Match",)
+_DECISIVE = ("Host", "Origin", "Sec-Fetch-Site")
+_FOR_PROGRAMS = ("/v1/", "/metrics")
+"""Paths that no link leads to."""
 
 
 @dataclass(frozen=True)
@@ -48,19 +55,23 @@ class SitePolicy:
             is_loopback=_is_loopback(settings.host),
         )
 
-    def refusal(self, path: str, headers: Headers) -> Refusal | None:
-        """What a request is answered in place of the application, if anything."""
+    def refusal(self, path: str, headers: Headers, *, scheme: str = "http") -> Refusal | None:
+        """What a request is answered in place of the application, if anything. `scheme` is that of its address: `http`,
+        `https`, `ws` or `wss`."""
+        for name in _DECISIVE:
+            if (times := len(headers.getlist(name))) > 1:
+                return Refusal(400, "doubled_header", f"{name} is given {times} times: give it once")
         host = _Authority.parsed(headers.get("host", ""))
         if not self._may_be_called(host):
             return Refusal(
                 421, "host_not_allowed", f"this server does not answer to {host.name!r}: name it in NAFIR_ALLOWED_HOSTS"
             )
-        origin = headers.get("origin")
+        origin, site = headers.get("origin"), headers.get("sec-fetch-site")
         if origin is None:
             # As of a picture in another site's page. A visitor may follow a link from there to the page itself.
-            is_foreign = path.startswith("/v1/") and headers.get("sec-fetch-site") == "cross-site"
+            is_foreign = path.startswith(_FOR_PROGRAMS) and site == "cross-site"
             origin = "another site" if is_foreign else None
-        elif origin.lower() in self.origins or _is_own(origin, host):
+        elif origin.lower() in self.origins or _is_own(origin, host, scheme=scheme, site=site):
             origin = None
         if origin is None:
             return None
@@ -84,11 +95,11 @@ class CrossSiteGate:
         self._policy = policy
         self._app = app
         if policy.origins:
-            self._app = CORSMiddleware(
+            self._app = _Cors(
                 app,
                 allow_origins=sorted(policy.origins),
-                allow_methods=["GET", "HEAD"],
-                allow_headers=["If-None-Match"],
+                allow_methods=_METHODS,
+                allow_headers=_HEADERS,
                 expose_headers=_EXPOSED,
             )
 
@@ -96,14 +107,29 @@ class CrossSiteGate:
         if scope["type"] not in {"http", "websocket"} or scope["path"] in _HEALTH:
             await self._app(scope, receive, send)
             return
-        refusal = self._policy.refusal(scope["path"], Headers(scope=scope))
+        refusal = self._policy.refusal(scope["path"], Headers(scope=scope), scheme=scope.get("scheme", "http"))
         if refusal is None:
             await self._app(scope, receive, _varying(send) if self._policy.origins else send)
-        elif scope["type"] == "websocket":
-            # Before it is accepted: the upgrade is answered 403.
+        elif scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
+            # Before it is accepted: the upgrade is answered 403, and without a body.
             await send({"type": "websocket.close", "code": 1008, "reason": refusal.code})
         else:
             await problem(refusal.status, refusal.code, refusal.detail)(scope, receive, send)
+
+
+class _Cors(CORSMiddleware):
+    """Refuses preflights with a problem document, as every other error."""
+
+    def preflight_response(self, request_headers: Headers) -> Response:
+        response = super().preflight_response(request_headers)
+        if response.status_code < 400:
+            return response
+        detail = f"pages of other sites may send {', '.join(_METHODS)}, with no header of their own but {_HEADERS[0]}"
+        refused = problem(response.status_code, "preflight_refused", detail)
+        for name, value in response.headers.items():
+            if name not in {"content-type", "content-length"}:
+                refused.headers[name] = value
+        return refused
 
 
 @dataclass(frozen=True)
@@ -122,15 +148,24 @@ class _Authority:
             return cls(text, None)
 
 
-def _is_own(origin: str, host: _Authority) -> bool:
-    """Whether a page came from where its request goes. A proxy in front may speak TLS, so the scheme does not count."""
-    scheme, _, rest = origin.lower().partition("://")
-    usual = _USUAL_PORTS.get(scheme)
+def _is_own(origin: str, host: _Authority, *, scheme: str, site: str | None) -> bool:
+    """Whether a page came from where its request goes, `scheme` included (RFC 6454, 4).
+
+    A proxy in front may speak TLS and not say so: then `scheme` is `http` for a page of either kind, and `site`, what
+    the browser says in `Sec-Fetch-Site`, tells the two apart. Browsers disagree on it for WebSockets, whose scheme is
+    another than a page's.
+    """
+    page_scheme, _, rest = origin.lower().partition("://")
+    if scheme in {"https", "wss"} and page_scheme != "https":
+        return False
+    if scheme in {"http", "https"} and site not in {None, "same-origin"}:
+        return False
+    usual = _USUAL_PORTS.get(page_scheme)
     if usual is None:
         return False
-    site = _Authority.parsed(rest)
-    ports = (site.port or usual, host.port or usual)
-    return bool(site.name) and site.name == host.name and ports[0] == ports[1]
+    page = _Authority.parsed(rest)
+    ports = (page.port or usual, host.port or usual)
+    return bool(page.name) and page.name == host.name and ports[0] == ports[1]
 
 
 def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -8,6 +8,7 @@ from fastapi.openapi.utils import get_openapi
 Object = dict[str, Any]
 
 _REFUSED: Final[dict[str, str]] = {
+    "400": "The request is malformed; `code` says how.",
     "403": "The request comes from another site, or the server refuses it.",
     "413": "The body is longer than the server takes.",
     "414": "The URL is longer than the server takes.",

@@ -22,7 +22,7 @@ from server.bench.report import (
     print_measures,
     print_rows,
 )
-from server.core.command_line import StrictTyper
+from server.core.command_line import StrictTyper, require_at_most_one
 from server.errors import NafirError
 
 app = StrictTyper(help="Measure what things cost on this host.", no_args_is_help=True)
@@ -117,6 +117,7 @@ def effects(
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a table for a README.")] = False,
 ) -> None:
     """What a plan of effects saves, and what it gets wrong, in six situations."""
+    require_at_most_one({"--json": as_json, "--markdown": markdown})
     from server.bench.effects import SCENARIOS, measure_effects
     from server.bench.effects_table import markdown_table, terminal_rows
     from server.bench.machine import describe_machine, instruction_set, processor

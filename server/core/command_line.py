@@ -1,15 +1,20 @@
-"""Command lines that take what they are told: numbers by one grammar, and every option at most once.
+"""Command lines that take what they are told: numbers by one grammar, every option at most once, no two that contradict
+each other, and no output that cannot be written.
 
-Without this, `--yaw-deg 0_1` is 1, and of `--yaw-deg 90 --yaw-deg 0` the first is dropped without a word.
+Without this, `--yaw-deg 0_1` is 1, of `--yaw-deg 90 --yaw-deg 0` the first is dropped without a word, and a command
+that worked for an hour says at its end that its folder is a file. `writable_file`, `writable_folder` and `figure_file`
+are callbacks of options: they are called before the command is.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, get_args
 
 import typer
 from typer.core import TyperCommand
 
+from server.core.files import require_figure, require_writable, require_writable_folder
 from server.core.numerals import parse_decimal, parse_integer
 from server.errors import NafirError
 
@@ -41,6 +46,35 @@ class StrictTyper(typer.Typer):
     def command(self, *args: Any, **options: Any) -> Callable[[Any], Any]:
         options.setdefault("cls", StrictCommand)
         return super().command(*args, **options)
+
+
+def writable_file(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Raises NafirError, naming the option, where a file cannot be written to what it was given."""
+    return _checked(require_writable, parameter, path)
+
+
+def writable_folder(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    """As `writable_file`, of a folder, which may not exist yet."""
+    return _checked(require_writable_folder, parameter, path)
+
+
+def figure_file(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    """As `writable_file`, of a picture that matplotlib will draw."""
+    return _checked(require_figure, parameter, path)
+
+
+def _checked(require: Callable[[Path, str], None], parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    if path is not None:
+        require(path, parameter.opts[0])
+    return path
+
+
+def require_at_most_one(options: Mapping[str, bool]) -> None:
+    """`options` are those of which only one can have its way, by name whether they are given. Raises NafirError for
+    several."""
+    given = [name for name, is_given in options.items() if is_given]
+    if len(given) > 1:
+        raise NafirError(f"{' and '.join(given)} contradict each other: leave one out")
 
 
 def _check_numbers(parameter: Any, given: Any) -> None:

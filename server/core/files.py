@@ -6,6 +6,8 @@ from pathlib import Path
 
 from server.errors import NafirError
 
+FIGURES = (".png", ".svg", ".pdf")
+
 
 def require_readable(path: Path, option: str) -> None:
     """Raises NafirError, naming `option`, for what is no file or may not be read."""
@@ -28,10 +30,17 @@ def require_writable(path: Path, option: str) -> None:
 
 def require_figure(path: Path, option: str) -> None:
     """As `require_writable`, of a picture that matplotlib will draw. Raises NafirError, too, where that is not
-    installed."""
+    installed, and for another ending than those of `FIGURES`."""
+    require_matplotlib(option)
+    if path.suffix not in FIGURES:
+        raise NafirError(f"{option}: {path}: a picture's name ends in {', '.join(FIGURES)}")
+    require_writable(path, option)
+
+
+def require_matplotlib(option: str) -> None:
+    """Raises NafirError, naming the `option` that asks for a picture, where matplotlib is not installed."""
     if importlib.util.find_spec("matplotlib") is None:
         raise NafirError(f"{option}: needs matplotlib; pip install matplotlib, or leave {option} out")
-    require_writable(path, option)
 
 
 def require_writable_folder(path: Path, option: str) -> None:

@@ -20,9 +20,9 @@ MOST_HEADER_BYTES = 10_000
 """As in NumPy: an array of plain numbers needs some hundred."""
 _HEADER = re.compile(
     r"""\s*\{\s*
-    ['"]descr['"]\s*:\s*['"](?P<dtype>[<>=|]?[A-Za-z]\d{0,4})['"]\s*,\s*
+    ['"]descr['"]\s*:\s*['"](?P<dtype>[<>=|]?[A-Za-z][0-9]{0,4})['"]\s*,\s*
     ['"]fortran_order['"]\s*:\s*(?P<fortran>True|False)\s*,\s*
-    ['"]shape['"]\s*:\s*\(\s*(?P<shape>(?:\d{1,18}L?\s*,\s*){0,32}(?:\d{1,18}L?\s*)?)\)\s*,?\s*
+    ['"]shape['"]\s*:\s*\(\s*(?P<shape>(?:[0-9]{1,18}L?\s*,\s*){0,32}(?:[0-9]{1,18}L?\s*)?)\)\s*,?\s*
     \}\s*""",
     re.VERBOSE,
 )
@@ -70,7 +70,7 @@ class NpyHeader:
             raise NpyError(f"holds {found['dtype']!r}, which is no type of numbers") from exc
         if dtype.kind not in "biufcSU":
             raise NpyError(f"holds {dtype}, not numbers")
-        shape = tuple(int(size) for size in re.findall(r"\d+", found["shape"]))
+        shape = tuple(int(size) for size in re.findall(r"[0-9]+", found["shape"]))
         return cls(dtype, shape, found["fortran"] == "True", 8 + width + length)
 
     def array(self, data: bytes) -> npt.NDArray[np.generic]:

@@ -8,12 +8,14 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from server.core.files import require_figure
+from server.core.command_line import figure_file
 
 
 def check(
     scene: Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")],
-    figure: Annotated[Path | None, typer.Option(help="Draw what was measured to this PNG (needs matplotlib).")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw what was measured to this PNG (needs matplotlib).", callback=figure_file)
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the poses that are tried.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
@@ -26,8 +28,6 @@ def check(
     from server.health.report import reasons, table, to_json
     from server.scene.bundle import Bundle, find_bundle
 
-    if figure is not None:
-        require_figure(figure, "--figure")
     bundle = Bundle.load(find_bundle(scene))
     console = Console(stderr=True)
     health = check_bundle(

@@ -109,8 +109,8 @@ class CompiledConvolver:
         """After `want`, another filter for a source's last stage."""
         self._own_tails_wanted[source] = filters.address
 
-    def want_tail(self, filters: PackedFilter) -> None:
-        self._tail_wanted[0] = filters.address
+    def want_tail(self, filters: PackedFilter | None) -> None:
+        self._tail_wanted[0] = 0 if filters is None else filters.address
 
     def process(self, blocks: FloatArray, output: FloatArray) -> None:
         if not process_block(self.address, blocks, output):

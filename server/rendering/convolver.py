@@ -51,6 +51,17 @@ class PartitionedIr:
         return sum(int(part.nbytes) for part in self.filters.spectra)
 
 
+@dataclass(frozen=True)
+class _Tail:
+    """What the stage of the shared tail convolves with: `filters` of `ir`, or silence."""
+
+    ir: PartitionedIr | None
+    filters: Any
+
+
+_NO_TAIL = _Tail(None, None)
+
+
 class Convolver:
     """`sources` mono inputs, each with its own IR of `channels` channels (1 or 2), mixed into one output.
 
@@ -107,7 +118,10 @@ class Convolver:
         # Compiled code holds addresses: an IR that was replaced is in use until its source's turn, and in the
         # window that is made of it then.
         self._retires_after = (TURNS + 2) * stages[-1].ticks
-        self._tail: PartitionedIr | None = None
+        self._tail = self._tail_before = _NO_TAIL
+        self._tail_chosen_at = -1
+        self._came_at = np.full(sources, -1)
+        """In which block each source got its first IR."""
 
     def prepare(
         self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None = None, same_from: int = 0
@@ -142,13 +156,15 @@ class Convolver:
         """Give a source its IR: at once before its first block, and by a crossfade from the next block on after it.
 
         Fades complete within their partition, so none is ever restarted; of several IRs that arrive before one, only
-        the newest is heard. Raises ValueError as `prepare`.
+        the newest is heard: what comes out is the same as if no other had arrived. Raises ValueError as `prepare`.
         """
         prepared = ir if isinstance(ir, PartitionedIr) else self.prepare(ir)
         if prepared.layout != self._layout:
             raise ValueError("the IR was prepared for another convolver")
         previous = self._irs[source]
-        if previous is not None:
+        if previous is None:
+            self._came_at[source] = self._engine.blocks
+        else:
             self._retire(previous)
         self._irs[source] = prepared
         self._tail_energy[source] = prepared.tail_energy
@@ -156,7 +172,7 @@ class Convolver:
         if self._shares_tail and self._switches_tail:
             self._engine.want_own_tail(source, self._silence)
         if self._has_shared_tail:
-            self._share_tail(None if previous is not None else source)
+            self._choose_tail()
 
     def share_tail(self, is_shared: bool) -> None:
         """Have all sources share a tail, or none; only of a convolver that switches tails. Nothing happens where its
@@ -167,25 +183,33 @@ class Convolver:
         for source, ir in enumerate(self._irs):
             if ir is not None:
                 self._engine.want_own_tail(source, self._silence if is_shared else ir.filters)
-        if self._tail is not None:
-            self._engine.want_tail(self._tail.filters if is_shared else self._silence)
+        self._choose_tail()
 
     def _retire(self, ir: PartitionedIr) -> None:
         self._retired.append((self._engine.blocks + self._retires_after, ir))
 
-    def _share_tail(self, newcomer: int | None) -> None:
-        """Choose the tail, and the level at which each source feeds it; a newcomer's is in effect at once."""
-        tail = next((ir for ir in self._irs if ir is not None and ir.tail_energy > 0), None)
-        if tail is None:
-            self._engine.tail_gain[1] = 0
-            return
-        if self._tail is not None and self._tail is not tail:
-            self._retire(self._tail)
+    def _choose_tail(self) -> None:
+        """Choose the shared tail, and the level at which each source feeds it; a newcomer's is in effect at once.
+
+        The choice depends on the IRs of the next block and on what the last block was made with, and on nothing that
+        was handed in and replaced between the two: an offline render knows nothing of that.
+        """
+        if self._tail_chosen_at != self._engine.blocks:
+            self._tail_chosen_at, self._tail_before = self._engine.blocks, self._tail
+        ir = next((ir for ir in self._irs if ir is not None and ir.tail_energy > 0), None)
+        if ir is not None:
+            tail = _Tail(ir, ir.filters if self._shares_tail else self._silence)
+        elif self._shares_tail or self._tail_before is _NO_TAIL:
+            tail = self._tail_before  # which nothing feeds any more: it rings out
+        else:
+            tail = _Tail(self._tail_before.ir, self._silence)
+        if self._tail.ir is not None and self._tail.ir is not tail.ir:
+            self._retire(self._tail.ir)
         self._tail = tail
-        self._engine.want_tail(tail.filters if self._shares_tail else self._silence)
-        self._engine.tail_gain[1] = np.sqrt(self._tail_energy / tail.tail_energy)
-        if newcomer is not None:
-            self._engine.tail_gain[0, newcomer] = self._engine.tail_gain[1, newcomer]
+        self._engine.want_tail(tail.filters)
+        self._engine.tail_gain[1] = 0.0 if ir is None else np.sqrt(self._tail_energy / ir.tail_energy)
+        newcomers = self._came_at == self._engine.blocks
+        self._engine.tail_gain[0, newcomers] = self._engine.tail_gain[1, newcomers]
 
     def process(self, blocks: FloatArray, out: FloatArray | None = None) -> FloatArray:
         """One block (sources, b) in, the mix (channels, b) of the same instant out: in `out`, or an array of its own.
@@ -228,7 +252,7 @@ class Convolver:
         self._tail_energy[source] = 0
         self._engine.clear(source)
         if self._has_shared_tail:
-            self._share_tail(None)
+            self._choose_tail()
 
     def reset(self) -> None:
         """Forget everything, as if just constructed."""
@@ -236,7 +260,9 @@ class Convolver:
         self._irs = [None] * self.sources
         self._tail_energy.fill(0)
         self._retired.clear()
-        self._tail = None
+        self._tail = self._tail_before = _NO_TAIL
+        self._tail_chosen_at = -1
+        self._came_at.fill(-1)
 
 
 def _energy(samples: FloatArray) -> float:

@@ -74,7 +74,7 @@ class NumpyConvolver:
         """After `want`, another filter for a source's last stage."""
         self._own_tails_wanted[source] = filters
 
-    def want_tail(self, filters: SpectralFilter) -> None:
+    def want_tail(self, filters: SpectralFilter | None) -> None:
         self._tail_wanted[0] = filters
 
     def process(self, blocks: FloatArray, output: FloatArray) -> None:

@@ -6,6 +6,7 @@ Axes as in the standard: x ahead, y left, z up; azimuth counter-clockwise from +
 `sofar` takes a third of a second to import, so it is imported where a file is read.
 """
 
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,10 @@ SLOWEST_RATE_HZ, FASTEST_RATE_HZ = 4_000.0, 768_000.0
 """No response of audio was measured at another rate; what says so has its unit wrong."""
 MOST_BYTES = 8 * 2**30
 """Of a file's variables, unpacked to 64 bits."""
+
+_ONE_READER = threading.Lock()
+"""HDF5's C library keeps global state without a lock of its own (unless it is built thread-safe, and the wheels of
+netCDF4 are not): two threads in it at once end the process now and then."""
 
 _LENGTHS_M = {
     **dict.fromkeys(("metre", "metres", "meter", "meters", "m"), 1.0),
@@ -59,10 +64,16 @@ class SofaFile:
 
     @classmethod
     def open(cls, path: Path) -> "SofaFile":
+        """Of threads that open files at once, each waits for the one before."""
         if path.suffix != ".sofa":  # sofar would open another file: it replaces any other suffix
             raise SofaError(path, "file", "a SOFA file's name ends in .sofa")
         if not path.is_file():
             raise SofaError(path, "file", "no such file")
+        with _ONE_READER:
+            return cls._read(path)
+
+    @classmethod
+    def _read(cls, path: Path) -> "SofaFile":
         import netCDF4
         import sofar
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from server.acoustics.geometry import FloorPlan, Vector3
+from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.npy import MOST_HEADER_BYTES, NpyError, NpyHeader
 from server.errors import BundleError, RequestError
 from server.scene.manifest import ARRAYS_FILE, Manifest
@@ -62,6 +63,10 @@ class Bundle:
             first = exc.errors()[0]
             field = ".".join(str(part) for part in first["loc"]) or "document"
             raise BundleError(path, field, first["msg"]) from exc
+        try:
+            require_distinct_keys(text)
+        except DoubledKeyError as exc:
+            raise BundleError(path, exc.key, "is there twice: give it once") from exc
         contents = _read_listed(folder, manifest)
         noise = np.zeros((2, 0), np.float32)
         if manifest.fields:

@@ -6,8 +6,7 @@ from starlette.applications import Starlette
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route, WebSocketRoute
-from starlette.testclient import TestClient
-from starlette.websockets import WebSocketDisconnect
+from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.settings import Settings
@@ -16,9 +15,9 @@ LOOPBACK = Settings(allowed_hosts=(), host="127.0.0.1")
 EVERYWHERE = Settings(allowed_hosts=(), host="0.0.0.0")
 
 
-def status(settings, path="/v1/scenes", **headers):
+def status(settings, path="/v1/scenes", *, scheme="http", **headers):
     given = Headers({name.replace("_", "-"): value for name, value in headers.items()})
-    refusal = SitePolicy.of(settings).refusal(path, given)
+    refusal = SitePolicy.of(settings).refusal(path, given, scheme=scheme)
     return 200 if refusal is None else refusal.status
 
 
@@ -66,6 +65,33 @@ def test_only_the_servers_own_page_may_use_it(origin, expected):
     assert status(LOOPBACK, "/v1/stream", host="localhost:8000", origin=origin) == expected
 
 
+@pytest.mark.parametrize("scheme", ["https", "wss"])
+def test_a_page_that_came_without_tls_is_not_the_own_page_of_a_server_with_it(scheme):
+    """RFC 6454, 5: the schemes of two origins that are the same are equal."""
+    assert status(LOOPBACK, scheme=scheme, host="localhost", origin="https://localhost") == 200
+    assert status(LOOPBACK, scheme=scheme, host="localhost", origin="http://localhost") == 403
+
+
+def test_where_a_proxy_does_not_say_that_it_speaks_tls_the_browser_tells_pages_apart():
+    """A browser says `same-origin` of a page of https://localhost alone, and `cross-site` of one of http://localhost."""
+    page = {"host": "localhost", "origin": "http://localhost"}
+    assert status(LOOPBACK, sec_fetch_site="same-origin", **page) == 200
+    assert status(LOOPBACK, sec_fetch_site="cross-site", **page) == 403
+    assert status(LOOPBACK, sec_fetch_site="same-site", **page) == 403
+
+
+@pytest.mark.parametrize("name", [b"host", b"origin", b"sec-fetch-site"])
+def test_what_decides_is_there_once(name):
+    """RFC 9112, 3.2, of `Host`; of the others, too, two servers in a row could each believe another one."""
+    good = {b"host": b"localhost", b"origin": b"http://localhost", b"sec-fetch-site": b"same-origin"}
+    once = list(good.items())
+    for second in (good[name], b"evil.example"):
+        refusal = SitePolicy.of(LOOPBACK).refusal("/v1/scenes", Headers(raw=[*once, (name, second)]))
+        assert (refusal.status, refusal.code) == (400, "doubled_header")
+        assert refusal.detail.lower().startswith(name.decode())
+    assert SitePolicy.of(LOOPBACK).refusal("/v1/scenes", Headers(raw=once)) is None
+
+
 def test_a_port_that_is_not_told_is_the_schemes():
     assert status(LOOPBACK, host="localhost", origin="http://localhost:80") == 200
     assert status(LOOPBACK, host="localhost:443", origin="https://localhost") == 200
@@ -81,6 +107,8 @@ def test_a_site_that_was_named_may_use_it_and_others_may_not():
 def test_pictures_in_pages_of_other_sites_cost_nothing_and_links_lead_to_the_page():
     foreign = {"host": "localhost", "sec_fetch_site": "cross-site"}
     assert status(LOOPBACK, "/v1/scenes/flat/loudness", **foreign) == 403
+    assert status(LOOPBACK, "/metrics", **foreign) == 403
+    assert status(LOOPBACK, "/metrics", host="localhost") == 200
     assert status(LOOPBACK, "/", **foreign) == 200
     assert status(LOOPBACK, "/v1/scenes", host="localhost", sec_fetch_site="same-origin") == 200
 
@@ -111,6 +139,23 @@ def test_a_named_site_may_read_answers_with_their_tags(client):
     assert client.options("/v1/scenes", headers=asked).status_code == 200
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"Access-Control-Request-Method": "DELETE"},
+        {"Access-Control-Request-Method": "GET", "Access-Control-Request-Headers": "X-Own"},
+    ],
+)
+def test_a_refused_preflight_is_a_problem_document(client, asked):
+    answer = client.options("/v1/scenes", headers={"Origin": "https://game.example", **asked})
+    assert answer.status_code == 400
+    assert answer.headers["Content-Type"] == "application/problem+json"
+    assert answer.json()["code"] == "preflight_refused"
+    assert "If-None-Match" in answer.json()["detail"]
+    # So that the page's author reads it in place of "failed to fetch".
+    assert answer.headers["Access-Control-Allow-Origin"] == "https://game.example"
+
+
 def test_answers_depend_on_who_asks(client):
     assert "Origin" in client.get("/v1/scenes").headers["Vary"]
 
@@ -128,13 +173,19 @@ def test_a_refusal_is_a_problem_document_that_names_the_setting(client):
         assert client.get("/livez", headers=headers).status_code == 200
 
 
-def test_a_stream_is_refused_before_it_opens(client):
-    for headers in ({"Origin": "https://evil.example"}, {"Host": "evil.example"}):
+def test_a_stream_is_refused_before_it_opens_with_a_problem_document(client):
+    for headers, status_code, code in (
+        ({"Origin": "https://evil.example"}, 403, "origin_not_allowed"),
+        ({"Host": "evil.example"}, 421, "host_not_allowed"),
+    ):
         with (
-            pytest.raises(WebSocketDisconnect),
+            pytest.raises(WebSocketDenialResponse) as refused,
             client.websocket_connect("ws://localhost:8000/v1/stream", headers=headers),
         ):
             pass
+        assert refused.value.status_code == status_code
+        assert refused.value.headers["Content-Type"] == "application/problem+json"
+        assert refused.value.json()["code"] == code
     with client.websocket_connect(
         "ws://localhost:8000/v1/stream", headers={"Origin": "https://game.example"}
     ) as stream:

@@ -5,7 +5,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from server.core.command_line import StrictCommand, StrictTyper
+from server.core.command_line import StrictCommand, StrictTyper, require_at_most_one
 from server.errors import NafirError
 
 app = StrictTyper()
@@ -70,3 +70,48 @@ def test_every_command_is_strict(module):
     found = list(commands(typer.main.get_command(importlib.import_module(module).app)))
     assert len(found) > 5
     assert all(isinstance(each, StrictCommand) for each in found)
+
+
+INPUTS = {
+    *("bundle", "clip", "hrtf", "path"),
+    *("as_long_as", "data", "points", "teacher"),
+}
+OUTPUTS = {"output", "figure"}
+NEEDED = {"--listener": "1,1,1", "--emitter": "1,1,1", "--path": "absent.csv", "--output": "new.wav"}
+"""Options that some commands cannot do without."""
+
+
+def path_options(module):
+    for command in commands(typer.main.get_command(importlib.import_module(module).app)):
+        for parameter in command.params:
+            kinds = str(getattr(getattr(parameter, "type_descriptor", None), "annotation", None))
+            if parameter.param_type_name == "option" and "Path" in kinds:
+                yield command, parameter
+
+
+@pytest.mark.parametrize("module", ["server.cli", "training.cli"])
+def test_every_command_looks_at_what_it_is_to_write_before_it_begins(module, tmp_path):
+    """Nothing else is there that it would need: where it read or computed anything first, it would say so instead."""
+    (tmp_path / "file").write_text("")
+    found = list(path_options(module))
+    assert {parameter.name for _, parameter in found} <= INPUTS | OUTPUTS
+    written = [(command, parameter) for command, parameter in found if parameter.name in OUTPUTS]
+    assert len(written) >= 4
+    for command, parameter in written:
+        given = {parameter.opts[0]: str(tmp_path / "file" / "x.png")}
+        arguments = []
+        for each in command.params:
+            if each.required and each.param_type_name == "argument":
+                arguments.append(str(tmp_path / "absent"))
+            elif each.required:
+                given.setdefault(each.opts[0], NEEDED[each.opts[0]])
+        line = [*arguments, *(part for option in given.items() for part in option)]
+        with pytest.raises(NafirError) as refused:
+            command.main(line, standalone_mode=False)
+        assert str(refused.value).startswith(f"{parameter.opts[0]}: "), command.name
+
+
+def test_of_what_contradicts_each_other_all_is_named():
+    require_at_most_one({"--a": True, "--b": False, "--c": False})
+    with pytest.raises(NafirError, match=r"^--a and --c contradict each other: leave one out$"):
+        require_at_most_one({"--a": True, "--b": False, "--c": True})

@@ -61,6 +61,8 @@ def test_what_the_system_refuses_is_refused(tmp_path, monkeypatch):
 
 def test_a_picture_needs_what_draws_it(tmp_path, monkeypatch):
     require_figure(tmp_path / "x.png", "--option")
+    with pytest.raises(NafirError, match=r"--option: .*x\.doc: a picture's name ends in \.png"):
+        require_figure(tmp_path / "x.doc", "--option")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(NafirError, match="--option: needs matplotlib"):
         require_figure(tmp_path / "x.png", "--option")

@@ -54,6 +54,7 @@ UNREADABLE = {
     "a minus a thousand times": (_file(_header(shape="-" * 5_000)), "header"),
     "digits without end": (_file(_header(shape="(" + "1" * 9_000)), "header"),
     "a string that does not end": (_file("{'descr': '''<f4"), "header"),
+    "digits of another script": (_file(_header(shape="(\u0662, 3)").encode(), bytes(24), version=3), "header"),
     "a null byte": (_file("{'descr': '\0'"), "header"),
     "objects": (_file(_header(descr="'|O8'"), b"\x80\x04N."), "not numbers"),
     "records": (_file(_header(descr="[('a', '<f4')]")), "header"),

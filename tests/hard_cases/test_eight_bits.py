@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import numpy_helper
+from onnx import helper, numpy_helper
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
@@ -86,6 +86,25 @@ def test_one_weight_that_fills_its_scale_spoils_its_own_column_alone(graphs, mea
     by_output = np.sqrt(np.mean(error**2, axis=0))
     measured("median error of levels", DB * float(np.median(by_output)), 0.1, "dB")
     assert np.isfinite(by_output).all()
+
+
+def test_a_product_of_few_weights_is_computed_exactly():
+    rng = np.random.default_rng(5)
+    weights, given = (rng.standard_normal((8, 8)).astype(np.float32) for _ in range(2))
+    ends = [helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [8, 8]) for name in ("given", "told")]
+    product = helper.make_node("MatMul", ["given", "weights"], ["told"], name="product")
+    graph = helper.make_graph(
+        [product], "one product", ends[:1], ends[1:], [numpy_helper.from_array(weights, "weights")]
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+    def told(least_weights):
+        session = open_session(to_int8(model, least_weights=least_weights).SerializeToString())
+        return session.run(None, {"given": given})[0]
+
+    exact = open_session(model.SerializeToString()).run(None, {"given": given})[0]
+    np.testing.assert_array_equal(told(weights.size + 1), exact)
+    assert np.abs(told(weights.size) - exact).max() > 1e-4
 
 
 @pytest.mark.parametrize("where_m", [50.0, 1e3, 1e6])

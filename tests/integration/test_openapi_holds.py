@@ -8,13 +8,15 @@ import urllib.request
 import pytest
 
 
-def schemathesis(address, folder, *, config=""):
+def schemathesis(address, folder, *, config, examples):
     """Ends by itself; with a seed, so that what fails fails again."""
     (folder / "schemathesis.toml").write_text(config)
     return subprocess.run(
         [
             *(sys.executable, "-m", "schemathesis.cli", "run", f"http://{address}/openapi.json"),
-            *("--checks", "all", "--seed", "1", "--max-examples", "10", "--no-color"),
+            *("--checks", "all", "--seed", "1", "--max-examples", str(examples), "--no-color"),
+            # Not stateful: sequences of requests follow links, of which a server that keeps nothing has none.
+            *("--phases", "examples,coverage,fuzzing"),
         ],
         cwd=folder,
         capture_output=True,
@@ -24,9 +26,13 @@ def schemathesis(address, folder, *, config=""):
     )
 
 
-@pytest.mark.parametrize("config", ["", '[parameters]\n"path.scene" = "flat"\n'], ids=["any scene", "a scene there is"])
-def test_the_server_is_as_its_document_says(served, tmp_path, config):
-    ran = schemathesis(served, tmp_path, config=config)
+@pytest.mark.parametrize(
+    ("config", "examples"),
+    [("", 5), ('[parameters]\n"path.scene" = "flat"\n', 10)],
+    ids=["any scene, which there is hardly ever", "a scene there is"],
+)
+def test_the_server_is_as_its_document_says(served, tmp_path, config, examples):
+    ran = schemathesis(served, tmp_path, config=config, examples=examples)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert "10 selected / 10 total" in ran.stdout
 
@@ -38,7 +44,7 @@ def test_every_refusal_is_told_with_its_type(served):
     assert len(operations) == 10
     for operation in operations:
         responses = operation["responses"]
-        assert {"403", "413", "414", "422", "431", "500", "503"} <= set(responses)
+        assert {"400", "403", "413", "414", "422", "431", "500", "503"} <= set(responses)
         for status, response in responses.items():
             if status[0] in "45":
                 assert set(response["content"]) == {"application/problem+json"}

@@ -30,9 +30,12 @@ def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own():
     # No client hears sooner than the server sends; histograms tell durations apart by a sixteenth of an octave.
     assert case["pose_to_audio_ms"]["p50"] <= case["client_pose_to_audio_ms"]["p50"] * 2 ** (1 / 16)
     loads = case["server_load_by_thread"]
-    # Threads of HTTP have nothing to do here.
-    assert all(load > 0 for name, load in loads.items() if name.startswith(("nafir-audio", "nafir-ir", "MainThread")))
-    assert any(name.startswith("nafir-audio") for name in loads)
+    # Threads that answer HTTP have nothing to do here; all others have.
+    own = {name: load for name, load in loads.items() if name.startswith(("nafir-", "MainThread"))}
+    idle = {name for name, load in own.items() if load == 0}
+    assert all(name.startswith("nafir-http") for name in idle), idle
+    for kind in ("nafir-audio", "nafir-ir", "MainThread"):
+        assert any(name.startswith(kind) for name in own), kind
     assert 0 < sum(loads.values()) <= case["server_load"] * 1.05
     assert case["client_load"] > 0
     assert case["trials"] == [{name: case[name] for name in ("sessions", "late_share", "errors")}]

@@ -1,6 +1,12 @@
 """SOFA files as they are found: each variable by its own Type and Units, however spelt, or refused by name."""
 
+import threading
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+
 import h5py
+import netCDF4
 import numpy as np
 import pytest
 import sofar
@@ -169,3 +175,30 @@ def test_more_directions_than_a_resampler_has_channels(tmp_path):
 def test_many_measurements_of_one_direction_are_one(tmp_path):
     path = grid_file(tmp_path / "again.sofa", np.tile(ANGLES, (400, 1)))
     assert len(read_sofa(path).directions) == len(ANGLES)
+
+
+def test_threads_that_read_at_once_take_turns_in_the_library_and_all_read_the_same(written, monkeypatch):
+    """HDF5's C library may be in one thread at a time."""
+    path, inside, most = written(), Counter(), []
+    expected = SofaFile.open(path).numbers("Data_IR")
+
+    def watched(call):
+        def called(*arguments, **options):
+            inside[threading.get_ident()] += 1
+            most.append(sum(calls > 0 for calls in inside.copy().values()))
+            time.sleep(0.005)  # long enough for another thread to come in
+            try:
+                return call(*arguments, **options)
+            finally:
+                inside[threading.get_ident()] -= 1
+
+        return called
+
+    for library, name in ((sofar, "read_sofa_as_netcdf"), (netCDF4, "Dataset")):
+        monkeypatch.setattr(library, name, watched(getattr(library, name)))
+    with ThreadPoolExecutor(8) as pool:
+        read = list(pool.map(lambda _: SofaFile.open(path).numbers("Data_IR"), range(24)))
+    assert len(most) >= 48
+    assert max(most) == 1
+    for responses in read:
+        np.testing.assert_array_equal(responses, expected)

@@ -106,3 +106,27 @@ def test_responses_without_a_tail_have_none_to_share(is_compiled):
     dry = np.zeros((1, 20 * SIZE), np.float32)
     dry[0, 0] = 1
     assert error_db(stream(convolver, dry)[:, :400], rooms(5)[0][:, :400].astype(float)) < -115
+
+
+@pytest.mark.parametrize("kind", [{"switches_tail": True}, {"shared_tail": True}, {}], ids=str)
+def test_what_is_replaced_before_a_block_leaves_no_trace(is_compiled, kind):
+    """One convolver is told everything, the other only what stands when a block is made. Some responses have no
+    tail."""
+    rng = np.random.default_rng(7)
+    told_all, told_last = make(is_compiled, **kind), make(is_compiled, **kind)
+    known = [ir[:, :length] for seed in range(4) for ir, length in zip(rooms(seed), (SAMPLES, 300, 300), strict=True)]
+    outputs = [[], []]
+    for _ in range(400):
+        dry = rng.standard_normal((SOURCES, SIZE)).astype(np.float32)
+        if rng.random() < 0.2:
+            calls = [(int(rng.integers(SOURCES)), known[rng.integers(len(known))]) for _ in range(8)]
+            switches = [bool(rng.integers(2)) for _ in calls]
+            for (source, ir), is_shared in zip(calls, switches, strict=True):
+                told_all.set_ir(source, ir)
+                told_all.share_tail(is_shared)
+            for source, ir in dict(calls).items():
+                told_last.set_ir(source, ir)
+            told_last.share_tail(switches[-1])
+        for convolver, output in zip((told_all, told_last), outputs, strict=True):
+            output.append(convolver.process(dry))
+    np.testing.assert_array_equal(*(np.concatenate(output, axis=1) for output in outputs))

@@ -112,6 +112,17 @@ def test_a_start_inside_a_wall_is_named():
         Manifest.model_validate(document)
 
 
+@pytest.mark.parametrize(("key", "again"), [("id", '"other"'), ("sample_rate", "48000"), ("minimum", "[0, 0, 0]")])
+def test_a_manifest_that_names_a_key_twice_is_refused_by_name(bundle_copy, key, again):
+    """`json` would take the last of two, other readers the first."""
+    manifest = bundle_copy / "scene.json"
+    text = manifest.read_text()
+    assert text.count(f'"{key}": ') == 1
+    manifest.write_text(text.replace(f'"{key}": ', f'"{key}": {again}, "{key}": '))
+    with pytest.raises(BundleError, match=rf"scene\.json: {key}: is there twice"):
+        Bundle.load(bundle_copy)
+
+
 def test_manifest_that_is_no_json_is_a_bundle_error(bundle_copy):
     (bundle_copy / "scene.json").write_text("{")
     with pytest.raises(BundleError, match=r"scene\.json"):

@@ -175,6 +175,31 @@ def test_results_of_scenes_come_into_one_table(nafir_train, dataset, tiny_bundle
     assert record["times"] == [{"step": "train", "wall_s": 90.0, "cpu_s": 60.0}]
 
 
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("evaluate", "bundle", "data", "--json", "--markdown"), ("--json", "--markdown")),
+        (("export", "run", "-o", "{tmp}/b", "--accept", "rise=a", "--accept", "rise=b"), ("--accept", "rise")),
+        (
+            ("simulate", "x.toml", "-o", "{tmp}/d", "--effects", "scattering=on,scattering=off"),
+            ("--effects", "scattering"),
+        ),
+        (("export", "run", "-o", "{tmp}/b", "--ranks", "64,1_6"), ("--ranks", "1_6")),
+        (("export", "run", "-o", "{tmp}/b", "--ranks", "\u0663"), ("--ranks", "\u0663")),
+        (("export", "run", "-o", "{tmp}/b", "--ranks", "0"), ("--ranks", "0")),
+        (("export", "{run}", "-o", "{tmp}/b", "--exact-tables"), ("exact-tables", "naf")),
+    ],
+)
+def test_what_contradicts_itself_is_refused_in_one_line_that_names_it(nafir_train, run, tmp_path, arguments, named):
+    given = [argument.format(tmp=tmp_path, run=run) for argument in arguments]
+    code, _, err = nafir_train(*given)
+    assert code == 2
+    assert "\n" not in err.strip()
+    for name in named:
+        assert name in err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_length_of_a_run_is_said_once(nafir_train, dataset, run, tmp_path):
     code, _, err = nafir_train("train", dataset.folder, "-o", tmp_path / "r", "--minutes", "1", "--as-long-as", run)
     assert code == 2

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from server.core.files import require_figure, require_writable
+from server.core.command_line import figure_file, require_at_most_one, writable_file
+from server.core.files import require_writable
 from training.options import Json, Seed
 
 
@@ -25,12 +26,17 @@ def evaluate(
     pairs: Annotated[int | None, typer.Option(min=1, help="Held-out pairs to draw; all if not given.")] = None,
     yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
     draws: Annotated[int, typer.Option(min=1, help="Compare with medians of so many more simulations.")] = 1,
-    figure: Annotated[Path | None, typer.Option(help="Draw decays and errors to this PNG.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw decays and errors to this PNG.", callback=figure_file)
+    ] = None,
     record: Annotated[bool, typer.Option(help="Write the measured errors of every level into the bundle.")] = False,
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="Write the results as JSON, too, and until then what is measured, to go on with."
+            "--output",
+            "-o",
+            help="Write the results as JSON, too, and until then what is measured, to go on with.",
+            callback=writable_file,
         ),
     ] = None,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
@@ -41,20 +47,19 @@ def evaluate(
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # times are of one core
     from rich.progress import track
 
-    from server.scene.bundle import Bundle
+    from server.scene.bundle import MANIFEST_FILE, Bundle
     from training.evaluation.fields import record_accuracy
     from training.evaluation.report import markdown, report
     from training.evaluation.run import evaluate_bundles
 
-    if output is not None:
-        require_writable(output, "--output")
-    if figure is not None:
-        require_figure(figure, "--figure")
+    require_at_most_one({"--json": as_json, "--markdown": as_markdown})
     runs = [place for place in places[:-1] if (place / "run.json").is_file()]
     bundles = [Bundle.load(place) for place in places[:-1] if place not in runs]
     if record and (len(bundles) != 1 or runs or draws > 1):
         problem = "takes one bundle, and errors from one simulation, as a frontier's are"
         raise typer.BadParameter(problem, param_hint="--record")
+    if record:
+        require_writable(bundles[0].folder / MANIFEST_FILE, "--record")
     console = Console(stderr=True)
     evaluation, published = evaluate_bundles(
         bundles,
@@ -83,7 +88,9 @@ def evaluate(
 
 def tabulate(
     results: Annotated[list[Path], typer.Argument(help="What evaluate --json wrote, a file per scene.")],
-    figure: Annotated[Path | None, typer.Option(help="Draw errors in units of the floor to this PNG.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw errors in units of the floor to this PNG.", callback=figure_file)
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """One Markdown table of the default levels over scenes, and what every step took where its times lie beside."""
@@ -110,7 +117,7 @@ def tabulate(
 def maps(
     bundle: Annotated[Path, typer.Argument(help="Scene bundle.")],
     data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's field was trained on.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="PNG to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="PNG to write.", callback=figure_file)],
     level: Annotated[str | None, typer.Option(help="Quality level; the default one if not given.")] = None,
     emitters: Annotated[int, typer.Option(min=1, max=8, help="How many emitters to map.")] = 3,
     spacing_m: Annotated[float, typer.Option(min=0.05, help="Between the cells of a map.")] = 0.25,
@@ -124,7 +131,6 @@ def maps(
     from training.evaluation.held_out import open_held_out
     from training.evaluation.maps import draw_maps, map_emitters
 
-    require_figure(output, "--output")
     console = Console(stderr=True)
     field = Levels.load(Bundle.load(bundle)).choose(level)
     with open_held_out(data) as held_out:
@@ -147,7 +153,9 @@ def probe(
     data: Annotated[Path, typer.Argument(help="Dataset folder the bundle's field was trained on.")],
     field: Annotated[str | None, typer.Option(help="Field of the bundle; the default level's if not given.")] = None,
     emitters: Annotated[int | None, typer.Option(min=1, help="Probes to draw as emitters; all if not given.")] = None,
-    figure: Annotated[Path | None, typer.Option(help="Draw true and decoded distances to this PNG.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw true and decoded distances to this PNG.", callback=figure_file)
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -160,8 +168,6 @@ def probe(
     from training.evaluation.probe_figure import draw_probe
     from training.probe import probe as probe_field
 
-    if figure is not None:
-        require_figure(figure, "--figure")
     console = Console(stderr=True)
     with open_held_out(data) as held_out:
         probing = probe_field(

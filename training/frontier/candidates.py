@@ -52,6 +52,10 @@ def candidates(
     swept = set(fields) if phases_of is None else set(phases_of)
     if unknown := sorted((swept | reused) - {*fields, NONE}):
         raise BundleError(bundle.folder, "fields", f"there is no {unknown[0]!r}, only {', '.join(fields)}")
+    for named in (swept, reused):
+        if NONE in named and len(named) > 1:
+            other = min(named - {NONE})
+            raise BundleError(bundle.folder, "fields", f"{NONE!r} and {other!r} contradict each other: leave one out")
     levels = [level for name, file in fields.items() for level in _levels(bundle.manifest, name, file, name in swept)]
     return [*levels, *(_reusing(name, reuse) for name in fields if name in reused for reuse in REUSES)]
 

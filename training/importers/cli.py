@@ -15,8 +15,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from server.core.command_line import StrictTyper
-from server.core.files import require_writable_folder
+from server.core.command_line import StrictTyper, writable_folder
 from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 from training.importers.receivers import Receivers
 from training.options import Json
@@ -41,7 +40,7 @@ class Axis(StrEnum):
 
 
 Source = Annotated[Path, typer.Argument(help="Folder to read.")]
-Output = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
+Output = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)]
 HeldOut = Annotated[
     float, typer.Option("--held-out", min=0.0, max=0.9, help="Share of pairs that training never sees.")
 ]
@@ -231,7 +230,6 @@ def _import(
 
     if not source.exists():
         raise SourceError(source, "source", "no such file or folder")
-    require_writable_folder(output, "--output")
     console = Console(stderr=True)
 
     def tracked(items: Sequence[_T]) -> Iterable[_T]:

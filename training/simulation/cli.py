@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from server.errors import NafirError
 from training.options import Seed
 
 if TYPE_CHECKING:
@@ -73,6 +74,8 @@ def _named(effects: str) -> dict[str, bool]:
         if name not in list(SimulatedEffect) or state not in {"on", "off"}:
             known = ", ".join(SimulatedEffect)
             raise typer.BadParameter(f"{part!r}: NAME=on or NAME=off, of {known}", param_hint="--effects")
+        if name in named:
+            raise NafirError(f"--effects: {name} is there twice: give it once")
         named[name] = state == "on"
     return named
 
