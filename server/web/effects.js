@@ -131,5 +131,10 @@ class Row {
 
   rest() {
     this.#switch.disabled = true;
+    this.root.classList.remove("on");
+    this.#bar.style.transform = "scaleX(0)";
+    this.#cost.textContent = "";
+    this.#reason.textContent = "–";
+    this.#undo.hidden = true;
   }
 }

@@ -177,7 +177,15 @@ def test_a_lost_connection_is_taken_up_again(browser):
     with serving(port) as url:
         page = open_page(context, url)
         start(page)
+        page.wait_for_function("nafir.state().effects !== null")
+        page.wait_for_function("document.getElementById('buffer').textContent !== '–'")
+        assert set(page.locator("#effects .reason").all_inner_texts()) != {"–"}
     page.wait_for_function("nafir.state().connection === 'waiting'")
+    for figure in ("latency", "latency-reverberation", "part-server", "buffer", "field-cost", "level", "effects-cost"):
+        assert page.inner_text(f"#{figure}") == "–", figure
+    assert page.locator(".meter output").all_inner_texts() == ["–", "–"]
+    assert set(page.locator("#effects .reason").all_inner_texts()) == {"–"}
+    assert "".join(page.locator("#effects .cost").all_inner_texts()) == ""
     with serving(port):
         page.wait_for_function("nafir.state().connection === 'live'", timeout=20_000)
         page.evaluate("nafir.setListener({ yaw: 1 })")
