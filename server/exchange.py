@@ -112,6 +112,7 @@ EXCHANGE: Final[tuple[Step, ...]] = (
             ir_samples=24_000,
             hrtf="kemar",
             level="fine",
+            max_emitters=16,
         ),
     ),
     Step(

@@ -7,7 +7,8 @@ from pydantic import BaseModel, ConfigDict
 
 from server.acoustics.audibility import THRESHOLDS
 from server.field.levels import Levels
-from server.scene.manifest import Phase, QualityLevel, Reuse
+from server.scene.level_titles import LevelOfField, level_titles
+from server.scene.manifest import FieldFile, Phase, QualityLevel, Reuse
 
 _RELATIVE = frozenset({"edt"})
 """Metrics whose threshold is a share of what is there, which means over pairs no longer tell."""
@@ -19,7 +20,7 @@ class _Document(BaseModel):
 
 class LevelPoint(_Document):
     """One quality level, None where nothing was measured; one that is not `is_offered` was worth its time when it was
-    measured, and cannot be asked for.
+    measured, and cannot be asked for. Requests and messages call it by its `name`; `title` is for people.
 
     Milliseconds are what a pose takes on one core until its binaural impulse response is ready to be convolved:
     `ms_mean`, `ms_p50` and `ms_p99` over a walk, and `ms_miss` for a pose that finds nothing kept, on `measured_on`,
@@ -36,6 +37,7 @@ class LevelPoint(_Document):
     """
 
     name: str
+    title: str
     is_offered: bool
     ms_mean: float | None
     ms_p50: float | None
@@ -61,18 +63,12 @@ class LevelPoint(_Document):
     shared_tail: bool
 
     @classmethod
-    def of(
-        cls,
-        level: QualityLevel,
-        *,
-        architecture: str | None,
-        rank: int | None,
-        ms_here: float | None = None,
-        is_offered: bool = True,
-    ) -> Self:
+    def of(cls, of: LevelOfField, title: str, *, ms_here: float | None = None, is_offered: bool = True) -> Self:
+        level = of.level
         cost, accuracy = level.cost, level.accuracy
         return cls(
             name=level.name,
+            title=title,
             is_offered=is_offered,
             ms_mean=cost and cost.ms_mean,
             ms_p50=cost and cost.ms_p50,
@@ -89,8 +85,8 @@ class LevelPoint(_Document):
             yaws=accuracy and accuracy.yaws,
             audible=accuracy and mean_jnd(accuracy.errors),
             audible_floor=accuracy and mean_jnd(accuracy.floor),
-            architecture=architecture,
-            rank=rank,
+            architecture=of.architecture,
+            rank=of.rank,
             phase=level.phase,
             frames=level.frames,
             reuse=level.reuse,
@@ -110,24 +106,19 @@ class Frontier(_Document):
     @classmethod
     def of(cls, levels: Levels, ms_here: Mapping[str, float]) -> Self:
         """`ms_here` by level, as far as it was measured."""
-        fields = levels.bundle.manifest.fields
-        points = []
-        for name in levels.names:
-            level = levels[name].level
-            file = fields.get(level.field)
-            points.append(
-                LevelPoint.of(
-                    level,
-                    architecture=None if file is None else file.architecture,
-                    rank=None if file is None else file.rank,
-                    ms_here=ms_here.get(name),
-                )
-            )
-        points += [
-            LevelPoint.of(point.level, architecture=point.architecture, rank=point.rank, is_offered=False)
-            for point in levels.bundle.manifest.frontier
-        ]
+        manifest = levels.bundle.manifest
+        offered = [_of_field(levels[name].level, manifest.fields) for name in levels.names]
+        measured = [LevelOfField(point.level, point.architecture, point.rank) for point in manifest.frontier]
+        # What is only measured takes no short title from what can be chosen.
+        titles = level_titles([*offered, *measured]) | level_titles(offered)
+        points = [LevelPoint.of(each, titles[each.name], ms_here=ms_here.get(each.name)) for each in offered]
+        points += [LevelPoint.of(each, titles[each.name], is_offered=False) for each in measured]
         return cls(scene=levels.bundle.id, default=levels.default.level.name, levels=tuple(points))
+
+
+def _of_field(level: QualityLevel, fields: Mapping[str, FieldFile]) -> LevelOfField:
+    file = fields.get(level.field)
+    return LevelOfField(level, None, None) if file is None else LevelOfField(level, file.architecture, file.rank)
 
 
 def mean_jnd(errors: Mapping[str, float]) -> float | None:

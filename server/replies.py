@@ -49,7 +49,8 @@ class SceneDescription(Message):
 
 class Welcome(Message):
     """Answer to a good hello. `window` is how many blocks may be unacknowledged before the server skips ahead. `level`
-    is the quality level heard at first."""
+    is the quality level heard at first. `max_emitters` is how many emitters the stream may have at once; servers up to
+    0.1 do not say."""
 
     type: Literal["welcome"] = "welcome"
     protocol: Literal[2] = PROTOCOL
@@ -64,6 +65,7 @@ class Welcome(Message):
     ir_samples: int
     hrtf: str
     level: str
+    max_emitters: int | None = None
 
 
 class EmitterAdded(Message):

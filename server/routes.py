@@ -99,7 +99,10 @@ def asyncapi() -> Response:
 
 @api.get("/scenes")
 async def scenes(request: Request) -> dict[str, Any]:
-    return {"scenes": [describe_scene(levels).model_dump() for levels in _host(request).scenes.values()]}
+    """What can be heard, and how many emitters a stream may have at once."""
+    host = _host(request)
+    listed = [describe_scene(levels).model_dump() for levels in host.scenes.values()]
+    return {"scenes": listed, "max_emitters": host.settings.max_emitters}
 
 
 @api.get("/scenes/{scene}")

@@ -240,6 +240,7 @@ class Connection:
                 ir_samples=field.ir_samples,
                 hrtf=hrtf,
                 level=ladder.rung.level,
+                max_emitters=self._host.settings.max_emitters,
             )
         )
         return Stream(

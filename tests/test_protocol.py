@@ -125,8 +125,28 @@ def test_a_welcome_with_its_scene_survives_the_wire(field):
         ir_samples=4_000,
         hrtf="kemar",
         level="standard",
+        max_emitters=16,
     )
     assert parse_server_message(welcome.serialize()) == welcome
+
+
+def test_a_welcome_of_a_server_that_does_not_tell_how_many_emitters_it_takes_is_understood(field):
+    welcome = Welcome(
+        session="5e",
+        scene=describe_scene(Levels([field])),
+        sample_rate=24_000,
+        block_size=256,
+        channels=2,
+        encoding="f32",
+        buffer_blocks=8,
+        window=40,
+        ir_samples=4_000,
+        hrtf="kemar",
+        level="standard",
+    )
+    said = json.loads(welcome.serialize())
+    del said["max_emitters"]
+    assert parse_server_message(json.dumps(said)) == welcome
 
 
 def test_hello_as_a_person_would_type_it():

@@ -87,7 +87,9 @@ def test_a_failing_warm_up_leaves_the_server_live_and_not_ready(field, hrtfs, ca
 
 
 def test_scenes(client):
-    (scene,) = client.get("/v1/scenes").json()["scenes"]
+    listed = client.get("/v1/scenes").json()
+    (scene,) = listed["scenes"]
+    assert listed["max_emitters"] == Settings().max_emitters
     assert scene == client.get("/v1/scenes/flat").json()
     assert (scene["id"], scene["sample_rate"], scene["height_m"]) == ("flat", 24_000, 2.8)
     assert scene["bounds"] == {"minimum": [0.3, 0.3, 0.5], "maximum": [7.7, 4.7, 2.3]}

@@ -81,6 +81,7 @@ def ears(client):
 def test_from_hello_to_sound(ears):
     assert (ears.welcome.sample_rate, ears.welcome.block_size, ears.welcome.channels) == (24_000, 256, 2)
     assert ears.welcome.scene.id == "flat"
+    assert ears.welcome.max_emitters == Settings().max_emitters
     first = ears.until(AudioBlock)
     assert (first.sequence, first.sample_clock, first.samples.shape) == (0, 0, (2, 256))
     # Half a metre away, so that the direct sound arrives within the first block.

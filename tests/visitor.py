@@ -4,6 +4,7 @@ Levels are in decibels relative to full scale. Modules that visit take the fixtu
 """
 
 import contextlib
+import os
 import shutil
 import socket
 import subprocess
@@ -11,7 +12,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pytest
@@ -40,17 +41,18 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def serving(port: int, *options: str) -> Iterator[str]:
-    """A server of its own process, ready to stream."""
+def serving(port: int, *options: str, settings: Mapping[str, str] | None = None) -> Iterator[str]:
+    """A server of its own process, ready to stream; `settings` are environment variables."""
     command = [sys.executable, "-c", "from server.cli import main; main()", "serve", "--port", str(port), *options]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, **(settings or {})})
     url = f"http://127.0.0.1:{port}"
     try:
         deadline = time.monotonic() + 180  # the first time ever, everything is compiled
         while True:
             assert process.poll() is None, "the server ended before it was ready"
             assert time.monotonic() < deadline, "the server was not ready within three minutes"
-            with contextlib.suppress(urllib.error.URLError, ConnectionError):
+            # A server that compiles may be slow to answer, too.
+            with contextlib.suppress(urllib.error.URLError, ConnectionError, TimeoutError):
                 urllib.request.urlopen(f"{url}/readyz", timeout=5).close()
                 break
             time.sleep(0.1)

@@ -8,6 +8,7 @@ const TITLES = {
   per_source_tail: "own late tails",
 };
 const titleOf = (name) => TITLES[name] ?? name.replaceAll("_", " ");
+const unbroken = (text) => text.replace(/(?<=\d) (?=\S)/g, "\u00a0"); // a number stays with its unit
 const microseconds = (value) => `${value < 10 ? value.toPrecision(2) : Math.round(value)} µs`;
 
 function element(tag, className, text) {
@@ -124,11 +125,16 @@ class Row {
     this.root.classList.toggle("overridden", overridden);
     this.#bar.style.transform = `scaleX(${Math.min(1, change / SHOWN_JND).toFixed(3)})`;
     this.#cost.textContent = cost === null || cost < 0.05 ? "" : microseconds(cost);
-    this.#reason.textContent = on > 0 && on < count ? `${reason} (${on} of ${count} sources)` : reason;
+    this.#reason.textContent = unbroken(on > 0 && on < count ? `${reason} (${on} of ${count} sources)` : reason);
     this.#undo.hidden = !overridden;
   }
 
   rest() {
     this.#switch.disabled = true;
+    this.root.classList.remove("on");
+    this.#bar.style.transform = "scaleX(0)";
+    this.#cost.textContent = "";
+    this.#reason.textContent = "–";
+    this.#undo.hidden = true;
   }
 }

@@ -4,6 +4,7 @@
 // metres or null).
 
 import { View } from "./paper.js";
+import { sourceColour } from "./palette.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -131,6 +132,7 @@ export class FloorPlan extends EventTarget {
       element("circle", { class: "disc", r: 14 }),
       text(id, { class: "letter", "text-anchor": "middle", dy: "0.36em" }),
     );
+    group.style.setProperty("--source", sourceColour(id));
     group.addEventListener("pointerdown", (event) => this.#grab(event));
     return group;
   }

@@ -35,7 +35,7 @@ export class Frontier extends EventTarget {
   #changes;
   #levels = [];
   #heard = null;
-  #told = []; // {at, text}, newest first
+  #told = []; // {at, level, text}, newest first
 
   /** `root` is the section; emits "chosen" with a level's name, or "auto". */
   constructor(root) {
@@ -59,10 +59,12 @@ export class Frontier extends EventTarget {
     this.#levels = levels;
     const options = levels.filter(({ is_offered: isOffered }) => isOffered).reverse().map((level) => {
       const cost = hereOf(level) ?? level.ms_mean;
-      return new Option(cost === null ? level.name : `${level.name}, ${milliseconds(cost)}`, level.name);
+      const option = new Option(cost === null ? level.title : `${level.title}, ${milliseconds(cost)}`, level.name);
+      option.title = level.name;
+      return option;
     });
     this.#choice.replaceChildren(new Option("Automatic", "auto"), ...options);
-    this.#choice.value = chosen;
+    this.#choice.value = levels.some(({ name }) => name === chosen) ? chosen : "auto";
     this.#choice.disabled = false;
     this.#draw();
   }
@@ -81,11 +83,13 @@ export class Frontier extends EventTarget {
   /** What the server says when it changes what is heard. */
   changed({ level, reason, ir_rate_hz: rateHz }) {
     const pace = rateHz === null ? "" : `, at most ${+rateHz.toFixed(1)} responses a second`;
-    this.#told.unshift({ at: new Date(), text: `${level}${pace}: ${REASONS[reason] ?? reason}` });
+    const title = this.#levels.find(({ name }) => name === level)?.title ?? level;
+    this.#told.unshift({ at: new Date(), level, text: `${title}${pace}: ${REASONS[reason] ?? reason}` });
     this.#told.length = Math.min(this.#told.length, KEPT);
     this.#changes.replaceChildren(
-      ...this.#told.map(({ at, text }) => {
+      ...this.#told.map(({ at, level: name, text }) => {
         const item = document.createElement("li");
+        item.title = name;
         const time = document.createElement("time");
         time.textContent = at.toLocaleTimeString([], { hour12: false });
         item.append(time, ` ${text}`);
@@ -102,10 +106,11 @@ export class Frontier extends EventTarget {
 
   #draw() {
     const heard = this.#levels.find(({ name }) => name === this.#heard);
-    this.#name.textContent = heard ? heard.name : "–";
+    this.#name.textContent = heard ? heard.title : "–";
+    this.#name.title = heard ? heard.name : "";
     this.#name.classList.toggle("long", this.#name.textContent.length > 16);
     const cost = heard ? hereOf(heard) : null;
-    this.#note.textContent = heard ? (cost === null ? "" : `${milliseconds(cost)} here`) : "once playing";
+    this.#note.textContent = heard ? (cost === null ? "" : `${milliseconds(cost)} here`.replaceAll(" ", "\u00a0")) : "once playing";
     this.#chart.replaceChildren();
     const placed = this.#levels.filter(isPlaced);
     this.#chart.parentElement.hidden = placed.length === 0;
@@ -165,7 +170,7 @@ export class Frontier extends EventTarget {
     const steps = Object.values(level.steps ?? {});
     const step = steps.length === 0 ? "" : `, steps of up to ${Math.max(...steps).toFixed(1)} JND`;
     const unoffered = level.is_offered ? "" : ", measured but not offered";
-    draw("title", {}, mark, `${level.name}: error ${level.audible.toFixed(2)} JND${floor}${step}${bundled}${here}${unoffered}`);
+    draw("title", {}, mark, `${level.title} (${level.name}): error ${level.audible.toFixed(2)} JND${floor}${step}${bundled}${here}${unoffered}`);
     if (!level.is_offered) return;
     mark.addEventListener("click", () => this.#choose(level.name));
   }

@@ -1,7 +1,7 @@
 // window.nafir: what a test or a curious person may do with the page from outside.
 //
 //   await nafir.ready                         the scene is on the page and play can be pressed
-//   nafir.state()                             {connection, playing, level, effects, listener, emitters, latency, reverberationLatency, poses}
+//   nafir.state()                             {connection, playing, level, head, effects, listener, emitters, latency, reverberationLatency, poses}
 //   await nafir.setListener({x, y, z, yaw})   metres and radians, each optional; resolves when it is heard (at once while paused)
 //   await nafir.setEmitter("A", {x, y, z})    likewise
 //   await nafir.capture(seconds)              {sampleRate, left, right}: the last seconds played (12 at most), before the volume
@@ -35,6 +35,7 @@ export function exposeHook(page) {
       connection: page.connection,
       playing: page.playing,
       level: page.level,
+      head: page.head,
       effects: structuredClone(page.rendered),
       listener: structuredClone(page.world.listener),
       emitters: structuredClone([...page.world.emitters.values()]),

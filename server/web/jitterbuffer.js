@@ -7,10 +7,10 @@
 const QUANTUM = 128; // of the Web Audio API
 const RESERVE = 64; // kept back so that a buffer running dry ends in a fade and not in a click
 const WINDOW_S = 1; // over which the lowest fill is taken
-const MEMORY = 15; // windows without a dip before the buffer is shortened a little: jitter that comes rarely still comes
-const SOON = 2; // windows before it is shortened of much more than that, as what came in a burst after a dropout
+const MEMORY_S = 15; // without a dip before the buffer is shortened a little: jitter that comes rarely still comes
+const SOON_S = 2; // before it is shortened of much more than that, as of what came in a burst after a dropout
 const MUCH_S = 0.025;
-const AGAIN_S = 0.3; // after a splice that did not suffice
+const AGAIN_S = 0.2; // after a splice that did not suffice
 const JUMP_S = 0.15; // above the headroom, as after a burst: half of it is skipped at once
 const HEADROOM_S = 0.05; // lowest fill aimed for on a quiet network
 const START_S = 0.05; // more than that at first: page, server and sound card are busiest while they start
@@ -21,6 +21,7 @@ const SLACK_S = 0.012; // above the headroom before the buffer is shortened
 const GROWTH_S = 0.015; // more headroom after each dropout
 const SHORTEST_LAG = 48;
 const LONGEST_LAG = 288;
+const INAUDIBLE = 1e-4; // sum of squares over a quantum's ears: 60 dB below full scale
 
 const raisedCosine = (length) => Float32Array.from({ length }, (_, i) => 0.5 - 0.5 * Math.cos((Math.PI * (i + 0.5)) / length));
 const CROSSFADE = raisedCosine(QUANTUM);
@@ -38,6 +39,7 @@ export class JitterBuffer {
 
   /** Forgets the audio and starts filling again; counters stay. */
   reset() {
+    this.ending = this.playing && this.fill >= RESERVE ? this.#faded() : null;
     this.read = 0;
     this.written = 0;
     this.playing = false;
@@ -49,12 +51,21 @@ export class JitterBuffer {
     this.marks = []; // {at, poseId, reverberationPoseId, fill}: where a newer pose becomes audible
     this.newestPose = -1;
     this.newestReverberationPose = -1;
-    this.dips = []; // lowest fill of each of the last windows since playing began
+    this.dips = []; // {lowest, seconds} of each window of the last MEMORY_S since playing began
     this.#openWindow();
+  }
+
+  /** What comes next, on its way out: a stream that ends while it is heard would end in a click. */
+  #faded() {
+    const ears = [new Float32Array(RESERVE), new Float32Array(RESERVE)];
+    this.#copy(...ears, RESERVE);
+    this.#ramp(...ears, FADE, 0, true);
+    return ears;
   }
 
   #openWindow(seconds = WINDOW_S) {
     this.lowest = Infinity;
+    this.windowS = seconds;
     this.windowLeft = Math.round(seconds * this.sampleRate);
   }
 
@@ -119,6 +130,8 @@ export class JitterBuffer {
     if (!this.playing) {
       left.fill(0);
       right.fill(0);
+      this.ending?.forEach((ear, index) => [left, right][index].set(ear));
+      this.ending = null;
       return [];
     }
     if (this.fill < frames + RESERVE) return this.#runDry(left, right, frames);
@@ -165,35 +178,43 @@ export class JitterBuffer {
   /** Samples to skip (positive) or repeat (negative) now that a window has ended; 0 leaves the buffer alone. */
   #correction() {
     const { lowest } = this;
-    this.#remember(lowest);
+    this.#remember();
     this.#openWindow();
     // Headroom won by a dropout is given back slowly, that of the start at once.
-    if (this.starting > 0 && --this.starting === 0) this.#settle();
+    if (this.starting > 0 && --this.starting === 0) this.headroomS -= START_S;
     this.headroomS = Math.max(HEADROOM_S, this.headroomS - 0.0002);
     const headroom = this.headroomS * this.sampleRate;
     if (lowest < headroom / 2) return this.#bestLag(-1, headroom);
     if (lowest > headroom + JUMP_S * this.sampleRate) return Math.round((lowest - headroom) / 2);
     const slack = SLACK_S * this.sampleRate;
-    const excess = Math.min(lowest, ...this.dips) - headroom;
-    const isLasting = this.dips.length >= (excess > MUCH_S * this.sampleRate ? SOON : MEMORY);
-    this.isShortening = excess > slack && (this.isShortening || isLasting);
-    return this.isShortening ? this.#bestLag(1, excess - slack / 2) : 0;
+    const recent = this.#lowestOf(SOON_S) - headroom;
+    this.isShortening = recent > (this.isShortening ? slack : MUCH_S * this.sampleRate);
+    return this.isShortening || this.#lowestOf(MEMORY_S) - headroom > slack ? this.#bestLag(1, recent - slack / 2) : 0;
   }
 
-  /** The start is over, and what dipped meanwhile says nothing of what is to come. */
-  #settle() {
-    this.headroomS -= START_S;
-    this.dips = [];
+  #remember() {
+    this.dips.push({ lowest: this.lowest, seconds: this.windowS });
+    while (this.#rememberedS - this.dips[0].seconds >= MEMORY_S) this.dips.shift();
   }
 
-  #remember(dip) {
-    this.dips.push(dip);
-    if (this.dips.length > MEMORY) this.dips.shift();
+  get #rememberedS() {
+    return this.dips.reduce((sum, { seconds }) => sum + seconds, 0);
   }
 
+  /** Lowest fill of the last seconds, in samples; -Infinity before so many have been played. */
+  #lowestOf(seconds) {
+    let lowest = Infinity;
+    let covered = 0;
+    for (let index = this.dips.length - 1; index >= 0 && covered < seconds - 1e-6; index--) {
+      lowest = Math.min(lowest, this.dips[index].lowest);
+      covered += this.dips[index].seconds;
+    }
+    return covered < seconds - 1e-6 ? -Infinity : lowest;
+  }
+
+  /** The longest lag of those at which the signal matches best. */
   #bestLag(sign, limit) {
-    let best = 0;
-    let least = Infinity;
+    const differences = [];
     for (let lag = SHORTEST_LAG; lag <= Math.min(LONGEST_LAG, limit); lag++) {
       const shift = sign * lag;
       if (shift > 0 && this.fill < QUANTUM + shift + RESERVE) break;
@@ -204,9 +225,11 @@ export class JitterBuffer {
         const there = (this.read + i + shift) % this.capacity;
         difference += (this.left[here] - this.left[there]) ** 2 + (this.right[here] - this.right[there]) ** 2;
       }
-      if (difference < least) [least, best] = [difference, shift];
+      differences.push(difference);
     }
-    return best;
+    const enough = 1.1 * Math.min(...differences) + INAUDIBLE;
+    const at = differences.findLastIndex((difference) => difference <= enough);
+    return at < 0 ? 0 : sign * (SHORTEST_LAG + at);
   }
 
   #splice(left, right, lag) {
@@ -218,7 +241,7 @@ export class JitterBuffer {
     }
     this.read += QUANTUM + lag;
     this.counters.splices += 1;
-    this.dips = this.dips.map((dip) => dip - lag);
+    this.dips = this.dips.map(({ lowest, seconds }) => ({ lowest: lowest - lag, seconds }));
     this.#openWindow(AGAIN_S);
   }
 

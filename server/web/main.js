@@ -4,6 +4,7 @@ import { FloorPlan } from "./floorplan.js";
 import { Effects } from "./effects.js";
 import { Frontier } from "./frontier.js";
 import { PoseLedger } from "./latency.js";
+import { Heads } from "./heads.js";
 import { Legend } from "./legend.js";
 import { LoudnessField, combine, parseGrid, raised, scaleOf } from "./loudness.js";
 import { Notices } from "./notices.js";
@@ -12,7 +13,7 @@ import { onThemeChange } from "./palette.js";
 import { Panel } from "./panel.js";
 import { Paper } from "./paper.js";
 import { Player } from "./player.js";
-import { fetchClips, fetchFrontier, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
+import { fetchClips, fetchFrontier, fetchHeads, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
 import { Sources } from "./sources.js";
 import { Walking } from "./walking.js";
 import { World } from "./world.js";
@@ -32,8 +33,9 @@ class Page {
     this.legend = new Legend(find("legend"));
     this.frontier = new Frontier(find("quality"));
     this.effects = new Effects(find("rendered"));
+    this.heads = new Heads(find("head"));
     this.rendered = null; // the server's plan of effects; null while there is no stream
-    this.level = null; // what is heard; null while there is no stream
+    this.level = this.head = null; // what is heard, and through whose ears; null while there is no stream
     this.player = new Player();
     this.ledger = new PoseLedger();
     this.reverberationLedger = new PoseLedger();
@@ -51,7 +53,7 @@ class Page {
 
   async open() {
     this.#setConnection("connecting", "Loading");
-    const scenes = await this.#untilAnswered(fetchScenes);
+    const { scenes, max_emitters: mostEmitters } = await this.#untilAnswered(fetchScenes);
     const wanted = new URLSearchParams(location.search).get("scene");
     const chosen = scenes.find(({ id }) => id === wanted) ?? scenes[0];
     if (!chosen) {
@@ -63,7 +65,8 @@ class Page {
     const scene = await this.#untilAnswered(() => fetchScene(chosen.id));
     this.#describe(scene);
     const clips = (await fetchClips().catch(() => null)) ?? [];
-    this.#setUp(scene, clips);
+    this.#setUp(scene, { clips, mostEmitters });
+    this.#fill("heads", fetchHeads, (heads) => this.heads.show(heads));
     if (clips.length === 0) this.#fill("clips", fetchClips, (found) => this.#gotClips(found));
     this.#fill("frontier", () => fetchFrontier(scene.id), (frontier) => this.frontier.show(frontier));
     this.#setConnection("idle", "Ready");
@@ -123,15 +126,15 @@ class Page {
     document.title = `${scene.name} · Nafir`;
   }
 
-  #setUp(scene, clips) {
+  #setUp(scene, { clips, mostEmitters }) {
     this.scene = scene;
     this.clips = clips;
-    this.world = new World(scene);
+    this.world = new World(scene, { mostEmitters });
     if (clips.length > 0) this.world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });
     else this.notices.show("clips", "The server has no clip to play.", { lasting: true });
     this.paper = new Paper(find("paper"), scene);
     this.plan = new FloorPlan({ svg: find("marks"), paper: this.paper, world: this.world });
-    this.sources = new Sources({ world: this.world, clips, list: find("sources"), add: find("add-source") });
+    this.sources = new Sources({ world: this.world, clips, list: find("sources"), add: find("add-source"), limit: find("source-limit") });
     new Walking(this.world, { focusedEmitter: () => this.plan.focusedEmitter, dropped: () => this.map() });
     this.#listenToWorld();
     this.#listenToSound();
@@ -193,7 +196,12 @@ class Page {
         this.rendered = detail;
         this.effects.show(detail);
       },
-      refused: ({ code, message }) => this.notices.show(code, message),
+      refused: ({ code, message }) => {
+        this.notices.show(code, message);
+        // A server that was started anew may offer other things than the page knows of.
+        if (code === "unknown_hrtf") fetchHeads().then((heads) => this.heads.show(heads), () => {});
+        if (code === "unknown_level") fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
+      },
     };
     this.worker.onmessage = ({ data: { type, detail } }) => handlers[type](detail);
     this.worker.onerror = (event) => this.notices.show("stream", event.message || "The stream could not be started.");
@@ -202,7 +210,11 @@ class Page {
   #listenToControls() {
     find("play").addEventListener("click", () => (this.playing ? this.pause() : this.play()));
     this.frontier.addEventListener("chosen", ({ detail }) => this.#tell("level", { name: detail }));
-    this.effects.addEventListener("wished", ({ detail }) => this.#tell("effects", detail));
+    this.effects.addEventListener("wished", ({ detail }) => {
+      this.heads.used = this.effects.wishes.output !== "mono";
+      this.#tell("effects", detail);
+    });
+    this.heads.addEventListener("chosen", ({ detail }) => this.#tell("head", { name: detail }));
     find("volume").addEventListener("input", ({ target }) => this.#setVolume(target.valueAsNumber));
     this.#setVolume(find("volume").valueAsNumber);
     onThemeChange(() => {
@@ -245,7 +257,13 @@ class Page {
     }
     if (!this.playing) return;
     this.notices.clear("audio");
-    const hello = { scene: this.scene.id, sampleRate: this.scene.sample_rate, level: this.frontier.chosen, ...this.effects.wishes };
+    const hello = {
+      scene: this.scene.id,
+      sampleRate: this.scene.sample_rate,
+      level: this.frontier.chosen,
+      head: this.heads.chosen,
+      ...this.effects.wishes,
+    };
     const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
     this.#tell("open", { url: streamUrl(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
   }
@@ -263,7 +281,7 @@ class Page {
   /** No figure stays that is no longer so. */
   #blank() {
     this.panel.rest();
-    this.frontier.heard = this.level = null;
+    this.frontier.heard = this.level = this.head = null;
     this.rendered = null;
     this.effects.rest();
     this.plan.glow(0, 0);
@@ -286,10 +304,15 @@ class Page {
   #streamState(detail) {
     if (!this.playing) return;
     const { state, attempt, retryMs, reason } = detail;
-    if (state === "connecting" && attempt === 0) this.#setConnection("connecting", "Connecting");
-    else if (state === "live") {
+    if (state === "connecting" && attempt === 0) {
+      this.#setConnection("connecting", "Connecting");
+      this.#blank();
+    } else if (state === "live") {
       this.#setConnection("live", "Live");
-      this.frontier.heard = this.level = detail.welcome.level;
+      const { welcome } = detail;
+      this.frontier.heard = this.level = welcome.level;
+      this.head = welcome.hrtf;
+      this.world.mostEmitters = welcome.max_emitters;
       // A page opened while the server warmed up does not know yet what levels cost there.
       fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
       this.notices.clear("connection");
@@ -302,7 +325,7 @@ class Page {
       this.notices.show("connection", reason, { lasting: true });
       this.#setPlaying(false);
       this.player.pause();
-      this.panel.rest();
+      this.#blank();
       this.#setConnection("refused", "Refused");
     }
   }

@@ -23,3 +23,11 @@ export function loudnessRamp() {
 export function onThemeChange(changed) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", changed);
 }
+
+const SOURCES = 8; // colours of the style sheet, --source-1 and on
+
+/** CSS colour of the source with this place in the alphabet of ids: neighbours differ. */
+export const sourceColour = (id) => {
+  const ordinal = [...id].reduce((sum, letter) => 26 * sum + letter.charCodeAt(0) - 64, 0);
+  return `var(--source-${((ordinal - 1) % SOURCES) + 1})`;
+};

@@ -1,4 +1,4 @@
-// HTTP side of the server: scenes, clips and loudness maps. Problem bodies become RequestError.
+// HTTP side of the server: scenes, clips, heads and loudness maps. Problem bodies become RequestError.
 
 const endpoint = (path) => new URL(`v1/${path}`, document.baseURI);
 
@@ -26,10 +26,11 @@ async function getJson(url, options) {
   });
 }
 
-export const fetchScenes = async () => (await getJson(endpoint("scenes"))).scenes;
+export const fetchScenes = () => getJson(endpoint("scenes"));
 export const fetchScene = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}`));
 export const fetchFrontier = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}/frontier`));
 export const fetchClips = async () => (await getJson(endpoint("clips"))).clips;
+export const fetchHeads = () => getJson(endpoint("hrtfs"));
 
 export function fetchLoudness(scene, { position, heightM, signal }) {
   const url = endpoint(`scenes/${encodeURIComponent(scene)}/loudness`);

@@ -2,7 +2,7 @@
 // remove one.
 
 import { isVisible } from "./geometry.js";
-import { MOST_EMITTERS } from "./world.js";
+import { sourceColour } from "./palette.js";
 
 const AHEAD = Math.PI / 12;
 const GAIN_DB = { min: -24, max: 12 };
@@ -15,20 +15,32 @@ function describe({ distanceM, bearing }, visible) {
   return `${distanceM.toFixed(1)} m, ${direction}${visible ? "" : ", out of sight"}`;
 }
 
+/** Not by `disabled`, which takes the keyboard away and lets no one ask why. */
+const disable = (button, isDisabled) => button.setAttribute("aria-disabled", isDisabled);
+
 export class Sources {
   #world;
   #clips;
   #list;
   #add;
+  #limit;
   #rows = new Map(); // id -> {row, select, remove, gain, place}
 
-  constructor({ world, clips, list, add }) {
+  /** `limit` says why none can be added. */
+  constructor({ world, clips, list, add, limit }) {
     this.#world = world;
     this.#clips = clips;
     this.#list = list;
     this.#add = add;
-    add.onclick = () => world.addEmitter({ clip: this.nextClip() });
+    this.#limit = limit;
+    add.disabled = false;
+    add.onclick = () => {
+      if (this.#why()) return;
+      const { id } = world.addEmitter({ clip: this.nextClip() });
+      this.#rows.get(id).row.scrollIntoView({ block: "nearest" });
+    };
     world.addEventListener("emitters", () => this.#sync());
+    world.addEventListener("limit", () => this.#sync());
     world.addEventListener("emitter", () => this.#describe());
     world.addEventListener("listener", () => this.#describe());
     list.replaceChildren();
@@ -46,9 +58,25 @@ export class Sources {
     return (this.#clips.find(({ name }) => !played.has(name)) ?? this.#clips[0]).name;
   }
 
+  /** Why no source can be added; empty where one can. */
+  #why() {
+    if (this.#clips.length === 0) return "The server has no clip to play.";
+    const { isFull, mostEmitters: most } = this.#world;
+    return isFull ? `This server plays at most ${most === 1 ? "one source" : `${most} sources`} at once.` : "";
+  }
+
+  /** Removes a source, and leaves the keyboard at the one that takes its place. */
+  #remove(id) {
+    const at = [...this.#rows.keys()].indexOf(id);
+    this.#world.removeEmitter(id);
+    const rows = [...this.#rows.values()];
+    (rows[Math.min(at, rows.length - 1)]?.remove ?? this.#add).focus();
+  }
+
   #build(emitter) {
     const row = document.createElement("li");
     row.dataset.source = emitter.id;
+    row.style.setProperty("--source", sourceColour(emitter.id));
     const badge = document.createElement("span");
     badge.className = "badge";
     badge.textContent = emitter.id;
@@ -68,7 +96,7 @@ export class Sources {
     remove.className = "remove";
     remove.textContent = "×";
     remove.setAttribute("aria-label", `Remove source ${emitter.id}`);
-    remove.addEventListener("click", () => this.#world.removeEmitter(emitter.id));
+    remove.addEventListener("click", () => this.#world.emitters.size > 1 && this.#remove(emitter.id));
     const gain = document.createElement("input");
     Object.assign(gain, { type: "range", className: "gain", step: 1, ...GAIN_DB, value: emitter.gainDb });
     gain.setAttribute("aria-label", `Gain of source ${emitter.id}, decibels`);
@@ -90,9 +118,12 @@ export class Sources {
     for (const emitter of emitters.values()) {
       if (!this.#rows.has(emitter.id)) this.#rows.set(emitter.id, this.#build(emitter));
     }
-    for (const { remove } of this.#rows.values()) remove.hidden = emitters.size < 2;
-    this.#add.disabled = this.#clips.length === 0;
-    this.#add.hidden = emitters.size >= MOST_EMITTERS;
+    for (const [id, { remove }] of this.#rows) {
+      disable(remove, emitters.size < 2);
+      remove.title = emitters.size < 2 ? "The last source stays." : `Remove source ${id}`;
+    }
+    this.#limit.textContent = this.#why();
+    disable(this.#add, this.#limit.textContent !== "");
     this.#describe();
   }
 

@@ -32,7 +32,7 @@ export class Stream {
   #heartbeat = 0;
 
   /**
-   * `hello` is {scene, sampleRate, level, effects, output}; `listeners` are callbacks: block(block), state({state, ...}),
+   * `hello` is {scene, sampleRate, level, effects, output, head}; `listeners` are callbacks: block(block), state({state, ...}),
    * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field}).
    */
   constructor({ url, hello, listener, emitters, listeners }) {
@@ -83,6 +83,15 @@ export class Stream {
     for (const [name, isOn] of Object.entries(wished)) if (isOn === null) delete wished[name];
     this.#hello = { ...this.#hello, effects: wished, output: output ?? this.#hello.output };
     if (this.#welcomed) this.#send(message.setEffects({ effects, output }));
+  }
+
+  /** Another head takes a new stream: the hello alone names it. */
+  setHead(head) {
+    this.#hello = { ...this.#hello, head };
+    clearTimeout(this.#retry);
+    this.#detach();
+    this.#attempt = 0;
+    this.#connect();
   }
 
   close() {

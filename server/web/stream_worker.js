@@ -36,6 +36,7 @@ const commands = {
   emitter: (detail) => stream?.setEmitter(detail),
   remove: ({ id }) => stream?.removeEmitter(id),
   level: ({ name }) => stream?.setLevel(name),
+  head: ({ name }) => stream?.setHead(name),
   effects: (wishes) => stream?.setEffects(wishes),
   close() {
     stream?.close();

@@ -57,8 +57,10 @@ export function parseBlock(buffer) {
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, level, effects, output, listener }) =>
-    JSON.stringify({ type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, listener }),
+  hello: ({ scene, sampleRate, level, effects, output, head, listener }) =>
+    JSON.stringify({
+      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, hrtf: head, listener,
+    }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),
   addEmitter: ({ id, clip, position, gainDb }) => JSON.stringify({ type: "add_emitter", id, clip, position, gain_db: gainDb }),

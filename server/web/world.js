@@ -1,15 +1,21 @@
 // What is in the scene: one listener and a few emitters, always in places where they may stand.
-// Events: "listener", "emitter" (detail: the emitter), "gain" (likewise) and "emitters" (one came or went).
+// Events: "listener", "emitter" (detail: the emitter), "gain" (likewise), "emitters" (one came or went) and "limit" (another number
+// of them may be there).
 
 import { Floor, distance, wrapAngle } from "./geometry.js";
 
-export const MOST_EMITTERS = 2;
 const INSIDE_M = 1e-4;
+const LETTERS = [..."ABCDEFGHIJKLMNOPQRSTUVWXYZ"];
+const IDS = [...LETTERS, ...LETTERS.flatMap((first) => LETTERS.map((second) => first + second))];
 
 export class World extends EventTarget {
-  constructor(scene) {
+  #mostEmitters;
+
+  /** `mostEmitters` is how many the server takes. */
+  constructor(scene, { mostEmitters }) {
     super();
     this.scene = scene;
+    this.#mostEmitters = mostEmitters;
     const { minimum, maximum } = scene.bounds;
     const clearance = scene.walls_known ? undefined : null;
     // Poses travel in single precision, which rounds what lies on the bounds to either side of them.
@@ -57,9 +63,23 @@ export class World extends EventTarget {
     this.#emit("gain", emitter);
   }
 
-  /** Adds an emitter named by the first free letter, by default at the scene's place for it or else where there is most room. */
+  get mostEmitters() {
+    return this.#mostEmitters;
+  }
+
+  set mostEmitters(most) {
+    if (most === this.#mostEmitters) return;
+    this.#mostEmitters = most;
+    this.#emit("limit");
+  }
+
+  get isFull() {
+    return this.emitters.size >= this.#mostEmitters;
+  }
+
+  /** Adds an emitter named by the first free letter, at `position` or else where there is most room. */
   addEmitter({ clip, position }) {
-    const id = ["A", "B", "C", "D"].find((letter) => !this.emitters.has(letter));
+    const id = IDS.find((each) => !this.emitters.has(each));
     const height = this.scene.emitter.position[2];
     const emitter = { id, clip, position: position ? [...position] : [...this.#roomiest(), height], gainDb: 0 };
     this.emitters.set(id, emitter);

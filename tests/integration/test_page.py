@@ -116,7 +116,8 @@ def test_dragging_and_keys_move_what_they_should(page):
     drag(".knob", x - handle_x, y - 80 - handle_y)
     assert page.evaluate("nafir.state().listener.yaw") == pytest.approx(math.pi / 2, abs=0.15)
 
-    with page.expect_response(lambda response: "/loudness" in response.url) as mapped:
+    # A map takes a dozen seconds of a core, behind everything else.
+    with page.expect_response(lambda response: "/loudness" in response.url, timeout=120_000) as mapped:
         drag("[data-emitter=A] .disc", 30, 30)
     assert mapped.value.ok
 
@@ -177,7 +178,15 @@ def test_a_lost_connection_is_taken_up_again(browser):
     with serving(port) as url:
         page = open_page(context, url)
         start(page)
+        page.wait_for_function("nafir.state().effects !== null")
+        page.wait_for_function("document.getElementById('buffer').textContent !== '–'")
+        assert set(page.locator("#effects .reason").all_inner_texts()) != {"–"}
     page.wait_for_function("nafir.state().connection === 'waiting'")
+    for figure in ("latency", "latency-reverberation", "part-server", "buffer", "field-cost", "level", "effects-cost"):
+        assert page.inner_text(f"#{figure}") == "–", figure
+    assert page.locator(".meter output").all_inner_texts() == ["–", "–"]
+    assert set(page.locator("#effects .reason").all_inner_texts()) == {"–"}
+    assert "".join(page.locator("#effects .cost").all_inner_texts()) == ""
     with serving(port):
         page.wait_for_function("nafir.state().connection === 'live'", timeout=20_000)
         page.evaluate("nafir.setListener({ yaw: 1 })")

@@ -51,16 +51,24 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     (measured,) = page.locator("#frontier .measured").all()
     assert measured.get_attribute("data-level") == "near"
     assert boxes[0]["x"] < measured.locator(".dot").bounding_box()["x"] < boxes[1]["x"]
-    options = page.locator("#level-choice option").all_inner_texts()
-    assert [option.split(",")[0] for option in options] == ["Automatic", "fine", "standard", "quick"]
+    options = page.locator("#level-choice option").all()
+    plain = ["Automatic", "Full, fine", "Full, standard", "At most 20 responses a second"]
+    shown = [option.inner_text() for option in options]
+    assert [re.sub(", [^ ]+ ms$", "", text) for text in shown] == plain
+    assert [option.get_attribute("title") for option in options] == [None, "fine", "standard", "quick"]
+    titles = page.locator("#frontier title").all_text_contents()
+    assert any(title.startswith("At most 20 responses a second (quick): error") for title in titles)
 
     start(page)
     page.wait_for_function("nafir.state().level !== null")
     page.select_option("#level-choice", "quick")
     page.wait_for_function("nafir.state().level === 'quick'")
-    assert page.inner_text("#level") == "quick"
+    assert page.inner_text("#level") == "At most 20 responses a second"
+    assert page.get_attribute("#level", "title") == "quick"
     assert page.locator("#frontier .heard").get_attribute("data-level") == "quick"
-    assert re.search(r"^\d\d:\d\d:\d\d ?quick.*: as you chose$", page.inner_text("#level-changes"), re.MULTILINE)
+    change = page.locator("#level-changes li").first
+    assert re.fullmatch(r"\d\d:\d\d:\d\d ?At most 20 responses a second.*: as you chose", change.inner_text())
+    assert change.get_attribute("title") == "quick"
     page.locator("#frontier [data-level=fine] .touch").click()
     page.wait_for_function("nafir.state().level === 'fine'")
     assert page.input_value("#level-choice") == "fine"

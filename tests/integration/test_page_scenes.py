@@ -1,4 +1,4 @@
-"""No part of the page that fails takes the page with it, nor the menu that leads to other scenes."""
+"""Every bundled scene is opened, played and left; no part that fails takes the page, or the way out of it, with it."""
 
 import re
 
@@ -6,7 +6,7 @@ import pytest
 
 from server.scene.bundle import bundled_scenes
 from tests import visitor
-from tests.visitor import start
+from tests.visitor import level_db, listen, start
 
 browser = visitor.browser
 server = visitor.server
@@ -27,6 +27,27 @@ def open_scene(context, server, scene):
     page.goto(f"{server}/?scene={scene}")
     page.evaluate("nafir.ready")
     return page
+
+
+def test_every_bundled_scene_is_opened_played_and_left_by_its_menu(context, server):
+    complaints: list[str] = []
+    context.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    context.on("weberror", lambda error: complaints.append(str(error.error)))
+    page = open_scene(context, server, SCENES[0])
+    for scene, following in zip(SCENES, [*SCENES[1:], SCENES[0]], strict=True):
+        assert page.input_value("#scene-choice") == scene
+        start(page)
+        page.wait_for_function("nafir.state().level !== null && nafir.state().effects !== null")
+        page.wait_for_timeout(500)
+        for ear_db in level_db(listen(page, seconds=1.5)):
+            assert -70 < ear_db < 0, scene
+        assert page.locator("#level").inner_text() != "–"
+        assert page.locator(".notice").all_inner_texts() == [], scene
+        with page.expect_navigation():
+            page.select_option("#scene-choice", following)
+        page.evaluate("nafir.ready")
+    assert page.input_value("#scene-choice") == SCENES[0]
+    assert complaints == []
 
 
 BROKEN = {

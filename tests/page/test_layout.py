@@ -23,5 +23,12 @@ def test_nothing_is_cut_off(browser, server, width):
             .map((node) => node.textContent.trim())"""
     )
     assert cut_off == []
+    # Whatever the connection says, the menu ends before it.
+    page.evaluate("document.getElementById('connection-text').textContent = 'Waiting for the server'")
+    assert page.locator("#scene-choice").is_visible()
+    end = page.evaluate("document.getElementById('scene-choice').getBoundingClientRect().right")
+    row = page.evaluate("document.querySelector('.scene').getBoundingClientRect().right")
+    assert end <= row + 0.5
+    assert page.evaluate("document.scrollingElement.scrollWidth") <= width
     assert re.fullmatch(r".+ · Nafir", page.title())
     context.close()

@@ -1,35 +1,46 @@
 """The figure of an evaluation: decays of a few held-out pairs above, the spread of every error below."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from server.acoustics.metrics import Metric
 from server.acoustics.room_parameters import energy_decay_db
-from training.evaluation.evaluate import METRICS, RATED, Evaluation, Source
+from training.evaluation.evaluate import METRICS, Evaluation, Kind, Result, Source
 from training.evaluation.held_out import Responses
 
-_COLOURS = (
-    "#0b6e99",
-    "#d1495b",
-    "#edae49",
-    "#8d6a9f",
-    "#66a182",
-    "#b56576",
-    "#3d5a80",
-    "#a68a64",
-    "#5b8e7d",
-    "#bc4b51",
-    "#7b6d8d",
-)
-_FLOOR_COLOUR = "#9a9a9a"
-_REFERENCE_COLOUR = "#222222"
+_COLOURS: Mapping[Kind, str] = {
+    "field": "#0b6e99",
+    "baseline": "#c4702b",
+    "simulation": "#8d6a9f",
+    "floor": "#8a8a8a",
+}
+_KINDS: Mapping[Kind, str] = {
+    "field": "field",
+    "baseline": "baseline",
+    "simulation": "one simulation",
+    "floor": "floor: two simulations of a pair",
+}
+_REFERENCE_COLOUR, _TEXT = "#222222", "#2b3a42"
 _DECAY_FLOOR_DB = -65.0
+_DPI = 110
+_ACROSS = 5  # panels of errors
+_PERCENTILES = (5, 25, 50, 75, 95)
+_LOGARITHMIC_FROM = 10.0
+"""Ratio between the largest and the smallest 5 to 95 % of a metric, from which on a linear axis would flatten half of
+it."""
+_MOST_DECADES = 4.0
+_BELOW = {"marker": "<", "markeredgecolor": "white", "markersize": 9}
 
 
 def draw_figure(
@@ -37,44 +48,79 @@ def draw_figure(
     path: Path,
     *,
     references: Callable[[int], Responses],
+    reference_name: str,
     columns: Mapping[str, Source],
     turn: npt.NDArray[np.integer],
     examples: Sequence[tuple[int, str]],
     sample_rate: float,
 ) -> None:
-    """Writes a PNG.
+    """Writes `figure_of` as a PNG."""
+    figure = figure_of(
+        evaluation,
+        references=references,
+        reference_name=reference_name,
+        columns=columns,
+        turn=turn,
+        examples=examples,
+        sample_rate=sample_rate,
+    )
+    figure.savefig(path, dpi=_DPI)
 
-    `examples`: held-out pairs whose decays are shown, each with a title. `columns`: the estimates drawn beside the
-    reference in those panels, named as in the evaluation; first channel, at the orientation `turn` (1,), an index into
-    the yaws of the data.
+
+def figure_of(
+    evaluation: Evaluation,
+    *,
+    references: Callable[[int], Responses],
+    reference_name: str,
+    columns: Mapping[str, Source],
+    turn: npt.NDArray[np.integer],
+    examples: Sequence[tuple[int, str]],
+    sample_rate: float,
+) -> Figure:
+    """Decays above, errors below.
+
+    `examples`: held-out pairs whose decays are shown, each with a title; `reference_name` is what their own responses
+    are called. `columns`: the estimates drawn beside the reference in those panels, named as in the evaluation; first
+    channel, at the orientation `turn` (1,), an index into the yaws of the data.
     """
-    judged = [result.name for result in evaluation.results if result.kind in RATED]
-    colour = dict(zip(judged, cycle(_COLOURS), strict=False))
-    across = max(len(examples), 5)
-    figure = Figure(figsize=(3.1 * across, 9.6), layout="constrained", facecolor="white")
+    rows = len(evaluation.results)
+    heights = 3.6, 2 * (0.9 + 0.22 * rows) + 1.0
+    figure = Figure(figsize=(15.0, sum(heights)), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.9))))
-    upper.suptitle(f"Energy decay of held-out pairs{', left ear' if evaluation.channels == 2 else ''}", fontsize=13)
-    for number, (axes, (pair, title)) in enumerate(
-        zip(np.atleast_1d(upper.subplots(1, len(examples), sharey=True)), examples, strict=True)
-    ):
-        _draw_decay(axes, references(pair)[0, 0], sample_rate, "reference", _REFERENCE_COLOUR)
+    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.06)
+    upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=heights)))
+    panels = np.atleast_1d(upper.subplots(1, len(examples), sharey=True))
+    for axes, (pair, title) in zip(panels, examples, strict=True):
+        _draw_decay(axes, references(pair)[0, 0], sample_rate, reference_name, _REFERENCE_COLOUR)
         for name, source in columns.items():
             if (answer := source(pair, turn)) is not None:
-                _draw_decay(axes, answer[0, 0], sample_rate, name, colour[name])
-        axes.set(title=title, xlabel="time (s)", ylim=(_DECAY_FLOOR_DB, 3.0))
+                _draw_decay(axes, answer[0, 0], sample_rate, name, _COLOURS[evaluation.of(name).kind])
+        axes.set(xlabel="time (s)", ylim=(_DECAY_FLOOR_DB, 3.0))
+        axes.set_title(title, fontsize=11, color=_TEXT)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.grid(alpha=0.25)
-        if number == 0:
-            axes.set_ylabel("energy still to come (dB)")
-            axes.legend(frameon=False, fontsize=9)
-    lower.suptitle("Errors over all held-out pairs and orientations: quartiles, 5 to 95 %, and mean (dot)", fontsize=13)
-    panels = lower.subplots(2, -(-len(METRICS) // 2)).ravel()
-    for axes, metric in zip(panels, METRICS, strict=False):
-        _draw_errors(axes, {result.name: result.errors[metric.name] for result in evaluation.results}, colour)
-        axes.set_title(f"{metric.label} ({metric.unit})" if metric.unit else metric.label)
-    for axes in panels[len(METRICS) :]:
-        axes.set_visible(False)
-    figure.savefig(path, dpi=110)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("energy still to come (dB)")
+    upper.suptitle(f"Energy decay of held-out pairs{', left ear' if evaluation.channels == 2 else ''}", fontsize=13)
+    _add_legend(upper, panels)
+    _draw_all_errors(lower, evaluation)
+    return figure
+
+
+def _add_legend(part: SubFigure, panels: Sequence[Axes]) -> None:
+    """One entry per name, whichever panels have it."""
+    entries = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    part.legend(
+        list(entries.values()),
+        list(entries),
+        loc="outside lower center",
+        ncols=len(entries),
+        frameon=False,
+        fontsize=10,
+    )
 
 
 def _draw_decay(axes: Axes, ir: npt.NDArray[np.floating], sample_rate: float, label: str, colour: str) -> None:
@@ -83,35 +129,90 @@ def _draw_decay(axes: Axes, ir: npt.NDArray[np.floating], sample_rate: float, la
     curve = energy_decay_db(ir, sample_rate)
     every = max(1, len(curve) // 1000)
     shown = np.where(curve[::every] > _DECAY_FLOOR_DB - 5.0, curve[::every], np.nan)
-    reference = label == "reference"
+    is_reference = colour == _REFERENCE_COLOUR
     axes.plot(
         np.arange(len(curve))[::every] / sample_rate,
         shown,
         color=colour,
         label=label,
-        linewidth=2.2 if reference else 1.4,
-        zorder=1 if reference else 2,
+        linewidth=2.2 if is_reference else 1.4,
+        zorder=1 if is_reference else 2,
     )
 
 
-def _draw_errors(axes: Axes, errors: Mapping[str, npt.NDArray[np.float64]], colour: Mapping[str, str]) -> None:
-    present = {name: values[~np.isnan(values)] for name, values in errors.items()}
-    drawn = [name for name, values in present.items() if len(values)]
-    if drawn:
-        boxes = axes.boxplot(
-            [present[name] for name in drawn],
-            positions=[list(errors).index(name) for name in drawn],
-            whis=(5, 95),
-            showfliers=False,
-            showmeans=True,
-            widths=0.65,
-            patch_artist=True,
-            medianprops={"color": "white", "linewidth": 1.5},
-            meanprops={"marker": "o", "markerfacecolor": "black", "markeredgecolor": "white", "markersize": 5},
-        )
-        for name, box in zip(drawn, boxes["boxes"], strict=True):
-            box.set(facecolor=colour.get(name, _FLOOR_COLOUR), edgecolor="none")
-    axes.set_xticks(range(len(errors)), list(errors), rotation=30, ha="right", fontsize=9)
-    axes.set_xlim(-0.6, len(errors) - 0.4)
-    axes.set_ylim(bottom=0.0)
-    axes.grid(axis="y", alpha=0.25)
+def _draw_all_errors(part: SubFigure, evaluation: Evaluation) -> None:
+    part.suptitle(f"Errors of {_counted(evaluation)}: 5 to 95 %, quartiles, median (line) and mean (dot)", fontsize=13)
+    down = math.ceil(len(METRICS) / _ACROSS)
+    panels = part.subplots(down, _ACROSS, sharey=True, squeeze=False).ravel()
+    is_below = False
+    for axes, metric in zip(panels, METRICS, strict=False):
+        is_below |= _draw_errors(axes, evaluation.results, metric)
+        sighted = f", {evaluation.visible_pairs} in sight" if metric.needs_direct_sound else ""
+        axes.set_title(f"{metric.label}{f' ({metric.unit})' if metric.unit else ''}{sighted}", fontsize=11, color=_TEXT)
+    for axes in panels[len(METRICS) :]:
+        axes.set_visible(False)
+    panels[0].set_ylim(len(evaluation.results) - 0.5, -0.5)
+    kinds = dict.fromkeys(result.kind for result in evaluation.results)
+    handles: list[Artist] = [Patch(color=_COLOURS[kind], label=_KINDS[kind]) for kind in kinds]
+    if is_below:
+        handles.append(Line2D([], [], **_BELOW, color=_TEXT, linestyle="none", label="median below the axis"))
+    part.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=10)
+
+
+def _counted(evaluation: Evaluation) -> str:
+    """Which pairs and orientations were measured, of how many."""
+    pairs = (
+        f"all {evaluation.pairs}"
+        if evaluation.pairs == evaluation.held_out
+        else f"{evaluation.pairs} of {evaluation.held_out}"
+    )
+    turns = "one orientation" if evaluation.yaws == 1 else f"{evaluation.yaws} orientations"
+    return f"{pairs} held-out pairs, {turns} each"
+
+
+def _draw_errors(axes: Axes, results: Sequence[Result], metric: Metric) -> bool:
+    """A row per method; where a median lies below a logarithmic axis, an arrow says so. Returns whether one does."""
+    present = [result.errors[metric.name][~np.isnan(result.errors[metric.name])] for result in results]
+    spreads = {row: np.percentile(values, _PERCENTILES) for row, values in enumerate(present) if len(values)}
+    low, is_logarithmic = _lower_end(list(spreads.values()))
+    for row, (least, lower, middle, upper, most) in spreads.items():
+        colour = _COLOURS[results[row].kind]
+        ends = np.maximum([least, lower, upper, most], low)
+        axes.plot(ends[[0, 3]], [row, row], color=colour, linewidth=1.2, solid_capstyle="butt", zorder=2)
+        axes.barh(row, ends[2] - ends[1], left=ends[1], height=0.62, color=colour, zorder=3)
+        axes.plot(max(float(present[row].mean()), low), row, "o", color="black", mec="white", ms=5, zorder=5)
+        if middle > low:
+            axes.plot([middle, middle], [row - 0.31, row + 0.31], color="white", linewidth=1.6, zorder=4)
+        elif is_logarithmic:
+            axes.plot(low, row, **_BELOW, color=colour, zorder=6, clip_on=False)
+    axes.set_yticks(range(len(results)), [result.name for result in results], fontsize=9)
+    axes.tick_params(axis="x", labelsize=9)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="x", alpha=0.25, zorder=0)
+    axes.spines[["top", "right"]].set_visible(False)
+    _set_scale(axes, low, is_logarithmic=is_logarithmic)
+    return is_logarithmic and any(spread[2] <= low for spread in spreads.values())
+
+
+def _lower_end(spreads: Sequence[npt.NDArray[np.floating]]) -> tuple[float, bool]:
+    """Where the axis of these percentiles begins, and whether it is logarithmic."""
+    medians = [spread[2] for spread in spreads if spread[2] > 0]
+    if not medians or max(medians) < _LOGARITHMIC_FROM * min(medians):
+        return 0.0, False
+    most = max(spread[-1] for spread in spreads)
+    least = min(value for spread in spreads for value in spread[1:3] if value > 0)
+    return max(0.8 * least, most / 10**_MOST_DECADES), True
+
+
+def _set_scale(axes: Axes, low: float, *, is_logarithmic: bool) -> None:
+    if not is_logarithmic:
+        axes.set_xlim(left=0.0)
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+        return
+    axes.set_xscale("log")
+    axes.set_xlim(left=low)
+    decades = np.log10(axes.get_xlim()[1] / low)
+    between = (1.0, 2.0, 5.0) if decades < 1.2 else (1.0, 3.0) if decades < 2.2 else (1.0,)
+    axes.xaxis.set_major_locator(LogLocator(subs=between))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())

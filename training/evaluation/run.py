@@ -8,7 +8,7 @@ import numpy as np
 from server.scene.bundle import Bundle
 from training.evaluation.coded import Track
 from training.evaluation.draws import median_parameters
-from training.evaluation.evaluate import Column, Evaluation, evaluate
+from training.evaluation.evaluate import Column, Evaluation, Kind, evaluate
 from training.evaluation.fields import field_columns
 from training.evaluation.figure import draw_figure
 from training.evaluation.held_out import HeldOut, open_held_out
@@ -16,8 +16,6 @@ from training.evaluation.kept_errors import KeptErrors, signature
 from training.evaluation.methods import DEFAULT_METHODS, floor_columns, method_columns, simulation_column
 from training.evaluation.published import PublishedTable, published_table
 from training.responses import open_responses
-
-_DRAWN = 2  # columns whose decays are drawn
 
 
 def evaluate_bundles(
@@ -79,11 +77,20 @@ def _draw(evaluation: Evaluation, path: Path, held_out: HeldOut, columns: Sequen
         evaluation,
         path,
         references=held_out.reference,
-        columns={column.name: column.source for column in columns[:_DRAWN]},
+        reference_name="measured response" if held_out.simulated is None else "simulated response",
+        columns={column.name: column.source for column in _drawn(columns)},
         turn=held_out.heard[:1],
         examples=_examples(held_out),
         sample_rate=held_out.sample_rate,
     )
+
+
+def _drawn(columns: Sequence[Column]) -> list[Column]:
+    """The first field and the first baseline: two levels of a field would hide each other."""
+    first: dict[Kind, Column] = {}
+    for column in columns:
+        first.setdefault(column.kind, column)
+    return list(first.values())
 
 
 def _examples(held_out: HeldOut) -> list[tuple[int, str]]:

@@ -3,11 +3,9 @@ import json
 import numpy as np
 import numpy.typing as npt
 import pytest
-from PIL import Image
 from rich.console import Console
 
 from training.evaluation.evaluate import METRICS, Column, Evaluation, evaluate, milliseconds_per_response
-from training.evaluation.figure import draw_figure
 from training.evaluation.held_out import EvaluationError
 from training.evaluation.published import SOUNDSPACES
 from training.evaluation.report import markdown, report
@@ -225,21 +223,3 @@ def test_time_is_of_one_response(held_out) -> None:
 
     assert milliseconds_per_response(Column("field", source, "field", extra_ms=1e4), held_out) > 1e4
     assert set(asked) == {1}
-
-
-def test_figure_is_a_picture(evaluated, held_out, tmp_path) -> None:
-    evaluation = evaluated(lambda pair: simulated(pair, seed=4))
-    path = tmp_path / "accuracy.png"
-    draw_figure(
-        evaluation,
-        path,
-        references=held_out.reference,
-        columns={"field": lambda index, turns: simulated(HELD_OUT[index], seed=4)[turns]},
-        turn=np.array([0]),
-        examples=[(0, "in sight"), (2, "hidden")],
-        sample_rate=RATE,
-    )
-    with Image.open(path) as picture:
-        assert picture.format == "PNG"
-        pixels = np.asarray(picture.convert("RGB"))
-    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100

@@ -1,0 +1,47 @@
+// Heads to hear through, as the server serves them. Emits "chosen" with a head's name.
+
+const TITLES = { kemar: "KEMAR" };
+const titleOf = (name) => TITLES[name] ?? name;
+
+export class Heads extends EventTarget {
+  #choice;
+  #isKnown = false;
+  #isUsed = true;
+
+  /** `choice` is the menu. */
+  constructor(choice) {
+    super();
+    this.#choice = choice;
+    choice.addEventListener("change", () => this.dispatchEvent(new CustomEvent("chosen", { detail: choice.value })));
+  }
+
+  /** Name of the head asked for; undefined where that is left to the server. */
+  get chosen() {
+    return this.#isKnown ? this.#choice.value : undefined;
+  }
+
+  /** Offers these heads; one that was chosen before stays so while it is among them. */
+  show({ default: usual, hrtfs }) {
+    const before = this.chosen;
+    const options = hrtfs.map((name) => {
+      const option = new Option(titleOf(name), name);
+      option.title = name;
+      return option;
+    });
+    this.#choice.replaceChildren(...options);
+    this.#choice.value = hrtfs.includes(before) ? before : usual;
+    this.#isKnown = true;
+    this.#enable();
+  }
+
+  /** Whether what is listened with has two ears. */
+  set used(isUsed) {
+    this.#isUsed = isUsed;
+    this.#enable();
+  }
+
+  #enable() {
+    this.#choice.disabled = !this.#isKnown || !this.#isUsed;
+    this.#choice.title = this.#isUsed ? "" : "One loudspeaker is heard through no head.";
+  }
+}
