@@ -248,7 +248,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self.read_paused and self.queue.empty():
             self.read_paused = False
             if self._next_slice is None:
-                self._go_on()
+                # Not at once: what comes next would be heard before this message is returned.
+                self._next_slice = self.loop.call_soon(self._go_on)
         return message
 
     def _spend(self, messages: float, nbytes: int = 0) -> None:
