@@ -156,6 +156,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self._seat is not None and self._leave_room is not None:
             self._seat.leave()
             self._leave_room()
+            self._seat = self._leave_room = None  # which hold the transport and this
         super().connection_lost(exc)
         if self._next_slice is not None:
             self._next_slice.cancel()

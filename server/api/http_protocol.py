@@ -203,6 +203,8 @@ class HttpProtocol(HttpToolsProtocol):
         successor.take_seat(seat, partial(self._room.leave, successor))
         self._room.leave(self)
         self._room.enter(successor, self.loop)
+        # It holds this. uvicorn lets go of it where a connection is lost, and this one never is.
+        self.parser = None  # type: ignore[assignment]
 
     @property
     def _is_upgrading(self) -> bool:
