@@ -27,7 +27,7 @@ FUZZ_SECONDS ?= 60
 TIMED := tests/integration tests/bench/test_sessions.py tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
 
 # Tests that attack a server beside a listener for minutes.
-ATTACKS := $(addprefix tests/integration/attacks/test_,abandoned_work.py churn.py floods.py http_requests.py)
+ATTACKS := $(addprefix tests/integration/attacks/test_,abandoned_work.py churn.py connect_loops.py floods.py http_requests.py)
 
 VENV := .venv
 BIN := $(VENV)/bin
