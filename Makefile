@@ -81,7 +81,7 @@ own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kin
 	$(BIN)/python -m training.own_scenes runs/own-scenes
 
 attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
-	$(BIN)/pytest $(ATTACKS)
+	$(BIN)/pytest -rs $(ATTACKS)
 
 hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
 	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md
