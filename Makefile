@@ -27,7 +27,7 @@ FUZZ_SECONDS ?= 60
 TIMED := tests/integration tests/bench/test_sessions.py tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
 
 # Tests that attack a server beside a listener for minutes.
-ATTACKS := $(addprefix tests/integration/attacks/test_,abandoned_work.py floods.py http_requests.py)
+ATTACKS := $(addprefix tests/integration/attacks/test_,abandoned_work.py churn.py connect_loops.py floods.py http_requests.py)
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -81,7 +81,7 @@ own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kin
 	$(BIN)/python -m training.own_scenes runs/own-scenes
 
 attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
-	$(BIN)/pytest $(ATTACKS)
+	$(BIN)/pytest -rs $(ATTACKS)
 
 hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
 	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md

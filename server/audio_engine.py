@@ -390,6 +390,7 @@ class AudioThread:
                 self._streams[stream] = place
             else:
                 self._streams.pop(stream, None)
+                stream.leave()
 
     def _freest_place(self, block_s: float) -> int:
         """Where the fewest streams are of those with blocks as long: of its phase, and of those that would be rendered

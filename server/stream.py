@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from server.blocks import AudioBlock
 from server.durations import DurationHistogram
@@ -133,6 +133,8 @@ class Stream:
         # Outcomes and not the futures, which hold whom they call back: this stream.
         self._answers: deque[tuple[IrRequest, _Computed | BaseException]] = deque()
         self._plans: deque[tuple[Plan, float] | BaseException] = deque()
+        self._under_way: set[Future[Any]] = set()
+        """What workers were given and have not answered. Whatever is answered is taken out, as it holds this stream."""
         self.regrets = RegretRecord()
         self._checks: deque[Regret | BaseException] = deque()
         self._full_since_s: float | None = None
@@ -253,7 +255,7 @@ class Stream:
         # Who has not been heard yet waits for it; all others only for something better.
         if (wanted := self.session.take_plan_request()) is not None:
             plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
-            plan.add_done_callback(self._keep_plan)
+            self._await(plan, self._keep_plan)
         self._ask(workers)
 
     def _ask(self, workers: Workers) -> None:
@@ -266,11 +268,27 @@ class Stream:
             answer = workers.submit(
                 _compute_timed, self._levels, request, self.session, kind="response", is_urgent=request.is_first
             )
-            answer.add_done_callback(partial(self._keep_answer, request))
+            self._await(answer, partial(self._keep_answer, request))
         if not (self._has_asked or self.wants_turn):
             self._asked_s = None
         elif self._asked_s is None:
             self._asked_s = self._time_s()
+
+    def _await(self, future: "Future[T]", keep: "Callable[[T | BaseException], None]") -> None:
+        """Have what comes of it kept: on the worker's thread, or at once where it is done."""
+        self._under_way.add(future)
+        future.add_done_callback(partial(self._settle, keep))
+
+    def _settle(self, keep: "Callable[[T | BaseException], None]", future: "Future[T]") -> None:
+        self._under_way.discard(future)
+        if not future.cancelled():
+            outcome: T | BaseException = _outcome(future)
+            keep(outcome)
+
+    def leave(self) -> None:
+        """Have nothing computed any more that this stream has asked for."""
+        for future in tuple(self._under_way):
+            future.cancel()
 
     def strain(self, now_s: float) -> Strain:
         """What it went through since this was asked last."""
@@ -357,9 +375,8 @@ class Stream:
         if self._asked_s is not None:
             self._asked_s = now_s
 
-    def _keep_answer(self, request: IrRequest, answer: "Future[_Computed]") -> None:
-        outcome = _outcome(answer)
-        self._answers.append((request, outcome))  # on the worker's thread
+    def _keep_answer(self, request: IrRequest, computed: "_Computed | BaseException") -> None:
+        self._answers.append((request, computed))
         self._wake()
 
     def _check_plan(self, workers: Workers) -> None:
@@ -370,11 +387,10 @@ class Stream:
         if (check := self.session.take_check()) is not None:
             self._next_check_s = None
             regret = workers.submit(check.run, self._levels[check.level], kind="plan")
-            regret.add_done_callback(self._keep_regret)
+            self._await(regret, self._keep_regret)
 
-    def _keep_regret(self, regret: "Future[Regret]") -> None:
-        outcome = _outcome(regret)
-        self._checks.append(outcome)  # on the worker's thread; looked at with the next block
+    def _keep_regret(self, regret: Regret | BaseException) -> None:
+        self._checks.append(regret)  # looked at with the next block
 
     def _take_regret(self, regret: Regret | BaseException) -> None:
         clock_s = self.next_block * self.block_s
@@ -386,9 +402,8 @@ class Stream:
         self.regrets.add(regret)
         self.session.learn(regret)
 
-    def _keep_plan(self, plan: "Future[tuple[Plan, float]]") -> None:
-        outcome = _outcome(plan)
-        self._plans.append(outcome)  # on the worker's thread
+    def _keep_plan(self, planned: tuple[Plan, float] | BaseException) -> None:
+        self._plans.append(planned)
         self._wake()
 
     def _take_plan(self, planned: tuple[Plan, float] | BaseException) -> list[ServerMessage]:

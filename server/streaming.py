@@ -20,6 +20,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -27,6 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from server.api.inflow import Allowance
 from server.api.response_cache import ResponseCache
 from server.api.stream_counts import StreamLedger
+from server.api.turn_taking import OneAtATime
 from server.audio_engine import AudioEngine
 from server.blocks import Encoding
 from server.catalogue import describe_scene
@@ -110,6 +112,8 @@ class StreamHost:
     """What all streams have counted."""
     streams: int = 0
     """Those open, and those being opened."""
+    openings: OneAtATime = dataclasses.field(default_factory=OneAtATime)
+    """Sessions are made one after the other: each takes some 8 ms of a processor."""
     silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
     """How long connections without a hello are waited for; who came first is first."""
 
@@ -186,7 +190,7 @@ class Connection:
         host.streams += 1
         try:
             stream = await self._open(hello)
-            return stream if isinstance(stream, Goodbye) else await self._pump(stream, hello)
+            return stream if stream is None or isinstance(stream, Goodbye) else await self._pump(stream, hello)
         finally:
             host.streams -= 1
 
@@ -211,7 +215,8 @@ class Connection:
             return Goodbye(POLICY_VIOLATION, error)
         return message
 
-    async def _open(self, hello: Hello) -> Stream | Goodbye:
+    async def _open(self, hello: Hello) -> Stream | Goodbye | None:
+        """None where the client has gone before it was its turn."""
         settings = self._host.settings
         levels = self._host.scenes.get(hello.scene)
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
@@ -224,9 +229,13 @@ class Connection:
             block_s = hello.block_size / field.sample_rate
             offer = self._host.offers[hello.scene]
             ladder = offer.ladder(hello.level, block_s=block_s)
-            session = await asyncio.to_thread(self._open_session, hello, levels, hrtf, ladder.rung, window)
+            session = await self._host.openings.run(
+                partial(self._open_session, hello, levels, hrtf, ladder.rung, window), is_wanted=self._is_there
+            )
         except RequestError as refusal:
             return _refused(refusal)
+        if session is None:
+            return None
         await self._send_message(
             Welcome(
                 session=uuid.uuid4().hex,
@@ -252,6 +261,9 @@ class Connection:
             lead=hello.buffer_blocks,
             deliver=self._deliver,
         )
+
+    def _is_there(self) -> bool:
+        return self._way is None or self._way.is_open()
 
     def _open_session(self, hello: Hello, levels: Levels, hrtf: str, rung: Rung, window: int) -> Session:
         host, field = self._host, levels.default

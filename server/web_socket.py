@@ -13,7 +13,7 @@ turn, and once a client has spent its budget (`server.api.inflow`) nothing is re
 import asyncio
 import logging
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import zip_longest
 from typing import Any, Final
@@ -40,6 +40,7 @@ from server.api.inflow import (
 )
 from server.api.resetting import reset
 from server.api.seats import Seat
+from server.api.turn_taking import TurnTaking
 from server.problems import problem
 from server.web_socket_frames import Cut, FrameCutter, header
 
@@ -73,6 +74,8 @@ class DirectWay:
     poses of the listener that a newer one follows directly."""
     allow: Callable[[Allowance], None] = _no_allowance
     """Has the client's budget fill at this rate."""
+    is_open: Callable[[], bool] = lambda: True
+    """Whether the client is still there, as far as is known."""
 
 
 def direct_way(scope: Mapping[str, Any]) -> DirectWay | None:
@@ -104,7 +107,10 @@ def watched(
 
         way.listen(hear_watched)
 
-    return {**scope, "extensions": {**scope["extensions"], _EXTENSION: {"way": DirectWay(write, listen, way.allow)}}}
+    return {
+        **scope,
+        "extensions": {**scope["extensions"], _EXTENSION: {"way": replace(way, write=write, listen=listen)}},
+    }
 
 
 class _Handshake(ServerProtocol):
@@ -135,6 +141,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
     """The newest that there was no room to send."""
     _seat: Seat | None = None
     _leave_room: Callable[[], None] | None = None
+    _turns: TurnTaking | None = None
     _closing_since_s: float | None = None
 
     def __init__(
@@ -147,15 +154,28 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         super().__init__(config, server_state, app_state, _loop)
         self.conn = _Handshake(max_size=config.ws_max_size, logger=logging.getLogger("uvicorn.error"))
 
-    def take_seat(self, seat: Seat, leave_room: Callable[[], None]) -> None:
+    def take_seat(self, seat: Seat, leave_room: Callable[[], None], turns: TurnTaking) -> None:
         """That of the HTTP connection which became this. It is in use once the application listens; until then it is
-        another's who comes when there is no other."""
-        self._seat, self._leave_room = seat, leave_room
+        another's who comes when there is no other. `turns` are those of requests, which a handshake is."""
+        self._seat, self._leave_room, self._turns = seat, leave_room, turns
+
+    async def run_asgi(self) -> None:
+        """In turn with requests; not at all where the client has gone by then."""
+        if self._turns is not None:
+            turn: asyncio.Future[None] = self.loop.create_future()
+            self._turns.begin(self.loop, lambda: None if turn.done() else turn.set_result(None))
+            await turn
+        if not self.disconnected:
+            await super().run_asgi()
+
+    def _is_open(self) -> bool:
+        return not (self.disconnected or self.transport.is_closing())
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._seat is not None and self._leave_room is not None:
             self._seat.leave()
             self._leave_room()
+            self._seat = self._leave_room = None  # which hold the transport and this
         super().connection_lost(exc)
         if self._next_slice is not None:
             self._next_slice.cancel()
@@ -174,7 +194,9 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
         if not self.handshake_complete:  # as it is where the request was refused
-            self.scope["extensions"][_EXTENSION] = {"way": DirectWay(self._write, self._listen, self._allow)}
+            self.scope["extensions"][_EXTENSION] = {
+                "way": DirectWay(self._write, self._listen, self._allow, self._is_open)
+            }
 
     def on_task_complete(self, task: asyncio.Task[None]) -> None:
         """The application is done. It holds this protocol by the way, and is held by whom it has listen: with neither,
@@ -248,7 +270,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self.read_paused and self.queue.empty():
             self.read_paused = False
             if self._next_slice is None:
-                self._go_on()
+                # Not at once: what comes next would be heard before this message is returned.
+                self._next_slice = self.loop.call_soon(self._go_on)
         return message
 
     def _spend(self, messages: float, nbytes: int = 0) -> None:

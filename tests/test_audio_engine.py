@@ -147,6 +147,24 @@ def test_a_closed_stream_makes_no_more_sound_and_closing_twice_does_no_harm(stag
     assert len(delivered) == count
 
 
+def test_nothing_more_is_computed_for_a_stream_that_has_left(stage):
+    stream, _ = stage.open()
+    staying, delivered = stage.open()
+    for each in (stream, staying):
+        add(each)
+    stage.run(2 * BLOCK_S)
+    asked = {arguments[-1]: future for future, _, arguments in stage.workers.work}
+    assert set(asked) == {stream.session, staying.session}
+    stage.engine.close(stream)
+    stage.run(BLOCK_S)
+    assert asked[stream.session].cancelled()
+    assert not asked[staying.session].cancelled()
+    stage.workers.work = [work for work in stage.workers.work if not work[0].cancelled()]
+    stage.workers.run()
+    stage.run(BLOCK_S)
+    assert any(isinstance(item, EmitterAdded) for item in delivered)
+
+
 def test_an_answer_takes_effect_with_the_next_block_and_no_block_waits_for_it(stage):
     stream, delivered = stage.open(lead=1)
     add(stream)

@@ -1,6 +1,7 @@
 """The short way out of a connection, on a server of its own: it says what ASGI would, in the same order."""
 
 import asyncio
+import contextlib
 import time
 from contextlib import asynccontextmanager
 from itertools import pairwise
@@ -350,6 +351,37 @@ def test_a_pose_that_an_older_one_follows_is_heard_and_so_is_that():
 def test_however_much_comes_at_once_all_of_it_is_heard_in_order():
     messages = [str(number) for number in range(3_000)]
     assert hear_all(*messages, until="2999") == messages
+
+
+def test_the_last_that_waits_is_heard_before_what_comes_behind_it():
+    """A hundred come in one piece. The first is left to ASGI, and with it those that were cut together with it."""
+    heard, is_open = [], asyncio.Event()
+
+    def hear(message):
+        if message == "0":
+            return False
+        heard.append(message)
+        return True
+
+    async def listen(scope, receive, send):
+        direct_way(scope).listen(hear)
+        is_open.set()
+        while len(heard) < 100:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(0.1):
+                    heard.append((await receive())["text"])
+            if heard[-1] == "0":  # by now all that was cut together waits
+                await asyncio.sleep(0.05)
+        await send({"type": "websocket.close"})
+
+    async def talk():
+        async with serving(listen) as address, connect(address, compression=None) as client:
+            await is_open.wait()
+            client.transport.write(_frames(*map(str, range(100))))
+            await asyncio.wait_for(client.wait_closed(), 10)
+
+    asyncio.run(talk())
+    assert heard == list(map(str, range(100)))
 
 
 def test_between_a_few_messages_others_have_their_turn():

@@ -200,9 +200,11 @@ class HttpProtocol(HttpToolsProtocol):
         super().handle_websocket_upgrade()
         successor = self.transport.get_protocol()
         assert isinstance(successor, WebSocketProtocol)
-        successor.take_seat(seat, partial(self._room.leave, successor))
+        successor.take_seat(seat, partial(self._room.leave, successor), self._room.turns)
         self._room.leave(self)
         self._room.enter(successor, self.loop)
+        # It holds this. uvicorn lets go of it where a connection is lost, and this one never is.
+        self.parser = None  # type: ignore[assignment]
 
     @property
     def _is_upgrading(self) -> bool:

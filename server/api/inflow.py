@@ -3,10 +3,13 @@
 A client spends from a budget that fills at a steady rate. Where it is spent, nothing is read from that socket until
 there is some again: the rest waits with the client, and nothing is lost. Pure: the clock is passed in, in seconds.
 
-**What a client may need.** The budget is in messages that take about 20 us each to cut, parse and pass on. A live block
-takes less than half of that, a pose that a newer one follows at once an eighth. The most that a player or an instrument
-has to say is a live block of 128 samples of every emitter, 1,000 poses a second, an acknowledgement of every block of
-128 samples, and 120 moves a second of every emitter.
+**What a client may need.** The budget is in messages that take about 20 us each to cut, parse, pass on and, where that
+is due, answer. On the event loop of a busy EPYC core an acknowledgement took 10 us, a ping with its pong 14, a refused
+gain 18, nonsense 24 and a refused pose 26. A pose that a newer one follows at once took 2, and counts as an eighth. A
+live block took 17 and counts as half: players of sixteen instruments send thousands, and with the whole cost everybody
+could say twice as much of all else. The most that a player or an instrument has to say is a live block of 128 samples
+of every emitter, 1,000 poses a second, an acknowledgement of every block of 128 samples, and 120 moves a second of
+every emitter.
 """
 
 import re

@@ -1,9 +1,11 @@
-"""Requests begin one after the other, and leave the event loop time for everything else."""
+"""Requests and streams begin one after the other, and leave time for everything else."""
 
 import asyncio
 from collections import deque
 from collections.abc import Callable
+from typing import TypeVar
 
+T = TypeVar("T")
 _LONGEST_PAUSE_S = 0.02
 
 
@@ -39,3 +41,22 @@ class TurnTaking:
 
     def _pause(self, loop: asyncio.AbstractEventLoop, begin_s: float) -> None:
         loop.call_later(min(loop.time() - begin_s, _LONGEST_PAUSE_S), self._next, loop)
+
+
+class OneAtATime:
+    """Does one piece of work at a time on another thread, first come first served, and then rests for as long again as
+    that took: however many ask, it takes at most half of a processor, and others have the interpreter's lock between.
+    """
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+
+    async def run(self, work: Callable[[], T], *, is_wanted: Callable[[], bool]) -> T | None:
+        """What `work` returns or raises; None, and nothing done, where it is no longer wanted when its turn comes."""
+        loop = asyncio.get_running_loop()
+        await self._lock.acquire()
+        begin_s = loop.time()
+        try:
+            return await asyncio.to_thread(work) if is_wanted() else None
+        finally:
+            loop.call_later(min(loop.time() - begin_s, _LONGEST_PAUSE_S), self._lock.release)

@@ -10,15 +10,17 @@ from websockets.asyncio.client import connect
 from server.blocks import AudioBlock
 from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
 
-HELLO = Hello(protocol=PROTOCOL, scene="flat", buffer_blocks=2).serialize()
+SCENE = "flat"
+HELLO = Hello(protocol=PROTOCOL, scene=SCENE, buffer_blocks=2).serialize()
 _SEQUENCE = struct.Struct("<I")
 _SEQUENCE_AT = 4
 
 
-async def visit(address: str, *, blocks: int, emitters: int, is_aborted: bool = False) -> None:
+async def visit(address: str, *, blocks: int, emitters: int, scene: str = SCENE, is_aborted: bool = False) -> None:
     """Hear so many blocks of so many emitters, walking; and leave with a goodbye, or drop the connection."""
+    hello = Hello(protocol=PROTOCOL, scene=scene, buffer_blocks=2)
     async with connect(f"ws://{address}/v1/stream", compression=None, max_queue=None) as socket:
-        await socket.send(HELLO)
+        await socket.send(hello.serialize())
         welcome = json.loads(await socket.recv())
         assert welcome["type"] == "welcome", welcome
         for number in range(emitters):
@@ -40,13 +42,13 @@ async def visit(address: str, *, blocks: int, emitters: int, is_aborted: bool = 
             socket.transport.abort()
 
 
-async def churn(address: str, visits: int, *, at_once: int, blocks: int, emitters: int) -> None:
+async def churn(address: str, visits: int, *, at_once: int, blocks: int, emitters: int, scene: str = SCENE) -> None:
     """So many visits, `at_once` at a time; every third is aborted."""
     numbers = count()
 
     async def visitor() -> None:
         while (number := next(numbers)) < visits:
-            await visit(address, blocks=blocks, emitters=emitters, is_aborted=number % 3 == 2)
+            await visit(address, blocks=blocks, emitters=emitters, scene=scene, is_aborted=number % 3 == 2)
 
     async with asyncio.TaskGroup() as group:
         for _ in range(at_once):

@@ -1,4 +1,4 @@
-"""However a connection ends, its session is let go of at once, and not when a collector looks for it."""
+"""However a connection ends, what belongs to it is let go of at once, and not when a collector looks for it."""
 
 import asyncio
 import gc
@@ -10,8 +10,10 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
 from server import streaming
+from server.api.http_protocol import HttpProtocol
 from server.session import Session
 from server.stream import Stream
+from server.web_socket import WebSocketProtocol
 from tests.integration.churn import HELLO, visit
 
 PATIENCE_S = 5.0
@@ -19,8 +21,8 @@ PATIENCE_S = 5.0
 
 @pytest.fixture
 def made(monkeypatch):
-    """Weak references to all sessions, streams and connections made from now on."""
-    references = []
+    """Weak references to all sessions, streams, connections and protocols made from now on, by kind."""
+    references = {Session: [], Stream: [], streaming.Connection: [], HttpProtocol: [], WebSocketProtocol: []}
 
     class Remembering:
         def __init__(self, kind):
@@ -28,9 +30,20 @@ def made(monkeypatch):
 
         def __call__(self, *arguments, **named):
             each = self._kind(*arguments, **named)
-            references.append(weakref.ref(each))
+            references[self._kind].append(weakref.ref(each))
             return each
 
+    def remember(protocol):
+        connect = protocol.connection_made
+
+        def connection_made(self, transport):
+            references[protocol].append(weakref.ref(self))
+            connect(self, transport)
+
+        monkeypatch.setattr(protocol, "connection_made", connection_made)
+
+    remember(HttpProtocol)
+    remember(WebSocketProtocol)
     monkeypatch.setattr(streaming, "Session", Remembering(Session))
     monkeypatch.setattr(streaming, "Stream", Remembering(Stream))
     monkeypatch.setattr("server.routes.Connection", Remembering(streaming.Connection))
@@ -80,12 +93,18 @@ ENDS = {
 
 @pytest.mark.usefixtures("uncollected")
 @pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
-def test_no_session_outlives_its_connection(monkeypatch, request, made, end):
+def test_nothing_outlives_its_connection(monkeypatch, request, made, end):
     monkeypatch.setenv("NAFIR_STALL_TIMEOUT_S", "0.5")
     served = request.getfixturevalue("served")
     asyncio.run(end(served))
     until_s = time.monotonic() + PATIENCE_S
-    while any(reference() is not None for reference in made) and time.monotonic() < until_s:
+    while any(left(made).values()) and time.monotonic() < until_s:
         time.sleep(0.02)
-    assert len(made) == 3
-    assert [reference() for reference in made] == [None] * 3
+    assert left(made) == dict.fromkeys(made, 0)
+    # Every question whether the server is ready has a connection of its own.
+    assert len(made.pop(HttpProtocol)) > 1
+    assert [len(references) for references in made.values()] == [1] * 4
+
+
+def left(made):
+    return {kind: sum(reference() is not None for reference in references) for kind, references in made.items()}

@@ -15,7 +15,7 @@ How a test uses it (`endures` and `address` are fixtures in `conftest.py`):
 
 `endures` asserts that blocks late or missing stay under 0.1 % beyond the bystander's own share at rest, and that every
 `/livez` answer comes within 250 ms. Where the rest was disturbed too, or other programs kept the processors busy, the
-measurement says nothing: it is repeated once.
+measurement says nothing: it is repeated, and after three such the test fails as inconclusive.
 
 Each module of tests has a server of its own, `nafir serve` in a process of its own. To give it other settings than the
 defaults, set `ENVIRONMENT = {"NAFIR_...": "..."}` in the module.

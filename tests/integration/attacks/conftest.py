@@ -19,6 +19,7 @@ from server.scene.bundle import bundled_scenes
 _READY_S = 300.0
 """The first time ever, everything is compiled."""
 _EXIT_S = 20.0
+_TRIES = 3
 
 
 def _load(name: str):
@@ -90,15 +91,20 @@ def server_pid(attacked) -> int:
 def endures(address, server_pid) -> Callable[[Callable[[], object]], object]:
     """Runs an attack beside the bystander, fails where that was harmed, and returns what the attack did.
 
-    Where other programs keep a processor busy, twice, the test is skipped: whose harm it was cannot be told.
+    Where the host was too busy for anybody to tell whose harm it was, it is tried again, and after three tries the test
+    fails and says so: a test that is left out proves nothing.
     """
 
     def run(attack: Callable[[], object]) -> object:
-        result, harm = bystander.beside_bystander(address, server_pid, attack)
-        if not harm.is_none and harm.is_inconclusive:
+        for _ in range(_TRIES):
             result, harm = bystander.beside_bystander(address, server_pid, attack)
-        if not harm.is_none and harm.is_crowded:
-            pytest.skip(f"other programs kept {harm.other_programs:.1f} processors busy: nothing can be said of {harm}")
+            if harm.is_none or not harm.is_inconclusive:
+                break
+        if not harm.is_none and harm.is_inconclusive:
+            pytest.fail(
+                f"inconclusive after {_TRIES} tries, run it on a quiet machine: other programs kept"
+                f" {harm.other_programs:.1f} processors busy, or it was not calm at rest either: {harm}"
+            )
         assert harm.is_none, f"{harm.late_beyond_rest:.2%} late beyond rest: {harm}"
         return result
 

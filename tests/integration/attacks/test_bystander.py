@@ -33,6 +33,26 @@ def test_silence_is_harm():
     assert bystander.Harm(calm, calm, calm, 0.0).is_none
 
 
+@pytest.mark.parametrize(("calm_at", "tries"), [(0, 1), (2, 3), (3, 3)])
+def test_what_says_nothing_is_tried_again_and_then_fails(endures, monkeypatch, calm_at, tries):
+    """Harm beside other programs is nobody's for sure."""
+    record = bystander.Record([(0.1, 0, 0)], [(0.1, 0.001)])
+    calm, silent = record.spell(0.0, 1.0), record.spell(1.0, 2.0)
+    made = []
+
+    def measure(*_):
+        made.append(bystander.Harm(calm, calm if len(made) == calm_at else silent, calm, 1.5))
+        return "done", made[-1]
+
+    monkeypatch.setattr(bystander, "beside_bystander", measure)
+    if calm_at < tries:
+        assert endures(None) == "done"
+    else:
+        with pytest.raises(pytest.fail.Exception, match=r"inconclusive after 3 tries.*kept 1\.5 processors busy"):
+            endures(None)
+    assert len(made) == tries
+
+
 def test_no_attack_harms_nobody(endures):
     assert endures(lambda: time.sleep(2.0)) is None
 
