@@ -24,7 +24,7 @@ MEASURE ?=
 # How long either fuzzer runs, in seconds.
 FUZZ_SECONDS ?= 60
 # Tests that watch the clock, and so have the machine to themselves.
-TIMED := tests/integration tests/bench/test_sessions.py tests/test_audio_engine.py tests/test_streaming.py tests/test_priority.py
+TIMED := tests/integration tests/bench/test_sessions.py tests/streaming/test_audio_engine.py tests/api/test_stream.py tests/runtime/test_priority.py
 
 # Tests that attack a server beside a listener for minutes.
 ATTACKS := $(addprefix tests/integration/attacks/test_,abandoned_work.py churn.py connect_loops.py floods.py http_requests.py)
@@ -78,7 +78,7 @@ office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere
 	@cat $(OFFICE)/table.md
 
 own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kinds, and how long they ring beside other simulations: runs/own-scenes.md
-	$(BIN)/python -m training.own_scenes runs/own-scenes
+	$(BIN)/python -m training.trials.own_scenes runs/own-scenes
 
 attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
 	$(BIN)/pytest -rs $(ATTACKS)
@@ -97,7 +97,7 @@ container-test: ## build the container image and try it read-only (needs buildah
 	tests/integration/container.sh
 
 predictions: $(VENV)/installed-training ## what plans predict of effects beside what simulation finds, in ten rooms of extremes: some minutes
-	$(BIN)/python -m training.simulation.rooms_tried
+	$(BIN)/python -m training.trials.rooms_tried
 
 clean: ## remove .venv and caches; keeps runs/
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
@@ -116,7 +116,7 @@ endif
 
 # Steps of one scene, a stamp for each that is finished; what an interrupted one has done is kept and gone on with. What
 # each takes is written to times.jsonl.
-STEP = $(BIN)/python -m training.stopwatch $(RUNS)/times.jsonl
+STEP = $(BIN)/python -m training.cli.stopwatch $(RUNS)/times.jsonl
 TRAIN = $(BIN)/nafir-train
 
 $(RUNS)/simulated: | $(VENV)/installed-training

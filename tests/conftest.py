@@ -11,14 +11,14 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.field.field import AcousticField
-from server.field.levels import Levels
-from server.hrtfs import DEFAULT_HRTF, HrtfLibrary
-from server.load import Rung
+from server.field.fields_by_level import FieldsByLevel
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.geometry import Geometry, Material, Materials, Opening
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Reuse, Start
+from server.streaming.load import QualityStep
 
 CODEC = CodecParameters(
     sample_rate=24_000, n_fft=256, hop=64, samples=4_000, lead_samples=64, known_frames=4, log_floor=1e-3
@@ -226,14 +226,14 @@ def at_nodes(bundle: Bundle, **reuse: object) -> AcousticField:
 
 
 @pytest.fixture
-def levels(field) -> Levels:
+def levels(field) -> FieldsByLevel:
     """The scene's only level, whose field is `field`."""
-    return Levels([field])
+    return FieldsByLevel([field])
 
 
 @pytest.fixture
-def rung(field) -> Rung:
-    return Rung.full(field.level, cost_ms=1.0)
+def rung(field) -> QualityStep:
+    return QualityStep.full(field.level, cost_ms=1.0)
 
 
 @pytest.fixture(scope="session")

@@ -4,13 +4,13 @@ from concurrent.futures import Future
 
 import numpy as np
 
-from server import audio_engine
-from server.audio_engine import AudioEngine
-from server.field.levels import Levels
-from server.load import Offer
-from server.protocol import PROTOCOL, Hello
-from server.session import Session
-from server.stream import Stream, TimedBlock
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.client_messages import PROTOCOL, Hello
+from server.streaming import audio_engine
+from server.streaming.audio_engine import AudioEngine
+from server.streaming.load import Offer
+from server.streaming.session import Session
+from server.streaming.stream import Stream, TimedBlock
 
 BLOCK_S = 256 / 24_000
 
@@ -51,7 +51,7 @@ class Patient:
 
 def open_stream(hello, field, filters, load_clip, *, lead, deliver, window=40):
     """At the top of its ladder, which has the scene's only level."""
-    levels, offer = Levels([field]), Offer((field.level,), {field.level.name: 1.0})
+    levels, offer = FieldsByLevel([field]), Offer((field.level,), {field.level.name: 1.0})
     ladder = offer.ladder(hello.level, block_s=BLOCK_S)
     session = Session(hello, levels, filters, load_clip, rung=ladder.rung, window=window)
     return Stream(session, levels, offer=offer, ladder=ladder, block_s=BLOCK_S, lead=lead, deliver=deliver)

@@ -43,7 +43,7 @@ def free_port() -> int:
 @contextlib.contextmanager
 def serving(port: int, *options: str, settings: Mapping[str, str] | None = None) -> Iterator[str]:
     """A server of its own process, ready to stream; `settings` are environment variables."""
-    command = [sys.executable, "-c", "from server.cli import main; main()", "serve", "--port", str(port), *options]
+    command = [sys.executable, "-c", "from server.cli.main import main; main()", "serve", "--port", str(port), *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, **(settings or {})})
     url = f"http://127.0.0.1:{port}"
     try:

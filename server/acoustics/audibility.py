@@ -42,7 +42,7 @@ def in_jnd(errors: Mapping[str, _Floats], reference: RoomParameters) -> dict[str
     return audible
 
 
-HEARD: Mapping[str, Threshold] = {
+JND_THRESHOLDS: Mapping[str, Threshold] = {
     **THRESHOLDS,
     "spectrum": Threshold(1.0, "that of level, ISO 3382-1:2009, table A.1, in every third of an octave"),
     "itd": Threshold(10.0, "Mills, J. Acoust. Soc. Am. 30 (1958): 10 us about straight ahead"),
@@ -66,4 +66,4 @@ def ratio_in_jnd(name: str, ratio_db: npt.ArrayLike) -> _Floats:
     ratio = np.asarray(ratio_db, dtype=np.float64)
     beyond = _GROWTH_DB * (np.exp((np.minimum(ratio, low) - low) / _GROWTH_DB) - 1)
     above = _GROWTH_DB * (1 - np.exp((high - np.maximum(ratio, high)) / _GROWTH_DB))
-    return np.asarray((np.clip(ratio, low, high) + beyond + above) / HEARD[name].amount)
+    return np.asarray((np.clip(ratio, low, high) + beyond + above) / JND_THRESHOLDS[name].amount)

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.cache_lines import on_lines, zeros_on_lines
 from server.acoustics.cells import Axis
-from server.acoustics.simd import LANES, broadcast, load, load_broadcast, multiply_add, store
-from server.compiled import compiled
+from server.kernels.cache_lines import on_lines, zeros_on_lines
+from server.kernels.compiled import compiled
+from server.kernels.simd import LANES, broadcast, load, load_broadcast, multiply_add, store
 
 Float32 = npt.NDArray[np.float32]
 

@@ -12,10 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.cache_lines import zeros_on_lines
 from server.acoustics.columns_kernel import NOTHING, Columns, spread_columns
 from server.acoustics.phase import MOST_COHERENT, UNDECIDED
-from server.acoustics.simd import (
+from server.acoustics.stft_kernel import Windows, one_before, place_bin, synthesise_next
+from server.kernels.cache_lines import zeros_on_lines
+from server.kernels.compiled import compiled
+from server.kernels.simd import (
     LANES,
     any_above,
     at_least,
@@ -31,8 +33,6 @@ from server.acoustics.simd import (
     store,
     subtract,
 )
-from server.acoustics.stft_kernel import Windows, one_before, place_bin, synthesise_next
-from server.compiled import compiled
 
 Float32 = npt.NDArray[np.float32]
 

@@ -7,7 +7,7 @@ moment. Thresholds are those of `server.acoustics.audibility`.
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.audibility import HEARD, ratio_in_jnd
+from server.acoustics.audibility import JND_THRESHOLDS, ratio_in_jnd
 from server.acoustics.decibels import power_to_db
 from server.acoustics.room_parameters import DIRECT_SOUND_S, RoomParameters, measure
 
@@ -42,7 +42,7 @@ def audible_difference(
     levels_db = [power_to_db(energy) for energy in energies]
     differences = {
         "level": _most(levels_db[1] - levels_db[0], "level"),
-        "spectrum": _spectral_difference(pair[0], pair[1], sample_rate) / HEARD["spectrum"].amount,
+        "spectrum": _spectral_difference(pair[0], pair[1], sample_rate) / JND_THRESHOLDS["spectrum"].amount,
     }
     ratios_db = {}
     for name, until_s in (("drr", DIRECT_SOUND_S), ("c50", _EARLY_S)):
@@ -67,7 +67,7 @@ def audible_difference(
 
 def _most(difference: npt.ArrayLike, name: str) -> float:
     """NaN where one of them cannot be measured."""
-    return float(np.max(np.abs(np.asarray(difference)))) / HEARD[name].amount
+    return float(np.max(np.abs(np.asarray(difference)))) / JND_THRESHOLDS[name].amount
 
 
 def _decay_s(parameters: RoomParameters, name: str) -> _Floats:

@@ -5,9 +5,9 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.decoding_kernel import Shape, Workspace, delay_of, silence
-from server.acoustics.simd import LANES, broadcast, load, multiply
 from server.acoustics.stft_kernel import Windows, analyse, impose_magnitudes, place_bin, synthesise
-from server.compiled import compiled
+from server.kernels.compiled import compiled
+from server.kernels.simd import LANES, broadcast, load, multiply
 
 Float32 = npt.NDArray[np.float32]
 

@@ -25,8 +25,8 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.cache_lines import on_lines
 from server.acoustics.codec import Codec
+from server.kernels.cache_lines import on_lines
 
 Real = npt.NDArray[np.float32]
 Complex = npt.NDArray[np.complex64]

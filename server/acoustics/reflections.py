@@ -16,7 +16,7 @@ import numpy.typing as npt
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import COINCIDENT_M, TOUCH_M, FloorPlan
 from server.acoustics.reflections_kernel import CEILING, FLOOR, WALL, find_first_echoes, find_reflections
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

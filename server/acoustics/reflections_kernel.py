@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import COINCIDENT_M, TOUCH_M
 from server.acoustics.sound_path_kernel import is_visible
-from server.compiled import compiled
+from server.kernels.compiled import compiled
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.geometry import COINCIDENT_M, FloorPlan
-from server.acoustics.screen import screen_gain_db
 from server.acoustics.sound_path_kernel import find_sound_paths
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -118,7 +118,7 @@ class SoundPathFinder:
         departure = np.where(in_sight[:, None], -towards, leg(emitters, last, -rise))
         detour = np.where(in_sight, -self._clearance_m(listener, emitters, from_listener), excess)
         return SoundPaths(
-            length, arrival, departure, excess, in_sight, screen_gain_db(2 * detour[:, None] / self._wavelengths_m)
+            length, arrival, departure, excess, in_sight, diffraction_gain_db(2 * detour[:, None] / self._wavelengths_m)
         )
 
     def _to_bends_m(self, points: Floats) -> Floats:

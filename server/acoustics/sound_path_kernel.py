@@ -8,9 +8,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.diffraction import CLEAR_FRESNEL_NUMBER, GRAZING_LOSS_DB, SMALL_ARGUMENT
 from server.acoustics.geometry import COINCIDENT_M, TOUCH_M
-from server.acoustics.screen import CLEAR_FRESNEL_NUMBER, GRAZING_LOSS_DB, SMALL_ARGUMENT
-from server.compiled import compiled
+from server.kernels.compiled import compiled
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -57,7 +57,7 @@ def is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> b
 
 @compiled
 def _screen_gain_db(fresnel_number: float) -> float:
-    """As screen.screen_gain_db."""
+    """As screen.diffraction_gain_db."""
     if fresnel_number <= CLEAR_FRESNEL_NUMBER:
         return 0.0
     x = math.sqrt(2 * math.pi * abs(fresnel_number))

@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.cache_lines import on_lines
 from server.acoustics.codec import Codec
-from server.acoustics.lane_fft import butterfly, order, transform_but_last, transform_lanes, twiddles
 from server.acoustics.phase import NO_PHASE
-from server.acoustics.simd import (
+from server.kernels.cache_lines import on_lines
+from server.kernels.compiled import compiled
+from server.kernels.lane_fft import butterfly, order, transform_but_last, transform_lanes, twiddles
+from server.kernels.simd import (
     LANES,
     add,
     at_least,
@@ -33,7 +34,6 @@ from server.acoustics.simd import (
     transpose,
     with_first,
 )
-from server.compiled import compiled
 
 Float32 = npt.NDArray[np.float32]
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from server.settings import Settings
+from server.api.settings import Settings
 
 HEALTH_PATHS = "/livez", "/readyz"
 """What a process supervisor asks: answered whatever `Host` says, and when all other connections are taken."""

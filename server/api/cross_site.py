@@ -23,8 +23,8 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.problems import Refusal, problem
-from server.settings import Settings
+from server.api.problems import Refusal, problem
+from server.api.settings import Settings
 
 _HEALTH = frozenset({"/livez", "/readyz"})
 _ANY = "*"

@@ -4,7 +4,7 @@
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
 
-from server.problems import problem
+from server.api.problems import problem
 from server.runtime.drain import Drain
 from server.runtime.racing import StoppedError, run_until
 

@@ -16,12 +16,12 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from server.api.connection_limits import HEALTH_PATHS, ConnectionLimits
+from server.api.problems import Refusal, problem
 from server.api.request_meter import RequestMeter
 from server.api.resetting import reset
 from server.api.seats import Seat, Seats
 from server.api.turn_taking import TurnTaking
-from server.problems import Refusal, problem
-from server.web_socket import WebSocketProtocol
+from server.api.web_socket import WebSocketProtocol
 
 _CHECK_EVERY_S = 0.5
 _LINGER_S = 2.0

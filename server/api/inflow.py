@@ -16,8 +16,8 @@ import re
 from dataclasses import dataclass
 from typing import Final, Self
 
-from server.blocks import DryBlock
-from server.protocol import ListenerPose
+from server.protocol.blocks import DryBlock
+from server.protocol.client_messages import ListenerPose
 
 SUPERSEDED_COST: Final = 1 / 8
 READ_COST: Final = 1 / 4

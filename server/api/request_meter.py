@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from server.api.connection_limits import ConnectionLimits
-from server.problems import Refusal
+from server.api.problems import Refusal
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from concurrent.futures import CancelledError
 from functools import partial
 from typing import Literal, Self, get_args
 
-from server.bounded_cache import BoundedCache
-from server.errors import RequestError
-from server.priority import become_background
+from server.core.bounded_cache import BoundedCache
+from server.core.errors import RequestError
 from server.runtime.pace import Checkpoint, Pace
+from server.runtime.priority import become_background
 from server.runtime.thread_pool import ThreadPool
 
 Kind = Literal["single", "map"]

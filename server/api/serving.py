@@ -17,7 +17,7 @@ from typing import NoReturn
 
 import uvicorn
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 from server.runtime.drain import Drain
 
 _BACKLOG = 2048

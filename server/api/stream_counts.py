@@ -9,9 +9,9 @@ import threading
 from collections import Counter, defaultdict
 from typing import NamedTuple, Self
 
-from server.durations import DurationHistogram
-from server.regret import RegretRecord
-from server.stream import Stream
+from server.core.durations import DurationHistogram
+from server.streaming.plan_audit import RegretRecord
+from server.streaming.stream import Stream
 
 
 class StreamTotals:

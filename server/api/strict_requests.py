@@ -18,8 +18,8 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute, Mount
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.api.problems import problem
 from server.core.near_names import suggestion
-from server.problems import problem
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from server.bench.report import (
     print_rows,
 )
 from server.core.command_line import StrictTyper, require_at_most_one
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 app = StrictTyper(help="Measure what things cost on this host.", no_args_is_help=True)
 
@@ -40,10 +40,10 @@ def field(
 ) -> None:
     """Time from a pose to a binaural impulse response, one at a time on one core, at every quality level."""
     from server.bench.field import measure_levels
-    from server.field.levels import Levels
+    from server.field.fields_by_level import FieldsByLevel
     from server.scene.bundle import Bundle, find_bundle
 
-    measured = measure_levels(Levels.load(Bundle.load(find_bundle(scene))), rounds=rounds, poses=poses)
+    measured = measure_levels(FieldsByLevel.load(Bundle.load(find_bundle(scene))), rounds=rounds, poses=poses)
     judgements = [Judgement(**row) for row in measured["summary"]]
     if as_json:
         print_json(measured)

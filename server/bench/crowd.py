@@ -19,9 +19,9 @@ import numpy as np
 from server.acoustics.geometry import Vector3
 from server.bench.gauge import POSE_IDS, Waiting
 from server.bench.scene import CLIP, SCENE
-from server.blocks import AudioBlock
-from server.durations import DurationHistogram
-from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.core.durations import DurationHistogram
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
 
 _ACKNOWLEDGE_EVERY = 4
 _CENTRE: Vector3 = (2.0, 2.0, 1.5)

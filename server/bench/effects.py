@@ -26,26 +26,34 @@ from server.acoustics.difference import audible_difference
 from server.acoustics.geometry import Pose, Vector3
 from server.bench.rooms import FloatArray, noise
 from server.bench.statistical_field import Room, StatisticalField, box
-from server.direct_sound import DirectSound
-from server.effect_costs import measure_costs
-from server.emitters import Emitter as SessionEmitter
 from server.field.field import AcousticField
-from server.field.levels import Levels
-from server.ir_request import composed_irs, compute_irs
-from server.load import Rung
-from server.places import place_of_field, reverberation_of
-from server.protocol import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose, ListenerStart, MoveEmitter
-from server.rendered_effects import EmitterEffects, SharedEffects
+from server.field.fields_by_level import FieldsByLevel
+from server.planning.effect_costs import measure_costs
+from server.planning.places import place_of_field, reverberation_of
+from server.planning.planner import Costs, make_plan
+from server.planning.scene_acoustics import Emitter, Listener, Output, Situation
+from server.protocol.client_messages import (
+    PROTOCOL,
+    AddEmitter,
+    BlockSize,
+    Hello,
+    ListenerPose,
+    ListenerStart,
+    MoveEmitter,
+)
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
+from server.responses.direct_sound import DirectSound
+from server.responses.effect_flags import EmitterEffects, SharedEffects
+from server.responses.full_response import kemar
+from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import CATALOGUE, EffectName, Overrides
 from server.scene.plan import Plan
-from server.scene.planner import Costs, make_plan
-from server.scene.situation import Emitter, Listener, Output, Situation
-from server.session import Session
-from server.whole_field import kemar
+from server.streaming.emitters import Emitter as SessionEmitter
+from server.streaming.load import QualityStep
+from server.streaming.session import Session
 
 BLOCK_SIZE: BlockSize = 256
 _POSES_PER_S = 30.0
@@ -268,7 +276,7 @@ class _Player:
     def __init__(self, scenario: Scenario, effects: Overrides) -> None:
         self._scenario = scenario
         self._field = field = scenario.field()
-        self._levels = Levels([field])
+        self._levels = FieldsByLevel([field])
         clip = DryAudio(0.05 * noise(0, field.sample_rate))
         hello = Hello(
             protocol=PROTOCOL,
@@ -283,7 +291,7 @@ class _Player:
             self._levels,
             kemar(field.sample_rate),
             lambda _: clip,
-            rung=Rung(field.level.name, None, False, 1.0),
+            rung=QualityStep(field.level.name, None, False, 1.0),
             window=10_000_000,
             place=place_of_field(field, BLOCK_SIZE),
         )

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from server.bench.machine import describe_machine
 from server.bench.report import Goal
 from server.field.field import AcousticField
-from server.field.levels import Levels
+from server.field.fields_by_level import FieldsByLevel
 from server.field.reuse import KEPT_BYTES
 
 Floats = npt.NDArray[np.float64]
@@ -22,7 +22,7 @@ GOAL = Goal("ms_p50 of the default level", 1.0, is_at_most=True)
 _STEP_M = 0.1
 
 
-def measure_levels(levels: Levels, *, rounds: int, poses: int) -> dict[str, Any]:
+def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[str, Any]:
     """Wall time of single IRs, by level: the median of the rounds' medians, and p99 of all; and of these the part that
     the graph takes, the rest being decoding.
 
@@ -51,7 +51,7 @@ def measure_levels(levels: Levels, *, rounds: int, poses: int) -> dict[str, Any]
     }
 
 
-def _fill_kept(levels: Levels) -> None:
+def _fill_kept(levels: FieldsByLevel) -> None:
     """With responses of the level that has most nodes, or as many as it has; the next take the place of others."""
     by_nodes = {(reuse.spacing_m, reuse.turn_deg): field for field in levels.values() if (reuse := field.level.reuse)}
     if not by_nodes:
@@ -86,7 +86,7 @@ def _time(field: AcousticField, listener: Floats, emitter: Floats, yaw: float) -
     return (done_s - started_s) * 1000, (time.perf_counter() - done_s) * 1000
 
 
-def _walk(levels: Levels, seed: int, poses: int) -> list[tuple[Floats, Floats, float]]:
+def _walk(levels: FieldsByLevel, seed: int, poses: int) -> list[tuple[Floats, Floats, float]]:
     """A listener's steps from a place to one in its sight, towards an emitter somewhere, and on from another place."""
     bounds, plan = levels.bundle.manifest.bounds, levels.bundle.floor_plan
     rng = np.random.default_rng(seed)

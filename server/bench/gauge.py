@@ -17,13 +17,13 @@ from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.blocks import AudioBlock
-from server.durations import DurationHistogram
-from server.protocol import ListenerPose
-from server.replies import Durations
-from server.stream import Stream
-from server.streaming import StreamHost
-from server.web_socket import watched
+from server.api.connection import StreamHost
+from server.api.web_socket import watched
+from server.core.durations import DurationHistogram
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import ListenerPose
+from server.protocol.server_messages import Durations
+from server.streaming.stream import Stream
 
 POSE_ID = struct.Struct("<4xI")
 """Where it stands in a binary pose of a listener."""

@@ -30,21 +30,21 @@ def serve() -> None:
     import soundfile
     import uvicorn
 
-    from server.app import create_app
+    from server.api.app import create_app
+    from server.api.settings import Settings
     from server.bench.gauge import Gauge
     from server.bench.rooms import noise
     from server.bench.scene import CLIP, SAMPLE_RATE, SCENE, BankField
-    from server.cli import server_options
-    from server.field.levels import Levels
-    from server.memory import give_back_large_arrays
-    from server.settings import Settings
+    from server.cli.main import server_options
+    from server.field.fields_by_level import FieldsByLevel
+    from server.runtime.memory import give_back_large_arrays
 
     give_back_large_arrays()
     with tempfile.TemporaryDirectory() as folder, socket.socket() as listener:
         clip = Path(folder) / f"{CLIP}.wav"
         soundfile.write(clip, 0.05 * noise(0, _CLIP_S * SAMPLE_RATE), SAMPLE_RATE, subtype="FLOAT")
         settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS)
-        app = Gauge(create_app(settings, scenes={SCENE: Levels([BankField()])}))
+        app = Gauge(create_app(settings, scenes={SCENE: FieldsByLevel([BankField()])}))
         server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
         listener.bind((settings.host, 0))
         threading.Thread(target=_stop_with_input, args=(server,), daemon=True).start()

@@ -9,11 +9,11 @@ import numpy as np
 from websockets.asyncio.client import connect
 
 from server.acoustics.geometry import Vector3
-from server.blocks import AudioBlock
-from server.clips import ClipLibrary
-from server.errors import NafirError
-from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
-from server.replies import Error, Welcome, parse_server_message
+from server.assets.clips import ClipLibrary
+from server.core.errors import NafirError
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.protocol.server_messages import Error, Welcome, parse_server_message
 
 _TURN_S = 12.0
 _ACKNOWLEDGE_EVERY = 4

@@ -8,9 +8,9 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.sound_path import SoundPathFinder
-from server.acoustics.spares import Spares
 from server.bench.rooms import FloatArray, room
 from server.field.field import AcousticField
+from server.kernels.array_pool import ArrayPool
 from server.scene.bundle import Bundle
 from server.scene.geometry import Geometry, Material, Materials
 from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
@@ -21,7 +21,7 @@ SAMPLE_RATE = 48_000
 IR_S = 1.0
 
 _BANK = 32
-_SPARES = Spares(16 * 1024 * 1024)
+_SPARES = ArrayPool(16 * 1024 * 1024)
 _LEVEL = 0.01
 _POSES_PER_M = 50.0
 _PLAIN = Material(absorption=(0.2,) * len(OCTAVE_BANDS_HZ), scattering=(0.1,) * len(OCTAVE_BANDS_HZ))

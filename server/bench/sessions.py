@@ -42,7 +42,7 @@ from server.bench.gauge import merged
 from server.bench.machine import describe_machine
 from server.bench.report import Goal, Judgement
 from server.bench.scene import IR_S, SAMPLE_RATE
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 _BLOCK_SIZE = 256
 _LATE_SHARE = 0.001

@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 _FIRST_BLOCK = """
 import numpy as np

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
+from server.responses.full_response import diffuse_energy, kemar
 from server.scene.bundle import Bundle
 from server.scene.geometry import Geometry, Material, Materials
 from server.scene.manifest import (
@@ -29,7 +30,6 @@ from server.scene.manifest import (
     QualityLevel,
     Start,
 )
-from server.whole_field import diffuse_energy, kemar
 
 Floats = npt.NDArray[np.float64]
 

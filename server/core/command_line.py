@@ -14,9 +14,9 @@ from typing import Any, get_args
 import typer
 from typer.core import TyperCommand
 
+from server.core.errors import NafirError
 from server.core.files import require_figure, require_writable, require_writable_folder
 from server.core.numerals import parse_decimal, parse_integer
-from server.errors import NafirError
 
 _PARSERS: dict[Any, Callable[[str], float]] = {int: parse_integer, float: parse_decimal}
 

@@ -4,7 +4,7 @@ import importlib.util
 import os
 from pathlib import Path
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 FIGURES = (".png", ".svg", ".pdf")
 

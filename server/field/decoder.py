@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.phase import FrozenNoise, correlated_noise, delayed, griffin_lim, separate, zero_phase
-from server.acoustics.spares import Spares
-from server.compiled import HAS_NUMBA
 from server.field.graph import Spectrograms
+from server.kernels.array_pool import ArrayPool
+from server.kernels.compiled import HAS_NUMBA
 from server.scene.manifest import CodecParameters, Phase
 
 if HAS_NUMBA:
@@ -25,13 +25,13 @@ if HAS_NUMBA:
         decode,
     )
     from server.acoustics.griffin_lim_kernel import iterate
-    from server.acoustics.simd import LANES
     from server.acoustics.stft_kernel import Windows
+    from server.kernels.simd import LANES
 
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-_SPARES = Spares(16 * 1024 * 1024)
+_SPARES = ArrayPool(16 * 1024 * 1024)
 """A request's responses wait for those of the next."""
 
 

@@ -1,8 +1,8 @@
 """A trained acoustic field: poses in, impulse responses of the reflected sound out.
 
 Reflected sound is all that follows the direct sound, which is not in here: it is computed from geometry
-(`server.whole_field` adds it). So are the first reflections, where the bundle's `image_order` is 1. Of measured scenes,
-whose `direct_sound` is the field's, responses are whole.
+(`server.responses.full_response` adds it). So are the first reflections, where the bundle's `image_order` is 1. Of
+measured scenes, whose `direct_sound` is the field's, responses are whole.
 
 Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
 """
@@ -15,8 +15,8 @@ from server.acoustics.geometry import Vector3
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
-from server.bounded_cache import BoundedCache
-from server.errors import BundleError, FieldError
+from server.core.bounded_cache import BoundedCache
+from server.core.errors import BundleError, FieldError
 from server.field.decoder import Decoder, add_from, resized
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph

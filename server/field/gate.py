@@ -10,7 +10,7 @@ Axes: B poses; responses (B, channel, sample).
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.scene.manifest import CodecParameters
 
 if HAS_NUMBA:

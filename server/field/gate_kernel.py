@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import compiled
+from server.kernels.compiled import compiled
 
 Float32 = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.cells import Axis
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
 from server.scene.bundle import Bundle
 from server.scene.manifest import CodecParameters

@@ -132,7 +132,7 @@ class Lattice:
         return float(self._paths.find(np.array(listener), np.array([emitter])).length_m[0])
 
 
-def moved(
+def delay_response(
     response: npt.NDArray[np.float32], later_samples: int, result: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.float32]:
     """(channel, sample) a response so many samples later, silent before; what comes after its end or before its

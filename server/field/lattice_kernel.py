@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.sound_path_kernel import contains, is_visible
-from server.compiled import compiled
+from server.kernels.compiled import compiled
 
 Floats = npt.NDArray[np.float64]
 Coordinates = tuple[float, float, float, float, float, float]

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import Vector3
 from server.acoustics.sound_path import SoundPathFinder
-from server.acoustics.spares import Spares
-from server.bounded_cache import BoundedCache
-from server.field.lattice import Lattice, Node, Snapped, moved
+from server.core.bounded_cache import BoundedCache
+from server.field.lattice import Lattice, Node, Snapped, delay_response
+from server.kernels.array_pool import ArrayPool
 from server.scene.bundle import Bundle
 from server.scene.manifest import QualityLevel
 
@@ -22,7 +22,7 @@ Kept = BoundedCache[tuple[object, ...], object]
 """What all levels of a scene keep, by whatever it depends on."""
 
 KEPT_BYTES = 64 * 1024 * 1024
-_SPARES = Spares(16 * 1024 * 1024)
+_SPARES = ArrayPool(16 * 1024 * 1024)
 
 
 class NodeResponses:
@@ -60,7 +60,7 @@ class NodeResponses:
         found = [(self.at(node), later) for node, later in self._snapped(listeners, emitters, yaws)]
         responses = _SPARES.floats(len(found), *found[0][0].shape)
         for (response, later), result in zip(found, responses, strict=True):
-            moved(response, later, result)
+            delay_response(response, later, result)
         return responses
 
     def nodes(self, listeners: Floats, emitters: Floats, yaws: Floats) -> tuple[Floats, Floats, Floats]:

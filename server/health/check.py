@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.decibels import amplitude_to_db
-from server.errors import FieldError, NafirError
+from server.core.errors import FieldError, NafirError
 from server.field.field import AcousticField, Silence
+from server.field.fields_by_level import FieldsByLevel
 from server.field.graph import FieldGraph
-from server.field.levels import Levels
 from server.health import laws, search
-from server.health.double_precision import DoubleWholeField
+from server.health.double_precision import DoubleFullResponse
 from server.health.energies import Energies, Predictions
 from server.health.findings import (
     BATCH,
@@ -39,9 +39,9 @@ from server.health.findings import (
     Law,
 )
 from server.health.poses import EMITTER, LISTENER, YAW, Poses, corners, scattered
+from server.responses.full_response import FullResponse, kemar
 from server.scene.bundle import Bundle
 from server.scene.manifest import Manifest
-from server.whole_field import WholeField, kemar
 
 Floats = npt.NDArray[np.float64]
 Responses = npt.NDArray[np.float32]
@@ -148,7 +148,7 @@ def check(
     """
     started_s = time.perf_counter()
     effort = effort or Effort()
-    levels = Levels.load(bundle)
+    levels = FieldsByLevel.load(bundle)
     fields = fields or _check_fields(bundle, levels, effort, seed, track)
     findings: list[Finding] = []
     for name in track([f"{_LEVEL}{name}" for name in levels]):
@@ -163,12 +163,12 @@ def check(
 
 def check_fields(bundle: Bundle, effort: Effort | None = None, *, seed: int = 0) -> FieldsHealth:
     """What does not depend on how a field's answers are decoded: neither on a scene's noise nor on its levels."""
-    return _check_fields(bundle, Levels.load(bundle), effort or Effort(), seed, iter)
+    return _check_fields(bundle, FieldsByLevel.load(bundle), effort or Effort(), seed, iter)
 
 
 def _check_fields(
     bundle: Bundle,
-    levels: Levels,
+    levels: FieldsByLevel,
     effort: Effort,
     seed: int,
     track: Callable[[Iterable[str]], Iterable[str]],
@@ -287,8 +287,8 @@ def _check_level(field: AcousticField, poses: Poses) -> list[Finding]:
     together, again = _responses(field, poses), _responses(field, poses)
     alone = np.concatenate([_responses(field, poses[row : row + 1]) for row in range(len(poses))])
     head = kemar(field.sample_rate)
-    whole = _responses(WholeField(field, head), poses)
-    exact = _responses(DoubleWholeField(field, head), poses)
+    whole = _responses(FullResponse(field, head), poses)
+    exact = _responses(DoubleFullResponse(field, head), poses)
     from_zero_phase = field.level.phase.kind == "griffin_lim" and not field.level.phase.warm
     if field.bundle.manifest.direct_sound == "geometry":  # else, in whatever unit it was measured
         findings.append(_worst(PEAK, name, poses, np.abs(together).max(axis=(1, 2)).astype(np.float64)))
@@ -308,7 +308,7 @@ def _answers(field: AcousticField, pose: Poses) -> bool:
     return True
 
 
-def _responses(field: AcousticField | WholeField, poses: Poses) -> Responses:
+def _responses(field: AcousticField | FullResponse, poses: Poses) -> Responses:
     return field.impulse_responses(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
 
 

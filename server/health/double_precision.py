@@ -18,7 +18,6 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.geometry import axes_of
 from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
-from server.early_reflections import EarlyReflections
 from server.field.decoder import Decoder
 from server.field.field import AcousticField, Silence
 from server.field.gate import Gate
@@ -26,7 +25,8 @@ from server.field.graph import Spectrograms
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.hrtf import HeadFilters
 from server.rendering.still_paths import StillPaths
-from server.whole_field import WholeField
+from server.responses.early_reflections import EarlyReflections
+from server.responses.full_response import FullResponse
 
 _Float32 = npt.NDArray[np.float32]
 _Floats = npt.NDArray[np.float64]
@@ -187,8 +187,8 @@ class _DoubleEarlyReflections(EarlyReflections):
         self._finder, self._air_db_per_m, self._paths = early._finder, early._air_db_per_m, paths
 
 
-class DoubleWholeField(WholeField):
-    """What `WholeField` answers with, in float64."""
+class DoubleFullResponse(FullResponse):
+    """What `FullResponse` answers with, in float64."""
 
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
         super().__init__(field if isinstance(field, Silence) else _DoubleField(field), filters)

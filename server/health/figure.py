@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 from server.health.check import Health
 from server.health.energies import WINDOW_S
 from server.health.findings import BATCH, DECAY, DOUBLE, ENERGY, LEVEL_PER_CM, LEVEL_PER_DEGREE, Finding

@@ -3,15 +3,15 @@
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.cache_lines import zeros_on_lines
-from server.acoustics.simd import LANES
-from server.rendering import right_angle
+from server.kernels import right_angle
+from server.kernels.cache_lines import zeros_on_lines
+from server.kernels.simd import LANES
 from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
 from server.rendering.packed_filter import PackedFilter, address, pack
 from server.rendering.partitions import Partitioning, Stage
-from server.rendering.products import COLUMNS, GROUP, apart
+from server.rendering.products import COLUMNS, GROUP, spectrum_stride
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -148,7 +148,7 @@ class _StageArrays:
         self.tables = right_angle.tables(stage.size)
         self.fade_out = raised_cosine(stage.size)[::-1].copy()
         tiles, self.slots = stage.size // LANES, stage.partitions
-        self.ring = zeros_on_lines(sources, self.slots, int(apart(stage.size)))
+        self.ring = zeros_on_lines(sources, self.slots, int(spectrum_stride(stage.size)))
         self.mix = zeros_on_lines(tiles, channels, COLUMNS, 2, LANES)
         self.output = zeros_on_lines(2, channels, stage.size)
         self.current, self.job_source, self.job_old, self.job_new = (np.zeros(sources, np.int64) for _ in _PER_SOURCE)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.ingest import LOUDEST
 from server.rendering.partitions import TURNS, Partitioning
 

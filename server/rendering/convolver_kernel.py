@@ -6,7 +6,8 @@ complex numbers as eight real parts then eight imaginary ones, and what is read 
 
     filter of a stage   near: (partition, tile, channel, part, 8), the first NEAR partitions;
                         far: (tile, partition, channel, part, 8), the others behind them
-    ring of a stage     (source, slot, tile, part, 8)          spectra of windows, `products.apart`, the newest first
+    ring of a stage     (source, slot, tile, part, 8)          spectra of windows, `products.spectrum_stride`, the
+    newest first
     mix of a stage      (tile, channel, column, part, 8)       columns as in `server.rendering.products`
 
 Memory is what limits it. So sources take turns, one in TURNS windows, and on its turn a source is multiplied for all
@@ -25,8 +26,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
-from server.acoustics.simd import add, broadcast, load, load_int, multiply_add, pointer, store
-from server.compiled import compiled
+from server.kernels.compiled import compiled
+from server.kernels.simd import add, broadcast, load, load_int, multiply_add, pointer, store
 from server.rendering import products, right_angle
 from server.rendering.convolver_records import CONVOLVER, STAGE
 from server.rendering.partitions import TURNS
@@ -276,7 +277,7 @@ def _transform(convolver, stage, job) -> None:
         history + 4 * first,
         history + 4 * second,
         convolver.scratch,
-        _ring(stage, source) + 4 * products.apart(size) * _newest(stage),
+        _ring(stage, source) + 4 * products.spectrum_stride(size) * _newest(stage),
         16,
         8,
         size,
@@ -334,8 +335,8 @@ def _exchange(stage, channels, source, old, new, first, last) -> None:
 
 @compiled
 def _ring(stage, source) -> int:
-    """The address of a source's ring of spectra (slot, tile, part, 8), which are `products.apart`."""
-    return stage.ring + 4 * products.apart(stage.size) * stage.slots * source
+    """The address of a source's ring of spectra (slot, tile, part, 8), which are `products.spectrum_stride`."""
+    return stage.ring + 4 * products.spectrum_stride(stage.size) * stage.slots * source
 
 
 @compiled
@@ -380,8 +381,8 @@ def _synthesise(convolver, stage, channel, out) -> None:
 @compiled
 def _invert_column(convolver, stage, channel, column, out) -> None:
     """The samples (size,) of what is in a column of a channel's mix; zeros are left there, for a window to come."""
-    mix = stage.mix + 4 * products.mixed(convolver.channels, 0, channel, column)
-    step = products.mixed(convolver.channels, 1, 0, 0)
+    mix = stage.mix + 4 * products.mix_offset(convolver.channels, 0, channel, column)
+    step = products.mix_offset(convolver.channels, 1, 0, 0)
     right_angle.inverse(mix, step, 8, convolver.scratch, out, stage.size, stage.twist, stage.passes, stage.lanes)
     _clear_column(convolver, stage, channel, column)
 
@@ -390,6 +391,6 @@ def _invert_column(convolver, stage, channel, column, out) -> None:
 def _clear_column(convolver, stage, channel, column) -> None:
     zero = broadcast(np.float32(0))
     for tile in range(stage.size // 8):
-        at = products.mixed(convolver.channels, tile, channel, column)
+        at = products.mix_offset(convolver.channels, tile, channel, column)
         store(stage.mix, at, zero)
         store(stage.mix, at + 8, zero)

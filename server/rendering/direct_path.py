@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.cache_lines import zeros_on_lines
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
-from server.compiled import HAS_NUMBA
+from server.kernels.cache_lines import zeros_on_lines
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.direct_path_kernel import TILE, ask, render_direct_paths, transform_tables
 from server.rendering.direct_path_records import SLOT, DirectPathState, FloatArray
 from server.rendering.fade import raised_cosine

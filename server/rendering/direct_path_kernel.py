@@ -13,7 +13,7 @@ moved, long before it could be heard, and crossfaded over the block: along a str
 blocks then join without a ripple at their rate, and along a raised cosine where they leap. A length that jumps further
 than anything moves is crossfaded too, from the old delay to the new.
 
-Filters work on the right-angle spectra of `server.rendering.right_angle`, all slots summed before the one way back: a
+Filters work on the right-angle spectra of `server.kernels.right_angle`, all slots summed before the one way back: a
 spectrum per ear of what it hears, one per filter whenever that changes.
 
 Letters: s slots, e ears (2, or 1 without a head), n taps, f bins, b block size, w the same in whole tiles of the loops
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import HAS_NUMBA, compiled_in_place
+from server.kernels.compiled import HAS_NUMBA, compiled_in_place
 from server.rendering.direct_path_records import BANDS, DirectPathState, DoubleArray, FloatArray
 from server.rendering.fractional_delay import BEFORE
 from server.rendering.sphere import find_triangle

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.cache_lines import on_lines
+from server.kernels.cache_lines import on_lines
 
 TAPS = 32
 BEFORE = TAPS // 2 - 1

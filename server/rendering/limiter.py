@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import HAS_NUMBA, compiled
+from server.kernels.compiled import HAS_NUMBA, compiled
 
 if HAS_NUMBA:
-    from server.rendering.by_reference import Reference
+    from server.kernels.by_reference import Reference
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.convolver import Convolver, FloatArray
 from server.rendering.direct_path import DirectPath
 from server.rendering.fade import raised_cosine
@@ -19,7 +19,7 @@ from server.rendering.partitions import is_power_of_two
 from server.rendering.sources import ClipPlayer, Source
 
 if HAS_NUMBA:
-    from server.rendering.by_reference import Reference
+    from server.kernels.by_reference import Reference
     from server.rendering.mixing_kernel import enter_convolver, record_of
 
 

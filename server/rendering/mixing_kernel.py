@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
-from server.acoustics.simd import broadcast, load, multiply, multiply_add, pointer, store
-from server.compiled import compiled
-from server.rendering.by_reference import Reference, reference_at
+from server.kernels.by_reference import Reference, reference_at
+from server.kernels.compiled import compiled
+from server.kernels.simd import broadcast, load, multiply, multiply_add, pointer, store
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.convolver import FloatArray
 from server.rendering.limiter import Limiter
 from server.rendering.mixing import Mixer, mix

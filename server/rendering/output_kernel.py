@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray, types
 
-from server.acoustics.simd import pointer
-from server.compiled import compiled
-from server.rendering.by_reference import Reference, ReferenceType, reference_at
+from server.kernels.by_reference import Reference, ReferenceType, reference_at
+from server.kernels.compiled import compiled
+from server.kernels.flush_to_zero import flush_to_zero, restore
+from server.kernels.simd import pointer
 from server.rendering.convolver_kernel import has_exchanged
-from server.rendering.flush_to_zero import flush_to_zero, restore
 from server.rendering.limiter import limit
 from server.rendering.mixing_kernel import MIXER, mix
 

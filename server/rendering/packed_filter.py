@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.spares import Spares
-from server.compiled import compiled
-from server.rendering import right_angle
+from server.kernels import right_angle
+from server.kernels.array_pool import ArrayPool
+from server.kernels.compiled import compiled
 from server.rendering.partitions import Partitioning
-from server.rendering.products import packed
+from server.rendering.products import filter_offset
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -19,7 +19,7 @@ IntArray = npt.NDArray[np.int64]
 _PER_STAGE = 3
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _SHIFT = np.uint64(32)
-_SPARES = Spares(64 * 1024 * 1024)
+_SPARES = ArrayPool(64 * 1024 * 1024)
 """A few dozen responses of a second: each that is exchanged leaves what the next one needs."""
 
 
@@ -112,8 +112,8 @@ def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digest
                     padded[end - begin : size] = 0
                     first = padded.ctypes.data
                 digest = _digest(words[channel, begin:end], size, digest)
-                at = packed(channels, size // 8, count, 0, partition)
-                step = packed(channels, size // 8, count, 1, partition) - at
+                at = filter_offset(channels, size // 8, count, 0, partition)
+                step = filter_offset(channels, size // 8, count, 1, partition) - at
                 to = spectra + 4 * (at + 16 * channel)
                 right_angle.forward(first, silence, bins, to, step, 8, size, twist, passes, lanes)
             digests[done] = np.int64(digest)

@@ -6,7 +6,9 @@ Outputs of `filter_block` are a multiple of `TILE` long: accumulators stay in re
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.simd import (
+from server.kernels import right_angle
+from server.kernels.compiled import compiled_in_place
+from server.kernels.simd import (
     broadcast,
     load,
     load_broadcast,
@@ -17,9 +19,7 @@ from server.acoustics.simd import (
     store,
     subtract,
 )
-from server.acoustics.wide_simd import load_16, load_broadcast_16, multiply_16, multiply_add_16, sum_each
-from server.compiled import compiled_in_place
-from server.rendering import right_angle
+from server.kernels.wide_simd import load_16, load_broadcast_16, multiply_16, multiply_add_16, sum_each
 from server.rendering.fractional_delay import PHASES, TAPS
 
 FloatArray = npt.NDArray[np.float32]

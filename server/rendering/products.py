@@ -8,9 +8,10 @@ registers.
 import numpy as np
 from numba import carray
 
-from server.acoustics.cache_lines import LINE_BYTES
-from server.acoustics.simd import load_int, pointer, prefetch
-from server.acoustics.wide_simd import (
+from server.kernels.cache_lines import LINE_BYTES
+from server.kernels.compiled import compiled
+from server.kernels.simd import load_int, pointer, prefetch
+from server.kernels.wide_simd import (
     add_16,
     broadcast_16,
     load_16,
@@ -21,7 +22,6 @@ from server.acoustics.wide_simd import (
     store_16,
     swap_halves,
 )
-from server.compiled import compiled
 from server.rendering.partitions import NEAR, TURNS
 
 COLUMNS = TURNS + 1
@@ -34,20 +34,20 @@ _SPECTRUM_AHEAD, _FILTER_AHEAD = 6 * LINE_BYTES, 16 * LINE_BYTES
 
 
 @compiled
-def mixed(channels, tile, channel, column) -> int:
+def mix_offset(channels, tile, channel, column) -> int:
     """Where the real parts of a tile are in a mix; the imaginary ones follow."""
     return 16 * (COLUMNS * (channels * tile + channel) + column)
 
 
 @compiled
-def apart(size) -> int:
+def spectrum_stride(size) -> int:
     """From a spectrum of a ring to the next: one line further than it is long, since lines a power of two apart would
     drive each other out of a cache."""
     return 2 * size + 16
 
 
 @compiled
-def packed(channels, tiles, count, tile, partition) -> int:
+def filter_offset(channels, tiles, count, tile, partition) -> int:
     """Where a tile is in a filter of `count` partitions: real and imaginary parts of the first channel, then of the
     second."""
     near = min(NEAR, count)
@@ -96,7 +96,7 @@ def _fetch_filter(filters, h) -> None:
 def _step(near, tiles, channels, count, tile, partition) -> int:
     """From a tile of a partition to that of the next one."""
     if partition + 1 == near:
-        return packed(channels, tiles, count, tile, near) - packed(channels, tiles, count, tile, near - 1)
+        return filter_offset(channels, tiles, count, tile, near) - filter_offset(channels, tiles, count, tile, near - 1)
     return 16 * channels * (tiles if partition + 1 < near else 1)
 
 
@@ -104,13 +104,13 @@ def _step(near, tiles, channels, count, tile, partition) -> int:
 def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
     """Add the products of the newest spectra of a group, in slot `newest` of their rings, to the mix of the window at
     work, and of the `ahead` - 1 that follow it: with the first partition of their filters, the second and so on."""
-    mix, tiles, start = stage.mix, stage.size // 8, apart(stage.size) * newest
+    mix, tiles, start = stage.mix, stage.size // 8, spectrum_stride(stage.size) * newest
     zero = broadcast_16(np.float32(0))
     for tile in range(first, last):
         x = start + 16 * tile
         for partition in range(ahead):
             h = 16 * channels * (tiles * partition + tile)
-            left = mixed(channels, tile, 0, (stage.window + partition) % TURNS)
+            left = mix_offset(channels, tile, 0, (stage.window + partition) % TURNS)
             right = left + 16 * COLUMNS * (channels - 1)
             left_sum, right_sum = zero, zero
             for member in range(members):
@@ -130,15 +130,15 @@ def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, 
     """Add partitions `begin` to `end` of a filter, times `sign` and the spectra in the ring, to a column of the mix,
     which is that of a window `ahead` of the one whose spectrum is in slot `newest`."""
     mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast_16(sign)
-    spectrum = apart(stage.size)
+    spectrum = spectrum_stride(stage.size)
     zero = broadcast_16(np.float32(0))
     near = min(NEAR, count)
     start = (newest + begin - ahead) % slots
     for tile in range(first, last):
-        left, right = mixed(channels, tile, 0, column), mixed(channels, tile, channels - 1, column)
+        left, right = mix_offset(channels, tile, 0, column), mix_offset(channels, tile, channels - 1, column)
         left_sum, right_sum = zero, zero
         slot = start
-        h = packed(channels, tiles, count, tile, begin)
+        h = filter_offset(channels, tiles, count, tile, begin)
         for partition in range(begin, end):
             x = spectrum * slot + 16 * tile
             real, opposed = multiply_16(load_twice(ring, x), factor), multiply_16(load_opposed(ring, x + 8), factor)
@@ -157,14 +157,14 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
     the window at work, and to those of the three that follow it what is known of them by now: from the first, second
     and third partition on."""
     mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
-    spectrum = apart(stage.size)
+    spectrum = spectrum_stride(stage.size)
     other = 16 * COLUMNS * (channels - 1)  # from one channel to the other, which is the same if there is only one
     zero = broadcast_16(np.float32(0))
     for tile in range(first, last):
-        a = mixed(channels, tile, 0, stage.window % TURNS)
-        b = mixed(channels, tile, 0, (stage.window + 1) % TURNS)
-        c = mixed(channels, tile, 0, (stage.window + 2) % TURNS)
-        d = mixed(channels, tile, 0, (stage.window + 3) % TURNS)
+        a = mix_offset(channels, tile, 0, stage.window % TURNS)
+        b = mix_offset(channels, tile, 0, (stage.window + 1) % TURNS)
+        c = mix_offset(channels, tile, 0, (stage.window + 2) % TURNS)
+        d = mix_offset(channels, tile, 0, (stage.window + 3) % TURNS)
         l_a, l_b, l_c, l_d = zero, zero, zero, zero
         r_a, r_b, r_c, r_d = zero, zero, zero, zero
         for member in range(members):

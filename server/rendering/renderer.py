@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import Quaternion
-from server.errors import NafirError
+from server.core.errors import NafirError
 from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
 from server.rendering.direct_path import DirectPath, PathTarget
 from server.rendering.hrtf import HeadFilters
@@ -183,10 +183,10 @@ class Renderer:
         return self._mixers.preparer(2).preparation
 
     def prepare_hearing(self, channels: int) -> None:
-        """Make ready for `hear_with`, on any thread."""
+        """Make ready for `set_channels`, on any thread."""
         self._mixers.prepare_hearing(channels)
 
-    def hear_with(self, channels: int) -> None:
+    def set_channels(self, channels: int) -> None:
         """Have emitters without IRs, and those to come, be heard by two ears of a head, or by one of none. Those that
         have an IR follow with the first one of so many channels."""
         self._mixer = self._mixers.of(channels)
@@ -306,7 +306,7 @@ class Renderer:
                 rows = [number for number, emitter in enumerate(emitters) if emitter.mixer is mixer]
                 mixer.direct.set_targets(slots, lengths_m[rows], arrivals[rows], band_gains_db[rows])
 
-    def hear_direct(self, emitter_id: str, *, is_heard: bool = True, distance: bool = True, air: bool = True) -> None:
+    def enable_direct(self, emitter_id: str, *, is_heard: bool = True, distance: bool = True, air: bool = True) -> None:
         """Whether an emitter's direct sound is heard by itself, and loses anything with distance and to the air; fades
         over the next block. Raises UnknownEmitterError."""
         emitter = self._emitter(emitter_id)

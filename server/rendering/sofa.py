@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 from server.rendering.sofa_file import SofaError, SofaFile, delay_rows
 
 _Floats = npt.NDArray[np.float64]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 _Floats = npt.NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from server.compiled import compiled_in_place
-from server.errors import NafirError
+from server.core.errors import NafirError
+from server.kernels.compiled import compiled_in_place
 
 _Floats = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.compiled import HAS_NUMBA, compiled
+from server.kernels.compiled import HAS_NUMBA, compiled
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.sphere import find_triangle
 

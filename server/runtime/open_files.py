@@ -2,7 +2,7 @@
 
 import sys
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 _OTHERS = 256
 """Beside connections: bundles, libraries, pipes, static files that are being sent."""

@@ -21,9 +21,9 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from server.acoustics.geometry import FloorPlan, Vector3
+from server.core.errors import BundleError, RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.npy import MOST_HEADER_BYTES, NpyError, NpyHeader
-from server.errors import BundleError, RequestError
 from server.scene.manifest import ARRAYS_FILE, Manifest
 
 MANIFEST_FILE = "scene.json"

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from server.errors import RequestError
+from server.core.errors import RequestError
 
 
 class EffectName(StrEnum):

@@ -14,14 +14,14 @@ from pathlib import Path
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 _READY_S = 300.0
 """Machine code may have to be made first."""
 _PATIENCE_S = 20.0
 _NEXT_LINE = re.compile(r"\n(?:DEBUG|INFO|WARNING|ERROR|CRITICAL)")
 _TRACE_CHARACTERS = 800
-_SERVE = "from server.cli import main; main()"
+_SERVE = "from server.cli.main import main; main()"
 
 
 class Host:

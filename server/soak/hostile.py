@@ -17,10 +17,9 @@ import numpy.typing as npt
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from server.blocks import AudioBlock, DryBlock, FloatArray
-from server.errors import NafirError
-from server.load import AUTO
-from server.protocol import (
+from server.core.errors import NafirError
+from server.protocol.blocks import AudioBlock, DryBlock, FloatArray
+from server.protocol.client_messages import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
@@ -33,8 +32,9 @@ from server.protocol import (
     SetGain,
     SetLevel,
 )
-from server.replies import Error, Pong, Welcome, parse_server_message
+from server.protocol.server_messages import Error, Pong, Welcome, parse_server_message
 from server.scene.effects import EffectName
+from server.streaming.load import AUTO
 
 _Floats = npt.NDArray[np.float64]
 

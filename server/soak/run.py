@@ -27,11 +27,11 @@ from websockets.exceptions import WebSocketException
 
 from server.bench.machine import describe_machine
 from server.bench.report import Goal, Judgement
-from server.blocks import AudioBlock
-from server.errors import NafirError
-from server.field.levels import Levels
-from server.protocol import Acknowledge
-from server.replies import EmitterAdded, Welcome, parse_server_message
+from server.core.errors import NafirError
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import Acknowledge
+from server.protocol.server_messages import EmitterAdded, Welcome, parse_server_message
 from server.scene.bundle import Bundle, find_bundle
 from server.soak.host import Host, serve
 from server.soak.hostile import Hostile
@@ -73,7 +73,7 @@ class Plan:
 def soak(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
     """Raises NafirError where the server does not start or ends before the first sound."""
     folder = find_bundle(plan.scene)
-    levels = Levels.load(Bundle.load(folder))
+    levels = FieldsByLevel.load(Bundle.load(folder))
     with serve(folder) as host:
         measured = asyncio.run(_Soak(plan, levels, host, advance).run())
     measured["silence_to_sound"] = silence_to_sound(levels.default)
@@ -106,7 +106,7 @@ def _judge_growth(measured: dict[str, Any]) -> Judgement:
 
 
 class _Soak:
-    def __init__(self, plan: Plan, levels: Levels, host: Host, advance: Advance) -> None:
+    def __init__(self, plan: Plan, levels: FieldsByLevel, host: Host, advance: Advance) -> None:
         self._plan = plan
         self._host = host
         self._advance = advance

@@ -9,13 +9,13 @@ import time
 import numpy as np
 
 from server.acoustics.geometry import Pose
-from server.aim import Aim
-from server.direct_sound import DirectSound
-from server.emitters import Emitter
 from server.field.field import AcousticField
 from server.rendering.ingest import DryAudio
 from server.rendering.sources import ClipPlayer
-from server.whole_field import kemar
+from server.responses.direct_sound import DirectSound
+from server.responses.full_response import kemar
+from server.streaming.direct_path_tracker import DirectPathTracker
+from server.streaming.emitters import Emitter
 
 _BLOCK_SIZE = 256
 _SOUND_S = 2.0
@@ -40,7 +40,7 @@ def silence_to_sound(field: AcousticField) -> float:
         )
         renderer.add_emitter("noise", ClipPlayer(DryAudio(loud), loop=False))
         renderer.set_ir("noise", ir)
-        Aim(direct, renderer, {"noise": emitter}).follow(listener)
+        DirectPathTracker(direct, renderer, {"noise": emitter}).follow(listener)
         times_s: dict[bool, list[float]] = {True: [], False: []}
         for block in range(round((_SOUND_S + _SILENCE_S) * rate / _BLOCK_SIZE)):
             started_s = time.perf_counter()

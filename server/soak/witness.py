@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.decibels import db_to_amplitude, power_to_db
-from server.blocks import AudioBlock
-from server.clips import ClipLibrary
-from server.field.levels import Levels
-from server.health.double_precision import DoubleWholeField
-from server.protocol import PROTOCOL, AddEmitter, Hello, ListenerStart
+from server.assets.clips import ClipLibrary
+from server.field.fields_by_level import FieldsByLevel
+from server.health.double_precision import DoubleFullResponse
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerStart
+from server.responses.full_response import kemar
 from server.scene.effects import EffectName
-from server.whole_field import kemar
 
 _CLIP = "man-reading"
 _GAIN_DB = -12.0
@@ -45,7 +45,7 @@ class Errors:
 class Witness:
     """Of one level of a scene, with every effect on."""
 
-    def __init__(self, levels: Levels) -> None:
+    def __init__(self, levels: FieldsByLevel) -> None:
         manifest = levels.bundle.manifest
         rate = manifest.codec.sample_rate
         start = manifest.start
@@ -62,7 +62,7 @@ class Witness:
         self._stretch_samples = round(_STRETCH_S * rate)
         self._begins: int | None = None
         yaw = math.radians(start.listener_yaw_deg)
-        response = DoubleWholeField(levels.default, kemar(rate)).impulse_responses(
+        response = DoubleFullResponse(levels.default, kemar(rate)).impulse_responses(
             [start.listener], [start.emitter], [yaw]
         )[0]
         clip = ClipLibrary(rate).load(_CLIP).samples.astype(np.float64) * db_to_amplitude(_GAIN_DB)

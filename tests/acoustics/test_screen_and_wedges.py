@@ -13,7 +13,7 @@ from scipy.special import fresnel
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db
-from server.acoustics.screen import screen_gain_db
+from server.acoustics.diffraction import diffraction_gain_db
 
 SPEED_OF_SOUND = 343.0
 WALL_END, RIGHT_ANGLE = 2.0, 1.5
@@ -73,7 +73,7 @@ def hidden_places(count, n, seed):
 
 def law_db(frequency, before, after, towards, away):
     straight = np.sqrt(before**2 + after**2 - 2 * before * after * np.cos(away - towards))
-    return screen_gain_db(2 * (before + after - straight) * frequency / SPEED_OF_SOUND)
+    return diffraction_gain_db(2 * (before + after - straight) * frequency / SPEED_OF_SOUND)
 
 
 @pytest.mark.parametrize("n", [WALL_END, RIGHT_ANGLE])

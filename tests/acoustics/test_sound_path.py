@@ -15,8 +15,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from server.acoustics import sound_path
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.screen import screen_gain_db
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 
 Floats = npt.NDArray[np.float64]
@@ -151,7 +151,7 @@ def test_there_and_back_are_the_same_path(name: str) -> None:
 def test_in_the_shadow_the_whole_detour_screens() -> None:
     paths = one(FINDER, (3.0, 1.0, 1.5), (5.2, 1.0, 1.5))
     detour = 2 * math.sqrt(2) + 0.2 - 2.2
-    np.testing.assert_allclose(paths.screen_db[0], screen_gain_db(2 * detour / WAVELENGTHS_M))
+    np.testing.assert_allclose(paths.screen_db[0], diffraction_gain_db(2 * detour / WAVELENGTHS_M))
     assert np.all(np.diff(paths.screen_db[0]) < 0)
 
 

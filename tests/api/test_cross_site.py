@@ -9,7 +9,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from server.api.cross_site import CrossSiteGate, SitePolicy
-from server.settings import Settings
+from server.api.settings import Settings
 
 LOOPBACK = Settings(allowed_hosts=(), host="127.0.0.1")
 EVERYWHERE = Settings(allowed_hosts=(), host="0.0.0.0")

@@ -11,7 +11,7 @@ import uvicorn
 
 from server.api.connection_limits import ConnectionLimits
 from server.api.http_protocol import limited_http
-from server.settings import Settings
+from server.api.settings import Settings
 
 CHUNK = b"x" * 65536
 SETTINGS = {
@@ -55,7 +55,7 @@ async def serving(**settings):
         application,
         port=0,
         http=limited_http(limits),
-        ws="server.web_socket:WebSocketProtocol",
+        ws="server.api.web_socket:WebSocketProtocol",
         ws_per_message_deflate=False,
         lifespan="off",
         log_level="critical",

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.api.inflow import USUAL, Allowance, Budget, message_cost, supersedes
-from server.blocks import DryBlock
-from server.protocol import Acknowledge, ListenerPose, MoveEmitter, Ping
+from server.protocol.blocks import DryBlock
+from server.protocol.client_messages import Acknowledge, ListenerPose, MoveEmitter, Ping
 
 
 @given(

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.api.connection_limits import ConnectionLimits
+from server.api.problems import Refusal
 from server.api.request_meter import Measured, RequestMeter
-from server.problems import Refusal
-from server.settings import Settings
+from server.api.settings import Settings
 
 LIMITS = dataclasses.replace(
     ConnectionLimits.of(Settings()),

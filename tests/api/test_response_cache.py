@@ -7,7 +7,7 @@ from concurrent.futures import CancelledError
 import pytest
 
 from server.api.response_cache import ResponseCache
-from server.errors import RequestError
+from server.core.errors import RequestError
 
 
 class Work:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from server.api.connection_limits import ConnectionLimits
 from server.api.seats import Seats, address_key
-from server.settings import Settings
+from server.api.settings import Settings
 
 
 def seats(total, per_address, reserve=0):

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from server.api.serving import bind, url
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 
 def closed(listeners):

@@ -5,9 +5,9 @@ import threading
 import pytest
 
 from server.api.stream_counts import StreamLedger
-from server.durations import DurationHistogram
-from server.regret import Regret, RegretRecord
-from server.stream import PoseTimes
+from server.core.durations import DurationHistogram
+from server.streaming.plan_audit import Regret, RegretRecord
+from server.streaming.stream import PoseTimes
 
 
 class Counting:

@@ -1,10 +1,10 @@
 import pytest
 from starlette.testclient import TestClient
 
-from server.app import create_app
-from server.field.levels import Levels
-from server.settings import Settings
-from tests.test_routes import PLACES, check_problem, wait_until_ready
+from server.api.app import create_app
+from server.api.settings import Settings
+from server.field.fields_by_level import FieldsByLevel
+from tests.api.test_routes import PLACES, check_problem, wait_until_ready
 
 SCENE = "/v1/scenes/flat"
 EMITTER = {"emitter": "6,3,1.5"}
@@ -30,7 +30,7 @@ CHANGING = {"date", "x-response-time"}
 
 @pytest.fixture(scope="module")
 def client(bundle, hrtfs):
-    levels = Levels.load(bundle)
+    levels = FieldsByLevel.load(bundle)
     with TestClient(create_app(Settings(), scenes={"flat": levels}, hrtfs=hrtfs)) as client:
         wait_until_ready(client)
         yield client

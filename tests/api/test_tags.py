@@ -3,12 +3,12 @@
 import pytest
 from starlette.testclient import TestClient
 
-from server.app import create_app
-from server.field.levels import Levels
+from server.api.app import create_app
+from server.api.settings import Settings
+from server.field.fields_by_level import FieldsByLevel
+from server.planning.planner import Cost
 from server.scene.effects import EffectName
-from server.scene.planner import Cost
-from server.settings import Settings
-from tests.test_routes import wait_until_ready
+from tests.api.test_routes import wait_until_ready
 
 PLAN = "/v1/scenes/flat/plan"
 
@@ -20,10 +20,10 @@ def server(bundle, hrtfs, monkeypatch):
 
     def start(cost_us):
         monkeypatch.setattr(
-            "server.app.measure_costs", lambda *_, **__: {name: Cost(cost_us, 1000) for name in EffectName}
+            "server.api.app.measure_costs", lambda *_, **__: {name: Cost(cost_us, 1000) for name in EffectName}
         )
-        monkeypatch.setattr("server.app._COSTS_AFTER_S", 0.0)
-        client = TestClient(create_app(Settings(), scenes={"flat": Levels.load(bundle)}, hrtfs=hrtfs))
+        monkeypatch.setattr("server.api.app._COSTS_AFTER_S", 0.0)
+        client = TestClient(create_app(Settings(), scenes={"flat": FieldsByLevel.load(bundle)}, hrtfs=hrtfs))
         held.append(client)
         client.__enter__()
         wait_until_ready(client)

@@ -9,8 +9,8 @@ from websockets.streams import StreamReader
 
 from server.bench.crowd import FrameReader, frame
 from server.bench.gauge import POSE_ID, POSE_IDS
-from server.blocks import AudioBlock
-from server.protocol import ListenerPose
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import ListenerPose
 
 LENGTHS = (0, 1, 125, 126, 127, 2_076, 65_535)
 

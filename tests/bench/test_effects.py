@@ -7,7 +7,7 @@ from server.acoustics.geometry import Pose
 from server.bench.effects import SCENARIOS, change_without, errors_of, everything, heard, plan_of, situation_of, without
 from server.bench.effects_table import markdown_table, terminal_rows
 from server.bench.statistical_field import SAMPLE_RATE, Room, StatisticalField, box
-from server.places import reverberation_of
+from server.planning.places import reverberation_of
 from server.scene.effects import EffectName
 
 SITUATIONS = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)

@@ -3,19 +3,19 @@
 import pytest
 
 from server.bench.field import measure_levels
-from server.calibration import calibrate
-from server.field.levels import Levels
+from server.field.fields_by_level import FieldsByLevel
 from server.field.reuse import KEPT_BYTES
 from server.scene.bundle import write_bundle
 from server.scene.manifest import Phase, QualityLevel, Reuse
+from server.streaming.calibration import calibrate
 
 
 @pytest.fixture(scope="module")
-def levels(bundle, tmp_path_factory) -> Levels:
+def levels(bundle, tmp_path_factory) -> FieldsByLevel:
     dear = QualityLevel(name="dear", field="arithmetic", phase=Phase(kind="griffin_lim", iterations=64))
     files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
     manifest = bundle.manifest.model_copy(update={"levels": (*bundle.manifest.levels, dear)})
-    return Levels.load(write_bundle(tmp_path_factory.mktemp("dear") / "scene", manifest, files))
+    return FieldsByLevel.load(write_bundle(tmp_path_factory.mktemp("dear") / "scene", manifest, files))
 
 
 def test_the_dear_level_costs_more_and_it_is_decoding_that_costs(levels):
@@ -38,6 +38,6 @@ def test_where_responses_are_kept_the_room_for_them_is_full(bundle, tmp_path):
     reusing = QualityLevel(name="reusing", field="arithmetic", reuse=Reuse(spacing_m=0.1, turn_deg=15))
     files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
     manifest = bundle.manifest.model_copy(update={"levels": (reusing,)})
-    levels = Levels.load(write_bundle(tmp_path / "scene", manifest, files))
+    levels = FieldsByLevel.load(write_bundle(tmp_path / "scene", manifest, files))
     measure_levels(levels, rounds=1, poses=2)
     assert levels.kept.bytes > 0.9 * KEPT_BYTES

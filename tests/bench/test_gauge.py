@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from server.bench.gauge import Gauge, Waiting
-from server.blocks import AudioBlock
-from server.protocol import ListenerPose
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import ListenerPose
 
 
 def pose(pose_id):

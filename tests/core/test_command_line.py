@@ -6,7 +6,7 @@ import typer
 from typer.testing import CliRunner
 
 from server.core.command_line import StrictCommand, StrictTyper, require_at_most_one
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 app = StrictTyper()
 
@@ -65,7 +65,7 @@ def commands(group):
         yield from commands(each) if hasattr(each, "commands") else (each,)
 
 
-@pytest.mark.parametrize("module", ["server.cli", "training.cli"])
+@pytest.mark.parametrize("module", ["server.cli.main", "training.cli.main"])
 def test_every_command_is_strict(module):
     found = list(commands(typer.main.get_command(importlib.import_module(module).app)))
     assert len(found) > 5
@@ -89,7 +89,7 @@ def path_options(module):
                 yield command, parameter
 
 
-@pytest.mark.parametrize("module", ["server.cli", "training.cli"])
+@pytest.mark.parametrize("module", ["server.cli.main", "training.cli.main"])
 def test_every_command_looks_at_what_it_is_to_write_before_it_begins(module, tmp_path):
     """Nothing else is there that it would need: where it read or computed anything first, it would say so instead."""
     (tmp_path / "file").write_text("")

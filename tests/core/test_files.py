@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from server.core.errors import NafirError
 from server.core.files import require_figure, require_readable, require_writable, require_writable_folder
-from server.errors import NafirError
 
 as_user = pytest.mark.skipif(os.geteuid() == 0, reason="root may read and write everything")
 

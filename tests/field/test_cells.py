@@ -6,11 +6,11 @@ from numpy.testing import assert_allclose
 from onnx import TensorProto, helper, numpy_helper
 
 from server.acoustics.phase import FrozenNoise
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.field.decoder import Decoder
 from server.field.field import AcousticField, frozen_noise
+from server.field.fields_by_level import FieldsByLevel
 from server.field.graph import OUTPUTS, Spectrograms
-from server.field.levels import Levels
 from server.scene.bundle import write_bundle
 from server.scene.manifest import FieldFile, Phase, QualityLevel
 
@@ -80,7 +80,7 @@ def _opened(bundle, folder, codec, told, phase=PHASES["frozen"]):
         }
     )
     written = write_bundle(folder, manifest, {**files, "cells.onnx": constant_graph(told)})
-    return Levels.load(written)["constant"]
+    return FieldsByLevel.load(written)["constant"]
 
 
 @pytest.fixture

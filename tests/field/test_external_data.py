@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.field.external_data import refers_to_other_files
 from server.field.graph import open_graph
 from server.scene.bundle import BUNDLED, write_bundle

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from onnx import TensorProto, helper, numpy_helper
 
 from server.acoustics.room_parameters import level_db
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.field.field import AcousticField
 from server.field.graph import OUTPUTS
 from server.scene.bundle import BUNDLED, Bundle, write_bundle

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from server.compiled import HAS_NUMBA
 from server.field.gate import MOST_GIVEN, Gate
+from server.kernels.compiled import HAS_NUMBA
 from server.scene.manifest import CodecParameters
 
 RATE, N_FFT, SAMPLES = 24_000, 256, 2_000

@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from onnx import TensorProto, helper, numpy_helper
 from pydantic import ValidationError
 
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.field.field import AcousticField
-from server.field.levels import Levels
+from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import write_bundle
 from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel
 
@@ -54,7 +54,7 @@ def _pulses(bundle, folder, *, pulse, codec=None, **options):
     entry = FieldFile(file="pulses.onnx", architecture="pulses", codec=codec)
     graph = response_graph((codec or bundle.manifest.codec).samples, pulse)
     level = QualityLevel(name="pulses", field="pulses", **options)
-    return Levels.load(_bundle(bundle, folder, {"pulses": entry}, [level], pulses=graph))["pulses"]
+    return FieldsByLevel.load(_bundle(bundle, folder, {"pulses": entry}, [level], pulses=graph))["pulses"]
 
 
 def _respond(field, emitter, **options):
@@ -129,7 +129,7 @@ def test_a_graph_of_another_length_is_a_bundle_error(bundle, tmp_path):
     level = QualityLevel(name="pulses", field="pulses")
     short = _bundle(bundle, tmp_path / "short", {"pulses": entry}, [level], pulses=response_graph(500, 100))
     with pytest.raises(BundleError, match=r"impulse_response: has shape"):
-        Levels.load(short)
+        FieldsByLevel.load(short)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_what_does_not_fit_together_is_refused(bundle, change, problem):
 def warm(bundle, tmp_path) -> AcousticField:
     phase = Phase(kind="griffin_lim", iterations=2, warm=True)
     levels = [QualityLevel(name="warm", field="arithmetic", phase=phase)]
-    return Levels.load(_bundle(bundle, tmp_path / "warm", {}, levels))["warm"]
+    return FieldsByLevel.load(_bundle(bundle, tmp_path / "warm", {}, levels))["warm"]
 
 
 def test_what_is_not_to_remember_answers_the_same_whatever_was_before(warm):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
-from server.field.lattice import Lattice, moved
+from server.field.lattice import Lattice, delay_response
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.manifest import Manifest, Reuse
 
@@ -88,7 +88,7 @@ def test_poses_of_a_cell_have_one_node_and_of_many_there_are_as_many_as_cells():
 def test_a_response_moves_by_whole_samples(later):
     response = np.arange(1, 19, dtype=np.float32).reshape(2, 9)
     expected = [[ear[at - later] if 0 <= at - later < 9 else 0 for at in range(9)] for ear in response.tolist()]
-    assert moved(response, later).tolist() == expected
+    assert delay_response(response, later).tolist() == expected
 
 
 headings = st.floats(-7, 7)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from server.bounded_cache import BoundedCache
+from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
-from server.field.lattice import moved
+from server.field.lattice import delay_response
 from server.field.reuse import KEPT_BYTES
 from server.scene.manifest import QualityLevel, Reuse
 
@@ -38,7 +38,7 @@ def test_a_pose_has_the_response_of_its_node_which_is_the_exact_levels(bundle, f
     for pose in zip(LISTENERS, EMITTERS, YAWS, strict=True):
         node, later = level.snap(tuple(pose[0]), tuple(pose[1]), float(pose[2]))
         exact = field.impulse_responses([node.listener], [node.emitter], [node.yaw])[0]
-        assert_array_equal(level.impulse_responses(*([end] for end in pose))[0], moved(exact, later))
+        assert_array_equal(level.impulse_responses(*([end] for end in pose))[0], delay_response(exact, later))
 
 
 def test_what_was_asked_before_or_with_it_makes_no_difference_to_a_bit(bundle, graph):

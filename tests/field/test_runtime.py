@@ -15,7 +15,7 @@ def test_nothing_is_left_in_the_home_folder(bundle, tmp_path):
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("ORT_", "XDG_"))}
     command = ["ir", str(bundle.folder), "--listener=2,2,1.5", "--emitter=4,2,1.5", f"--output={tmp_path / 'ir.wav'}"]
     subprocess.run(
-        [sys.executable, "-c", "from server.cli import main; main()", *command],
+        [sys.executable, "-c", "from server.cli.main import main; main()", *command],
         env={**environment, "HOME": str(home)},
         check=True,
         stdout=subprocess.DEVNULL,

@@ -14,12 +14,12 @@ from pathlib import Path
 if sys.argv[1] == "without":
     sys.modules["numba"] = sys.modules["llvmlite"] = None
 import numpy as np
-from server.compiled import HAS_NUMBA
-from server.field.levels import Levels
+from server.kernels.compiled import HAS_NUMBA
+from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import Bundle
 
 assert HAS_NUMBA == (sys.argv[1] == "with")
-field = Levels.load(Bundle.load(Path(sys.argv[2]))).default
+field = FieldsByLevel.load(Bundle.load(Path(sys.argv[2]))).default
 rng = np.random.default_rng(2)
 listeners, emitters = rng.uniform((1, 1, 1.3), (7, 4, 1.8), (2, 12, 3))
 np.save(sys.argv[3], field.impulse_responses(listeners, emitters, rng.uniform(-3, 3, 12)))

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from server.blocks import DryBlock
-from server.errors import BundleError, RequestError
+from server.core.errors import BundleError, RequestError
 from server.field.external_data import refers_to_other_files
-from server.protocol import parse_client_message
+from server.protocol.blocks import DryBlock
+from server.protocol.client_messages import parse_client_message
 from server.scene.bundle import BUNDLED, MANIFEST_FILE, Bundle
 from server.scene.manifest import ARRAYS_FILE
 

@@ -6,16 +6,16 @@ Oracles are float64 and know nothing of blocks, partitions or filters.
 import numpy as np
 from scipy.signal import fftconvolve
 
-from server.field.levels import Levels
-from server.ir_request import compute_irs
-from server.load import Rung
-from server.protocol import PROTOCOL, AddEmitter, Hello
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
+from server.protocol.server_messages import Error
 from server.rendering.direct_path import PathTarget
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
-from server.replies import Error
-from server.session import Session
+from server.responses.ir_request import compute_irs
+from server.streaming.load import QualityStep
+from server.streaming.session import Session
 
 RATE, SIZE, IR_SAMPLES = 24_000, 256, 6_000
 FLAT = np.zeros(7)
@@ -109,7 +109,7 @@ def not_finite(samples):
     return int(samples.size - np.count_nonzero(np.isfinite(samples)))
 
 
-FULL = Rung("standard", None, False, 1.0)
+FULL = QualityStep("standard", None, False, 1.0)
 CLIP = 0.005 * noise(3, 3_000)
 
 
@@ -117,7 +117,7 @@ class Listening:
     """A session in the flat scene whose responses are there as soon as it asks for them."""
 
     def __init__(self, field, filters, clip=CLIP, **options):
-        self.levels = Levels([field])
+        self.levels = FieldsByLevel([field])
         audio = DryAudio(clip)
         self.session = Session(
             Hello(protocol=PROTOCOL, scene="flat"),

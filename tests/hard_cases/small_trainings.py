@@ -6,12 +6,12 @@ import torch
 from rich.progress import Progress
 
 from tests.training.conftest import one_thread  # noqa: F401 - sums in parallel are not repeatable
-from training.importers.report import ImportReport
+from training.data.importers.report import ImportReport
+from training.data.responses import ImportedDataset, Measurement
+from training.learning.runs import Configuration, NafRecipe
+from training.learning.train import load_learner, train
 from training.models.factorised import FieldShape
 from training.models.naf import NafShape
-from training.responses import ImportedDataset, Measurement
-from training.runs import Configuration, NafRecipe
-from training.train import load_learner, train
 
 RATE, SAMPLES = 8_000, 1_200
 FACTORISED = Configuration(
@@ -28,7 +28,7 @@ GRID = [((float(x), float(y), 1.5), (1.4, 1.6, 1.2)) for x in range(4) for y in 
 def single_precision():
     """The clock decides between precisions, and on a busy machine not always alike."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("training.train.bfloat16_gains", lambda *_: False)
+        patch.setattr("training.learning.train.bfloat16_gains", lambda *_: False)
         yield
 
 

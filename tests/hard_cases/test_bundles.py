@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.scene.bundle import MANIFEST_FILE, Bundle
 from server.scene.manifest import ARRAYS_FILE
 from tests.hard_cases.doors import load, write_arrays, write_manifest

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from server.blocks import AudioBlock, DryBlock
-from server.errors import RequestError
-from server.pacing import SendWindow, StreamClock
-from server.protocol import Acknowledge, ListenerPose, parse_client_message
+from server.core.errors import RequestError
+from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.client_messages import Acknowledge, ListenerPose, parse_client_message
+from server.streaming.pacing import SendWindow, StreamClock
 from tests.hard_cases.listening import (
     HERE,
     RATE,

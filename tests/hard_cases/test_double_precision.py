@@ -15,19 +15,19 @@ import pytest
 import scipy.signal
 
 from server.acoustics.geometry import Pose
-from server.direct_sound import DirectSound
-from server.field.levels import Levels
-from server.health.double_precision import DoubleWholeField
-from server.render import PathPoint, RenderedEmitter, render
+from server.field.fields_by_level import FieldsByLevel
+from server.health.double_precision import DoubleFullResponse
+from server.offline.render import PathPoint, RenderedEmitter, render
+from server.responses.direct_sound import DirectSound
+from server.responses.full_response import kemar
 from server.scene.bundle import Bundle, bundled_scenes
-from server.whole_field import kemar
 
 ROOT = Path(__file__).parents[2]
 BOUND_DB = -90.0
 LEVELS = [
     pytest.param(folder.name, name, id=f"{folder.name} {name}")
     for folder in bundled_scenes()
-    for name in Levels.load(Bundle.load(folder))
+    for name in FieldsByLevel.load(Bundle.load(folder))
 ]
 SECONDS = 0.7
 
@@ -46,16 +46,16 @@ if sys.argv[1] == "double":
     run = graph.FieldGraph.run
     graph.FieldGraph.run = lambda *given: [output.astype(np.float64) for output in run(*given)]
 from server.acoustics.geometry import Pose
-from server.compiled import HAS_NUMBA
-from server.direct_sound import DirectSound
-from server.field.levels import Levels
-from server.render import PathPoint, RenderedEmitter, render
+from server.kernels.compiled import HAS_NUMBA
+from server.responses.direct_sound import DirectSound
+from server.field.fields_by_level import FieldsByLevel
+from server.offline.render import PathPoint, RenderedEmitter, render
 from server.scene.bundle import Bundle, find_bundle
-from server.whole_field import kemar
+from server.responses.full_response import kemar
 
 assert HAS_NUMBA == (sys.argv[1] == "single")
 scene, out, seconds = sys.argv[2], sys.argv[3], float(sys.argv[4])
-levels = Levels.load(Bundle.load(find_bundle(scene)))
+levels = FieldsByLevel.load(Bundle.load(find_bundle(scene)))
 bundle = levels.bundle
 start, rate = bundle.manifest.start, bundle.manifest.codec.sample_rate
 rng = np.random.default_rng(11)
@@ -112,7 +112,7 @@ def test_a_walk_is_heard_as_in_double_precision(walks, scene, level, measured):
 
 @pytest.mark.parametrize(("scene", "level"), LEVELS)
 def test_a_listener_at_rest_hears_a_convolution_with_exact_responses(scene, level, measured):
-    levels = Levels.load(Bundle.load(next(folder for folder in bundled_scenes() if folder.name == scene)))
+    levels = FieldsByLevel.load(Bundle.load(next(folder for folder in bundled_scenes() if folder.name == scene)))
     field, start = levels[level], levels.bundle.manifest.start
     head = kemar(field.sample_rate)
     clip = 0.02 * np.random.default_rng(4).standard_normal(4_000).astype(np.float32)
@@ -125,7 +125,7 @@ def test_a_listener_at_rest_hears_a_convolution_with_exact_responses(scene, leve
         [PathPoint.at(0, Pose.from_yaw(start.listener, yaw))],
         length=length,
     )
-    response = DoubleWholeField(field, head).impulse_responses([start.listener], [start.emitter], [yaw])[0]
+    response = DoubleFullResponse(field, head).impulse_responses([start.listener], [start.emitter], [yaw])[0]
     expected = scipy.signal.fftconvolve(clip[None].astype(np.float64), response.astype(np.float64), axes=-1)
     count = min(length, expected.shape[-1])
     measured("difference", difference_db(heard[:, :count], expected[:, :count]), BOUND_DB, "dB")

@@ -13,7 +13,7 @@ from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from server.field.graph import INPUTS, OUTPUTS
 from server.field.runtime import open_session
-from training.graphs import to_int8, to_onnx
+from training.bundling.graphs import to_int8, to_onnx
 from training.models.cells import Cells
 from training.models.factorised import ExportedField, FactorisedField, FieldShape
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.errors import NafirError
-from server.protocol import AddEmitter, MoveEmitter, RemoveEmitter, SetGain
+from server.core.errors import NafirError
+from server.protocol.client_messages import AddEmitter, MoveEmitter, RemoveEmitter, SetGain
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, UnknownEmitterError
 from tests.hard_cases.listening import (
     SIZE,

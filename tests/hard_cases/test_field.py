@@ -9,10 +9,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from server.acoustics.geometry import FloorPlan
-from server.errors import FieldError
+from server.core.errors import FieldError
 from server.field.field import AcousticField
+from server.field.fields_by_level import FieldsByLevel
 from server.field.graph import FieldGraph, open_graph
-from server.field.levels import Levels
 from server.health import laws
 from server.health.energies import Predictions
 from server.health.poses import EMITTER, LISTENER, YAW, allowed, corners, scattered
@@ -28,11 +28,11 @@ FAR = [(9.0, 6.0), (80.0, -40.0), (5e3, 5e3), (1e6, -1e6), (1e15, 0.0)]
 
 
 @pytest.fixture(scope="module")
-def apartment() -> Levels:
-    return Levels.load(Bundle.load(find_bundle("apartment")))
+def apartment() -> FieldsByLevel:
+    return FieldsByLevel.load(Bundle.load(find_bundle("apartment")))
 
 
-@pytest.fixture(params=[*Levels.load(Bundle.load(find_bundle("apartment")))])
+@pytest.fixture(params=[*FieldsByLevel.load(Bundle.load(find_bundle("apartment")))])
 def level(apartment, request) -> AcousticField:
     return apartment[request.param]
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.acoustics.geometry import Pose
-from server.errors import RequestError
-from server.protocol import SetGain, parse_client_message
-from server.render import RenderedEmitter
+from server.core.errors import RequestError
+from server.offline.render import RenderedEmitter
+from server.protocol.client_messages import SetGain, parse_client_message
 from server.rendering.ingest import LOUDEST, LOUDEST_GAIN
 from tests.hard_cases.listening import (
     IR_SAMPLES,

@@ -22,10 +22,10 @@ from tests.hard_cases.small_trainings import (
     write,
 )
 from tests.training.conftest import one_thread  # noqa: F401 - sums in parallel are not repeatable
-from training import runs as runs_module
+from training.learning import runs as runs_module
 from training.learning.factorised import FactorisedLearner
-from training.runs import Configuration, RunError, load_checkpoint
-from training.train import DivergedError, load_learner
+from training.learning.runs import Configuration, RunError, load_checkpoint
+from training.learning.train import DivergedError, load_learner
 
 _ROOT = Path(__file__).parents[2]
 
@@ -111,17 +111,20 @@ def test_an_error_on_what_is_held_back_that_explodes_is_never_kept(responses, tm
 # Killed.
 
 KILLED_AT = [
-    pytest.param("training.runs._write_whole", 1, id="before anything is written"),
-    pytest.param("training.runs._write_whole", 2, id="between the files that say what the run is"),
-    pytest.param("training.train._Loop._choose_precision", 1, id="before the first step"),
-    *(pytest.param("training.train._Loop._step", number, id=f"before step {number}") for number in range(1, 7)),
+    pytest.param("training.learning.runs._write_whole", 1, id="before anything is written"),
+    pytest.param("training.learning.runs._write_whole", 2, id="between the files that say what the run is"),
+    pytest.param("training.learning.train._Loop._choose_precision", 1, id="before the first step"),
+    *(
+        pytest.param("training.learning.train._Loop._step", number, id=f"before step {number}")
+        for number in range(1, 7)
+    ),
     pytest.param("torch.optim.AdamW.step", 3, id="before parameters change"),
-    pytest.param("training.train.append_log", 2, id="before a round is logged"),
-    pytest.param("training.train.save_checkpoint", 1, id="before the first checkpoint"),
-    pytest.param("training.train.save_checkpoint", 2, id="after a round is logged"),
+    pytest.param("training.learning.train.append_log", 2, id="before a round is logged"),
+    pytest.param("training.learning.train.save_checkpoint", 1, id="before the first checkpoint"),
+    pytest.param("training.learning.train.save_checkpoint", 2, id="after a round is logged"),
     pytest.param("torch.save", 2, id="as a checkpoint is written"),
-    pytest.param("training.train._Loop._finish", 1, id="before it is finished"),
-    pytest.param("training.train.save_checkpoint", 4, id="before the finished field is kept"),
+    pytest.param("training.learning.train._Loop._finish", 1, id="before it is finished"),
+    pytest.param("training.learning.train.save_checkpoint", 4, id="before the finished field is kept"),
 ]
 
 
@@ -173,9 +176,9 @@ def test_a_process_killed_by_the_system_leaves_a_run_that_goes_on(responses, who
         "import sys, time, torch; torch.set_num_threads(1)\n"
         "from pathlib import Path\n"
         "from rich.progress import Progress\n"
-        "import training.train as t\n"
-        "from training.responses import ImportedDataset\n"
-        "from training.runs import Configuration\n"
+        "import training.learning.train as t\n"
+        "from training.data.responses import ImportedDataset\n"
+        "from training.learning.runs import Configuration\n"
         "save = t.save_checkpoint\n"
         "def slowly(run, state):\n"
         "    save(run, state); print('saved', flush=True); time.sleep(60)\n"
@@ -204,7 +207,7 @@ def test_a_log_torn_in_the_middle_of_a_line_is_written_again(responses, whole, t
             file.write("0.5,0.1,")
         raise Killed
 
-    monkeypatch.setattr("training.train.append_log", torn)
+    monkeypatch.setattr("training.learning.train.append_log", torn)
     with pytest.raises(Killed):
         trained(responses, tmp_path, FACTORISED)
     monkeypatch.undo()

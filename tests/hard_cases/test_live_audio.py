@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from scipy.signal import fftconvolve
 
 from server.acoustics.geometry import Pose
-from server.blocks import DryBlock
-from server.clips import DecodeError, decode
-from server.direct_sound import DirectSound
-from server.protocol import AddEmitter
-from server.render import PathPoint, RenderedEmitter, render
+from server.assets.clips import DecodeError, decode
+from server.offline.render import PathPoint, RenderedEmitter, render
+from server.protocol.blocks import DryBlock
+from server.protocol.client_messages import AddEmitter
 from server.rendering.direct_path import PathTarget
 from server.rendering.ingest import LOUDEST, DryAudio
 from server.rendering.sources import LiveSource
+from server.responses.direct_sound import DirectSound
 from tests.hard_cases.listening import (
     RATE,
     SIZE,

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
 from server.acoustics.geometry import Pose
-from server.blocks import AudioBlock
-from server.direct_sound import DirectSound
-from server.protocol import ListenerPose
-from server.render import PathPoint, RenderedEmitter, render
+from server.offline.render import PathPoint, RenderedEmitter, render
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import ListenerPose
 from server.rendering.limiter import CEILING, Limiter
+from server.responses.direct_sound import DirectSound
 from tests.hard_cases.listening import HERE, SIZE, THERE, Listening, decibels, noise, not_finite
 
 LOUD = 20 * noise(1, 10_000)

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.errors import RequestError
-from server.protocol import Hello, parse_client_message
+from server.core.errors import RequestError
+from server.protocol.client_messages import Hello, parse_client_message
 from tests.hard_cases.doors import BLOCKS, MESSAGES, receive
 from tests.hard_cases.listening import Listening, not_finite
 

@@ -9,16 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.acoustics.air import absorption_db_per_m
+from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, HYPERCARDIOID, OMNIDIRECTIONAL, Cardioid
 from server.acoustics.geometry import FARTHEST_M, FloorPlan, Pose
 from server.acoustics.reflections import ReflectionFinder
-from server.acoustics.screen import screen_gain_db
 from server.acoustics.sound_path import SoundPathFinder
-from server.errors import RequestError
-from server.protocol import ListenerPose, MoveEmitter
-from server.radiation import reverberation_gain
+from server.core.errors import RequestError
+from server.protocol.client_messages import ListenerPose, MoveEmitter
 from server.rendering.direct_path import PathTarget
 from server.rendering.still_paths import StillPaths
+from server.responses.radiation import reverberation_gain
 from server.scene.bundle import BUNDLED, Bundle
 from tests.hard_cases.listening import AHEAD, FLAT, Listening, hear, noise, not_finite, play, renderer
 
@@ -238,14 +238,14 @@ def _mirrors_of(plan):
 
 @pytest.mark.parametrize("number", [0.0, -0.0, 5e-324, -5e-324, 1e-300, -0.1915871349, -1e300, 1e300, 1e-8, -1e-8])
 def test_a_screen_never_amplifies_and_is_always_finite(measured, number):
-    gain = float(screen_gain_db(number))
+    gain = float(diffraction_gain_db(number))
     assert math.isfinite(gain)
     measured("gain", gain, 0.0, "dB")
 
 
 def test_a_screen_grows_without_steps_as_one_walks_behind_it(measured):
     numbers = np.linspace(-0.4, 4.0, 200_001)
-    gains = screen_gain_db(numbers)
+    gains = diffraction_gain_db(numbers)
     measured("largest rise", float(np.max(np.diff(gains))), 1e-12, "dB")
     measured("largest step", float(np.max(-np.diff(gains))), 0.01, "dB")
 

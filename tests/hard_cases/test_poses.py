@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import Pose, Quaternion
 from server.acoustics.minimum_phase import band_cepstra
-from server.protocol import ListenerPose, MoveEmitter
+from server.protocol.client_messages import ListenerPose, MoveEmitter
 from server.rendering.direct_path import NEAR_LIMIT_M, PathTarget
 from server.rendering.hrtf import filter_taps
 from server.rendering.still_paths import StillPaths

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.acoustics.geometry import LEVEL, Pose, Quaternion, axes_of
-from server.errors import RequestError
-from server.protocol import ListenerPose, parse_client_message
-from server.render import PathError, read_path
+from server.core.errors import RequestError
+from server.offline.render import PathError, read_path
+from server.protocol.client_messages import ListenerPose, parse_client_message
 from tests.hard_cases.listening import Listening
 
 HERE = (2.0, 2.0, 1.5)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from tests.hard_cases.listening import (
     IR_SAMPLES,
     SIZE,

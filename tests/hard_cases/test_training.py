@@ -21,10 +21,10 @@ from tests.hard_cases.small_trainings import (
     write,
 )
 from tests.training.conftest import one_thread  # noqa: F401 - sums in parallel are not repeatable
-from training.dataset import DatasetError
+from training.data.dataset import DatasetError
+from training.data.responses import FILE, ImportedDataset, ResponsesError
+from training.learning.train import load_learner
 from training.models.targets import codec_of, delay_samples
-from training.responses import FILE, ImportedDataset, ResponsesError
-from training.train import load_learner
 
 # Responses that hardly are any.
 

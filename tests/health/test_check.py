@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from server.cli import app
+from server.cli.main import app
 from server.health.check import Effort, HealthError, check
 from server.scene.manifest import Bounds, Start
 from tests.damaged_field import write_damaged

@@ -7,8 +7,8 @@ from itertools import count
 
 from websockets.asyncio.client import connect
 
-from server.blocks import AudioBlock
-from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
 
 SCENE = "flat"
 HELLO = Hello(protocol=PROTOCOL, scene=SCENE, buffer_blocks=2).serialize()

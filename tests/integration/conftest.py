@@ -10,15 +10,15 @@ from contextlib import AbstractContextManager, contextmanager
 import pytest
 import uvicorn
 
-from server.app import create_app
-from server.cli import server_options
-from server.field.levels import Levels
-from server.hrtfs import HrtfLibrary
-from server.settings import Settings
+from server.api.app import create_app
+from server.api.settings import Settings
+from server.assets.hrtfs import HrtfLibrary
+from server.cli.main import server_options
+from server.field.fields_by_level import FieldsByLevel
 
 
 @contextmanager
-def _serving(levels: Levels, hrtfs: HrtfLibrary) -> Iterator[str]:
+def _serving(levels: FieldsByLevel, hrtfs: HrtfLibrary) -> Iterator[str]:
     app = create_app(settings := Settings(port=0), scenes={levels.bundle.id: levels}, hrtfs=hrtfs)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
     thread = threading.Thread(target=server.run)
@@ -35,7 +35,7 @@ def _serving(levels: Levels, hrtfs: HrtfLibrary) -> Iterator[str]:
 
 
 @pytest.fixture
-def serving() -> Callable[[Levels, HrtfLibrary], AbstractContextManager[str]]:
+def serving() -> Callable[[FieldsByLevel, HrtfLibrary], AbstractContextManager[str]]:
     """Makes HOST:PORT of a server of a scene's levels, ready, with the options of `nafir serve`."""
     return _serving
 
@@ -43,7 +43,7 @@ def serving() -> Callable[[Levels, HrtfLibrary], AbstractContextManager[str]]:
 @pytest.fixture
 def served(bundle, hrtfs) -> Iterator[str]:
     """HOST:PORT of a server of the arithmetic scene."""
-    with _serving(Levels.load(bundle), hrtfs) as address:
+    with _serving(FieldsByLevel.load(bundle), hrtfs) as address:
         yield address
 
 

@@ -8,14 +8,14 @@ import pytest
 from typer.testing import CliRunner
 from websockets.asyncio.server import serve
 
+from server.api.catalogue import describe_scene
 from server.bench.cli import app
 from server.bench.listen import listen
-from server.blocks import AudioBlock
-from server.catalogue import describe_scene
-from server.errors import NafirError
-from server.field.levels import Levels
-from server.protocol import AddEmitter, parse_client_message
-from server.replies import Welcome
+from server.core.errors import NafirError
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import AddEmitter, parse_client_message
+from server.protocol.server_messages import Welcome
 
 
 def test_field_bench_reports_the_scene_it_was_given(bundle):
@@ -25,7 +25,7 @@ def test_field_bench_reports_the_scene_it_was_given(bundle):
     assert outcome.exit_code == (0 if judgement["reached"] else 1), outcome.output
     assert measured["host"]["instruction_set"]
     assert measured["ir_s"] == pytest.approx(4_000 / 24_000)
-    assert [level["name"] for level in measured["levels"]] == list(Levels.load(bundle))
+    assert [level["name"] for level in measured["levels"]] == list(FieldsByLevel.load(bundle))
     for level in measured["levels"]:
         assert 0 < level["ms_p50"] <= level["ms_p99"]
 
@@ -53,7 +53,7 @@ class SkippingServer:
 
     async def __call__(self, socket):
         await socket.recv()
-        description = describe_scene(Levels([self.field]))
+        description = describe_scene(FieldsByLevel([self.field]))
         welcome = Welcome(
             session="s",
             scene=description,

@@ -9,11 +9,11 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from server import streaming
+from server.api import connection as streaming
 from server.api.http_protocol import HttpProtocol
-from server.session import Session
-from server.stream import Stream
-from server.web_socket import WebSocketProtocol
+from server.api.web_socket import WebSocketProtocol
+from server.streaming.session import Session
+from server.streaming.stream import Stream
 from tests.integration.churn import HELLO, visit
 
 PATIENCE_S = 5.0
@@ -46,7 +46,7 @@ def made(monkeypatch):
     remember(WebSocketProtocol)
     monkeypatch.setattr(streaming, "Session", Remembering(Session))
     monkeypatch.setattr(streaming, "Stream", Remembering(Stream))
-    monkeypatch.setattr("server.routes.Connection", Remembering(streaming.Connection))
+    monkeypatch.setattr("server.api.routes.Connection", Remembering(streaming.Connection))
     return references
 
 

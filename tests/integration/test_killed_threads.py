@@ -13,9 +13,9 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from server import app
-from server.blocks import AudioBlock
-from server.protocol import Acknowledge, AddEmitter
+from server.api import app
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import Acknowledge, AddEmitter
 from tests.integration.churn import HELLO
 from tests.killing import kill, threads_may_die
 

@@ -8,10 +8,10 @@ import soundfile
 
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.geometry import Pose
-from server.clips import ClipLibrary
-from server.direct_sound import DirectSound
+from server.assets.clips import ClipLibrary
 from server.field.field import AcousticField
-from server.render import PathPoint, RenderedEmitter, render
+from server.offline.render import PathPoint, RenderedEmitter, render
+from server.responses.direct_sound import DirectSound
 from server.scene.effects import EffectName
 
 LIVE = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "live.py"

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from server.blocks import AudioBlock
-from server.field.levels import Levels
-from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, SetLevel
-from server.replies import LevelChanged, Status, parse_server_message
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, SetLevel
+from server.protocol.server_messages import LevelChanged, Status, parse_server_message
 from server.scene.manifest import QualityLevel
 
 # Long blocks, so that what a response costs fits into one on a slow host too.
@@ -43,7 +43,9 @@ class Laborious:
 
 @pytest.fixture
 def served(serving, field, hrtfs):
-    with serving(Levels([Laborious(field, "fine", FINE_S), Laborious(field, "quick", QUICK_S)]), hrtfs) as address:
+    with serving(
+        FieldsByLevel([Laborious(field, "fine", FINE_S), Laborious(field, "quick", QUICK_S)]), hrtfs
+    ) as address:
         yield address
 
 

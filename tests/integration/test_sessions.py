@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from server.bench import sessions
 from server.bench.cli import app
-from server.errors import NafirError
+from server.core.errors import NafirError
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be confined to a core")
 

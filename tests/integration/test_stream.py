@@ -8,8 +8,8 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
 
-from server.blocks import AudioBlock
-from server.protocol import PROTOCOL, Acknowledge, Hello
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, Hello
 
 HELLO = Hello(protocol=PROTOCOL, scene="flat").serialize()
 

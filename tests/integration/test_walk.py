@@ -15,13 +15,13 @@ from websockets.sync.server import serve
 
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.geometry import Pose
-from server.catalogue import describe_scene
-from server.clips import ClipLibrary
-from server.direct_sound import DirectSound
-from server.field.levels import Levels
-from server.protocol import SetLevel
-from server.render import RenderedEmitter, read_path, render
-from server.replies import EmitterAdded, Welcome
+from server.api.catalogue import describe_scene
+from server.assets.clips import ClipLibrary
+from server.field.fields_by_level import FieldsByLevel
+from server.offline.render import RenderedEmitter, read_path, render
+from server.protocol.client_messages import SetLevel
+from server.protocol.server_messages import EmitterAdded, Welcome
+from server.responses.direct_sound import DirectSound
 from server.scene.bundle import write_bundle
 from server.scene.manifest import QualityLevel
 
@@ -50,7 +50,7 @@ def test_what_a_walker_heard_is_what_an_offline_render_of_his_path_says(served, 
     clip = ClipLibrary(rate).load("woman-reading")
     emitter = RenderedEmitter(clip, Pose(bundle.manifest.start.emitter), loop=True)
     direct_sound = DirectSound.of(bundle, filters)
-    fields = Levels.load(bundle)
+    fields = FieldsByLevel.load(bundle)
     offline = render(fields.default, direct_sound, [emitter], path, length=len(live), levels=fields)
     difference = np.sqrt(np.mean((live - offline.T) ** 2)) / np.sqrt(np.mean(live**2))
     assert amplitude_to_db(difference) < -90
@@ -62,7 +62,7 @@ def test_the_command_that_a_walk_prints_renders_it_again(served, bundle, tmp_pat
     command = re.search(r"nafir (render .*)", done.stdout)[1].split()
     command[command.index("flat")] = str(bundle.folder)
     command[command.index("again.wav")] = str(again)
-    run = [sys.executable, "-c", "from server.cli import main; main()", *command]
+    run = [sys.executable, "-c", "from server.cli.main import main; main()", *command]
     subprocess.run(run, check=True, capture_output=True, timeout=60)
     live, _ = soundfile.read(heard, dtype="float32")
     offline, _ = soundfile.read(again, dtype="float32")
@@ -75,7 +75,7 @@ def levels(bundle, tmp_path):
     rough = QualityLevel(name="rough", field="arithmetic", frames=8, shared_tail=True)
     files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
     manifest = bundle.manifest.model_copy(update={"levels": (*bundle.manifest.levels, rough)})
-    return Levels.load(write_bundle(tmp_path / "scene", manifest, files))
+    return FieldsByLevel.load(write_bundle(tmp_path / "scene", manifest, files))
 
 
 @contextmanager
@@ -125,7 +125,7 @@ def test_a_walk_whose_level_changes_is_rendered_again_by_the_command_it_prints(s
     command = re.search(r"nafir (render .*)", done.stdout)[1].split()
     command[command.index(levels.bundle.id)] = str(levels.bundle.folder)
     command[command.index("again.wav")] = str(again)
-    run = [sys.executable, "-c", "from server.cli import main; main()", *command]
+    run = [sys.executable, "-c", "from server.cli.main import main; main()", *command]
     subprocess.run(run, check=True, capture_output=True, timeout=60)
     live, _ = soundfile.read(heard, dtype="float32")
     offline, _ = soundfile.read(again, dtype="float32")
@@ -163,7 +163,7 @@ def test_a_walk_to_the_wrong_address_says_so_in_one_line(served, tmp_path, url):
 def test_a_walk_whose_server_goes_away_says_so_in_one_line(field, tmp_path):
     welcome = Welcome(
         session="s",
-        scene=describe_scene(Levels([field])),
+        scene=describe_scene(FieldsByLevel([field])),
         sample_rate=24_000,
         block_size=256,
         channels=2,

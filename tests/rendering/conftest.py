@@ -3,7 +3,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.direct_path import DirectPath
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 from server.rendering.sphere import triangulate

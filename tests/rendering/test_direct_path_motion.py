@@ -287,7 +287,7 @@ if sys.argv[1] == "numpy":
 sys.path.insert(0, sys.argv[3])
 from conftest import no_head
 from test_direct_path_motion import BLOCK, RATE, listen, tone, wander
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.direct_path import DirectPath
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.partitions import Partitioning
 
 if not HAS_NUMBA:

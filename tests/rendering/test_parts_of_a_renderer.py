@@ -128,11 +128,11 @@ def test_muted_direct_sound_fades_out_and_is_there_at_once_when_it_comes_back(en
     for is_muted in (False, True):
         renderer = engine(has_head=channels == 2)
         add(renderer, clip)
-        renderer.hear_direct("a", air=air)
+        renderer.enable_direct("a", air=air)
         parts = [run(renderer, 20)]
-        renderer.hear_direct("a", is_heard=not is_muted, air=air)
+        renderer.enable_direct("a", is_heard=not is_muted, air=air)
         parts.append(run(renderer, 9))
-        renderer.hear_direct("a", air=air)
+        renderer.enable_direct("a", air=air)
         parts.append(run(renderer, 9))
         heard.append(np.concatenate(parts, axis=1))
     always, muted = heard
@@ -148,7 +148,7 @@ def test_muted_direct_sound_takes_no_time_but_that_of_its_line(engine):
     renderer = engine()
     add(renderer, noise(6, 3_000))
     run(renderer, 5)
-    renderer.hear_direct("a", is_heard=False)
+    renderer.enable_direct("a", is_heard=False)
     run(renderer, 2)
     state = next(iter(renderer._mixers)).direct.state
     before = state.heard.copy(), state.position[0]
@@ -198,7 +198,7 @@ def test_a_head_is_put_on_and_taken_off_by_a_fade_of_what_goes_in(engine, first,
     add(renderer, clip, irs[first])
     heard = [run(renderer, 12)]
     assert renderer.can_hear_with(second)
-    renderer.hear_with(second)
+    renderer.set_channels(second)
     if has_ir:
         renderer.set_ir("a", irs[second])
     assert not renderer.can_hear_with(first)
@@ -216,7 +216,7 @@ def test_what_rang_out_after_a_head_was_taken_off_is_let_go(engine):
     add(renderer, tone(), ir=room(11))
     run(renderer, 5)
     renderer.set_ir("a", room(12, channels=1))
-    renderer.hear_with(1)
+    renderer.set_channels(1)
     run(renderer, 3)
     assert len(list(renderer._mixers)) == 2
     run(renderer, 2 * SECOND)
@@ -240,7 +240,7 @@ def test_a_source_that_changes_its_ears_is_asked_once_per_block(engine):
     renderer.add_emitter("a", source, awaits_ir=False)
     renderer.set_path("a", PathTarget(2.0, AHEAD, FLAT))
     heard = [run(renderer, 20)]
-    renderer.hear_with(1)
+    renderer.set_channels(1)
     heard.append(run(renderer, 20))
     assert source.asked == 40
     assert splatter_db(np.concatenate(heard, axis=1)[:, SIZE:]) < -90
@@ -254,13 +254,13 @@ def toggles(renderer):
 
     def ears(channels):
         if renderer.can_hear_with(channels):
-            renderer.hear_with(channels)
+            renderer.set_channels(channels)
             renderer.set_ir("a", irs[channels])
 
     return {
-        "direct_path": lambda on: renderer.hear_direct("a", is_heard=on),
-        "distance_attenuation": lambda on: renderer.hear_direct("a", distance=on),
-        "air_absorption": lambda on: renderer.hear_direct("a", air=on),
+        "direct_path": lambda on: renderer.enable_direct("a", is_heard=on),
+        "distance_attenuation": lambda on: renderer.enable_direct("a", distance=on),
+        "air_absorption": lambda on: renderer.enable_direct("a", air=on),
         "occlusion": lambda on: renderer.set_path("a", PathTarget(3.0, AHEAD, bands if on else FLAT)),
         "hrtf": lambda on: ears(2 if on else 1),
         "responses": lambda on: renderer.set_ir("a", irs[2]) if on else renderer.drop_ir("a"),

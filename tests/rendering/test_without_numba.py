@@ -11,7 +11,7 @@ import sys
 if sys.argv[1] == "without":
     sys.modules["numba"] = None
 import numpy as np
-from server.compiled import HAS_NUMBA
+from server.kernels.compiled import HAS_NUMBA
 from server.rendering.direct_path import PathTarget
 from server.rendering.hrtf import KEMAR, Hrtf, HeadFilters
 from server.rendering.renderer import Renderer, render_all

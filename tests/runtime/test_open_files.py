@@ -6,7 +6,7 @@ import sys
 PROGRAM = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_NOFILE, (200, int(sys.argv[1])))
-from server.errors import NafirError
+from server.core.errors import NafirError
 from server.runtime.open_files import allow_connections
 try:
     allow_connections(300)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from server.errors import BundleError, RequestError
+from server.core.errors import BundleError, RequestError
 from server.scene.bundle import BUNDLED, Bundle, bundled_scenes, find_bundle, write_bundle
 from server.scene.manifest import Manifest
 

@@ -1,7 +1,7 @@
 """What visitors read in place of the names of quality levels."""
 
-from server.field.levels import Levels
-from server.frontier import Frontier
+from server.api.frontier import Frontier
+from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import Bundle, bundled_scenes
 from server.scene.level_titles import LevelOfField, level_titles
 from server.scene.manifest import Phase, QualityLevel, Reuse
@@ -59,7 +59,7 @@ def test_levels_of_one_kind_are_told_apart_by_the_first_detail_that_differs():
 
 def test_in_every_bundled_scene_titles_differ_from_each_other_and_from_names():
     for folder in bundled_scenes():
-        levels = Frontier.of(Levels.load(Bundle.load(folder)), {}).levels
+        levels = Frontier.of(FieldsByLevel.load(Bundle.load(folder)), {}).levels
         titles = [level.title for level in levels]
         assert len(set(titles)) == len(titles)
         assert not {level.name for level in levels} & set(titles)

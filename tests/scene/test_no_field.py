@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from server.calibration import calibrate
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.field.field import AcousticField
-from server.field.levels import Levels
-from server.impulse_response import ImpulseResponse, IrQuery
+from server.field.fields_by_level import FieldsByLevel
+from server.responses.full_response import kemar
+from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import Bundle, find_bundle
-from server.whole_field import kemar
+from server.streaming.calibration import calibrate
 
 C = 343.0
 
@@ -26,7 +26,7 @@ def test_the_open_field_is_one_file(open_field):
 
 
 def test_its_only_level_is_silence(open_field):
-    levels = Levels.load(open_field)
+    levels = FieldsByLevel.load(open_field)
     assert len(levels) == 1
     responses = levels.default.impulse_responses([(0, 0, 1.5)] * 3, [(4, 0, 1.5)] * 3, [0, 1, 2])
     assert responses.shape == (3, 2, levels.default.ir_samples)

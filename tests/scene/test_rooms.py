@@ -6,7 +6,7 @@ import pytest
 
 from server.scene.geometry import Geometry, Opening
 from server.scene.rooms import rooms_of
-from training.scene_file import SceneFile
+from training.data.scene_file import SceneFile
 
 SCENES = Path(__file__).parents[2] / "training" / "scenes"
 

@@ -10,21 +10,21 @@ from typer.testing import CliRunner
 from websockets.asyncio.server import serve
 
 from server.acoustics.geometry import Pose
+from server.assets.clips import ClipLibrary
 from server.bench.report import missed
-from server.blocks import AudioBlock
-from server.cli import app
-from server.clips import ClipLibrary
-from server.direct_sound import DirectSound
-from server.field.levels import Levels
-from server.protocol import PROTOCOL
-from server.render import PathPoint, RenderedEmitter, render
-from server.replies import Place, Pong, SceneDescription, Welcome
+from server.cli.main import app
+from server.field.fields_by_level import FieldsByLevel
+from server.offline.render import PathPoint, RenderedEmitter, render
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL
+from server.protocol.server_messages import Place, Pong, SceneDescription, Welcome
+from server.responses.direct_sound import DirectSound
+from server.responses.full_response import kemar
 from server.scene.bundle import Bundle, find_bundle
 from server.soak.hostile import Hostile
 from server.soak.run import _growth, judge
 from server.soak.silence import silence_to_sound
 from server.soak.witness import Errors, Witness
-from server.whole_field import kemar
 
 FINE = {
     "duration_s": 1_800.0,
@@ -41,7 +41,7 @@ FINE = {
 
 @pytest.fixture(scope="module")
 def levels():
-    return Levels.load(Bundle.load(find_bundle("apartment")))
+    return FieldsByLevel.load(Bundle.load(find_bundle("apartment")))
 
 
 @pytest.fixture(scope="module")

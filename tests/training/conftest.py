@@ -8,19 +8,19 @@ import pytest
 import torch
 from rich.progress import Progress
 
-from server import whole_field
 from server.health.check import Effort
 from server.rendering.hrtf import HeadFilters
+from server.responses import full_response as whole_field
 from server.scene.bundle import Bundle
-from training import noise
-from training.dataset import Dataset
-from training.export import export
+from training.bundling import noise
+from training.bundling.export import export
+from training.data.dataset import Dataset
+from training.data.responses import SimulatedResponses
+from training.data.scene_file import SceneFile
+from training.learning.runs import Configuration
+from training.learning.train import train
 from training.models.factorised import FieldShape
-from training.responses import SimulatedResponses
-from training.runs import Configuration
-from training.scene_file import SceneFile
 from training.simulation.run import simulate
-from training.train import train
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation
 
@@ -54,7 +54,9 @@ def configuration() -> Configuration:
 def brief_health_checks() -> Iterator[None]:
     """Enough to find what is wrong all over; exports are many here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("training.export.EFFORT", Effort(scattered=16, halved=4, climbing=2, responses=2, field_s=2.0))
+        patch.setattr(
+            "training.bundling.export.EFFORT", Effort(scattered=16, halved=4, climbing=2, responses=2, field_s=2.0)
+        )
         yield
 
 

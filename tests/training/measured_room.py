@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from training.dataset import SPEED_OF_SOUND
-from training.evaluation.baselines import TrainingPairs
-from training.importers.report import ImportReport
-from training.responses import ImportedDataset, Measurement
+from training.baselines.baselines import TrainingPairs
+from training.data.dataset import SPEED_OF_SOUND
+from training.data.importers.report import ImportReport
+from training.data.responses import ImportedDataset, Measurement
 
 RATE = 16_000
 SAMPLES = 2400

@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.room_parameters import RoomParameters, measure
-from training.dataset import TAKES, Dataset
-from training.evaluation.coded import Track
-from training.evaluation.held_out import EvaluationError, HeldOut
+from training.baselines.coded import Track
+from training.baselines.held_out import EvaluationError, HeldOut
+from training.data.dataset import TAKES, Dataset
 from training.simulation.pairs import PairSimulation
 from training.simulation.references import GeometricSound
 

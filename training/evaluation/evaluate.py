@@ -25,7 +25,7 @@ from server.acoustics.metrics import (
     summarise,
 )
 from server.acoustics.room_parameters import RoomParameters, measure
-from training.evaluation.held_out import EvaluationError, HeldOut, Responses
+from training.baselines.held_out import EvaluationError, HeldOut, Responses
 from training.evaluation.kept_errors import Errors, KeptErrors
 
 FLOOR = "floor"

@@ -7,13 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from server.field.field import AcousticField
-from server.field.levels import Levels
+from server.field.fields_by_level import FieldsByLevel
+from server.responses.full_response import FullResponse
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy, QualityLevel
-from server.whole_field import WholeField
+from training.baselines.held_out import EvaluationError, HeldOut, Responses, require_same_scene
+from training.baselines.moved_lattice import with_moved_lattice
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
-from training.evaluation.held_out import EvaluationError, HeldOut, Responses, require_same_scene
-from training.evaluation.moved_lattice import with_moved_lattice
 
 _PLACES = 8
 """Of a lattice; held-out pairs take turns."""
@@ -28,7 +28,7 @@ def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
     for bundle in bundles:
         if held_out.simulated is not None:
             require_same_scene(bundle, held_out.simulated)
-        levels = Levels.load(bundle)
+        levels = FieldsByLevel.load(bundle)
         for level, field in levels.items():
             file = bundle.manifest.fields[field.level.field]
             columns.append(
@@ -64,7 +64,7 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
         )
     rng = np.random.default_rng(_PLACES)
     fields = [field] if field.nodes is None else [with_moved_lattice(field, rng) for _ in range(_PLACES)]
-    wholes = [WholeField.through_kemar(moved) for moved in fields]
+    wholes = [FullResponse.through_kemar(moved) for moved in fields]
     listeners, emitters = held_out.listeners, held_out.emitters
 
     def source(index: int, turns: npt.NDArray[np.integer]) -> Responses:

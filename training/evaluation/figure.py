@@ -16,8 +16,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from server.acoustics.metrics import Metric
 from server.acoustics.room_parameters import energy_decay_db
+from training.baselines.held_out import Responses
 from training.evaluation.evaluate import METRICS, Evaluation, Kind, Result, Source
-from training.evaluation.held_out import Responses
 
 _COLOURS: Mapping[Kind, str] = {
     "field": "#0b6e99",

@@ -2,9 +2,8 @@
 from the training listeners.
 
 Level is energy per ear, averaged over ears and two opposite head orientations, in dB relative to the emitter's free
-field at one metre, as `server.loudness` defines it. Grids are (row, column), row 0 the southernmost, NaN outside the
-room. Metres.
-"""
+field at one metre, as `server.responses.loudness` defines it. Grids are (row, column), row 0 the southernmost, NaN
+outside the room. Metres."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -19,11 +18,11 @@ from matplotlib.image import AxesImage
 
 from server.acoustics.decibels import power_to_db
 from server.field.field import AcousticField
-from server.loudness import LoudnessMap, loudness_map
-from server.whole_field import WholeField, kemar
-from training.dataset import SPEED_OF_SOUND, Dataset
-from training.evaluation.baselines import TrainingPairs, barycentric
-from training.evaluation.held_out import EvaluationError, HeldOut, require_same_scene
+from server.responses.full_response import FullResponse, kemar
+from server.responses.loudness import LoudnessMap, loudness_map
+from training.baselines.baselines import TrainingPairs, barycentric
+from training.baselines.held_out import EvaluationError, HeldOut, require_same_scene
+from training.data.dataset import SPEED_OF_SOUND, Dataset
 from training.simulation.direct_paths import DirectPaths
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
@@ -77,7 +76,7 @@ def map_emitters(
     if dataset is None:
         raise EvaluationError(f"{held_out.name}: maps need a simulated scene, whose walls are known")
     require_same_scene(field.bundle, dataset)
-    whole = WholeField.through_kemar(field)
+    whole = FullResponse.through_kemar(field)
     start = dataset.scene.start
     chosen = spread_out(dataset.probes, np.array(start.emitter), emitters)
     return [
@@ -89,7 +88,7 @@ def map_emitters(
 def _maps(
     held_out: HeldOut,
     dataset: Dataset,
-    whole: WholeField,
+    whole: FullResponse,
     emitter: int,
     *,
     listener_height_m: float,

@@ -16,17 +16,17 @@ import torch
 
 from server.acoustics.codec import Codec
 from server.acoustics.phase import FrozenNoise, correlated_noise, separate
+from training.baselines.held_out import EvaluationError, HeldOut, Responses
+from training.data.responses import ResponseSet, SimulatedResponses
 from training.evaluation.evaluate import Column
-from training.evaluation.held_out import EvaluationError, HeldOut, Responses
 from training.learning.factorised import FactorisedLearner
 from training.learning.naf import NafLearner
+from training.learning.runs import Configuration
+from training.learning.train import load_learner
 from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
 from training.models.targets import LEAD_SAMPLES, align
-from training.responses import ResponseSet, SimulatedResponses
-from training.runs import Configuration
-from training.train import load_learner
 
 Answers = tuple[npt.NDArray[np.float32], ...]
 _BYTES_PER_PARAMETER = 4

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from training.evaluation.baselines import linear, linear_aligned, nearest
-from training.evaluation.coded import AAC, AudioCodec, CodedResponses, Track, opus
+from training.baselines.baselines import linear, linear_aligned, nearest
+from training.baselines.coded import AAC, AudioCodec, CodedResponses, Track, opus
+from training.baselines.held_out import EvaluationError, HeldOut, Responses
+from training.baselines.helmholtz import HelmholtzInterpolation
+from training.baselines.image_sources import ImageSources
+from training.baselines.shaped import ShapedNearest
 from training.evaluation.evaluate import FLOOR, ONE_SIMULATION, Column, Source
-from training.evaluation.held_out import EvaluationError, HeldOut, Responses
-from training.evaluation.helmholtz import HelmholtzInterpolation
-from training.evaluation.image_sources import ImageSources
-from training.evaluation.shaped import ShapedNearest
 
 DEFAULT_METHODS = ("nearest", "linear", "linear-aligned")
 Answer = Callable[[int, npt.NDArray[np.integer]], Responses | None]

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from training.probe import Probing
+from training.evaluation.probe import Probing
 
 _COLOURS = {"features": "#0b6e99", "MFCC": "#d1495b"}
 _MAP = "viridis"

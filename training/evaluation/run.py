@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from server.scene.bundle import Bundle
-from training.evaluation.coded import Track
+from training.baselines.coded import Track
+from training.baselines.held_out import HeldOut, open_held_out
+from training.data.responses import open_responses
 from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import Column, Evaluation, Kind, evaluate
 from training.evaluation.fields import field_columns
 from training.evaluation.figure import draw_figure
-from training.evaluation.held_out import HeldOut, open_held_out
 from training.evaluation.kept_errors import KeptErrors, signature
 from training.evaluation.methods import DEFAULT_METHODS, floor_columns, method_columns, simulation_column
 from training.evaluation.published import PublishedTable, published_table
-from training.responses import open_responses
 
 
 def evaluate_bundles(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from server.acoustics.metrics import Metric
-from server.errors import NafirError
+from server.core.errors import NafirError
 from training.evaluation.evaluate import FLOOR, METRICS, ONE_SIMULATION
 from training.evaluation.report import short
 
@@ -232,7 +232,7 @@ class StepTime:
 
 
 def step_times(log: Path) -> list[StepTime]:
-    """Of a log that `training.stopwatch` wrote, in order of first appearance. Raises ResultError."""
+    """Of a log that `training.cli.stopwatch` wrote, in order of first appearance. Raises ResultError."""
     totals: dict[str, list[float]] = {}
     try:
         for line in log.read_text().splitlines():
@@ -242,7 +242,7 @@ def step_times(log: Path) -> list[StepTime]:
     except OSError as exc:
         raise ResultError(f"{log}: cannot be read: {exc.strerror}") from exc
     except (ValueError, KeyError, TypeError) as exc:
-        raise ResultError(f"{log}: not what training.stopwatch writes: {exc!r}") from exc
+        raise ResultError(f"{log}: not what training.cli.stopwatch writes: {exc!r}") from exc
     return [StepTime(step, *seconds) for step, seconds in totals.items()]
 
 

@@ -18,8 +18,8 @@ from server.acoustics.codec import Codec
 from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_loss
 from server.acoustics.room_parameters import RoomParameters, measure
 from server.field.field import AcousticField
-from server.whole_field import WholeField
-from training.dataset import Dataset, StoredResponses
+from server.responses.full_response import FullResponse
+from training.data.dataset import Dataset, StoredResponses
 from training.simulation.references import References
 
 _STEP_M = 0.05
@@ -78,7 +78,7 @@ class Estimate:
     """Whole responses of a field. Where it starts warm, each is asked for a step after its neighbour, as on a walk."""
 
     def __init__(self, field: AcousticField) -> None:
-        self._whole = WholeField.through_kemar(field)
+        self._whole = FullResponse.through_kemar(field)
         self._walks = field.level.phase.warm
 
     def __call__(self, entry: Entry) -> _Responses:

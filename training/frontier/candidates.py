@@ -6,7 +6,7 @@ the rest was cut off, so cutting it would always seem to be worth the time it sa
 
 from collections.abc import Iterable, Iterator
 
-from server.errors import BundleError
+from server.core.errors import BundleError
 from server.scene.bundle import Bundle
 from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel, Reuse
 

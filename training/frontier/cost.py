@@ -14,15 +14,15 @@ import numpy.typing as npt
 import psutil
 
 from server.bench.machine import processor
-from server.bounded_cache import BoundedCache
-from server.calibration import Listener
+from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
-from server.field.levels import Levels
+from server.field.fields_by_level import FieldsByLevel
 from server.field.reuse import KEPT_BYTES, Kept
 from server.rendering.hrtf import HeadFilters
+from server.responses.full_response import kemar
 from server.scene.bundle import Bundle
 from server.scene.manifest import Cost, QualityLevel
-from server.whole_field import kemar
+from server.streaming.calibration import Listener
 from training.frontier.walk import POSES_PER_S, walk
 
 STRETCH_S = 5
@@ -56,7 +56,7 @@ class Times:
 
 
 def measure(
-    levels: Levels,
+    levels: FieldsByLevel,
     *,
     walk_s: float,
     budget_s: float,

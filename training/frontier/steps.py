@@ -13,7 +13,7 @@ from server.acoustics.geometry import Pose
 from server.acoustics.metrics import parameter_errors
 from server.acoustics.room_parameters import measure
 from server.field.field import AcousticField
-from server.whole_field import WholeField
+from server.responses.full_response import FullResponse
 from training.frontier.walk import SPEED_M_PER_S, walk
 
 STEP_M = 0.01
@@ -33,7 +33,7 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
         nodes = [field.snap(pose.position, emitter, pose.yaw) for pose in poses]
         steps = [step for step, (one, other) in zip(steps, itertools.pairwise(nodes), strict=True) if one != other]
     chosen = np.unique(np.linspace(0, len(steps) - 1, min(count, len(steps))).astype(int)) if steps else []
-    whole = WholeField.through_kemar(field)
+    whole = FullResponse.through_kemar(field)
     largest: dict[str, float] = {}
     for number in chosen:
         before, after = (measure(_response(whole, pose), field.sample_rate) for pose in steps[number])
@@ -47,6 +47,6 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
     return largest
 
 
-def _response(whole: WholeField, pose: Pose) -> npt.NDArray[np.float32]:
+def _response(whole: FullResponse, pose: Pose) -> npt.NDArray[np.float32]:
     emitter = whole.bundle.manifest.start.emitter
     return whole.impulse_responses([pose.position], [emitter], [pose.yaw])[0]

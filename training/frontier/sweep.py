@@ -16,12 +16,12 @@ import numpy as np
 from rich.progress import Progress
 
 from server.field.field import AcousticField
-from server.field.levels import Levels
+from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, QualityLevel
-from training.dataset import Dataset
-from training.evaluation.held_out import require_same_scene
-from training.evaluation.moved_lattice import with_moved_lattice
+from training.baselines.held_out import require_same_scene
+from training.baselines.moved_lattice import with_moved_lattice
+from training.data.dataset import Dataset
 from training.frontier.accuracy import Errors, Estimate, SampledPairs
 from training.frontier.bound import TruePhase
 from training.frontier.cost import STRETCH_S, cost_of, measure, memory_mb, one_core
@@ -111,7 +111,7 @@ def sweep(
     task = progress.add_task("timing", total=math.ceil(effort.walk_s / STRETCH_S))
     with one_core():
         times = measure(
-            Levels.load(trial),
+            FieldsByLevel.load(trial),
             walk_s=effort.walk_s,
             budget_s=effort.budget_s,
             seed=effort.seed,

@@ -10,10 +10,12 @@ import torch
 from rich.progress import Progress
 from torch import Tensor
 
+from training.data.responses import ResponseSet, SimulatedResponses
 from training.learning.energies import RAYLEIGH_DEFICIT, EnergyError
 from training.learning.learner import Losses, Rows
-from training.learning.lessons import Lessons, lessons_of
+from training.learning.lessons import DistillationTargets, lessons_of
 from training.learning.naf import NafLearner
+from training.learning.runs import Configuration, FactorisedRecipe, RecipeError, require_same_data, restore
 from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
@@ -21,8 +23,6 @@ from training.models.level_correction import LevelsInterpolated, level_correctio
 from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
-from training.responses import ResponseSet, SimulatedResponses
-from training.runs import Configuration, FactorisedRecipe, RecipeError, require_same_data, restore
 
 # What a target differs by from the best possible prediction (ln magnitude of one noisy bin, of a pooled cell; unit
 # phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its
@@ -63,7 +63,7 @@ class FactorisedLearner:
         deficit = 0.0 if self._expected else RAYLEIGH_DEFICIT
         self._energy_error = EnergyError(self.cells, self.field.heads, deficit=deficit)
         self._targets: Targets | None = None
-        self._lessons: Lessons | None = None
+        self._lessons: DistillationTargets | None = None
 
     def prepare(self, progress: Progress) -> None:
         if self.recipe.teacher is not None:
@@ -143,7 +143,7 @@ class FactorisedLearner:
             losses["energy"] = self.recipe.energy_weight * error
         return losses
 
-    def _taught(self, run: Path) -> Lessons:
+    def _taught(self, run: Path) -> DistillationTargets:
         """Raises RunError if the folder holds no finished run on these data, and RecipeError if it is of another
         kind."""
         configuration = Configuration.read(run)
@@ -175,6 +175,6 @@ class FactorisedLearner:
         field.level_correction[:, levels] = level_correction(examples, heard, field.heads.areas)
 
 
-def _rows_of(source: Targets | Lessons, rows: Rows) -> tuple[npt.NDArray[np.floating], ...]:
+def _rows_of(source: Targets | DistillationTargets, rows: Rows) -> tuple[npt.NDArray[np.floating], ...]:
     """Listener, emitter, yaw and flat target."""
     return source.listener[rows], source.emitter[rows], source.yaw[rows], source.flat[rows]

@@ -1,9 +1,9 @@
 """Which learner a configuration asks for."""
 
+from training.data.responses import ResponseSet
 from training.learning.factorised import FactorisedLearner
 from training.learning.naf import NafLearner
-from training.responses import ResponseSet
-from training.runs import Configuration
+from training.learning.runs import Configuration
 
 
 def learner_of(responses: ResponseSet, configuration: Configuration) -> FactorisedLearner | NafLearner:

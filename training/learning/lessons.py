@@ -22,7 +22,7 @@ _BESIDE_M = 0.5
 
 
 @dataclass(frozen=True)
-class Lessons:
+class DistillationTargets:
     """Poses (lesson, 3), yaws (lesson,) and flat targets (lesson, heads.size), whose levels alone count."""
 
     listener: npt.NDArray[np.float32]
@@ -32,7 +32,7 @@ class Lessons:
 
 
 @torch.no_grad()
-def lessons_of(teacher: NafLearner, cells: Cells, count: int, seed: int) -> Lessons:
+def lessons_of(teacher: NafLearner, cells: Cells, count: int, seed: int) -> DistillationTargets:
     """Of poses beside those measured, within half a metre in plan where that is inside the room."""
     rng = np.random.default_rng([seed, 9])
     responses, plan = teacher.responses, teacher.site.plan
@@ -53,4 +53,4 @@ def lessons_of(teacher: NafLearner, cells: Cells, count: int, seed: int) -> Less
         pose = (torch.from_numpy(part[row : row + 1]) for part in (listener, emitter, yaw))
         magnitude = teacher.codec.magnitude(graph(*pose)[0][0].double().numpy())
         flats.append(flat_targets(teacher.codec.synthesise(magnitude * phasors), cells))
-    return Lessons(listener, emitter, yaw, np.stack(flats))
+    return DistillationTargets(listener, emitter, yaw, np.stack(flats))

@@ -9,13 +9,13 @@ from rich.progress import Progress
 from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
+from training.data.responses import ResponseSet, SimulatedResponses
 from training.learning.learner import Losses, Rows
+from training.learning.runs import Configuration, NafRecipe, RecipeError
 from training.learning.schedule import decay_to_a_tenth
 from training.models.naf import Naf, NafShape
 from training.models.site import Site
 from training.models.targets import align, codec_of, delay_samples
-from training.responses import ResponseSet, SimulatedResponses
-from training.runs import Configuration, NafRecipe, RecipeError
 from training.simulation.references import WholeResponses
 
 N_FFT = 512

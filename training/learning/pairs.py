@@ -3,8 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from training.dataset import DatasetError
-from training.responses import SAME_POINT_M, ResponseSet
+from training.data.dataset import DatasetError
+from training.data.responses import SAME_POINT_M, ResponseSet
 
 _HELD_BACK_SHARE = 0.05
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import i0e, i1e
 
-from training.dataset import Dataset
+from training.data.dataset import Dataset
 from training.models.cells import Cells
 from training.models.targets import LEAD_SAMPLES, align
 from training.simulation.expected import ExpectedSpectrograms

@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
-from training.dataset import DatasetError
+from training.data.dataset import DatasetError
+from training.data.responses import ResponseSet, SimulatedResponses
 from training.models.cells import Cells
 from training.models.expected_targets import ExpectedTargets
 from training.models.targets import align, delay_samples, flat_targets
-from training.responses import ResponseSet, SimulatedResponses
 
 _FORMAT = 1
 _FLUSH_S = 10.0

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.codec import Codec
-from training.dataset import DatasetError
+from training.data.dataset import DatasetError
+from training.data.responses import ResponseSet
 from training.models.cells import Cells
-from training.responses import ResponseSet
 
 LEAD_SAMPLES = 64
 N_FFT = 256

@@ -13,12 +13,12 @@ import numpy.typing as npt
 
 from server.acoustics.metrics import parameter_errors, summarise
 from server.acoustics.room_parameters import RoomParameters, measure
-from server.whole_field import kemar
-from training.dataset import GEOMETRIC_ORDER
-from training.scene_file import SceneFile
+from server.responses.full_response import kemar
+from training.data.dataset import GEOMETRIC_ORDER
+from training.data.scene_file import SceneFile
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.direct_paths import DirectPaths
 from training.simulation.pairs import PairSimulation
-from training.simulation.plan import SimulationPlan
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer

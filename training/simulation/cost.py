@@ -6,10 +6,10 @@ from time import thread_time
 
 import numpy as np
 
-from training.dataset import GEOMETRIC_ORDER
-from training.scene_file import SceneFile
+from training.data.dataset import GEOMETRIC_ORDER
+from training.data.scene_file import SceneFile
+from training.data.simulation_plan import SimulatedEffect, SimulationPlan
 from training.simulation.pairs import PairSimulation
-from training.simulation.plan import SimulatedEffect, SimulationPlan
 from training.simulation.size import SimulationSize
 
 _RAYS_TRIED = 500

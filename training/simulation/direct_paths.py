@@ -15,9 +15,9 @@ from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import SoundPathFinder
 from server.acoustics.transmission import transmission_loss_db, walls_between
 from server.scene.manifest import Air
-from training.dataset import SPEED_OF_SOUND
-from training.scene_file import SceneFile
-from training.simulation.plan import SimulationPlan
+from training.data.dataset import SPEED_OF_SOUND
+from training.data.scene_file import SceneFile
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.tracing import free_field_amplitude
 
 _Floats = npt.NDArray[np.float64]

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.codec import Codec
-from server.whole_field import kemar
-from training.dataset import GEOMETRIC_ORDER, Dataset
+from server.responses.full_response import kemar
+from training.data.dataset import GEOMETRIC_ORDER, Dataset
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.minimum_phase import folded_cepstrum
-from server.acoustics.simd import (
+from server.kernels.simd import (
     LANES,
     broadcast,
     cosine_sine,

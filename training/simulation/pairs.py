@@ -13,13 +13,13 @@ from time import process_time, thread_time
 import numpy as np
 import numpy.typing as npt
 
-from server.whole_field import kemar
-from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND, TAKES, OwnResponse, own_duration_s
-from training.scene_file import SceneFile
+from server.responses.full_response import kemar
+from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND, TAKES, OwnResponse, own_duration_s
+from training.data.scene_file import SceneFile
+from training.data.shared_tail import SharedTail, shared_power
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.half_precision import to_half
-from training.simulation.plan import SimulationPlan
 from training.simulation.rays import sphere_directions
-from training.simulation.shared_tail import SharedTail, shared_power
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tail_noise import draw_tail
 from training.simulation.tracing import RoomTracer

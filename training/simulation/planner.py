@@ -4,9 +4,9 @@ An effect is called for where leaving it out would change some parameter by a qu
 errors of the data add to those of the fields trained on them, which are two to three times as large.
 """
 
-from training.dataset import GEOMETRIC_ORDER
-from training.scene_file import SceneFile, SceneFileError
-from training.simulation.plan import Overrides, SimulatedEffect, SimulationDecision, SimulationPlan
+from training.data.dataset import GEOMETRIC_ORDER
+from training.data.scene_file import SceneFile, SceneFileError
+from training.data.simulation_plan import Overrides, SimulatedEffect, SimulationDecision, SimulationPlan
 from training.simulation.predictions import Prediction, Predictions
 from training.simulation.size import SimulationSize
 

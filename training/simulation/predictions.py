@@ -10,19 +10,19 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.audibility import HEARD
+from server.acoustics.audibility import JND_THRESHOLDS
 from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.acoustics.transmission import transmission_loss_db, walls_between
 from server.scene.limits import MOST_SAMPLES
-from training.dataset import SPEED_OF_SOUND
-from training.scene_file import SceneFile
+from training.data.dataset import SPEED_OF_SOUND
+from training.data.scene_file import SceneFile
+from training.data.shared_tail import FADE_S
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.diffuse_room import DiffuseRoom
-from training.simulation.plan import SimulationPlan
 from training.simulation.rays import receiver_radii, surface_shares
-from training.simulation.shared_tail import FADE_S
 from training.simulation.size import SimulationSize
 from training.simulation.tracing import RoomTracer
 from training.simulation.trial import Change, Trial
@@ -34,7 +34,7 @@ _EARLY_S = 0.050
 _RAY_VARIANCE = 1.1**2 - 1
 # Mean of the square over the square of the mean of chords of a sphere that parallel lines cut.
 _CHORDS = 9 / 8
-_LEVEL_DB = HEARD["level"].amount
+_LEVEL_DB = JND_THRESHOLDS["level"].amount
 _EMITTERS_TRIED = 16
 # Of sequences of walls, each by a receiver, and of paths round corners, each by a wall.
 _MOST_IMAGE_TESTS, _MOST_PATH_TESTS = 30_000_000, 20_000_000
@@ -110,7 +110,7 @@ class Predictions:
         changes_db = power_to_db(1 + np.concatenate(shares) * spread)
         over_bands = np.sqrt((changes_db**2).mean(axis=-1))
         reason = f"paths by {order} surfaces bring {100 * np.mean(shares):.0f} % of the energy on average"
-        return Prediction(float(over_bands.max()) / HEARD["spectrum"].amount, "spectrum", reason)
+        return Prediction(float(over_bands.max()) / JND_THRESHOLDS["spectrum"].amount, "spectrum", reason)
 
     def scattering(self, *, has_rays: bool) -> Prediction:
         if not has_rays:

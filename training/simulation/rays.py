@@ -22,8 +22,8 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.scene.geometry import Geometry
-from training.dataset import SPEED_OF_SOUND
-from training.scene_file import HISTOGRAM_BIN_S
+from training.data.dataset import SPEED_OF_SOUND
+from training.data.scene_file import HISTOGRAM_BIN_S
 
 _Floats = npt.NDArray[np.float64]
 

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from server.whole_field import kemar
-from training.dataset import GEOMETRIC_ORDER, Dataset, StoredResponses
-from training.responses import SimulatedResponses
+from server.responses.full_response import kemar
+from training.data.dataset import GEOMETRIC_ORDER, Dataset, StoredResponses
+from training.data.responses import SimulatedResponses
 from training.simulation.direct_paths import DirectPaths
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
-from training.dataset import Dataset, OwnResponse
-from training.scene_file import SceneFile
+from training.data.dataset import Dataset, OwnResponse
+from training.data.scene_file import SceneFile
+from training.data.simulation_plan import SimulationPlan, overrides_among
 from training.simulation.half_precision import to_half
 from training.simulation.pairs import PairSimulation
-from training.simulation.plan import SimulationPlan, overrides_among
 from training.simulation.planner import planner_of
 
 

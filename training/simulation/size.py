@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
-from training.scene_file import SceneFile, SceneFileError
+from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.data.scene_file import SceneFile, SceneFileError
 
 MOST_PROBES = 2_000
 """Each is heard from every other: four million pairs."""

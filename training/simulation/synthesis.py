@@ -23,8 +23,8 @@ from scipy.sparse import coo_array
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.rendering.hrtf import HeadFilters
 from server.scene.manifest import Air
-from training.dataset import SPEED_OF_SOUND
-from training.scene_file import HISTOGRAM_BIN_S
+from training.data.dataset import SPEED_OF_SOUND
+from training.data.scene_file import HISTOGRAM_BIN_S
 from training.simulation.head_spectra import HeadSpectra, band_weights
 from training.simulation.tracing import Arrivals, free_field_amplitude
 

@@ -3,8 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from training.scene_file import HISTOGRAM_BIN_S
-from training.simulation.shared_tail import BANDS_AT_ONCE, SharedTail, shared_power
+from training.data.scene_file import HISTOGRAM_BIN_S
+from training.data.shared_tail import BANDS_AT_ONCE, SharedTail, shared_power
 from training.simulation.synthesis import BinauralSynthesis, power_at
 
 _NOISE_S = 2.0

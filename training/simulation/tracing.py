@@ -9,10 +9,10 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_amplitude, db_to_power
 from server.scene.geometry import Geometry
 from server.scene.manifest import Air
-from training.dataset import SPEED_OF_SOUND
-from training.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.data.dataset import SPEED_OF_SOUND
+from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.images import images_in_height, images_in_plan
-from training.simulation.plan import SimulationPlan
 from training.simulation.rays import RayTracer, sphere_directions, surface_shares
 
 _Floats = npt.NDArray[np.float64]

@@ -18,15 +18,15 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.audibility import HEARD, ratio_in_jnd
+from server.acoustics.audibility import JND_THRESHOLDS, ratio_in_jnd
 from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.scene.geometry import Geometry
-from training.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
-from training.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.diffuse_room import DiffuseRoom
 from training.simulation.direct_paths import DirectPaths
-from training.simulation.plan import SimulationPlan
 from training.simulation.rays import sphere_directions
 from training.simulation.tracing import RoomTracer
 
@@ -174,7 +174,7 @@ class Trial:
             difference = (after[name] - values)[..., :audible]
             if name in {"edt", "t60"}:
                 difference = 100 * difference / values[..., :audible]
-            unit = 1.0 if name == "c50" else HEARD[name].amount
+            unit = 1.0 if name == "c50" else JND_THRESHOLDS[name].amount
             jnd = min(MOST_JND, float(np.max(_root_mean_square(difference / unit), initial=0.0)))
             if jnd > found.jnd:
                 found = Change(jnd, name)

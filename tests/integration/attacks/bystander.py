@@ -39,9 +39,9 @@ from typing import TypeVar
 
 from websockets.asyncio.client import connect
 
-from server.blocks import AudioBlock
-from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
-from server.replies import Welcome, parse_server_message
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.protocol.server_messages import Welcome, parse_server_message
 
 SCENE = "apartment"
 CLIP = "man-reading"

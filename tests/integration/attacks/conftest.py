@@ -39,7 +39,7 @@ def _serving(**environment: str) -> Iterator[tuple[str, int]]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = [sys.executable, "-c", "from server.cli import main; main()", "serve", "--port", str(port)]
+    command = [sys.executable, "-c", "from server.cli.main import main; main()", "serve", "--port", str(port)]
     with subprocess.Popen(command, env={**os.environ, **environment}, stdout=subprocess.DEVNULL) as process:
         try:
             _wait_until_ready(process, port)

@@ -6,7 +6,7 @@ import time
 import pytest
 from websockets.frames import Frame, Opcode
 
-from server.protocol import PROTOCOL, AddEmitter, Hello
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
 
 PER_S = 200
 ATTACK_S = 5.0

@@ -17,9 +17,9 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from server.blocks import AudioBlock
-from server.protocol import PROTOCOL, Acknowledge, Hello
-from server.replies import parse_server_message
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, Hello
+from server.protocol.server_messages import parse_server_message
 
 DRAIN_S = 5.0
 _READY_S = 300.0
@@ -64,7 +64,7 @@ def serving(tmp_path, *, until_ready=True):
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     log = tmp_path / "log"
-    command = [sys.executable, "-c", "from server.cli import main; main()", "serve", "--port", str(port)]
+    command = [sys.executable, "-c", "from server.cli.main import main; main()", "serve", "--port", str(port)]
     with log.open("wb") as output:
         environment = {**os.environ, "NAFIR_DRAIN_S": str(DRAIN_S)}
         process = subprocess.Popen(command, stdout=output, stderr=output, env=environment)

@@ -13,9 +13,9 @@ from websockets.frames import Frame, Opcode
 from websockets.http11 import Response
 from websockets.uri import parse_uri
 
-from server.blocks import AudioBlock, DryBlock
-from server.protocol import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, Ping, SetGain
-from server.replies import parse_server_message
+from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, Ping, SetGain
+from server.protocol.server_messages import parse_server_message
 
 FLOOD_S = 5.0
 AT_ONCE = 500

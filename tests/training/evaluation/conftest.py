@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from training.evaluation.baselines import TrainingPairs
-from training.evaluation.held_out import HeldOut
+from training.baselines.baselines import TrainingPairs
+from training.baselines.held_out import HeldOut
 
 RATE = 8_000
 SAMPLES = 4_000

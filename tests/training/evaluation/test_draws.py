@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from server.acoustics.room_parameters import RoomParameters, measure
-from training.dataset import Dataset
+from training.baselines.held_out import EvaluationError, open_held_out
+from training.data.dataset import Dataset
 from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import ONE_SIMULATION
-from training.evaluation.held_out import EvaluationError, open_held_out
 from training.evaluation.run import evaluate_bundles
 from training.simulation.pairs import PairSimulation
 

@@ -5,8 +5,8 @@ import numpy.typing as npt
 import pytest
 from rich.console import Console
 
+from training.baselines.held_out import EvaluationError
 from training.evaluation.evaluate import METRICS, Column, Evaluation, evaluate, milliseconds_per_response
-from training.evaluation.held_out import EvaluationError
 from training.evaluation.published import SOUNDSPACES
 from training.evaluation.report import markdown, report
 

@@ -4,8 +4,8 @@ from PIL import Image
 
 from server.acoustics.decibels import power_to_db
 from server.field.field import AcousticField
-from training.evaluation.baselines import linear
-from training.evaluation.held_out import EvaluationError, open_held_out
+from training.baselines.baselines import linear
+from training.baselines.held_out import EvaluationError, open_held_out
 from training.evaluation.maps import (
     _interpolated_power,
     _simulated_power,

@@ -6,14 +6,14 @@ from rich.progress import Progress
 
 from server.acoustics.codec import Codec
 from server.acoustics.phase import FrozenNoise
-from training.evaluation.held_out import EvaluationError
+from training.baselines.held_out import EvaluationError
+from training.data.importers.report import ImportReport
+from training.data.responses import ImportedDataset, Measurement
 from training.evaluation.measured_fields import decoded, moved_later
 from training.evaluation.run import evaluate_bundles
-from training.importers.report import ImportReport
+from training.learning.train import train
 from training.models.frozen_noise import even_noise
 from training.models.targets import LEAD_SAMPLES, align
-from training.responses import ImportedDataset, Measurement
-from training.train import train
 
 RATE = 16_000
 SAMPLES = 4_000

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from server.bounded_cache import BoundedCache
-from server.calibration import Listener
-from server.errors import BundleError
+from server.core.bounded_cache import BoundedCache
+from server.core.errors import BundleError
 from server.field.field import AcousticField
-from server.field.levels import Levels
+from server.field.fields_by_level import FieldsByLevel
 from server.field.reuse import KEPT_BYTES
+from server.responses.full_response import kemar
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Phase, QualityLevel, Reuse
-from server.whole_field import kemar
+from server.streaming.calibration import Listener
 from training.frontier.accuracy import Estimate, SampledPairs
 from training.frontier.candidates import candidates
 from training.frontier.figure import draw_frontier
@@ -103,7 +103,7 @@ def test_with_another_noise_it_is_measured_again(tiny_bundle, dataset, chosen, t
 
 def test_a_bundle_offers_the_optimal_levels_and_keeps_what_was_measured(frontier, tiny_bundle, tmp_path) -> None:
     record(tiny_bundle, frontier, tmp_path)
-    loaded = Levels.load(Bundle.load(tmp_path))
+    loaded = FieldsByLevel.load(Bundle.load(tmp_path))
     assert list(loaded) == [point.level.name for point in frontier.offered]
     measured = {point.level.name for point in loaded.bundle.manifest.frontier}
     assert measured == {point.level.name for point in frontier.best} - set(loaded)

@@ -5,16 +5,16 @@ import pytest
 import torch
 from rich.progress import Progress
 
-from training.importers.report import ImportReport
+from training.data.importers.report import ImportReport
+from training.data.responses import ImportedDataset, Measurement, SimulatedResponses
 from training.learning.factorised import FactorisedLearner
 from training.learning.lessons import lessons_of
 from training.learning.pairs import split
+from training.learning.runs import Configuration, FactorisedRecipe, NafRecipe, RecipeError, configure
+from training.learning.train import load_learner, train
 from training.models.factorised import ExportedField, FieldShape
 from training.models.naf import NafShape
 from training.models.targets import LEAD_SAMPLES, align, delay_samples, flat_targets
-from training.responses import ImportedDataset, Measurement, SimulatedResponses
-from training.runs import Configuration, FactorisedRecipe, NafRecipe, RecipeError, configure
-from training.train import load_learner, train
 
 SILENT = Progress(disable=True)
 RATE, SAMPLES = 16_000, 2_000

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from training.dataset import DatasetError
-from training.importers.report import ImportReport
+from training.data.dataset import DatasetError
+from training.data.importers.report import ImportReport
+from training.data.responses import ImportedDataset, Measurement, SimulatedResponses
 from training.models import stored_targets
 from training.models.cells import Cells
 from training.models.stored_targets import load_targets
 from training.models.targets import LEAD_SAMPLES, align, codec_of, flat_targets
-from training.responses import ImportedDataset, Measurement, SimulatedResponses
 
 SILENT = Progress(disable=True)
 

@@ -6,7 +6,7 @@ import pytest
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.scene.geometry import Geometry, Material, Materials
-from training.scene_file import HISTOGRAM_BIN_S
+from training.data.scene_file import HISTOGRAM_BIN_S
 from training.simulation.rays import sphere_directions
 
 

@@ -7,11 +7,11 @@ from time import process_time
 import numpy as np
 import pytest
 
-from training.cli import main
-from training.scene_file import SceneFile
+from training.cli.main import main
+from training.data.scene_file import SceneFile
+from training.data.simulation_plan import SimulatedEffect, SimulationPlan
 from training.simulation.check import check_plan
 from training.simulation.cost import predicted_s, with_costs
-from training.simulation.plan import SimulatedEffect, SimulationPlan
 from training.simulation.planner import planner_of
 from training.simulation.run import prepared
 

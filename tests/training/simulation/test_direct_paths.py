@@ -7,9 +7,9 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.sound_path import SoundPathFinder
 from server.acoustics.transmission import transmission_loss_db
-from training.scene_file import SceneFile
+from training.data.scene_file import SceneFile
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.direct_paths import DirectPaths
-from training.simulation.plan import SimulationPlan
 
 CORNERS = ((0, 0), (3, 0), (3, 4), (3.2, 4), (3.2, 0), (7, 0), (7, 5), (0, 5))
 HERE, ROUND_THE_CORNER, BESIDE = np.array([1.0, 1.0, 1.2]), np.array([6.0, 1.5, 1.6]), np.array([2.0, 2.0, 1.4])

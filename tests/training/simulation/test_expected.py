@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from server.acoustics.codec import Codec
-from server.whole_field import kemar
-from training.dataset import Dataset, DatasetError
+from server.responses.full_response import kemar
+from training.data.dataset import Dataset, DatasetError
+from training.data.simulation_plan import SimulationPlan
 from training.simulation.expected import ExpectedSpectrograms
-from training.simulation.plan import SimulationPlan
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import Arrivals

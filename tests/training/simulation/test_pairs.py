@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from training.dataset import TAKES
-from training.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.data.dataset import TAKES
+from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.data.simulation_plan import SimulatedEffect, SimulationPlan
 from training.simulation import pairs
 from training.simulation.pairs import PairSimulation
-from training.simulation.plan import SimulatedEffect, SimulationPlan
 from training.simulation.planner import planner_of
 from training.simulation.rays import RayTracer
 from training.simulation.synthesis import BinauralSynthesis

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from server.scene.geometry import Opening
-from training.scene_file import SceneFile, SceneFileError
-from training.simulation.plan import SimulatedEffect, SimulationPlan, overrides_among
+from training.data.scene_file import SceneFile, SceneFileError
+from training.data.simulation_plan import SimulatedEffect, SimulationPlan, overrides_among
 from training.simulation.planner import THRESHOLD_JND, planner_of
 from training.simulation.predictions import Predictions
 

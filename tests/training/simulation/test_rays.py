@@ -3,7 +3,7 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.scene.geometry import Material, Materials
-from training.scene_file import HISTOGRAM_BIN_S
+from training.data.scene_file import HISTOGRAM_BIN_S
 from training.simulation.rays import RayTracer, sphere_directions
 
 RAMP = np.linspace(0, 1, 7)

@@ -9,8 +9,8 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.rendering.hrtf import KEMAR, Hrtf
-from server.whole_field import kemar
-from training.responses import SimulatedResponses
+from server.responses.full_response import kemar
+from training.data.responses import SimulatedResponses
 from training.simulation.rays import sphere_directions
 from training.simulation.references import GeometricSound, References, WholeResponses
 from training.simulation.synthesis import BinauralSynthesis

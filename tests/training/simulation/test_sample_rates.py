@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
-from training.scene_file import SceneFile
-from training.simulation.plan import SimulatedEffect
+from training.data.scene_file import SceneFile
+from training.data.simulation_plan import SimulatedEffect
 from training.simulation.planner import planner_of
 from training.simulation.run import prepared
 

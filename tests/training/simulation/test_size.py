@@ -4,8 +4,8 @@ from time import perf_counter
 
 import pytest
 
-from training.dataset import Dataset
-from training.scene_file import SceneFile, SceneFileError
+from training.data.dataset import Dataset
+from training.data.scene_file import SceneFile, SceneFileError
 from training.simulation.planner import planner_of
 from training.simulation.size import SimulationSize
 

@@ -3,7 +3,7 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.scene.manifest import Air
-from training.scene_file import HISTOGRAM_BIN_S
+from training.data.scene_file import HISTOGRAM_BIN_S
 from training.simulation.rays import sphere_directions
 from training.simulation.tracing import RoomTracer, free_field_amplitude
 

@@ -1,0 +1,184 @@
+"""The ASGI application: loads scenes, starts the audio engine, warms up, serves."""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Mapping
+from concurrent.futures import CancelledError
+from contextlib import asynccontextmanager
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import get_args
+
+from fastapi import FastAPI
+
+from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
+from server.api.connection import StreamHost
+from server.api.cross_site import CrossSiteGate, SitePolicy
+from server.api.drain_gate import DrainGate
+from server.api.openapi import install_openapi
+from server.api.page_files import PageFiles
+from server.api.problems import install_problems
+from server.api.response_cache import ResponseCache
+from server.api.routes import api, documents, health
+from server.api.settings import Settings
+from server.api.strict_requests import StrictRequests
+from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.core.entity_tags import fingerprint
+from server.field.fields_by_level import FieldsByLevel
+from server.planning.effect_costs import measure_costs
+from server.planning.places import place_of_field
+from server.protocol.client_messages import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
+from server.rendering.warm_up import warm_up
+from server.responses.ir_request import compute_irs
+from server.runtime.drain import Drain
+from server.runtime.memory import collect_as_usual, collect_rarely
+from server.runtime.own_thread import run_in_own_thread
+from server.runtime.priority import DutyCycle, become_background, become_prompt
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
+from server.runtime.workers import Workers
+from server.streaming.audio_engine import AudioEngine
+from server.streaming.calibration import calibrate
+from server.streaming.load import AUTO, Offer
+from server.streaming.session import Session
+
+_CALIBRATION_POSES = 3
+_COSTS_AFTER_S = 5.0
+_COSTS_SHARE = 0.05
+"""Of a core."""
+WEB = Path(__file__).parent / "web"
+
+_logger = logging.getLogger(__name__)
+
+
+def create_app(
+    settings: Settings,
+    *,
+    scenes: Mapping[str, FieldsByLevel] | None = None,
+    hrtfs: HrtfLibrary | None = None,
+    drain: Drain | None = None,
+) -> FastAPI:
+    """`scenes` by id, and `hrtfs`, where the caller has loaded them already to see their errors first. `drain` is begun
+    by who ends the server.
+
+    Otherwise they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError for an HRTF.
+    """
+    drain = Drain(settings.drain_s) if drain is None else drain
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
+        loaded = await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes
+        heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
+        with (
+            Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers,
+            ResponseCache(
+                # One more than there are IR workers, which maps leave to what is cheap.
+                workers=settings.ir_workers + 1,
+                waiting=settings.max_waiting_requests,
+                is_urgent=lambda: workers.are_busy,
+            ) as responses,
+        ):
+            audio = AudioEngine(
+                asyncio.get_running_loop().call_soon_threadsafe,
+                workers,
+                threads=settings.audio_threads,
+                is_real_time=settings.realtime,
+                ir_share=settings.ir_share,
+            )
+            host = StreamHost(
+                scenes=loaded,
+                clips=open_clips(loaded, settings.clips),
+                hrtfs=heads,
+                audio=audio,
+                settings=settings,
+                responses=responses,
+                readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool))),
+            )
+            if settings.realtime:
+                become_prompt()
+            audio.start()
+            tasks = [asyncio.create_task(_become_ready(host)), asyncio.create_task(host.readiness.watch.run())]
+            try:
+                yield {"host": host}
+            finally:
+                drain.begin()
+                for task in tasks:
+                    task.cancel()
+                await asyncio.to_thread(audio.stop)
+                collect_as_usual()
+
+    app = FastAPI(
+        title="Nafir",
+        version=version("nafir"),
+        description="Renders how a place sounds, in real time. Live streams are described at /asyncapi.json.",
+        lifespan=lifespan,
+        docs_url="/docs",
+        redoc_url=None,
+    )
+    app.add_middleware(DrainGate, drain=drain)
+    install_problems(app)
+    app.include_router(health)
+    app.include_router(documents)
+    app.include_router(api)
+    install_openapi(app)
+    app.add_middleware(StrictRequests, routes=app.router.routes)
+    app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))
+    app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
+    return app
+
+
+async def _become_ready(host: StreamHost) -> None:
+    try:
+        await run_in_own_thread(partial(_warm_up, host), "nafir-warm-up")
+    except Exception:  # whatever it is, the server stays up, and not ready, for an operator to look at
+        _logger.exception("warm-up failed")
+        host.readiness.warm_up = "failed"
+        return
+    collect_rarely()
+    host.readiness.warm_up = "done"
+    _logger.info("ready: %s", ", ".join(host.scenes))
+    # Nothing waits for these: whoever came first is served first.
+    await asyncio.sleep(_COSTS_AFTER_S)
+    breaks = DutyCycle(_COSTS_SHARE)
+    try:
+        await run_in_own_thread(partial(_measure_effects, host, breaks), "nafir-costs")
+    except Exception:  # plans are made without costs, as they were until now
+        _logger.exception("what effects cost could not be measured: plans do not say")
+    finally:
+        breaks.call_off()
+
+
+def _measure_effects(host: StreamHost, breaks: DutyCycle) -> None:
+    """See what effects cost here. Plans of streams opened before do not say."""
+    become_background()
+    for scene, levels in host.scenes.items():
+        try:
+            host.effect_costs[scene] = measure_costs(levels.default, rest=breaks.rest)
+        except CancelledError:  # nobody waits any longer
+            return
+
+
+def _warm_up(host: StreamHost) -> None:
+    """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render. And
+    see how long this host takes for a response of each level."""
+    warm_up(get_args(BlockSize))
+    for scene, levels in host.scenes.items():
+        host.places[scene] = place_of_field(levels.default)
+        filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
+        offer = host.offers[scene] = Offer(
+            tuple(levels[name].level for name in levels.names), calibrate(levels, filters, _CALIBRATION_POSES)
+        )
+        clips = playable_clips(host.clips[scene])
+        hello = Hello(protocol=PROTOCOL, scene=scene)
+        (rung, *_) = offer.rungs(AUTO, block_s=hello.block_size / levels.default.sample_rate)
+        session = Session(hello, levels, filters, host.clips[scene].load, rung=rung, window=100)
+        start = levels.bundle.manifest.start
+        clip = clips[0].name if clips else None
+        session.receive(AddEmitter(id="warm-up", clip=clip, live=clip is None, position=start.emitter))
+        for turn in range(1, 9):
+            session.receive(ListenerPose(pose_id=turn, position=start.listener, yaw=0.1 * turn))
+            if (request := session.take_request()) is not None:
+                session.accept(compute_irs(levels, request, session.renderer))
+            session.render_block()
+    fingerprint()

@@ -1,0 +1,83 @@
+"""What a server offers: scenes with their fields, clips to hear in them, and heads to hear them through."""
+
+import logging
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from server.assets.clips import Clip, ClipLibrary, DecodeError
+from server.assets.hrtfs import HrtfLibrary
+from server.assets.names import named_by_stem
+from server.core.errors import BundleError
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.server_messages import Place, SceneDescription
+from server.scene.bundle import MANIFEST_FILE, Bundle, bundled_scenes
+
+_logger = logging.getLogger(__name__)
+
+
+def load_scenes(bundles: Iterable[Path]) -> dict[str, FieldsByLevel]:
+    """Quality levels by scene id: the bundled scenes, and `bundles`, which win where one of those has the id.
+
+    Raises BundleError for the first bundle that is damaged, or has the id of another of `bundles`.
+    """
+    own: dict[str, Bundle] = {}  # read first: what is wrong with them is told before the others' graphs are read
+    for folder in bundles:
+        bundle = Bundle.load(folder)
+        other = own.setdefault(bundle.id, bundle)
+        if other.folder.resolve() != folder.resolve():
+            problem = f"is {bundle.id!r}, and so is that of {other.folder}; leave one out, or change one"
+            raise BundleError(folder / MANIFEST_FILE, "id", problem)
+    shipped = [Bundle.load(folder) for folder in bundled_scenes()]
+    return {bundle.id: FieldsByLevel.load(bundle) for bundle in ({each.id: each for each in shipped} | own).values()}
+
+
+def load_hrtfs(files: Iterable[Path], scenes: Mapping[str, FieldsByLevel]) -> HrtfLibrary:
+    """Heads for the sample rates of the scenes. Raises HrtfError for the first file that cannot be used."""
+    return HrtfLibrary(files, {levels.default.sample_rate for levels in scenes.values()})
+
+
+def open_clips(scenes: Mapping[str, FieldsByLevel], files: Iterable[Path]) -> dict[str, ClipLibrary]:
+    """Clips by scene id; scenes of one sample rate share a library, and files are named by their stem.
+
+    Raises ValueError for two of one stem.
+    """
+    named = named_by_stem(files)
+    rates = {scene: levels.default.sample_rate for scene, levels in scenes.items()}
+    by_rate = {rate: ClipLibrary(rate, named) for rate in set(rates.values())}
+    return {scene: by_rate[rate] for scene, rate in rates.items()}
+
+
+def playable_clips(clips: ClipLibrary) -> list[Clip]:
+    """Every clip that can be decoded, decoded; the log says of the others why not."""
+    playable = []
+    for name in clips.names:
+        try:
+            playable.append(clips.describe(name))
+        except DecodeError as exc:
+            _logger.warning("clip left out: %s", exc)
+    return playable
+
+
+def describe_scene(levels: FieldsByLevel) -> SceneDescription:
+    field, manifest = levels.default, levels.bundle.manifest
+    start, plan = manifest.start, levels.bundle.floor_plan
+    return SceneDescription(
+        id=manifest.id,
+        name=manifest.name,
+        description=manifest.description,
+        sample_rate=field.sample_rate,
+        ir_samples=field.ir_samples,
+        channels=manifest.channels,
+        speed_of_sound=manifest.speed_of_sound,
+        bounds=manifest.bounds,
+        walls_known=manifest.geometry is not None,
+        corners=plan.corners,
+        height_m=plan.height_m - plan.floor_m,
+        openings=() if manifest.geometry is None else manifest.geometry.openings,
+        listener=Place(position=start.listener, yaw=math.radians(start.listener_yaw_deg)),
+        emitter=Place(position=start.emitter),
+        level=field.level.name,
+        levels=manifest.levels,
+        accepted_laws=manifest.accepted,
+    )

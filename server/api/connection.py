@@ -1,0 +1,422 @@
+"""The asyncio driver of a WebSocket stream: moves bytes between the socket, the session and the audio thread.
+
+One `Connection` per client, living on the event loop. A reader passes what the client says to the audio thread; a
+sender passes on what the audio thread made. Nothing here grows without bound: messages to the audio thread are refused
+beyond `MAX_WAITING_MESSAGES`, audio beyond the window is never made, and a client that reads so slowly that its answers
+pile up is cut off, whether or not it ever reads again. So is one that acknowledges nothing for `stall_timeout_s`.
+
+A connection takes one of the server's streams with a hello, and not before. Those without one are few: one too many
+ends that which has been silent for longest, so that nobody who speaks is kept out by those who do not.
+
+What ends a connection is returned, and not raised: an exception that a task keeps holds the frames that hold the task,
+and a session in them would wait for the collector.
+"""
+
+import asyncio
+import contextlib
+import dataclasses
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from server.api.catalogue import describe_scene
+from server.api.inflow import Allowance
+from server.api.response_cache import ResponseCache
+from server.api.settings import Settings
+from server.api.stream_counts import StreamLedger
+from server.api.turn_taking import OneAtATime
+from server.api.web_socket import FastPath
+from server.assets.clips import ClipLibrary, DecodeError
+from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.core.errors import RequestError
+from server.field.fields_by_level import FieldsByLevel
+from server.planning.places import place_of
+from server.planning.planner import Costs
+from server.planning.scene_acoustics import SceneAcoustics
+from server.protocol.blocks import Encoding
+from server.protocol.client_messages import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
+from server.protocol.server_messages import Error, Pong, ServerMessage, Welcome
+from server.rendering.ingest import DryAudio
+from server.runtime.racing import StoppedError, run_until
+from server.runtime.readiness import Readiness
+from server.streaming.audio_engine import AudioEngine
+from server.streaming.load import Offer, QualityStep
+from server.streaming.session import Session
+from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
+
+NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
+MAX_WAITING_ANSWERS = 256
+_GOODBYE_S = 1.0
+"""Even closing waits for room in the socket, and a client that does not read makes none."""
+
+
+def load_clip(clips: ClipLibrary, name: str) -> DryAudio:
+    """Raises RequestError unknown_clip, or undecodable_clip with the decoder's reason."""
+    try:
+        return clips.load(name)
+    except DecodeError as exc:
+        raise RequestError("undecodable_clip", str(exc), field="clip") from exc
+
+
+def _first_blocks(outgoing: Iterable[Outgoing]) -> Iterator[TimedBlock]:
+    """Those before which nothing else is."""
+    for each in outgoing:
+        if not isinstance(each, TimedBlock):
+            return
+        yield each
+
+
+@dataclass(frozen=True)
+class Goodbye:
+    """The connection ends with this code, after an error message."""
+
+    close_code: int
+    error: Error
+
+
+_TOO_SLOW: Final = Goodbye(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
+_DRAINING: Final = Goodbye(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
+_BUSY: Final = Goodbye(TRY_AGAIN_LATER, Error(code="server_busy", message="the server has no free stream"))
+_FAILED: Final = Goodbye(INTERNAL_ERROR, Error(code="internal_error", message="the stream failed"))
+
+
+def _refused(refusal: RequestError) -> Goodbye:
+    return Goodbye(POLICY_VIOLATION, Error.from_refusal(refusal))
+
+
+@dataclass
+class StreamHost:
+    """What all connections share: loaded scenes, their clips, heads, the audio engine, and how many streams there
+    are. `offers` says what the quality levels of each scene cost here, once that was measured."""
+
+    scenes: Mapping[str, FieldsByLevel]
+    clips: Mapping[str, ClipLibrary]
+    """By scene, since every scene has its sample rate."""
+    hrtfs: HrtfLibrary
+    audio: AudioEngine
+    settings: Settings
+    responses: ResponseCache
+    readiness: Readiness
+    offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
+    places: dict[str, SceneAcoustics] = dataclasses.field(default_factory=dict)
+    """What plans of effects are made for, by scene."""
+    effect_costs: dict[str, Costs] = dataclasses.field(default_factory=dict)
+    """By scene, once they were measured."""
+    ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
+    """What all streams have counted."""
+    streams: int = 0
+    """Those open, and those being opened."""
+    openings: OneAtATime = dataclasses.field(default_factory=OneAtATime)
+    """Sessions are made one after the other: each takes some 8 ms of a processor."""
+    silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
+    """How long connections without a hello are waited for; who came first is first."""
+
+    def is_full(self) -> bool:
+        return self.streams >= self.settings.max_streams
+
+    def await_hello(self, patience: asyncio.Timeout) -> None:
+        """Note that a connection has not spoken yet; where there are too many, wait for the first of them no more."""
+        self.silent[patience] = None
+        if len(self.silent) > self.settings.max_silent:
+            longest = next(iter(self.silent))
+            del self.silent[longest]
+            longest.reschedule(asyncio.get_running_loop().time())
+
+
+class Connection:
+    """One client from its hello to its goodbye. `way` is the short one in and out, where there is one."""
+
+    def __init__(
+        self,
+        websocket: WebSocket,
+        host: StreamHost,
+        *,
+        way: FastPath | None = None,
+        time_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._websocket = websocket
+        self._way = way
+        self._host = host
+        self._time_s = time_s
+        self._outgoing: deque[Outgoing] = deque()
+        self._has_outgoing = asyncio.Event()
+        self._is_sending = self._is_taking_in = False
+        self._capacity = MAX_WAITING_ANSWERS
+        self._is_overfull = asyncio.Event()
+        self._stream: Stream | None = None
+        self._encoding: Encoding = "f32"
+
+    async def run(self) -> None:
+        """Serve the client until either side ends it."""
+        with contextlib.suppress(WebSocketDisconnect), self._host.readiness.drain.in_flight():
+            await self._websocket.accept()
+            goodbye = await self._serve_until_drained()
+            if goodbye is not None:
+                await self._say(goodbye)
+
+    async def _say(self, goodbye: Goodbye) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_GOODBYE_S):
+                await self._send_message(goodbye.error)
+                await self._websocket.close(goodbye.close_code, goodbye.error.code)
+
+    async def _serve_until_drained(self) -> Goodbye | None:
+        drain = self._host.readiness.drain
+        if drain.has_begun:
+            return _DRAINING
+        try:
+            return await run_until(self._serve(), drain.begun())
+        except StoppedError:
+            return _DRAINING
+
+    async def _serve(self) -> Goodbye | None:
+        """Until the client has gone, which returns None, or is to be sent away."""
+        host = self._host
+        if (obstacle := host.readiness.obstacle) is not None:
+            return Goodbye(TRY_AGAIN_LATER, Error(code="not_ready", message=obstacle.message))
+        if host.is_full():
+            return _BUSY
+        hello = await self._receive_hello()
+        if isinstance(hello, Goodbye):
+            return hello
+        if host.is_full():  # by now
+            return _BUSY
+        host.streams += 1
+        try:
+            stream = await self._open(hello)
+            return stream if stream is None or isinstance(stream, Goodbye) else await self._pump(stream, hello)
+        finally:
+            host.streams -= 1
+
+    async def _receive_hello(self) -> Hello | Goodbye:
+        host = self._host
+        try:
+            async with asyncio.timeout(host.settings.hello_timeout_s) as patience:
+                host.await_hello(patience)
+                try:
+                    first = await self._receive()
+                finally:
+                    host.silent.pop(patience, None)
+            if isinstance(first, bytes):
+                raise RequestError("hello_expected", "the first message is a hello, as JSON text, and not binary")
+            message = self._parse(first)
+        except TimeoutError:
+            return Goodbye(POLICY_VIOLATION, Error(code="hello_expected", message="no hello came in time"))
+        except RequestError as refusal:
+            return _refused(refusal)
+        if not isinstance(message, Hello):
+            error = Error(code="hello_expected", message=f"the first message is a hello, not {message.type}")
+            return Goodbye(POLICY_VIOLATION, error)
+        return message
+
+    async def _open(self, hello: Hello) -> Stream | Goodbye | None:
+        """None where the client has gone before it was its turn."""
+        settings = self._host.settings
+        levels = self._host.scenes.get(hello.scene)
+        hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
+        window = settings.window_blocks + hello.buffer_blocks
+        self._capacity = window + MAX_WAITING_ANSWERS
+        try:
+            if levels is None:
+                raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
+            field = levels.default
+            block_s = hello.block_size / field.sample_rate
+            offer = self._host.offers[hello.scene]
+            ladder = offer.ladder(hello.level, block_s=block_s)
+            session = await self._host.openings.run(
+                partial(self._open_session, hello, levels, hrtf, ladder.rung, window), is_wanted=self._is_there
+            )
+        except RequestError as refusal:
+            return _refused(refusal)
+        if session is None:
+            return None
+        await self._send_message(
+            Welcome(
+                session=uuid.uuid4().hex,
+                scene=describe_scene(levels),
+                sample_rate=field.sample_rate,
+                block_size=hello.block_size,
+                channels=session.renderer.outputs,
+                encoding=hello.encoding,
+                buffer_blocks=hello.buffer_blocks,
+                window=window,
+                ir_samples=field.ir_samples,
+                hrtf=hrtf,
+                level=ladder.rung.level,
+                max_emitters=self._host.settings.max_emitters,
+            )
+        )
+        return Stream(
+            session,
+            levels,
+            offer=offer,
+            ladder=ladder,
+            block_s=block_s,
+            lead=hello.buffer_blocks,
+            deliver=self._deliver,
+        )
+
+    def _is_there(self) -> bool:
+        return self._way is None or self._way.is_open()
+
+    def _open_session(self, hello: Hello, levels: FieldsByLevel, hrtf: str, rung: QualityStep, window: int) -> Session:
+        host, field = self._host, levels.default
+        return Session(
+            hello,
+            levels,
+            host.hrtfs.filters(hrtf, field.sample_rate),
+            lambda name: load_clip(host.clips[hello.scene], name),
+            rung=rung,
+            max_emitters=host.settings.max_emitters,
+            shared_tail=host.settings.shared_tail,
+            window=window,
+            place=place_of(levels.bundle, host.places[hello.scene].reverberations, block_size=hello.block_size),
+            costs=lambda: host.effect_costs.get(hello.scene, {}),
+        )
+
+    async def _pump(self, stream: Stream, hello: Hello) -> Goodbye | None:
+        """Read and send until the client has gone or is to be sent away."""
+        self._stream, self._encoding = stream, hello.encoding
+        self._host.ledger.open(stream)
+        self._host.audio.open(stream)
+        tasks = [
+            asyncio.create_task(self._read_incoming(stream, hello)),
+            asyncio.create_task(self._send_outgoing()),
+            asyncio.create_task(self._watch(stream)),
+        ]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._host.audio.close(stream)
+            self._host.ledger.close(stream)
+            self._stream = None
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        # Where the client has gone, there is nobody to be told why it is sent away.
+        return None if any(task.result() is None for task in done) else next(iter(done)).result()
+
+    async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
+        """Until the client has gone."""
+        if self._way is not None:
+            emitters, rate = self._host.settings.max_emitters, self._host.scenes[hello.scene].default.sample_rate
+            self._way.allow(Allowance.of(emitters=emitters, sample_rate=rate))
+            self._way.listen(self._hear)
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                data = await self._receive()
+                self._is_taking_in = True
+                await self._take_in(data, stream, hello)
+                self._is_taking_in = False
+
+    def _hear(self, data: str | bytes) -> bool:
+        """Take in what needs nothing but the audio thread, unless something that came before is not yet."""
+        if self._is_taking_in or self._stream is None:
+            return False
+        try:
+            message = self._parse(data)
+            if isinstance(message, AddEmitter):
+                return False
+            self._pass_on(message, self._stream)
+        except RequestError as refusal:
+            self._enqueue([Error.from_refusal(refusal)])
+        return True
+
+    async def _take_in(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
+        try:
+            message = self._parse(data)
+            if isinstance(message, AddEmitter) and message.clip is not None:
+                # Decoded once, here and off the loop, so that the audio thread finds it ready.
+                await asyncio.to_thread(load_clip, self._host.clips[hello.scene], message.clip)
+            self._pass_on(message, stream)
+        except RequestError as refusal:
+            self._enqueue([Error.from_refusal(refusal)])
+
+    def _pass_on(self, message: ClientMessage, stream: Stream) -> None:
+        """Raises RequestError too_many_messages."""
+        if isinstance(message, Ping):
+            self._enqueue([Pong(id=message.id)])
+        elif not stream.offer(message):
+            raise RequestError("too_many_messages", "too many messages in one block: this one was not heeded")
+
+    async def _receive(self) -> str | bytes:
+        event = await self._websocket.receive()
+        if event["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(event.get("code", NORMAL))
+        text: str | None = event.get("text")
+        return event["bytes"] if text is None else text
+
+    def _parse(self, data: str | bytes) -> ClientMessage:
+        limit = self._host.settings.max_message_bytes
+        size = len(data.encode() if isinstance(data, str) else data)
+        if size > limit:
+            raise RequestError("message_too_large", f"a message has at most {limit} bytes, not {size}", status=413)
+        return parse_client_message(data)
+
+    def _deliver(self, outgoing: list[Outgoing]) -> None:
+        """Send blocks at once where there is a short way and nothing waits to go before them."""
+        if self._stream is None:
+            return  # what was made before the audio thread knew that the connection ends
+        blocks: list[bytes] = []
+        if self._way is not None and not (self._outgoing or self._is_sending):
+            now_s = self._time_s()
+            blocks = [self._serialize(block, now_s) for block in _first_blocks(outgoing)]
+            if blocks and not self._way.write(blocks):
+                blocks = []
+        if len(blocks) < len(outgoing):
+            self._enqueue(outgoing[len(blocks) :])
+
+    def _enqueue(self, outgoing: list[Outgoing]) -> None:
+        """Where there is no room, what comes is lost, and the connection ends."""
+        if len(self._outgoing) + len(outgoing) > self._capacity:
+            self._is_overfull.set()
+            return
+        self._outgoing += outgoing
+        self._has_outgoing.set()
+
+    async def _watch(self, stream: Stream) -> Goodbye:
+        """Until the client reads too slowly, or acknowledges nothing. Apart from the sender, which may be waiting for
+        the very client that does not read."""
+        patience_s = left_s = self._host.settings.stall_timeout_s
+        while left_s > 0:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(left_s):
+                    await self._is_overfull.wait()
+                    return _TOO_SLOW
+            left_s = patience_s - stream.stalled_s
+        message = f"no block was acknowledged for {patience_s:g} s, and there is no room for more"
+        return Goodbye(POLICY_VIOLATION, Error(code="stalled", message=message))
+
+    async def _send_outgoing(self) -> Goodbye | None:
+        """Until the client has gone, which returns None, or the stream cannot go on."""
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                await self._has_outgoing.wait()
+                self._has_outgoing.clear()
+                self._is_sending = True
+                while self._outgoing:
+                    match self._outgoing.popleft():
+                        case TimedBlock() as timed:
+                            await self._websocket.send_bytes(self._serialize(timed, self._time_s()))
+                        case StreamFailed():
+                            return _FAILED
+                        case message:
+                            await self._send_message(message)
+                self._is_sending = False
+        return None
+
+    def _serialize(self, timed: TimedBlock, now_s: float) -> bytes:
+        block = timed.block
+        if not block.is_late and now_s > timed.deadline_s and self._stream is not None:
+            self._stream.blocks_late += 1
+            block.is_late = True
+        return block.serialize(self._encoding)
+
+    async def _send_message(self, message: ServerMessage) -> None:
+        await self._websocket.send_text(message.serialize())

@@ -1,0 +1,76 @@
+"""Errors of the HTTP interface: problem documents (RFC 9457) with the `code` and `field` of the WebSocket's errors."""
+
+from dataclasses import dataclass
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from server.core.errors import RequestError
+
+_POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "height_m"})
+_STATUSES = {"position_out_of_bounds": 404, "unknown_level": 404, "map_too_fine": 409, "map_too_slow": 409}
+"""Of what is well formed and asks for what there is not, or for too much: 422 is for what is malformed."""
+_CODES = {404: "not_found", 405: "method_not_allowed"}
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """What a request is answered before the application sees it: `status` of HTTP, `code` for programs, `detail` for
+    people."""
+
+    status: int
+    code: str
+    detail: str
+
+
+def problem(
+    status: int, code: str, detail: str, field: str | None = None, *, retry_after_s: int | None = None
+) -> JSONResponse:
+    """`code` is for programs and does not change; `detail` is for people; `field` is the parameter at fault.
+    `retry_after_s` is when it is worth asking again, where the fault passes."""
+    return JSONResponse(
+        {
+            "type": "about:blank",
+            "title": HTTPStatus(status).phrase,
+            "status": status,
+            "detail": detail,
+            "code": code,
+            "field": field,
+        },
+        status_code=status,
+        media_type="application/problem+json",
+        headers=None if retry_after_s is None else {"Retry-After": str(retry_after_s)},
+    )
+
+
+def install_problems(app: FastAPI) -> None:
+    """Answer every error with a problem document."""
+
+    async def refused(_: Request, exc: Exception) -> JSONResponse:
+        assert isinstance(exc, RequestError)
+        status = _STATUSES.get(exc.code, exc.status)
+        return problem(status, exc.code, str(exc), exc.field, retry_after_s=exc.retry_after_s)
+
+    async def invalid(_: Request, exc: Exception) -> JSONResponse:
+        assert isinstance(exc, RequestValidationError)
+        first = exc.errors()[0]
+        field = str(first["loc"][-1])
+        code = "malformed_pose" if field in _POSE_PARAMETERS else "malformed_request"
+        return problem(422, code, f"{field}: {first['msg'].removeprefix('Value error, ')}", field)
+
+    async def http(_: Request, exc: Exception) -> JSONResponse:
+        assert isinstance(exc, HTTPException)
+        response = problem(exc.status_code, _CODES.get(exc.status_code, "http_error"), str(exc.detail))
+        response.headers.update(exc.headers or {})
+        return response
+
+    async def crashed(_: Request, __: Exception) -> JSONResponse:
+        return problem(500, "internal_error", "the server failed to answer; its log says why")
+
+    app.add_exception_handler(RequestError, refused)
+    app.add_exception_handler(RequestValidationError, invalid)
+    app.add_exception_handler(HTTPException, http)
+    app.add_exception_handler(Exception, crashed)

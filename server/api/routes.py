@@ -1,0 +1,306 @@
+"""HTTP and WebSocket endpoints: they parse, hand over, and answer. Angles in degrees, positions in metres."""
+
+import json
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Query, Request, Response, WebSocket
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
+from pydantic import BeforeValidator, Field
+
+from server.api.asyncapi import document
+from server.api.catalogue import describe_scene, playable_clips
+from server.api.connection import Connection, StreamHost
+from server.api.frontier import Frontier
+from server.api.response_cache import Compute, Kind
+from server.api.telemetry import ServerCollector, exposition
+from server.api.web_socket import direct_way
+from server.assets.hrtfs import DEFAULT_HRTF
+from server.core.entity_tags import content_tag
+from server.core.errors import RequestError
+from server.core.numerals import parse_decimal
+from server.field.fields_by_level import FieldsByLevel
+from server.planning.plan_query import EFFECT_PATTERN, OUTPUTS, PlanDocument, PlanQuery, parse_effects, rounded
+from server.responses.full_response import FullResponse
+from server.responses.impulse_response import (
+    IR_FORMATS,
+    MEDIA_TYPES,
+    POSITION_PATTERN,
+    ImpulseResponse,
+    IrQuery,
+    entity_tag,
+    parse_format,
+    parse_position,
+)
+from server.responses.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
+from server.runtime.pace import Checkpoint
+from server.runtime.racing import StoppedError, run_until
+
+MAX_MAP_SPACING_M = 20.0
+MAX_MAP_S = 120.0
+MAX_PLANNED = 16
+CLIENT_CLOSED_REQUEST = 499
+"""For the log alone: nobody is there to read it."""
+CACHE_CONTROL = "public, max-age=3600"
+"""Entity tags outlive it: after an hour an unchanged answer costs a 304."""
+
+api = APIRouter(prefix="/v1")
+health = APIRouter()
+documents = APIRouter(include_in_schema=False)
+
+_PLACE: dict[str, Any] = {"pattern": POSITION_PATTERN}
+
+
+def _between(low: float, high: float) -> dict[str, Any]:
+    """Bounds, told in the schema too: behind `Number`'s parser pydantic does not."""
+    return {"ge": low, "le": high, "json_schema_extra": {"minimum": low, "maximum": high}}
+
+
+Number = Annotated[float, BeforeValidator(lambda value: parse_decimal(value) if isinstance(value, str) else value)]
+LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
+PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"], json_schema_extra=_PLACE)]
+YawDeg = Annotated[
+    Number, Query(**_between(-36_000, 36_000), description="of the head, counter-clockwise, 0 looks along +x")
+]
+EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
+_IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
+_IR_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
+_MAP_TYPES = {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
+_MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
+
+
+@health.get("/livez")
+async def livez() -> dict[str, str]:
+    """The process answers."""
+    return {"status": "live"}
+
+
+@health.get("/readyz")
+async def readyz(request: Request) -> dict[str, str]:
+    """Streams may be opened: everything is warmed up, all threads do their work, and the server is not told to stop."""
+    if (obstacle := _host(request).readiness.obstacle) is not None:
+        raise RequestError(obstacle.code, obstacle.message, status=503, retry_after_s=obstacle.retry_after_s)
+    return {"status": "ready"}
+
+
+@health.get("/metrics", include_in_schema=False)
+async def metrics(request: Request) -> Response:
+    """For Prometheus."""
+    body = await anyio.to_thread.run_sync(exposition, ServerCollector(_host(request)))
+    return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+
+@documents.get("/asyncapi.json")
+def asyncapi() -> Response:
+    """Of the stream what /openapi.json is of the rest; in a thread, for the first answer is long in the making."""
+    return Response(document(), media_type="application/json")
+
+
+@api.get("/scenes")
+async def scenes(request: Request) -> dict[str, Any]:
+    """What can be heard, and how many emitters a stream may have at once."""
+    host = _host(request)
+    listed = [describe_scene(levels).model_dump() for levels in host.scenes.values()]
+    return {"scenes": listed, "max_emitters": host.settings.max_emitters}
+
+
+@api.get("/scenes/{scene}")
+async def one_scene(request: Request, scene: str) -> dict[str, Any]:
+    return describe_scene(_levels(request, scene)).model_dump()
+
+
+@api.get("/scenes/{scene}/frontier")
+async def frontier(request: Request, scene: str) -> Frontier:
+    """What the accuracy of each quality level costs in time."""
+    levels, offer = _levels(request, scene), _host(request).offers.get(scene)
+    return Frontier.of(levels, {} if offer is None else offer.ms_here)
+
+
+@api.get("/scenes/{scene}/impulse-response", response_class=Response, responses={200: _IR_TYPES})
+async def impulse_response(
+    request: Request,
+    scene: str,
+    listener: PositionText,
+    emitter: PositionText,
+    yaw_deg: YawDeg = 0.0,
+    level: LevelText = None,
+    format: Annotated[str, Query(description="wav, npy or json", json_schema_extra={"enum": [*IR_FORMATS]})] = "wav",  # noqa: A002  the parameter's name
+) -> Response:
+    """The impulse response between two places, as `nafir ir` writes it."""
+    field = _levels(request, scene).choose(level)
+    name = parse_format(format)
+    query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
+    query.require_inside(field)
+    return await _cached(
+        request,
+        query.etag(field, name),
+        MEDIA_TYPES[name],
+        lambda _: ImpulseResponse.compute(field, query).encode(name),
+    )
+
+
+@api.get("/scenes/{scene}/loudness", response_class=Response, responses={200: _MAP_TYPES})
+async def loudness(
+    request: Request,
+    scene: str,
+    emitter: PositionText,
+    height_m: Annotated[Number, Query(**_between(-1_000, 1_000), description="of the listener's ears")] = 1.5,
+    spacing_m: Annotated[
+        Number | None,
+        Query(
+            **_between(FINEST_M, MAX_MAP_SPACING_M),
+            description="between map points; by default as the scene's size asks",
+        ),
+    ] = None,
+    level: LevelText = None,
+    format: Annotated[str, Query(description="png or json", json_schema_extra={"enum": ["png", "json"]})] = "png",  # noqa: A002  the parameter's name
+) -> Response:
+    """How loud an emitter is at every place of the scene."""
+    field = _levels(request, scene).choose(level)
+    if format not in {"png", "json"}:
+        raise RequestError("unknown_format", f"{format!r} is none of png, json", field="format")
+    position = parse_position(emitter, "emitter")
+    field.bundle.require_inside(position, "emitter")
+    bounds = field.bundle.manifest.bounds
+    if not bounds.minimum[2] <= height_m <= bounds.maximum[2]:
+        raise RequestError("position_out_of_bounds", f"height_m {height_m:g} is outside the scene", field="height_m")
+
+    spacing_m = usual_spacing_m(field.bundle) if spacing_m is None else spacing_m
+    points = field.bundle.floor_plan.area_m2 / spacing_m**2
+    if points > MAX_POINTS:
+        raise RequestError("map_too_fine", f"more than {MAX_POINTS} points: widen spacing_m", field="spacing_m")
+    offer = _host(request).offers.get(scene)
+    if offer and points * offer.ms_here[field.level.name] > 1000 * MAX_MAP_S:
+        problem = (
+            f"at level {field.level.name} that many points take too long: widen spacing_m, or take a cheaper level"
+        )
+        raise RequestError("map_too_slow", problem, field="level")
+
+    def draw(checkpoint: Checkpoint) -> bytes:
+        whole = FullResponse.through_kemar(field)
+        levels = loudness_map(whole, position, listener_height_m=height_m, spacing_m=spacing_m, checkpoint=checkpoint)
+        return levels.to_png() if format == "png" else json.dumps(levels.to_json()).encode()
+
+    parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
+    media_type = "image/png" if format == "png" else "application/json"
+    return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw, kind="map")
+
+
+@api.get("/scenes/{scene}/plan", response_model=PlanDocument)
+async def plan(
+    request: Request,
+    scene: str,
+    listener: Annotated[
+        str | None, Query(description="x,y,z in metres; by default where a visitor starts", json_schema_extra=_PLACE)
+    ] = None,
+    yaw_deg: YawDeg = 0.0,
+    emitter: Annotated[
+        list[Annotated[str, Field(json_schema_extra=_PLACE)]] | None,
+        Query(description="x,y,z in metres; may be repeated", json_schema_extra={"maxItems": MAX_PLANNED}),
+    ] = None,
+    walks: Annotated[bool, Query(description="the listener walks and turns the head")] = True,
+    move: Annotated[bool, Query(description="the emitters move")] = False,
+    output: Annotated[
+        str, Query(description="headphones or mono", json_schema_extra={"enum": [*OUTPUTS]})
+    ] = "headphones",
+    effect: Annotated[list[EffectText] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
+) -> Response:
+    """Which effects a situation calls for, why, and what they cost on this host."""
+    emitters = emitter or []
+    if len(emitters) > MAX_PLANNED:
+        raise RequestError("too_many_emitters", f"a plan is made for at most {MAX_PLANNED} emitters", field="emitter")
+    query = PlanQuery(
+        listener=None if listener is None else parse_position(listener, "listener"),
+        yaw_deg=yaw_deg,
+        emitters=tuple(parse_position(text, "emitter") for text in emitters),
+        walks=walks,
+        move=move,
+        output=output,
+        effects=parse_effects(effect or []),
+    )
+    field = _levels(request, scene).default
+    query.check(field)
+    costs = _host(request).effect_costs.get(scene)
+    # Until they are measured, this process measures its own once, and keeps to them.
+    told = None if costs is None else {name: asdict(cost) for name, cost in costs.items()}
+    body = await _computed(
+        request,
+        entity_tag(field, "plan", {**asdict(query), "scene": scene, "costs": told}, "json"),
+        lambda _: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
+    )
+    if body is None:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
+    # What it costs is of this host and of this start of the server: nothing but the body itself says so.
+    headers = {"ETag": content_tag(body), "Cache-Control": "no-cache"}
+    if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(body, media_type="application/json", headers=headers)
+
+
+@api.get("/clips")
+async def clips(request: Request) -> dict[str, Any]:
+    """Recordings an emitter can play."""
+    host = _host(request)
+    named = {}
+    for library in set(host.clips.values()):
+        for clip in await anyio.to_thread.run_sync(playable_clips, library):
+            named[clip.name] = clip
+    return {"clips": [named[name] for name in sorted(named)]}
+
+
+@api.get("/hrtfs")
+async def hrtfs(request: Request) -> dict[str, Any]:
+    """Heads a stream can be heard through."""
+    return {"default": DEFAULT_HRTF, "hrtfs": _host(request).hrtfs.names}
+
+
+@api.websocket("/stream")
+async def stream(websocket: WebSocket) -> None:
+    await Connection(websocket, _host(websocket), way=direct_way(websocket.scope)).run()
+
+
+def _host(connection: Request | WebSocket) -> StreamHost:
+    host = connection.state.host
+    assert isinstance(host, StreamHost)
+    return host
+
+
+def _levels(request: Request, scene: str) -> FieldsByLevel:
+    try:
+        return _host(request).scenes[scene]
+    except KeyError:
+        raise RequestError("unknown_scene", f"there is no scene {scene!r}", field="scene", status=404) from None
+
+
+async def _cached(request: Request, etag: str, media_type: str, compute: Compute, *, kind: Kind = "single") -> Response:
+    """Answer 304 where the client has it already, and else compute it, for as long as the client waits."""
+    headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
+    if _has_tag(request.headers.get("if-none-match", ""), etag):
+        return Response(status_code=304, headers=headers)
+    body = await _computed(request, etag, compute, kind=kind)
+    if body is None:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
+    return Response(body, media_type=media_type, headers=headers)
+
+
+async def _computed(request: Request, etag: str, compute: Compute, *, kind: Kind = "single") -> bytes | None:
+    """The body kept or computed for as long as the client waits; None where it has gone."""
+    client = "" if request.client is None else request.client.host
+    computing = _host(request).responses.get(etag, compute, kind=kind, client=client)
+    try:
+        return await run_until(computing, _disconnected(request))
+    except StoppedError:
+        return None
+
+
+async def _disconnected(request: Request) -> None:
+    """Return once the client has gone."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+def _has_tag(if_none_match: str, etag: str) -> bool:
+    """Weak comparison, as RFC 9110 asks of If-None-Match."""
+    tags = {tag.strip().removeprefix("W/") for tag in if_none_match.split(",")}
+    return etag in tags or "*" in tags

@@ -1,0 +1,127 @@
+"""Dry recordings that emitters play: the bundled ones and files of the user's.
+
+A clip is decoded once, to mono at the rate of the scene, and checked there: at least one sample, and a file that holds
+what is no audio is refused as a whole.
+"""
+
+import logging
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+import numpy.typing as npt
+import soxr
+
+from server.assets.audio_file import AudioFileError, read_audio, to_mono
+from server.core.errors import NafirError, RequestError
+from server.rendering.ingest import LOUDEST, DryAudio
+
+FloatArray = npt.NDArray[np.float32]
+
+_logger = logging.getLogger(__name__)
+
+_BUNDLED = Path(__file__).parent / "clips_data"
+
+
+class DecodeError(NafirError):
+    """A file that cannot be played; `reason` says why."""
+
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(f"{name}: {reason}")
+        self.name = name
+        self.reason = reason
+
+
+class UnknownClipError(RequestError):
+    """No clip of that name."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__("unknown_clip", f"there is no clip {name!r}", field="clip", status=404)
+        self.name = name
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What to show of a clip. `credit` is empty for the user's own files."""
+
+    name: str
+    title: str
+    duration_s: float
+    credit: str
+
+
+def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAudio:
+    """Read an audio file (wav, flac, ogg, and whatever else libsndfile reads) as mono at `sample_rate`.
+
+    Channels are averaged, or `channel`, counted from 0, is taken; where they cancel each other, the louder one. The
+    log warns of that, and of headers that lie. Raises DecodeError.
+    """
+    try:
+        recording = read_audio(path)
+        samples = recording.samples
+        if samples.shape[0] == 0:
+            raise AudioFileError("it holds no samples")
+        # Before averaging and resampling, which would spread one bad sample over many.
+        is_bad = ~np.isfinite(samples).all(axis=1)
+        if is_bad.any():
+            raise AudioFileError(f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
+        if (peak := np.abs(samples).max()) > LOUDEST:
+            raise AudioFileError(f"its peak of {peak:.3g} is not audio, where full scale is 1")
+        mono, downmix = to_mono(samples, channel)
+    except AudioFileError as exc:
+        raise DecodeError(path.name, str(exc)) from exc
+    for finding in filter(None, (recording.finding, downmix)):
+        _logger.warning("warning: %s: %s", path, finding)
+    if recording.sample_rate != sample_rate:
+        mono = soxr.resample(mono, recording.sample_rate, sample_rate, quality="VHQ")
+        if mono.size == 0:
+            raise DecodeError(path.name, f"too short to be heard at {sample_rate} Hz")
+    return DryAudio(mono)
+
+
+class ClipLibrary:
+    """Clips by name at one sample rate: the bundled ones, and `files`, which win where a name is taken.
+
+    Safe to use from any thread. Clips are decoded when first asked for and kept.
+    """
+
+    def __init__(self, sample_rate: int, files: Mapping[str, Path] | None = None) -> None:
+        self.sample_rate = sample_rate
+        with (_BUNDLED / "clips.toml").open("rb") as stream:
+            self._labels: dict[str, dict[str, str]] = tomllib.load(stream)
+        self._paths = {name: _BUNDLED / f"{name}.ogg" for name in self._labels}
+        for name, path in (files or {}).items():
+            if name in self._paths:
+                _logger.warning("warning: %s takes the place of the bundled clip %r", path, name)
+            self._paths[name] = path
+            self._labels[name] = {"title": name, "credit": ""}
+        self._decoded: dict[str, DryAudio] = {}
+        self._lock = Lock()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """In alphabetical order."""
+        return tuple(sorted(self._paths))
+
+    def load(self, name: str) -> DryAudio:
+        """Raises UnknownClipError and DecodeError."""
+        path = self._path(name)
+        with self._lock:
+            if name not in self._decoded:
+                self._decoded[name] = decode(path, self.sample_rate)
+            return self._decoded[name]
+
+    def describe(self, name: str) -> Clip:
+        """Raises UnknownClipError and DecodeError."""
+        self._path(name)
+        labels = self._labels[name]
+        return Clip(name, labels["title"], self.load(name).size / self.sample_rate, labels["credit"])
+
+    def _path(self, name: str) -> Path:
+        try:
+            return self._paths[name]
+        except KeyError:
+            raise UnknownClipError(name) from None

@@ -1,0 +1,40 @@
+"""Heads to hear through: measured sets of HRTFs, ready for the sample rates of the scenes."""
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+from server.assets.names import named_by_stem
+from server.core.errors import RequestError
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+
+DEFAULT_HRTF = "kemar"
+
+_logger = logging.getLogger(__name__)
+
+
+class HrtfLibrary:
+    """The KEMAR set, and `files` (SOFA, SimpleFreeFieldHRIR) by stem, which win where a name is taken.
+
+    Everything is read and filtered here, at `sample_rates`, so that a stream finds it ready. Raises HrtfError for the
+    first file that cannot be used, and ValueError for two of one stem.
+    """
+
+    def __init__(self, files: Iterable[Path], sample_rates: Iterable[int]) -> None:
+        named = named_by_stem(files)
+        if DEFAULT_HRTF in named:
+            _logger.warning("warning: %s takes the place of the bundled head %r", named[DEFAULT_HRTF], DEFAULT_HRTF)
+        paths = {DEFAULT_HRTF: KEMAR, **named}
+        self._filters = {
+            (name, rate): HeadFilters.from_hrtf(Hrtf.read(path, rate))
+            for rate in set(sample_rates)
+            for name, path in paths.items()
+        }
+        self.names = tuple(sorted(paths))
+
+    def filters(self, name: str, sample_rate: int) -> HeadFilters:
+        """Raises RequestError unknown_hrtf."""
+        if name not in self.names:
+            known = ", ".join(self.names)
+            raise RequestError("unknown_hrtf", f"there is no HRTF {name!r}, only {known}", field="hrtf", status=404)
+        return self._filters[name, sample_rate]

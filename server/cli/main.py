@@ -1,0 +1,375 @@
+"""The `nafir` command: serve scenes, write impulse responses, render paths.
+
+Errors a person can act on end the process with one line and exit code 2, as wrong usage does.
+"""
+
+import contextlib
+import io
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from server.bench import cli as bench
+from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
+from server.core.errors import NafirError, RequestError
+from server.core.files import require_readable
+from server.health.cli import check
+from server.rendering.partitions import BLOCK_SIZES, is_block_size
+from server.soak.cli import soak
+
+if TYPE_CHECKING:
+    from server.api.settings import Settings
+    from server.field.field import AcousticField
+    from server.offline.render import RenderedEmitter
+
+app = StrictTyper(
+    name="nafir",
+    help="Hear how a place sounds while you move through it.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+app.add_typer(bench.app, name="bench")
+app.command()(check)
+app.command()(soak)
+
+Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
+Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]
+AsJson = Annotated[bool, typer.Option("--json", help="Say what was done as JSON, for programs.")]
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        app()
+    except NafirError as exc:
+        Console(stderr=True, soft_wrap=True).print(f"[bold red]error:[/] {escape(str(exc))}", highlight=False)
+        sys.exit(2)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on; 0 picks one. [default: 8000]")] = None,
+    bundle: Annotated[
+        list[Path] | None,
+        typer.Option(help="Scene bundle to serve as well, in place of a bundled scene of the same id; repeatable."),
+    ] = None,
+    clip: Annotated[list[Path] | None, typer.Option(help="Audio file to offer as a clip; repeatable.")] = None,
+    hrtf: Annotated[
+        list[Path] | None, typer.Option(help="SOFA file with a head to offer beside KEMAR; repeatable.")
+    ] = None,
+) -> None:
+    """Serve scenes over HTTP and WebSocket, and a page to walk through them.
+
+    Every setting can also come from the environment: NAFIR_HOST, NAFIR_PORT, NAFIR_BUNDLES, ...
+    """
+    import uvicorn
+    from pydantic import ValidationError
+
+    from server.api import serving
+    from server.api.app import create_app
+    from server.api.catalogue import load_hrtfs, load_scenes
+    from server.api.settings import Settings
+    from server.runtime.drain import Drain
+    from server.runtime.memory import give_back_large_arrays
+    from server.runtime.open_files import allow_connections
+
+    give_back_large_arrays()
+    given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf}
+    try:
+        settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        place = f"setting {'.'.join(str(part) for part in first['loc'])}: " if first["loc"] else ""
+        raise NafirError(f"{place}{first['msg'].removeprefix('Value error, ')}") from exc
+    allow_connections(settings.max_connections)
+    for name in ("clips", "hrtfs"):
+        for path in getattr(settings, name):
+            require_readable(path, name)
+    with contextlib.ExitStack() as opened:
+        # Before what takes time: a port that cannot be had is told of at once.
+        listeners = [opened.enter_context(listener) for listener in serving.bind(settings.host, settings.port)]
+        scenes = load_scenes(settings.bundles)
+        if not scenes:
+            raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
+        hrtfs = load_hrtfs(settings.hrtfs, scenes)
+        drain = Drain(settings.drain_s)
+        application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain)
+        url = serving.url(listeners[0], settings.host)
+        said = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
+        serving.serve(
+            uvicorn.Config(application, **server_options(settings)),
+            listeners,
+            drain,
+            on_start=lambda: Console().print(said, highlight=False),
+        )
+
+
+def server_options(settings: "Settings") -> dict[str, Any]:
+    """How uvicorn has to run the application."""
+    from server.api.connection_limits import ConnectionLimits
+    from server.api.http_protocol import limited_http
+
+    return {
+        "http": limited_http(ConnectionLimits.of(settings)),
+        "timeout_keep_alive": settings.keep_alive_s,
+        "host": settings.host,
+        "port": settings.port,
+        "loop": "auto",  # uvloop wherever it exists
+        "ws": "server.api.web_socket:WebSocketProtocol",
+        "ws_max_size": settings.max_frame_bytes,
+        "ws_per_message_deflate": False,
+    }
+
+
+@app.command()
+def ir(
+    scene: Scene,
+    listener: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
+    emitter: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="File to write: .wav, .npy or .json.", callback=writable_file)
+    ],
+    yaw_deg: Annotated[
+        float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
+    ] = 0.0,
+    level: Level = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the binaural impulse response between two places."""
+    from server.field.field import AcousticField
+    from server.field.fields_by_level import require_level
+    from server.responses.impulse_response import ImpulseResponse, IrQuery, parse_format, parse_position
+    from server.scene.bundle import Bundle, find_bundle
+
+    name = parse_format(output.suffix.removeprefix("."))
+    if not math.isfinite(yaw_deg):
+        raise RequestError("malformed_pose", "yaw-deg is not finite", field="yaw_deg")
+    query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
+    bundle = Bundle.load(find_bundle(scene))
+    field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
+    started_s = time.perf_counter()
+    response = ImpulseResponse.compute(field, query)
+    duration_ms = (time.perf_counter() - started_s) * 1000
+    _write(output, response.encode(name))
+    _report(
+        as_json,
+        f"{output}: {response.samples.shape[1] / response.sample_rate:.2f} s at {response.sample_rate} Hz, "
+        f"computed in {duration_ms:.1f} ms",
+        {
+            "output": str(output),
+            "scene": response.scene,
+            "level": response.level,
+            "sample_rate": response.sample_rate,
+            "samples": response.samples.shape[1],
+            "duration_ms": round(duration_ms, 3),
+        },
+    )
+
+
+@app.command()
+def render(
+    scene: Scene,
+    emitter: Annotated[
+        list[str], typer.Option(help="Clip name or audio file, and where it plays; repeatable.", metavar="CLIP@X,Y,Z")
+    ],
+    path: Annotated[
+        Path,
+        typer.Option(
+            help="CSV: sample or time_s; x, y, z; qx, qy, qz, qw or yaw_deg; reverberation_sample where it is later; "
+            "level where it changes."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32.", callback=writable_file)],
+    block_size: Annotated[
+        int, typer.Option(help=f"Poses take effect at multiples of it, samples: {BLOCK_SIZES}.")
+    ] = 256,
+    level: Level = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
+    hrtf: Annotated[
+        Path | None, typer.Option(help="SOFA file with the head to hear through, instead of KEMAR.")
+    ] = None,
+    effects: Annotated[
+        str,
+        typer.Option(
+            help="all, plan (those the walk calls for), or names between commas.", metavar="all|plan|NAME,..."
+        ),
+    ] = "plan",
+    mono: Annotated[bool, typer.Option("--mono", help="For one loudspeaker: one channel, no head.")] = False,
+    duration_s: Annotated[
+        float | None, typer.Option(help="Length to render; by default until all has rung out.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Render to a file what a listener hears who walks along a path."""
+    import scipy.io.wavfile
+
+    from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
+    from server.field.fields_by_level import FieldsByLevel
+    from server.offline.render import MAX_RENDER_S, planned_effects, read_path
+    from server.offline.render import render as render_path
+    from server.responses.direct_sound import DirectSound
+    from server.scene.bundle import Bundle, find_bundle
+
+    if not is_block_size(block_size):
+        raise NafirError(f"--block-size: {block_size} is not {BLOCK_SIZES}")
+    if output.suffix != ".wav":
+        raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
+    require_at_most_one({"--mono": mono, "--hrtf": hrtf is not None})
+    names = {name.strip() for name in effects.split(",")}
+    require_at_most_one({"--mono": mono, f"--effects {effects}": "hrtf" in names})
+    if hrtf is not None and not names & {"all", "plan", "hrtf"}:
+        raise NafirError(
+            f"--hrtf and --effects {effects} contradict each other: add hrtf to the effects, or leave one out"
+        )
+    bundle = Bundle.load(find_bundle(scene))
+    levels = FieldsByLevel.load(bundle)
+    field = levels.choose(level)
+    if duration_s is not None and not 1 / field.sample_rate <= duration_s <= MAX_RENDER_S:
+        raise RequestError(
+            "malformed_duration",
+            f"duration-s: {duration_s:g} is not between one sample and {MAX_RENDER_S} s",
+            field="duration_s",
+        )
+    emitters = [_read_emitter(text, field, loop=loop) for text in emitter]
+    points = read_path(path, field.sample_rate, list(levels))
+    if level is not None and points[0].level not in {None, level}:
+        raise NafirError(
+            f"--level {level} and --path contradict each other: the path begins at level {points[0].level}; "
+            "leave --level out"
+        )
+    for number, point in enumerate(points, start=1):
+        field.bundle.require_inside(point.pose.position, f"path point {number}")
+    length = None if duration_s is None else round(duration_s * field.sample_rate)
+    heads = HrtfLibrary([] if hrtf is None else [hrtf], [field.sample_rate])
+    filters = heads.filters(DEFAULT_HRTF if hrtf is None else hrtf.stem, field.sample_rate)
+    planned = planned_effects(effects, field, points[0].pose, output="mono" if mono else "headphones")
+    started_s = time.perf_counter()
+    with Progress(transient=True, disable=as_json, console=Console(stderr=True)) as progress:
+        task = progress.add_task("rendering", total=1.0)
+        samples = render_path(
+            field,
+            DirectSound.of(field.bundle, filters),
+            emitters,
+            points,
+            block_size=block_size,
+            length=length,
+            progress=lambda done: progress.update(task, completed=done),
+            planned=planned,
+            levels=levels,
+        )
+    elapsed_s = time.perf_counter() - started_s
+    rendered_s = samples.shape[1] / field.sample_rate
+    content = io.BytesIO()
+    scipy.io.wavfile.write(content, field.sample_rate, samples.T)
+    _write(output, content.getvalue())
+    _report(
+        as_json,
+        f"{output}: {rendered_s:.2f} s at {field.sample_rate} Hz, rendered in {elapsed_s:.2f} s",
+        {
+            "output": str(output),
+            "scene": field.bundle.id,
+            "sample_rate": field.sample_rate,
+            "samples": samples.shape[1],
+            "rendered_s": rendered_s,
+            "elapsed_s": round(elapsed_s, 3),
+        },
+    )
+
+
+@app.command()
+def plan(
+    scene: Scene,
+    listener: Annotated[
+        str | None, typer.Option(help="x,y,z in metres. [default: where a visitor starts]", metavar="X,Y,Z")
+    ] = None,
+    emitter: Annotated[
+        list[str] | None, typer.Option(help="x,y,z in metres; repeatable. [default: the visitor's]", metavar="X,Y,Z")
+    ] = None,
+    yaw_deg: Annotated[
+        float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
+    ] = 0.0,
+    still: Annotated[bool, typer.Option("--still", help="The listener neither walks nor turns the head.")] = False,
+    moving: Annotated[bool, typer.Option("--moving", help="The emitters move.")] = False,
+    mono: Annotated[bool, typer.Option("--mono", help="One loudspeaker plays it, not headphones.")] = False,
+    effect: Annotated[
+        list[str] | None, typer.Option(help="Switch an effect on or off; repeatable.", metavar="NAME=on|off")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw it to this file, too: .png or .svg.", callback=figure_file)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Which effects a situation calls for, why, and what they cost on this host."""
+    from server.field.field import AcousticField
+    from server.planning.plan_figure import draw
+    from server.planning.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
+    from server.planning.plan_table import print_plan
+    from server.responses.impulse_response import parse_position
+    from server.scene.bundle import Bundle, find_bundle
+
+    query = PlanQuery(
+        listener=None if listener is None else parse_position(listener, "listener"),
+        yaw_deg=yaw_deg,
+        emitters=tuple(parse_position(text, "emitter") for text in emitter or ()),
+        walks=not still,
+        move=moving,
+        output="mono" if mono else "headphones",
+        effects=parse_effects(effect or ()),
+    )
+    field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    document = PlanDocument.of(field.bundle.id, query.plan(field))
+    if figure is not None:
+        draw(document, figure)
+    if as_json:
+        typer.echo(rounded(document))
+    else:
+        print_plan(document)
+
+
+@app.command()
+def protocol() -> None:
+    """Print the AsyncAPI document of the live stream, as a server has it at /asyncapi.json."""
+    from server.api.asyncapi import document
+
+    typer.echo(document())
+
+
+def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "RenderedEmitter":
+    """`CLIP@x,y,z`, where CLIP names a bundled clip, or else an audio file."""
+    from server.acoustics.geometry import Pose
+    from server.assets.clips import ClipLibrary, decode
+    from server.offline.render import RenderedEmitter
+    from server.responses.impulse_response import parse_position
+
+    clip, at, place = text.rpartition("@")
+    if not at:
+        raise RequestError("malformed_pose", f"emitter: {text!r} is not CLIP@x,y,z", field="emitter")
+    position = parse_position(place, "emitter")
+    field.bundle.require_inside(position, "emitter")
+    clips = ClipLibrary(field.sample_rate)
+    samples = clips.load(clip) if clip in clips.names else decode(Path(clip), field.sample_rate)
+    return RenderedEmitter(samples, Pose(position), loop=loop)
+
+
+def _write(output: Path, content: bytes) -> None:
+    try:
+        output.write_bytes(content)
+    except OSError as exc:
+        raise NafirError(f"{output}: {exc.strerror}") from exc
+
+
+def _report(as_json: bool, sentence: str, document: dict[str, object]) -> None:
+    if as_json:
+        typer.echo(json.dumps(document))
+    else:
+        Console(soft_wrap=True).print(escape(sentence), highlight=False)

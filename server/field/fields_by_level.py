@@ -1,0 +1,83 @@
+"""All quality levels of a scene: one field each, and one session per graph between them."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from server.acoustics.phase import FrozenNoise
+from server.core.bounded_cache import BoundedCache
+from server.core.errors import RequestError
+from server.field.field import AcousticField, Silence, frozen_noise
+from server.field.graph import FieldGraph, open_graph
+from server.field.reuse import KEPT_BYTES, Kept
+from server.field.runtime import InferenceSession
+from server.scene.bundle import Bundle
+from server.scene.manifest import CodecParameters
+
+
+class FieldsByLevel(Mapping[str, AcousticField]):
+    """Quality levels by name, in the manifest's order; the first is the default."""
+
+    def __init__(self, fields: Sequence[AcousticField], kept: Kept | None = None) -> None:
+        """`fields` of one bundle, one at least; those that reuse responses keep them in `kept`."""
+        self.kept: Kept = BoundedCache(KEPT_BYTES) if kept is None else kept
+        self._fields = {field.level.name: field for field in fields}
+
+    @classmethod
+    def load(cls, bundle: Bundle, threads: int = 1) -> "FieldsByLevel":
+        """Raises BundleError for a graph that does not fit the manifest."""
+        if not bundle.manifest.fields:
+            return cls([Silence(bundle, level) for level in bundle.manifest.levels])
+        sessions: dict[str, InferenceSession] = {}
+        graphs: dict[str, FieldGraph] = {}
+        for name in dict.fromkeys(level.field for level in bundle.manifest.levels):
+            file = bundle.manifest.fields[name].file
+            if file not in sessions:
+                sessions[file] = open_graph(bundle, file, threads=threads)
+            graphs[name] = FieldGraph(bundle, name, sessions[file])
+        noises: dict[CodecParameters, FrozenNoise] = {}
+        kept: Kept = BoundedCache(KEPT_BYTES)
+        fields = []
+        for level in bundle.manifest.levels:
+            graph = graphs[level.field]
+            if graph.parameters not in noises:
+                noises[graph.parameters] = frozen_noise(bundle, graph)
+            fields.append(AcousticField(bundle, level, graph, noises[graph.parameters], kept))
+        return cls(fields, kept)
+
+    def __getitem__(self, name: str) -> AcousticField:
+        return self._fields[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+    @property
+    def default(self) -> AcousticField:
+        return next(iter(self._fields.values()))
+
+    @property
+    def bundle(self) -> Bundle:
+        return self.default.bundle
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Cheapest first, by the mean cost measured for each; where one was not, the manifest's order reversed."""
+        costs = {name: field.level.cost for name, field in self._fields.items()}
+        measured = {name: cost.ms_mean for name, cost in costs.items() if cost is not None}
+        if len(measured) < len(costs):
+            return tuple(reversed(costs))
+        return tuple(sorted(measured, key=measured.__getitem__))
+
+    def choose(self, name: str | None) -> AcousticField:
+        """The level a client named, or the default. Raises RequestError `unknown_level` with the names there are."""
+        return self.default if name is None else self[require_level(self.bundle, name)]
+
+
+def require_level(bundle: Bundle, name: str) -> str:
+    """The name, if the bundle has such a quality level. Raises RequestError `unknown_level` with those there are."""
+    names = [level.name for level in bundle.manifest.levels]
+    if name not in names:
+        problem = f"scene {bundle.id} has no quality level {name!r}, only {', '.join(names)}"
+        raise RequestError("unknown_level", problem, field="level")
+    return name

@@ -1,0 +1,244 @@
+"""When a session asks which effects its situation calls for, and what it was told last.
+
+A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
+One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, or to move faster than it
+did; while poses change, twice a second at most, once a second for many emitters, and less often where plans take more
+than their share of time. Clocks are seconds of sound.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from server.acoustics.directivity import Directivity
+from server.acoustics.geometry import Pose
+from server.planning.motion import Motion
+from server.planning.planner import Costs, make_plan
+from server.planning.scene_acoustics import Emitter, Listener, Output, SceneAcoustics, Situation
+from server.responses.effect_flags import EmitterEffects, SharedEffects
+from server.scene.effects import EffectName, Overrides
+from server.scene.plan import Decision, Plan
+
+PERIOD_S = 0.5
+_EMITTERS_PER_PERIOD, _MOST_PERIODS = 8, 2
+"""Plans of more take longer, and are made less often."""
+_LONGEST_S = 2.0
+"""All are made well within the `HORIZON_S` that they look ahead."""
+SHARE_OF_ALL = 0.03
+"""Of a core that plans of all streams of an audio thread may take, as long as each is made every `_LONGEST_S`."""
+_GRID_M = 0.25
+"""Poses that differ by less call for no new plan."""
+
+
+class Placed(Protocol):
+    """An emitter, as far as a plan is concerned; `pattern` is how it radiates, heard or not."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def pattern(self) -> Directivity: ...
+
+    @property
+    def gain_db(self) -> float: ...
+
+    @property
+    def is_live(self) -> bool: ...
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """A plan to make; `corrections` are effects that were switched off and turned out to be heard, with the reason why
+    they are on."""
+
+    situation: Situation
+    previous: Plan | None
+    overrides: Overrides
+    corrections: Mapping[EffectName, str]
+    costs: Costs
+
+    @property
+    def is_first(self) -> bool:
+        """Whether an emitter is in none yet."""
+        return self.previous is None or not self.situation.emitters.keys() <= self.previous.by_emitter.keys()
+
+    def plan(self) -> Plan:
+        """Milliseconds, more of them the more emitters: not for the audio thread."""
+        overrides = {**dict.fromkeys(self.corrections, True), **self.overrides}
+        plan = make_plan(self.situation, previous=self.previous, overrides=overrides, costs=self.costs)
+        return _explained(plan, {name: why for name, why in self.corrections.items() if name not in self.overrides})
+
+
+class PlannedEffects:
+    """Of one session in `place`. `scene` are the wishes of who made the scene, which `own` ones, of who listens,
+    override. `costs` tells what effects cost here, or nothing as long as nobody knows."""
+
+    def __init__(
+        self,
+        place: SceneAcoustics,
+        listener: Pose,
+        *,
+        output: Output = "headphones",
+        scene: Overrides | None = None,
+        own: Overrides | None = None,
+        costs: Callable[[], Costs] = dict,
+    ) -> None:
+        self.place = place
+        self.output = output
+        self.plan: Plan | None = None
+        self.corrections: dict[EffectName, str] = {}
+        self._scene = dict(scene or {})
+        self._own = dict(own or {})
+        self._costs = costs
+        self._listener = Motion(listener, 0.0)
+        self._emitters: dict[str, Motion] = {}
+        self._is_stale = False
+        self._in_flight = False
+        self._next_look_s = 0.0
+        self._interval_s = 0.0
+        self._seen: object = None
+
+    @property
+    def overrides(self) -> dict[EffectName, bool]:
+        return {**self._scene, **self._own}
+
+    @property
+    def shared(self) -> SharedEffects:
+        """Without a plan, whether there is a head is told from the output."""
+        if self.plan is None or not self.plan.shared:
+            return SharedEffects(head=self.overrides.get(EffectName.HRTF, self.output == "headphones"))
+        return SharedEffects.of(self.plan)
+
+    def wish(self, wishes: Mapping[EffectName, bool | None], output: Output | None) -> None:
+        """On, off, or, with None, as the plan or the scene has it."""
+        for name, is_on in wishes.items():
+            if is_on is None:
+                self._own.pop(name, None)
+            else:
+                self._own[name] = is_on
+        self.output = output or self.output
+        self._is_stale = True
+
+    def correct(self, corrections: Mapping[EffectName, str]) -> None:
+        """Have effects be on from now on, for the reasons given."""
+        self.corrections.update(corrections)
+        self._is_stale = True
+
+    def follow_listener(self, pose: Pose, clock_s: float) -> None:
+        turned = self._listener.turns(clock_s)
+        self._follow(self._listener, pose, clock_s)
+        self._is_stale |= turned != self._listener.turns(clock_s)
+
+    def follow_emitter(self, name: str, pose: Pose, clock_s: float) -> None:
+        """One that comes is at rest until it moves."""
+        motion = self._emitters.get(name)
+        if motion is None:
+            self._emitters[name] = Motion(pose, clock_s)
+            self._is_stale = True
+            return
+        self._follow(motion, pose, clock_s)
+
+    def _follow(self, motion: Motion, pose: Pose, clock_s: float) -> None:
+        """What is faster than before leaves what a plan has looked at."""
+        moved, speed_m_s = motion.moves(clock_s), motion.speed_m_s(clock_s)
+        motion.follow(pose, clock_s)
+        self._is_stale |= moved != motion.moves(clock_s) or motion.speed_m_s(clock_s) > speed_m_s
+
+    def forget_emitter(self, name: str) -> None:
+        self._emitters.pop(name, None)
+        self._is_stale = True
+
+    def space(self, interval_s: float) -> None:
+        """Have at least so much time pass from one plan to the next while poses change, as far as plans last."""
+        self._interval_s = min(interval_s, _LONGEST_S)
+
+    def take_request(self, listener: Pose, emitters: Mapping[str, Placed], clock_s: float) -> PlanRequest | None:
+        """None where an earlier one is unanswered, or nothing has changed."""
+        if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
+            return None
+        periods = min(max(1.0, len(emitters) / _EMITTERS_PER_PERIOD), _MOST_PERIODS)
+        self._next_look_s = clock_s + max(PERIOD_S * periods, self._interval_s)
+        motion = self._listener
+        situation = Situation(
+            self.place,
+            Listener(listener, motion.speed_m_s(clock_s), motion.turns(clock_s), self.output),
+            {name: self._emitter(name, emitter, clock_s) for name, emitter in emitters.items()},
+        )
+        costs = self._costs()
+        seen = _coarse(situation), bool(costs)
+        if not self._is_stale and seen == self._seen:
+            return None
+        self._is_stale, self._seen, self._in_flight = False, seen, True
+        return PlanRequest(situation, self.plan, self.overrides, dict(self.corrections), costs)
+
+    def accept(self, plan: Plan) -> bool:
+        """Put the plan asked for last into effect. Whether it switches anything, or is the first to say what costs."""
+        self._in_flight = False
+        before, self.plan = self.plan, plan
+        if before is None or _switched_on(before) != _switched_on(plan):
+            return True
+        return before.cost_us + before.saved_us == 0 < plan.cost_us + plan.saved_us
+
+    def give_up(self) -> None:
+        """No plan came of the request: what is on stays on."""
+        self._in_flight = False
+
+    def of_emitter(self, name: str, clock_s: float, *, has_early: bool, has_late: bool) -> EmitterEffects | None:
+        """None of one that came after the plan was asked for."""
+        if self.plan is None or name not in self.plan.by_emitter:
+            return None
+        effects = EmitterEffects.of(self.plan, name, has_early=has_early, has_late=has_late)
+        holds_still = self.overrides.get(EffectName.PROPAGATION_DELAY) is False
+        # It may have begun to move since the plan was asked for.
+        follows = effects.propagation_delay or (self._is_under_way(name, clock_s) and not holds_still)
+        return dataclasses.replace(effects, propagation_delay=follows, holds_still=holds_still)
+
+    def _is_under_way(self, name: str, clock_s: float) -> bool:
+        """Whether the direct sound of an emitter changes with poses."""
+        listener = self._listener
+        turns = listener.turns(clock_s) and self.output == "headphones"
+        return self._emitters[name].moves(clock_s) or listener.moves(clock_s) or turns
+
+    def _emitter(self, name: str, emitter: Placed, clock_s: float) -> Emitter:
+        motion = self._emitters[name]
+        return Emitter(
+            emitter.pose,
+            emitter.pattern,
+            emitter.gain_db,
+            motion.speed_m_s(clock_s),
+            motion.turns(clock_s),
+            emitter.is_live,
+        )
+
+
+def _coarse(situation: Situation) -> object:
+    """What a plan depends on, as far as it matters."""
+
+    def cell(pose: Pose) -> tuple[int, ...]:
+        return tuple(round(coordinate / _GRID_M) for coordinate in pose.position)
+
+    listener = situation.listener
+    emitters = tuple(
+        (name, cell(emitter.pose), emitter.speed_m_s, emitter.turns, emitter.gain_db)
+        for name, emitter in situation.emitters.items()
+    )
+    return cell(listener.pose), listener.speed_m_s, listener.turns, emitters
+
+
+def _switched_on(plan: Plan) -> frozenset[tuple[str | None, EffectName, bool, bool]]:
+    return frozenset((each.emitter, each.name, each.called_for, each.overridden) for each in plan.decisions)
+
+
+def _explained(plan: Plan, reasons: Mapping[EffectName, str]) -> Plan:
+    """With other reasons for some effects than that somebody wished for them."""
+
+    def explain(decisions: Mapping[EffectName, Decision]) -> dict[EffectName, Decision]:
+        return {
+            name: dataclasses.replace(each, reason=reasons[name], overridden=False)
+            if name in reasons and each.overridden
+            else each
+            for name, each in decisions.items()
+        }
+
+    return Plan(explain(plan.shared), {name: explain(each) for name, each in plan.by_emitter.items()})

@@ -1,0 +1,353 @@
+"""What is heard of each emitter, in energies: of the direct sound along the paths within reach, of the first
+reflections, and of what a field holds; and so what changes where an effect is left out.
+
+Energies add up, except where first reflections meet the direct sound, whose interference is computed. A head is a
+sphere with outer ears. Axes as in `server.planning.reach`, and v variants, in each of which some effects are left out;
+energies are relative to the direct sound at one metre.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.audibility import JND_THRESHOLDS, ratio_in_jnd
+from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
+from server.acoustics.decibels import db_to_power, power_to_db
+from server.acoustics.geometry import axes_of
+from server.planning.reach import Reach
+from server.planning.scene_acoustics import Emitter, Reverberation, Situation
+from server.scene.effects import EffectName
+
+Floats = npt.NDArray[np.float64]
+Off = frozenset[EffectName]
+
+ALL_ON: Off = frozenset()
+MOST_JND = 100.0
+"""Where something is missing altogether; numbers stay finite."""
+
+_COHERENT = frozenset(
+    {
+        EffectName.DIRECT_PATH,
+        EffectName.DISTANCE_ATTENUATION,
+        EffectName.DIRECTIVITY,
+        EffectName.EARLY_REFLECTIONS,
+        EffectName.DIFFRACTION,
+    }
+)
+"""What changes how direct sound and first reflections add up."""
+
+_SILENCE = 1e-12
+_FACING_GAIN = 4.0
+"""6 dB; heads differ, and outer ears do more at 4 kHz (Shaw, J. Acoust. Soc. Am. 56, 1974)."""
+_DIRECT_S = 0.0015
+_DECAY_POINTS = 48
+_THIRDS_HZ = 1000 * 2 ** (np.arange(-9, 11) / 3)
+_PER_THIRD = 2 ** (np.linspace(-0.5, 0.5, 7) / 3)
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Of the direct sound (v, n, band), the first reflections (v, e, band), the rest (v, e, band), and of that what
+    comes within 50 ms (v, e, band)."""
+
+    direct: Floats
+    mirrored: Floats
+    held: Floats
+    early: Floats
+
+
+@dataclass(frozen=True)
+class Mirrored:
+    """m paths by way of one surface, as everybody is now: whose, how long, at what gain (m, band) of surface and of
+    departure, and from where (m, 3)."""
+
+    owner: npt.NDArray[np.int64]
+    length_m: Floats
+    surface_db: Floats
+    departure_db: Floats
+    arrival: Floats
+
+
+class _Way(NamedTuple):
+    """What paths do to energy: by their length, by the air (·, band), and by the direction they leave in (·, band)."""
+
+    spread: Floats
+    air: Floats
+    departure: Floats
+
+
+@dataclass(frozen=True)
+class Change:
+    """What leaving out an effect changes most, in JND."""
+
+    jnd: float
+    parameter: str
+
+
+UNCHANGED = Change(0.0, "level")
+
+
+class Prediction:
+    """Of all emitters of a situation, one at least."""
+
+    def __init__(self, situation: Situation) -> None:
+        self.situation = situation
+        self.place, self.listener = situation.place, situation.listener
+        self.emitters: list[Emitter] = list(situation.emitters.values())
+        self.reach = Reach.of(situation)
+        self.mirrored = self._mirror()
+        self.shares = self.place.band_shares
+        self.reverberation: list[Reverberation | None] = [
+            each.reverberation or self.place.reverberation for each in self.emitters
+        ]
+        self._held = np.zeros((len(self.emitters), len(OCTAVE_BANDS_HZ)))
+        self._early, self._diffuse = np.zeros_like(self._held), np.ones_like(self._held)
+        for number, (emitter, rest) in enumerate(zip(self.emitters, self.reverberation, strict=True)):
+            if not emitter.is_omnidirectional:
+                self._diffuse[number] = np.mean(db_to_power(emitter.directivity.diffuse_gain_db))
+            if rest is not None:
+                self._held[number], self._early[number] = rest.energy, rest.early
+        self._facing_gain = _FACING_GAIN if self.listener.output == "headphones" else 1.0
+        self._decays = _Decays.of(self)
+        self.whole = self.energies([ALL_ON])
+        self._heard = self._parameters(self.whole)
+
+    def energies(self, variants: Sequence[Off]) -> Energies:
+        """What is heard without some effects, in each of v variants."""
+        reach, place = self.reach, self.place
+        mirror = self.mirrored_energies(variants)
+        direct = np.zeros((len(variants), len(reach.owner), len(OCTAVE_BANDS_HZ)))
+        mirrored = np.zeros((len(variants), *self._held.shape))
+        held = np.zeros_like(mirrored)
+        for variant, off in enumerate(variants):
+            straight = EffectName.OCCLUSION in off
+            way = self._straight if straight else self._bent
+            if EffectName.DIRECT_PATH not in off and not place.holds_direct_sound:
+                row = direct[variant]
+                row += 1
+                if EffectName.DISTANCE_ATTENUATION not in off:
+                    row *= way.spread
+                if EffectName.AIR_ABSORPTION not in off:
+                    row *= way.air
+                if EffectName.DIRECTIVITY not in off:
+                    row *= way.departure
+                if EffectName.DIFFRACTION in off and not straight:
+                    row *= reach.paths.in_sight[:, None]
+                elif not straight:
+                    row *= self._screen
+            if EffectName.EARLY_REFLECTIONS not in off:
+                np.add.at(mirrored[variant], self.mirrored.owner, mirror[variant])
+            if EffectName.LATE_REVERBERATION not in off:
+                held[variant] = self._held if EffectName.DIRECTIVITY in off else self._held * self._diffuse
+        return Energies(direct, mirrored, held, held * self._early)
+
+    def mirrored_energies(self, variants: Sequence[Off]) -> Floats:
+        """(v, m, band) where there are any; air is in them whether or not the direct sound is without."""
+        everywhere, beamed = self._mirrored_energies
+        return np.array([everywhere if EffectName.DIRECTIVITY in off else beamed for off in variants])
+
+    @cached_property
+    def _mirrored_energies(self) -> tuple[Floats, Floats]:
+        """(m, band) where all radiate alike everywhere, and as they do."""
+        paths = self.mirrored
+        way = self._way(paths.length_m, paths.departure_db)
+        everywhere = db_to_power(paths.surface_db) * way.spread * way.air
+        return everywhere, everywhere * way.departure
+
+    @cached_property
+    def _bent(self) -> "_Way":
+        return self._way(self.reach.paths.length_m, self.reach.departure_db)
+
+    @cached_property
+    def _straight(self) -> "_Way":
+        return self._way(self.reach.straight_m, self.reach.straight_departure_db)
+
+    @cached_property
+    def _screen(self) -> Floats:
+        return db_to_power(self.reach.paths.screen_db)
+
+    def _way(self, length_m: Floats, departure_db: Floats) -> "_Way":
+        spread = np.maximum(length_m, self.place.nearest_m)[:, None] ** -2.0
+        return _Way(spread, db_to_power(-length_m[:, None] * self.place.air_db_per_m), db_to_power(departure_db))
+
+    def changes(self, variants: Sequence[Off]) -> dict[str, Floats]:
+        """(v, e) change of each parameter in each variant, in JND, the worst within reach."""
+        left = self.energies(variants)
+        without = self._parameters(left)
+        changes = {"spectrum": self.reach.most(self._spectral_change_db(left)) / JND_THRESHOLDS["spectrum"].amount}
+        for name, heard in self._heard.items():
+            if name == "edt":
+                # A decay that cannot be told, with or without, changes nothing: energies tell the rest.
+                told = (heard > 0) & (without[name] > 0)
+                ratio = np.divide(without[name], heard, out=np.ones_like(without[name]), where=told)
+                changes[name] = np.abs(ratio - 1) * 100 / JND_THRESHOLDS[name].amount
+            else:
+                difference = np.abs(without[name] - heard) / (
+                    1 if name in {"drr", "c50"} else JND_THRESHOLDS[name].amount
+                )
+                changes[name] = self.reach.most(difference)
+        for number, off in enumerate(variants):
+            quiet = all(change[number].min() < 1 for change in changes.values())
+            if quiet and off & _COHERENT:
+                beats_db = np.max(np.abs(self._thirds_db(off) - self._heard_thirds_db), axis=-1)
+                changes["spectrum"][number] = np.maximum(
+                    changes["spectrum"][number], beats_db / JND_THRESHOLDS["spectrum"].amount
+                )
+        return {name: np.minimum(change, MOST_JND) for name, change in changes.items()}
+
+    def _parameters(self, energies: Energies) -> dict[str, Floats]:
+        """Level (v, n) in dB, DRR and C50 (v, n) in JND, EDT (v, e) in seconds."""
+        owner = self.reach.owner
+        after = energies.mirrored + energies.held
+        late = (energies.held - energies.early) @ self.shares
+        direct, early = energies.direct @ self.shares, (after @ self.shares) - late
+
+        def ratio_db(above: Floats, below: Floats) -> Floats:
+            return power_to_db((above + _SILENCE) / (below + _SILENCE))
+
+        return {
+            "level": power_to_db(direct + (early + late)[:, owner] + _SILENCE),
+            "drr": ratio_in_jnd("drr", ratio_db(direct, (early + late)[:, owner])),
+            "c50": ratio_in_jnd("c50", ratio_db(direct + early[:, owner], late[:, owner])),
+            "edt": self._decays.early_decay_s(self, energies),
+        }
+
+    def _spectral_change_db(self, left: Energies) -> Floats:
+        """(v, n) in the band where it is greatest, at an ear that hears the direct sound as it comes, or at one that
+        faces it and hears it louder than what comes from everywhere.
+
+        What a field holds is noise: in a third of an octave it is more or less in phase with the rest by chance, and
+        the more so the fewer modes there are, of which a decay has as many as its bandwidth times its duration.
+        """
+        owner, whole = self.reach.owner, self.whole
+        within = bands_within(self.place.sample_rate)
+        mirrored, held = whole.mirrored, whole.held
+        mirrored_change = np.abs(np.sqrt(mirrored) - np.sqrt(left.mirrored))[:, owner]
+        held_root = np.sqrt(held)[:, owner]
+        held_change = np.abs(np.sqrt(held) - np.sqrt(left.held))[:, owner]
+        after, other_after = (energies.held + energies.mirrored for energies in (whole, left))
+        after, other_after = (energy[:, owner] + _SILENCE for energy in (after, other_after))
+        mirrored, chance = mirrored[:, owner], 2 * self._chance[owner]
+
+        def change(gain: float) -> Floats:
+            direct, other_direct = whole.direct * gain, left.direct * gain
+            amplitude = np.abs(np.sqrt(direct) - np.sqrt(other_direct)) + mirrored_change
+            by_chance = amplitude * held_root + held_change * np.sqrt(direct + mirrored)
+            before, without = direct + after, other_direct + other_after
+            most = np.abs(before - without) + by_chance * chance
+            return np.asarray((most / np.minimum(before, without))[..., :within].max(axis=-1))
+
+        return power_to_db(1 + np.maximum(change(1.0), change(self._facing_gain)))
+
+    @cached_property
+    def _chance(self) -> Floats:
+        """(e, band) how much of noise is in phase with something, at most: two standard deviations."""
+        third_hz = np.asarray(OCTAVE_BANDS_HZ) * (2 ** (1 / 6) - 2 ** (-1 / 6))
+        decays_s = np.array([np.zeros(len(third_hz)) if rest is None else rest.t60_s for rest in self.reverberation])
+        return np.asarray(2 / np.sqrt(np.maximum(third_hz * decays_s / 6.9, 4)))
+
+    @cached_property
+    def _heard_thirds_db(self) -> Floats:
+        return self._thirds_db(ALL_ON)
+
+    @cached_property
+    def _phases(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.complex128]]:
+        """(frequency,) the bands of frequencies in thirds of octaves; (m, frequency) by how much mirrored paths are
+        later than the direct sound."""
+        frequency = (_THIRDS_HZ[0.45 * self.place.sample_rate > _THIRDS_HZ, None] * _PER_THIRD).ravel()
+        bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
+        paths, direct_m = self.mirrored, self.reach.paths.length_m
+        later_s = (paths.length_m - direct_m[paths.owner]) / self.place.speed_of_sound
+        return bands, np.exp(-2j * np.pi * later_s[:, None] * frequency)
+
+    def _thirds_db(self, off: Off) -> Floats:
+        """(e, third) spectrum, as everybody is now: the direct sound and the first reflections with their phases, and
+        what the field holds."""
+        energies, (bands, turns) = self.energies([off]), self._phases
+        count = len(self.emitters)
+        wave = np.sqrt(energies.direct[0, :count])[:, bands].astype(np.complex128)
+        if EffectName.EARLY_REFLECTIONS not in off:
+            amplitude = np.sqrt(self.mirrored_energies([off])[0])
+            wave += self._decays.whose @ (amplitude[:, bands] * turns)
+        power = np.abs(wave) ** 2 + energies.held[0][:, bands] + _SILENCE
+        return power_to_db(power.reshape(count, -1, len(_PER_THIRD)).mean(axis=-1))
+
+    def _mirror(self) -> Mirrored:
+        bands = len(OCTAVE_BANDS_HZ)
+        if self.place.reflections is None:
+            none = np.zeros((0, bands))
+            return Mirrored(np.zeros(0, np.int64), np.zeros(0), none, none, np.zeros((0, 3)))
+        places = np.array([emitter.pose.position for emitter in self.emitters])
+        found = self.place.reflections.find(self.listener.pose.position, places)
+        departure_db = np.zeros((len(found.emitter), bands))
+        for number, emitter in enumerate(self.emitters):
+            if not emitter.is_omnidirectional:
+                mine = found.emitter == number
+                departure_db[mine] = emitter.directivity.gain_db(
+                    found.departure[mine] @ axes_of(emitter.pose.orientation).T
+                )
+        return Mirrored(found.emitter, found.length_m, found.gain_db, departure_db, found.arrival)
+
+
+@dataclass(frozen=True)
+class _Decays:
+    """Energy decay curves of all emitters as everybody is now, over the times in which a decay is read; (e, time) each,
+    `held` (e, band, time) and `mirrored` (m, time) for energies that are 1."""
+
+    time_s: Floats
+    held: Floats
+    direct: Floats
+    mirrored: Floats
+    whose: Floats
+    """(e, m) 1 where a mirrored path is of an emitter."""
+
+    @classmethod
+    def of(cls, prediction: "Prediction") -> "_Decays":
+        longest, paths = np.ones((len(prediction.emitters), len(OCTAVE_BANDS_HZ))), prediction.mirrored
+        for number, rest in enumerate(prediction.reverberation):
+            if rest is not None:
+                longest[number] = rest.t60_s
+        time_s = (longest @ prediction.shares)[:, None] * np.linspace(0, 1 / 6, _DECAY_POINTS)
+        later_s = (paths.length_m - prediction.reach.paths.length_m[paths.owner]) / prediction.place.speed_of_sound
+        return cls(
+            time_s,
+            held=np.exp(-6 * np.log(10) * time_s[:, None] / longest[..., None]) * prediction.shares[:, None],
+            direct=np.clip(1 - time_s / _DIRECT_S, 0, 1),
+            mirrored=(time_s[paths.owner] < later_s[:, None]).astype(np.float64),
+            whose=(paths.owner == np.arange(len(longest))[:, None]).astype(np.float64),
+        )
+
+    def early_decay_s(self, prediction: "Prediction", energies: Energies) -> Floats:
+        """(v, e); 0 where the direct sound alone is the first 10 dB, or nothing decays."""
+        shares, paths = prediction.shares, prediction.mirrored
+        count = len(self.time_s)
+        curve = np.einsum("veb,ebt->vet", energies.held, self.held)
+        curve += (energies.direct[:, :count] @ shares)[..., None] * self.direct
+        if len(paths.owner):
+            # All paths of an emitter in the proportion they have together.
+            energy = prediction.mirrored_energies([ALL_ON])[0] @ shares
+            whole = self.whose @ energy
+            steps = self.whose @ (energy[:, None] * self.mirrored) / np.maximum(whole, _SILENCE)[:, None]
+            curve += (energies.mirrored @ shares)[..., None] * steps
+        curve_db = power_to_db((curve + _SILENCE) / (curve[..., :1] + _SILENCE))
+        first = (curve_db >= -10).astype(np.float64)
+        points = first.sum(axis=-1)
+        middle_s = np.sum(first * self.time_s, axis=-1) / points
+        off_s = (self.time_s - middle_s[..., None]) * first
+        slope = np.sum(off_s * curve_db, axis=-1) / np.maximum(np.sum(off_s**2, axis=-1), _SILENCE)
+        told = (points > _DECAY_POINTS // 8) & (slope < 0) & energies.held.any(axis=-1)
+        return np.where(told, -60 / np.where(told, slope, -1.0), 0.0)
+
+
+def worst(changes: Mapping[str, Floats]) -> list[list[Change]]:
+    """Of all parameters, [variant][emitter]; `changes` are (v, e) of each."""
+    parameters, all_changes = list(changes), np.stack(list(changes.values()))
+    most, which = all_changes.max(axis=0).tolist(), all_changes.argmax(axis=0).tolist()
+    return [
+        [Change(jnd, parameters[number]) for jnd, number in zip(*row, strict=True)]
+        for row in zip(most, which, strict=True)
+    ]

@@ -1,0 +1,128 @@
+"""The paths of the direct sound within reach: where each emitter is now, and where it and the listener can be before a
+plan is made anew.
+
+Axes: n rows, each an emitter and a listener at some places of theirs; e emitters, the first e rows being as everybody
+is now; bands are OCTAVE_BANDS_HZ. Metres.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.geometry import COINCIDENT_M, axes_of
+from server.acoustics.sound_path import SoundPaths
+from server.planning.scene_acoustics import SceneAcoustics, Situation
+
+Floats = npt.NDArray[np.float64]
+
+HORIZON_S = 3.0
+"""So far a plan looks ahead."""
+
+_COURSES = 8
+_TURNS = np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
+"""Ahead of an emitter that turns, beside and behind it."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """`owner` (n,) is the index of a row's emitter. `departure_db` (n, band) is its gain where the path leaves it and
+    `straight_departure_db` where the straight line does."""
+
+    owner: npt.NDArray[np.int64]
+    listener: Floats
+    emitter: Floats
+    straight_m: Floats
+    paths: SoundPaths
+    departure_db: Floats
+    straight_departure_db: Floats
+
+    @classmethod
+    def of(cls, situation: Situation) -> "Reach":
+        """Of one emitter or more."""
+        place, emitters = situation.place, list(situation.emitters.values())
+        here = np.array([emitter.pose.position for emitter in emitters])
+        listeners = _within_reach(np.array([situation.listener.pose.position]), [situation.listener.speed_m_s], place)
+        movers = [number for number, emitter in enumerate(emitters) if emitter.speed_m_s > 0]
+        elsewhere = _within_reach(here[movers], [emitters[number].speed_m_s for number in movers], place)
+        turners = [number for number, each in enumerate(emitters) if each.turns and not each.is_omnidirectional]
+
+        owner, at_listener, at_emitter = (
+            [np.arange(len(emitters))],
+            [np.repeat(listeners[0], len(here), axis=0)],
+            [here],
+        )
+        for course, listener in enumerate(listeners[1:]):
+            # Each towards the others, and away from those that go the opposite way.
+            at = np.concatenate([here, *([elsewhere[1 + (course + _COURSES // 2) % _COURSES]] if movers else [])])
+            owner.append(np.concatenate([np.arange(len(emitters)), np.array(movers, np.int64)]))
+            at_listener.append(np.repeat(listener, len(at), axis=0))
+            at_emitter.append(at)
+        for at in elsewhere[1:]:
+            owner.append(np.array(movers, np.int64))
+            at_listener.append(np.repeat(listeners[0], len(movers), axis=0))
+            at_emitter.append(at)
+        for _ in _TURNS:
+            owner.append(np.array(turners, np.int64))
+            at_listener.append(np.repeat(listeners[0], len(turners), axis=0))
+            at_emitter.append(here[turners])
+        rows, listener, emitter = np.concatenate(owner), np.concatenate(at_listener), np.concatenate(at_emitter)
+
+        paths, offset = _paths(place, listener, emitter), listener - emitter
+        straight_m = np.linalg.norm(offset, axis=-1)
+        straight = offset / np.maximum(straight_m, COINCIDENT_M)[:, None]
+        departure_db, straight_departure_db = np.zeros((2, len(rows), len(OCTAVE_BANDS_HZ)))
+        for number, each in enumerate(emitters):
+            if not each.is_omnidirectional:
+                of_it = np.flatnonzero(rows == number)
+                axes = axes_of(each.pose.orientation)
+                departure_db[of_it] = each.directivity.gain_db(paths.departure[of_it] @ axes.T)
+                straight_departure_db[of_it] = each.directivity.gain_db(straight[of_it] @ axes.T)
+                if number in turners:
+                    turned = each.directivity.gain_db(_TURNS)
+                    departure_db[of_it[-len(_TURNS) :]] = turned
+                    straight_departure_db[of_it[-len(_TURNS) :]] = turned
+        return cls(rows, listener, emitter, straight_m, paths, departure_db, straight_departure_db)
+
+    def most(self, values: Floats) -> Floats:
+        """(v, n) to (v, e): the greatest of each emitter's rows."""
+        greatest = np.full((int(self.owner.max()) + 1, len(values)), -np.inf)
+        np.maximum.at(greatest, self.owner, values.T)
+        return greatest.T
+
+
+def _within_reach(points: Floats, speeds_m_s: list[float], place: SceneAcoustics) -> Floats:
+    """(1 + course, point, 3): where they are, and in every direction as far as they get, or as the place reaches.
+
+    One that would end in a wall goes half as far, or stays. Of points at rest only the first.
+    """
+    if not any(speeds_m_s):
+        return points[np.newaxis]
+    angle = 2 * np.pi / _COURSES * np.arange(_COURSES)
+    courses = np.stack([np.cos(angle), np.sin(angle), np.zeros(_COURSES)], axis=-1)
+    far = HORIZON_S * np.asarray(speeds_m_s)[:, None] * courses[:, None]
+    ends, halfway = (np.clip(points + way, place.minimum, place.maximum) for way in (far, far / 2))
+    if place.plan is not None:
+        inside = place.plan.contains(np.stack([ends, halfway]))[..., None]
+        ends = np.where(inside[0], ends, np.where(inside[1], halfway, points))
+    return np.concatenate([points[np.newaxis], ends])
+
+
+def _paths(place: SceneAcoustics, listener: Floats, emitter: Floats) -> SoundPaths:
+    if place.paths is None:
+        straight_m = np.linalg.norm(listener - emitter, axis=-1)
+        towards = (emitter - listener) / np.maximum(straight_m, COINCIDENT_M)[:, None]
+        silent = np.zeros((len(listener), len(OCTAVE_BANDS_HZ)))
+        return SoundPaths(
+            straight_m, towards, -towards, np.zeros(len(listener)), np.ones(len(listener), dtype=np.bool_), silent
+        )
+    found = SoundPaths.empty(len(listener))
+    # Rows of one listener stand together.
+    edges = np.flatnonzero(np.any(np.diff(listener, axis=0), axis=-1)) + 1
+    for start, stop in zip([0, *edges], [*edges, len(listener)], strict=True):
+        for whole, part in zip(
+            vars(found).values(), vars(place.paths.find(listener[start], emitter[start:stop])).values(), strict=True
+        ):
+            whole[start:stop] = part
+    return found

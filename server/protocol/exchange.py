@@ -1,0 +1,208 @@
+"""A conversation over /v1/stream, as its documentation tells it: every message there is, at least once."""
+
+from typing import Any, Final, NamedTuple, get_args
+
+import numpy as np
+
+from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.client_messages import (
+    PROTOCOL,
+    Acknowledge,
+    AddEmitter,
+    ClientMessage,
+    DirectivityPattern,
+    Hello,
+    ListenerPose,
+    ListenerStart,
+    MoveEmitter,
+    Ping,
+    RemoveEmitter,
+    SetEffects,
+    SetGain,
+    SetLevel,
+)
+from server.protocol.server_messages import (
+    Durations,
+    EffectDecision,
+    EmitterAdded,
+    EmitterRemoved,
+    Error,
+    LevelChanged,
+    LiveStatus,
+    Place,
+    PlanChanged,
+    Pong,
+    SceneDescription,
+    ServerMessage,
+    Status,
+    Welcome,
+)
+from server.scene.geometry import Opening
+from server.scene.manifest import AcceptedLaw, Bounds, QualityLevel
+
+
+class Step(NamedTuple):
+    """With `is_binary` a pose travels as bytes, as blocks always do."""
+
+    meaning: str
+    message: ClientMessage | ServerMessage | AudioBlock
+    is_binary: bool = False
+
+    @property
+    def is_of_client(self) -> bool:
+        return isinstance(self.message, get_args(ClientMessage))
+
+    @property
+    def name(self) -> str:
+        """Of this kind of message."""
+        return f"{self.message.type}_binary" if self.is_binary else self.message.type
+
+    @property
+    def payload(self) -> dict[str, Any] | str:
+        """As on the wire, but for what a client may leave out, and bytes in hexadecimal digits."""
+        match self.message:
+            case AudioBlock() | DryBlock() as block:
+                return block.serialize("f32").hex()
+            case ListenerPose() as pose if self.is_binary:
+                return pose.serialize_binary().hex()
+            case message:
+                said = message.model_dump(mode="json", exclude_unset=self.is_of_client)
+                return {"type": message.type, **said}
+
+
+_STUDIO: Final = SceneDescription(
+    id="studio",
+    name="Studio",
+    description="A live room with a booth.",
+    sample_rate=48_000,
+    ir_samples=24_000,
+    channels=("left", "right"),
+    speed_of_sound=343.0,
+    bounds=Bounds(minimum=(0.3, 0.3, 0.5), maximum=(6.7, 3.7, 2.3)),
+    walls_known=True,
+    corners=((0, 0), (7, 0), (7, 4), (0, 4)),
+    height_m=2.8,
+    openings=(Opening(name="door", start=(5.0, 1.0), end=(5.0, 2.0)),),
+    listener=Place(position=(1.5, 2.0, 1.6)),
+    emitter=Place(position=(6.0, 2.5, 1.5)),
+    level="fine",
+    levels=(QualityLevel(name="fine", field="rank16"), QualityLevel(name="fast", field="rank4", ir_rate_hz=20.0)),
+    accepted_laws=(AcceptedLaw(law="decay", reason="the booth has a flutter echo"),),
+)
+_TWO_FRAMES: Final = np.array([[0.5, 0.25], [-0.25, 0.0]], np.float32)
+
+EXCHANGE: Final[tuple[Step, ...]] = (
+    Step(
+        "asks for a scene, and says where the listener stands",
+        Hello(
+            protocol=PROTOCOL, scene="studio", block_size=256, listener=ListenerStart(position=(1.5, 2.0, 1.6), yaw=0.0)
+        ),
+    ),
+    Step(
+        "says what the stream is like; sound begins to flow",
+        Welcome(
+            session="c1d6a2c0b3f94c0c8f0f3d3a6f0f7a55",
+            scene=_STUDIO,
+            sample_rate=48_000,
+            block_size=256,
+            channels=2,
+            encoding="f32",
+            buffer_blocks=8,
+            window=40,
+            ir_samples=24_000,
+            hrtf="kemar",
+            level="fine",
+            max_emitters=16,
+        ),
+    ),
+    Step(
+        "has a recording play",
+        AddEmitter(
+            id="talker",
+            clip="woman-reading",
+            position=(6.0, 2.5, 1.5),
+            yaw=3.1416,
+            gain_db=-6.0,
+            directivity=DirectivityPattern(pattern="cardioid"),
+        ),
+    ),
+    Step("it is heard from block 24 on", EmitterAdded(id="talker", sample_clock=6_144)),
+    Step(
+        "says which effects the situation calls for",
+        PlanChanged(
+            decisions=(
+                EffectDecision(
+                    name="air_absorption",
+                    emitter="talker",
+                    called_for=False,
+                    change_jnd=0.124,
+                    parameter="spectrum",
+                    cost_us=0.8,
+                    memory_bytes=0,
+                    reason="4.5 m of air take nothing away that one could hear",
+                    overridden=False,
+                ),
+            ),
+            cost_us=41.5,
+            saved_us=0.8,
+            sample_clock=6_144,
+        ),
+    ),
+    Step("the listener turns", ListenerPose(pose_id=1, position=(1.5, 2.0, 1.6), yaw=0.2)),
+    Step(
+        "the listener walks",
+        ListenerPose(pose_id=2, position=(1.75, 2.0, 1.5), orientation=(0.0, 0.0, 0.0, 1.0)),
+        is_binary=True,
+    ),
+    Step(
+        "the direct sound is of pose 2 and the reverberation fades to that of pose 1 (here cut to two frames)",
+        AudioBlock(32, 8_192, 2, 1, _TWO_FRAMES, is_exchange=True),
+    ),
+    Step("blocks 0 to 32 have arrived", Acknowledge(sequence=32)),
+    Step("puts a microphone into the scene", AddEmitter(id="me", live=True, position=(2.0, 2.0, 1.5))),
+    Step("what it hears (here two frames)", DryBlock("me", 0, np.array([0.5, -0.5], np.float32))),
+    Step("it is carried about", MoveEmitter(id="me", position=(2.5, 2.0, 1.5), pose_id=3)),
+    Step("turns it down", SetGain(id="me", gain_db=-12.0)),
+    Step(
+        "wants the air after all, and of reflections what the plan says", SetEffects(effects={"air_absorption": True})
+    ),
+    Step("takes a cheaper quality", SetLevel(level="fast")),
+    Step(
+        "it is heard from here on",
+        LevelChanged(level="fast", reason="chosen", ir_rate_hz=20.0, shared_tail=False, sample_clock=47_104),
+    ),
+    Step(
+        "tells how the stream does, once a second",
+        Status(
+            sample_clock=48_128,
+            blocks_sent=188,
+            blocks_late=0,
+            blocks_dropped=0,
+            unacknowledged=5,
+            buffer_ms=42.5,
+            render_ms=Durations(p50=0.07, p99=0.11, p99_9=0.2),
+            lateness_ms=Durations(p50=0.15, p99=0.4, p99_9=0.9),
+            ir_ms=Durations(p50=1.6, p99=2.4, p99_9=None),
+            pose_ms=Durations(p50=4.2, p99=6.1, p99_9=6.1),
+            reverberation_ms=Durations(p50=9.8, p99=14.2, p99_9=14.2),
+            ir_exchanges=3,
+            blocks_limited=0,
+            level="fast",
+            ir_rate_hz=20.0,
+            live=(LiveStatus(id="me", samples_queued=512, samples_dropped=0, samples_gated=0, underruns=0),),
+        ),
+    ),
+    Step("asks how long the way is", Ping(id=7)),
+    Step("answers at once", Pong(id=7)),
+    Step("leaves the room", ListenerPose(pose_id=4, position=(99.0, 2.0, 1.6), yaw=0.0)),
+    Step(
+        "is refused; the stream goes on",
+        Error(
+            code="position_out_of_bounds",
+            message="position (99, 2, 1.6) is outside [0.3, 0.3, 0.5] to [6.7, 3.7, 2.3] m of scene studio",
+            field="position",
+        ),
+    ),
+    Step("takes the microphone away", RemoveEmitter(id="me")),
+    Step("it is gone", EmitterRemoved(id="me")),
+)

@@ -1,0 +1,87 @@
+"""What one microphone heard of an emitter, for two ears.
+
+The direct sound comes from the emitter and is heard from there through the head. What follows it comes from all sides
+and is heard through the mean of the head over all of them, the same at both ears: where each reflection came from, a
+lone microphone does not know. The two parts add up to what was measured: heard through no head at all they are the
+measured response to the last bit.
+
+Axes: responses (B, channel, sample), sample 0 the moment of emission. Metres; positions in the world's axes.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import oaconvolve
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import amplitude_to_db
+from server.acoustics.geometry import COINCIDENT_M, Pose, Vector3
+from server.acoustics.minimum_phase import folded_cepstrum
+from server.rendering.hrtf import HeadFilters
+from server.rendering.sphere import solid_angles
+from server.rendering.still_paths import StillPaths
+from server.scene.bundle import Bundle
+
+_Float32 = npt.NDArray[np.float32]
+
+DIRECT_S = 0.0025
+"""The direct sound's length, as the direct-to-reverberant ratio has it (`server.acoustics.room_parameters`)."""
+_FADE_S = 0.0005
+_LEAD_S = 0.003  # to the head's centre, so that the advance of the nearer ear has room
+_TAIL_S = 0.002  # after a filter's taps, for the delay of the farther ear
+_N_FFT = 2048
+
+
+class Binauralization:
+    """One head's; safe to share between threads."""
+
+    def __init__(self, filters: HeadFilters, *, speed_of_sound: float) -> None:
+        self._rate = filters.sample_rate
+        self._speed_of_sound = speed_of_sound
+        self._paths = StillPaths(filters, speed_of_sound=speed_of_sound, air_db_per_m=np.zeros(len(OCTAVE_BANDS_HZ)))
+        self._lead = round(_LEAD_S * self._rate)
+        self._taps = self._lead + filters.taps + round(_TAIL_S * self._rate)
+        self._length_m = np.array([self._lead / self._rate * speed_of_sound])
+        # Distance has had its say in what was measured.
+        self._gain_db = np.full((1, len(OCTAVE_BANDS_HZ)), amplitude_to_db(self._length_m))
+        self._from_everywhere = mean_over_directions(filters)
+
+    @classmethod
+    def of(cls, bundle: Bundle, filters: HeadFilters) -> "Binauralization | None":
+        """None where the bundle's fields have two ears of their own."""
+        manifest = bundle.manifest
+        return cls(filters, speed_of_sound=manifest.speed_of_sound) if len(manifest.channels) == 1 else None
+
+    def binauralize(self, responses: _Float32, listener: Pose, emitters: Sequence[Vector3]) -> _Float32:
+        """(B, 2, sample) of responses (B, 1, sample) from emitters (B, 3)."""
+        samples = responses.shape[-1]
+        offsets = np.asarray(emitters, dtype=np.float64) - np.asarray(listener.position)
+        distances_m = np.linalg.norm(offsets, axis=-1)
+        direct = responses[:, 0] * self._direct_window(distances_m / self._speed_of_sound, samples)
+        rest = responses[:, 0] - direct
+        heard = oaconvolve(rest, self._from_everywhere[np.newaxis], axes=-1)[:, np.newaxis, :samples].repeat(2, axis=1)
+        for row, (offset, distance_m) in enumerate(zip(offsets, distances_m, strict=True)):
+            head = self._head(offset / distance_m if distance_m > COINCIDENT_M else np.array((1.0, 0.0, 0.0)), listener)
+            whole = oaconvolve(direct[row][np.newaxis], head, axes=-1)
+            heard[row] += whole[:, self._lead : self._lead + samples]
+        return heard.astype(np.float32)
+
+    def _direct_window(self, arrivals_s: npt.NDArray[np.float64], samples: int) -> _Float32:
+        """(B, sample) 1 until the direct sound has passed, and 0 soon after."""
+        after_s = np.arange(samples) / self._rate - arrivals_s[:, np.newaxis] - DIRECT_S
+        return (0.5 - 0.5 * np.sin(np.pi / 2 * np.clip(after_s / _FADE_S, -1.0, 1.0))).astype(np.float32)
+
+    def _head(self, arrival: npt.NDArray[np.float64], listener: Pose) -> _Float32:
+        """(2, tap) what the head makes of an impulse from the direction `arrival` (3,), `_lead` samples late."""
+        head = np.zeros((2, self._taps), np.float32)
+        self._paths.add(self._length_m, arrival[np.newaxis], self._gain_db, listener.orientation, head)
+        return head
+
+
+def mean_over_directions(filters: HeadFilters) -> _Float32:
+    """(tap,) minimum-phase filter with the power of an ear that sound comes to from everywhere, mean of both ears."""
+    power = np.abs(np.exp(np.fft.rfft(filters.cepstra, _N_FFT))) ** 2
+    everywhere = np.einsum("d,def->f", solid_angles(filters.directions), power) / 2
+    cepstrum = folded_cepstrum(0.5 * np.log(everywhere))
+    return np.fft.irfft(np.exp(np.fft.rfft(cepstrum, _N_FFT)), _N_FFT)[: filters.taps].astype(np.float32)

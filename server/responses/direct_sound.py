@@ -1,0 +1,208 @@
+"""Where the sound that comes before all reflections travels in a scene: what a renderer's direct paths follow
+(`server.streaming.direct_path_tracker`), or a response holds of emitters that stand still. Beside it, where the scene
+wants them from geometry, the first reflections.
+
+Metres; positions and directions in the world's axes.
+"""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.decibels import amplitude_to_db, db_to_amplitude
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.geometry import FloorPlan, Pose
+from server.acoustics.sound_path import SoundPathFinder, SoundPaths
+from server.rendering.direct_path import NEAR_LIMIT_M
+from server.rendering.hrtf import HeadFilters, NoHead
+from server.rendering.limiter import CEILING
+from server.rendering.renderer import Renderer
+from server.rendering.still_paths import StillPaths
+from server.responses.binaural import Binauralization
+from server.responses.early_reflections import EarlyReflections
+from server.responses.effect_flags import EmitterEffects
+from server.responses.radiation import departure_gain_db, reverberation_gain
+from server.scene.bundle import Bundle
+
+_Floats = npt.NDArray[np.float64]
+Key = TypeVar("Key")
+
+_SILENT_DB = -100.0
+_IN_THE_OPEN = FloorPlan(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)), 1.0)
+"""A plan without a corner to go round: every path is straight."""
+
+
+class Aimed(Protocol):
+    """An emitter, as far as its direct sound is concerned; `directivity` is the one that is heard."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def directivity(self) -> Directivity: ...
+
+    @property
+    def effects(self) -> EmitterEffects: ...
+
+
+class FoundPaths(NamedTuple):
+    """Of n emitters: lengths (n,), directions of arrival (n, 3), gains (n, band) beside distance and air."""
+
+    length_m: _Floats
+    arrival: _Floats
+    gain_db: _Floats
+
+
+class PathBatch(Generic[Key]):
+    """The ways from emitters whose paths are found alike, as long as those stay as and where they are."""
+
+    def __init__(self, finder: SoundPathFinder, emitters: Sequence[tuple[Key, Aimed]]) -> None:
+        self.keys = [key for key, _ in emitters]
+        self._finder = finder
+        self._places = np.array([emitter.pose.position for _, emitter in emitters])
+        self._paths = SoundPaths.empty(len(emitters))
+        self._unbent = [row for row, (_, emitter) in enumerate(emitters) if not emitter.effects.diffraction]
+        self._beaming = [
+            (row, emitter) for row, (_, emitter) in enumerate(emitters) if emitter.directivity is not OMNIDIRECTIONAL
+        ]
+
+    def find(self, listener: Pose) -> FoundPaths:
+        """The paths to a listener, in the order of `keys`; good until the next are found."""
+        paths = self._finder.find(np.array(listener.position), self._places, self._paths)
+        gain_db = paths.screen_db
+        for row in self._unbent:
+            gain_db[row] = 0.0 if paths.in_sight[row] else _SILENT_DB
+        for row, emitter in self._beaming:
+            gain_db[row] += departure_gain_db(emitter, paths.departure[row])
+        return FoundPaths(paths.length_m, paths.arrival, gain_db)
+
+
+class DirectSound:
+    """One scene's floor plan and air, heard through one head; `air_db_per_m` (7,) per octave band.
+
+    `early_reflections` are what the impulse responses of the scene's fields leave out, None where they hold it. Fields
+    that hold the direct sound too leave nothing to a renderer: then there are no `filters` for it, and where those
+    fields have no ears either, `binauralization` gives them the listener's. `field_gain`, linear, takes the fields'
+    responses to unit pressure one metre from an emitter.
+    """
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        *,
+        speed_of_sound: float,
+        air_db_per_m: npt.NDArray[np.float64],
+        filters: HeadFilters | None,
+        early_reflections: EarlyReflections | None = None,
+        early_without_head: EarlyReflections | None = None,
+        binauralization: Binauralization | None = None,
+        field_gain: float = 1.0,
+    ) -> None:
+        self.early_reflections = early_reflections
+        self.early_without_head = early_without_head
+        self.binauralization = binauralization
+        self.field_gain = field_gain
+        self._finder = SoundPathFinder(plan, speed_of_sound)
+        self._straight = SoundPathFinder(_IN_THE_OPEN, speed_of_sound)
+        self._speed_of_sound = speed_of_sound
+        self._air_db_per_m = air_db_per_m
+        self._filters = filters
+
+    @classmethod
+    def of(cls, bundle: Bundle, filters: HeadFilters) -> "DirectSound":
+        manifest = bundle.manifest
+        return cls(
+            bundle.floor_plan,
+            speed_of_sound=manifest.speed_of_sound,
+            air_db_per_m=manifest.air.absorption_db_per_m,
+            filters=filters if manifest.direct_sound == "geometry" else None,
+            early_reflections=EarlyReflections.of(bundle, filters),
+            early_without_head=EarlyReflections.of(bundle, NoHead(filters.sample_rate)),
+            binauralization=Binauralization.of(bundle, filters),
+            field_gain=float(db_to_amplitude(-manifest.reference_level_db)),
+        )
+
+    def renderer(
+        self,
+        *,
+        block_size: int,
+        ir_samples: int,
+        sample_rate: int,
+        max_emitters: int,
+        shared_tail: bool = False,
+        switches_tail: bool = False,
+        outputs: int = 2,
+        has_head: bool = True,
+    ) -> Renderer:
+        return Renderer(
+            block_size=block_size,
+            ir_samples=ir_samples,
+            sample_rate=sample_rate,
+            filters=self._filters,
+            speed_of_sound=self._speed_of_sound,
+            air_db_per_m=self._air_db_per_m,
+            max_emitters=max_emitters,
+            shared_tail=shared_tail,
+            switches_tail=switches_tail,
+            ceiling=CEILING,
+            outputs=outputs,
+            has_head=has_head,
+        )
+
+    def early(self, channels: int) -> EarlyReflections | None:
+        """Those that two ears hear, or one without a head."""
+        return self.early_reflections if channels == 2 else self.early_without_head
+
+    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Aimed]) -> None:
+        """Add the direct sound that `listener` hears of each emitter to its response (B, ear, sample), for emitters
+        whose direct sound stands still; sample 0 is emission.
+
+        A renderer plays these responses at the emitter's `reverberation_gain`, which this makes up for.
+        """
+        if self._filters is None:
+            return
+        for ways in self.ways_from(enumerate(emitters)):
+            for row, length_m, arrival, gain_db in zip(ways.keys, *ways.find(listener), strict=True):
+                emitter = emitters[row]
+                effects = emitter.effects
+                gain = gain_db - amplitude_to_db(reverberation_gain(emitter.directivity))
+                if not effects.distance_attenuation:
+                    gain = gain + amplitude_to_db(max(length_m, NEAR_LIMIT_M))
+                still = self._still(responses.shape[1], has_air=effects.air_absorption)
+                still.add(
+                    np.array([length_m]), arrival[np.newaxis], gain[np.newaxis], listener.orientation, responses[row]
+                )
+
+    @property
+    def is_heard_apart(self) -> bool:
+        """Whether there is a direct sound beside what the scene's fields hold."""
+        return self._filters is not None
+
+    def ways_from(self, emitters: Iterable[tuple[Key, Aimed]]) -> list["PathBatch[Key]"]:
+        """From emitters, each with what tells it from others. Those that walls may hide are looked for round corners;
+        for others nothing is looked for."""
+        hidden: list[tuple[Key, Aimed]] = []
+        open_: list[tuple[Key, Aimed]] = []
+        for each in emitters:
+            (hidden if each[1].effects.occlusion else open_).append(each)
+        return [PathBatch(finder, some) for finder, some in ((self._finder, hidden), (self._straight, open_)) if some]
+
+    def _still(self, channels: int, *, has_air: bool) -> StillPaths:
+        return self._still_paths[channels - 1][has_air]
+
+    @cached_property
+    def _still_paths(self) -> tuple[tuple[StillPaths, StillPaths], tuple[StillPaths, StillPaths]]:
+        """For one ear and for two, without air and with it."""
+        assert self._filters is not None
+        airless = np.zeros_like(self._air_db_per_m)
+        one, two = (
+            tuple(
+                StillPaths(ears, speed_of_sound=self._speed_of_sound, air_db_per_m=air)
+                for air in (airless, self._air_db_per_m)
+            )
+            for ears in (NoHead(self._filters.sample_rate), self._filters)
+        )
+        return (one[0], one[1]), (two[0], two[1])

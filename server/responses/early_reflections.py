@@ -1,0 +1,108 @@
+"""A scene's first reflections as part of impulse responses: by way of one wall, the floor or the ceiling.
+
+They come a few milliseconds after the direct sound and interfere with it; their phase turns faster with the poses than
+a field can follow, and geometry knows it exactly. Scenes whose manifest says so leave them to this.
+
+A reflection appears and vanishes as somebody walks past the end of a wall. It does with the impulse response that it is
+part of, and those are crossfaded.
+
+Axes: B poses; responses (B, ear, sample). Metres; positions and directions in the world's axes.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import amplitude_to_db, db_to_power
+from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.acoustics.geometry import FloorPlan, Pose
+from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
+from server.acoustics.transmission import PathFinder, TransmittedPaths, transmission_loss_db
+from server.rendering.direct_path import NEAR_LIMIT_M
+from server.rendering.fractional_delay import TAPS
+from server.rendering.hrtf import HeadFilters, NoHead
+from server.rendering.still_paths import StillPaths
+from server.responses.radiation import Placed, departure_gain_db, reverberation_gain
+from server.scene.bundle import Bundle
+from server.scene.geometry import Materials
+
+_Floats = npt.NDArray[np.float64]
+
+
+class EarlyReflections:
+    """One scene's surfaces and air, heard through one head; `air_db_per_m` (band,). Safe to share between threads."""
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        materials: Materials,
+        *,
+        speed_of_sound: float,
+        air_db_per_m: _Floats,
+        filters: HeadFilters | NoHead,
+        transmission: bool = False,
+    ) -> None:
+        """With `transmission` what goes straight through walls, as their mass lets it, is heard with them."""
+        surfaces = materials.walls, materials.floor, materials.ceiling
+        gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
+        self.filters = filters
+        self._finder: PathFinder = ReflectionFinder(plan, gains_db)
+        mass = materials.walls.surface_mass_kg_m2
+        if transmission and mass is not None:
+            self._finder = TransmittedPaths(self._finder, plan, transmission_loss_db(mass, OCTAVE_BANDS_HZ))
+        # Each of the two legs of a path is no longer than the room.
+        (west, south), (east, north) = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
+        longest_s = 2 * math.hypot(east - west, north - south, plan.height_m) / speed_of_sound
+        self.end_samples = math.ceil((longest_s + filters.longest_delay_s) * filters.sample_rate) + filters.taps + TAPS
+        """From this sample of a response on, none of them is heard."""
+        self._air_db_per_m = air_db_per_m
+        self._paths = StillPaths(filters, speed_of_sound=speed_of_sound, air_db_per_m=air_db_per_m)
+
+    @classmethod
+    def of(cls, bundle: Bundle, filters: HeadFilters | NoHead) -> "EarlyReflections | None":
+        """None where the bundle's fields hold the first reflections themselves."""
+        manifest = bundle.manifest
+        geometry = manifest.geometry
+        if manifest.image_order == 0 or geometry is None:
+            return None
+        return cls(
+            bundle.floor_plan,
+            geometry.materials,
+            speed_of_sound=manifest.speed_of_sound,
+            air_db_per_m=manifest.air.absorption_db_per_m,
+            filters=filters,
+            transmission=manifest.transmission,
+        )
+
+    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Placed]) -> None:
+        """Add what `listener` hears of each emitter to its response (B, ear, sample); sample 0 is emission.
+
+        A renderer plays these responses at the emitter's `reverberation_gain`, as is right for sound from all sides;
+        these paths have a gain of their own instead.
+        """
+        found = self._finder.find(listener.position, [emitter.pose.position for emitter in emitters])
+        gains_db = found.gain_db
+        for path, number in enumerate(found.emitter):
+            emitter = emitters[number]
+            if emitter.directivity != OMNIDIRECTIONAL:
+                played_db = amplitude_to_db(reverberation_gain(emitter.directivity))
+                gains_db[path] += departure_gain_db(emitter, found.departure[path]) - played_db
+        starts = np.searchsorted(found.emitter, np.arange(len(emitters) + 1))
+        for response, start, stop in zip(responses, starts[:-1], starts[1:], strict=True):
+            paths = slice(start, stop)
+            self._paths.add(
+                found.length_m[paths], found.arrival[paths], gains_db[paths], listener.orientation, response
+            )
+
+    def band_power(self, listeners: _Floats, emitter: npt.ArrayLike) -> _Floats:
+        """(B, band) squared pressure that they bring to `listeners` (B, 3) from one emitter (3,), all round."""
+        # A path is the same both ways, and here are many listeners to one emitter.
+        found = self._finder.find(emitter, listeners)
+        levels_db = found.gain_db - found.length_m[:, None] * self._air_db_per_m
+        power = np.zeros((len(listeners), levels_db.shape[-1]))
+        spread = np.maximum(found.length_m, NEAR_LIMIT_M)[:, None] ** 2
+        np.add.at(power, found.emitter, db_to_power(levels_db) / spread)
+        return power

@@ -1,0 +1,111 @@
+"""A scene's whole impulse responses: the direct path from geometry, with it the first reflections where the field
+leaves them out, and what follows from the field; or all of it from the field, where that holds the direct sound.
+
+Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians.
+"""
+
+from functools import cache, cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import db_to_power
+from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.geometry import Pose
+from server.acoustics.sound_path import SoundPathFinder
+from server.field.field import AcousticField
+from server.rendering.direct_path import NEAR_LIMIT_M
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.sphere import solid_angles
+from server.rendering.still_paths import StillPaths
+from server.responses.early_reflections import EarlyReflections
+from server.responses.node_reflections import add_first_reflections
+from server.scene.bundle import Bundle
+
+_N_FFT = 512
+
+
+@cache
+def kemar(sample_rate: int) -> HeadFilters:
+    """The head of single responses, of maps, and of simulations."""
+    return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
+
+
+class _AllRound(NamedTuple):
+    """An emitter that radiates alike in all directions."""
+
+    pose: Pose
+    directivity: Directivity = OMNIDIRECTIONAL
+
+
+class FullResponse:
+    """A field heard through one head, direct sound included; thread-safe, as the field is. Emitters radiate alike in
+    all directions."""
+
+    def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
+        manifest = field.bundle.manifest
+        self.field = field
+        self._filters = filters
+        self._air_db_per_m = manifest.air.absorption_db_per_m
+        self._paths = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
+        self._direct = StillPaths(filters, speed_of_sound=manifest.speed_of_sound, air_db_per_m=self._air_db_per_m)
+        self._early = EarlyReflections.of(field.bundle, filters)
+
+    @classmethod
+    def through_kemar(cls, field: AcousticField) -> "FullResponse":
+        """Heard by the head that everything is heard by where no other was asked for."""
+        return cls(field, kemar(field.sample_rate))
+
+    @property
+    def bundle(self) -> Bundle:
+        return self.field.bundle
+
+    @property
+    def sample_rate(self) -> int:
+        return self.field.sample_rate
+
+    def impulse_responses(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
+    ) -> npt.NDArray[np.float32]:
+        """(B, channel, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
+        listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        responses = self.field.impulse_responses(listeners, emitters, yaws)
+        if self.bundle.manifest.direct_sound == "field":
+            return responses
+        for response, listener, emitter, yaw in zip(responses, listeners, emitters, yaws, strict=True):
+            head = Pose.from_yaw(tuple(listener), float(yaw))
+            paths = self._paths.find(listener, emitter[None])
+            self._direct.add(paths.length_m, paths.arrival, paths.screen_db, head.orientation, response)
+            if self._early is not None:
+                add_first_reflections(self.field, self._early, response[None], head, [_AllRound(Pose(tuple(emitter)))])
+        return responses
+
+    def path_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """(B,) energy per ear of what `impulse_responses` adds to those of the field, averaged over all orientations of
+        the head."""
+        if self.bundle.manifest.direct_sound == "field":
+            return np.zeros(len(listeners))
+        # A path is the same both ways, and here are many listeners to one emitter.
+        paths = self._paths.find(emitter, listeners)
+        spread = np.maximum(paths.length_m, NEAR_LIMIT_M)[:, None] ** 2
+        bands = db_to_power(paths.screen_db - paths.length_m[:, None] * self._air_db_per_m) / spread
+        if self._early is not None:
+            bands += self._early.band_power(listeners, emitter)
+        return np.asarray(bands @ self._diffuse_energy)
+
+    @cached_property
+    def _diffuse_energy(self) -> npt.NDArray[np.float64]:
+        return diffuse_energy(self._filters)
+
+
+def diffuse_energy(filters: HeadFilters) -> npt.NDArray[np.float64]:
+    """(band,) energy per ear of a unit impulse from everywhere, by octave band."""
+    spectra = np.abs(np.exp(np.fft.rfft(filters.cepstra, _N_FFT))) ** 2
+    everywhere = np.einsum("d,def->f", solid_angles(filters.directions), spectra) / 2
+    frequency = np.maximum(np.fft.rfftfreq(_N_FFT, 1 / filters.sample_rate), 1.0)
+    band = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
+    # Bins between DC and Nyquist stand for two.
+    weight = np.r_[1, np.full(len(frequency) - 2, 2), 1] / _N_FFT
+    return np.asarray(np.bincount(band, everywhere * weight, len(OCTAVE_BANDS_HZ)), dtype=np.float64)

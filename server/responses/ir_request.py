@@ -1,0 +1,172 @@
+"""Impulse responses (IRs) that a session asks for, and how they are computed."""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.directivity import Directivity
+from server.acoustics.geometry import Pose
+from server.field.fields_by_level import FieldsByLevel
+from server.rendering.convolver import PartitionedIr
+from server.responses.direct_sound import DirectSound
+from server.responses.downmix import binaural_to_mono
+from server.responses.effect_flags import ALL_ON, EmitterEffects
+from server.responses.ir_cache import Preparer, prepared_irs
+from server.responses.node_reflections import Snapping, add_first_reflections
+
+
+class Asked(Protocol):
+    """An emitter, as far as its response is concerned; `directivity` is the one that is heard."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def directivity(self) -> Directivity: ...
+
+    @property
+    def effects(self) -> EmitterEffects: ...
+
+
+class Ask(Protocol):
+    """Impulse responses (batch, channel, sample), in an array of their own, for poses in metres and radians."""
+
+    def __call__(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
+    ) -> npt.NDArray[np.float32]: ...
+
+
+class Field(Snapping, Protocol):
+    """What an acoustic field gives."""
+
+    @property
+    def ir_samples(self) -> int: ...
+
+    @property
+    def sample_rate(self) -> int: ...
+
+    def impulse_responses(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
+    ) -> npt.NDArray[np.float32]: ...
+
+
+class Hearing(Preparer, Protocol):
+    """A renderer, as far as it makes anything ready on any thread."""
+
+    def prepare_hearing(self, channels: int) -> None: ...
+
+
+@dataclass(frozen=True)
+class EmitterSnapshot:
+    """An emitter as it was when its IR was asked for; `serial` tells it from others of the same id."""
+
+    serial: int
+    pose: Pose
+    directivity: Directivity
+    identity: Hashable | None = None
+    """Of the response asked for, where poses share responses."""
+    effects: EmitterEffects = ALL_ON
+
+
+@dataclass(frozen=True)
+class IrRequest:
+    """IRs of a quality level wanted for the poses as they were when `pose_id` was the newest, for two ears of a head or
+    for one without."""
+
+    pose_id: int
+    level: str
+    listener: Pose
+    emitters: tuple[EmitterSnapshot, ...]
+    """Those whose IR is out of date."""
+    direct_sound: DirectSound
+    """What the field's IRs leave out, as this session's head hears it."""
+    channels: int = 2
+    is_first: bool = False
+    """Whether an emitter has none yet, and waits to be heard."""
+
+
+@dataclass(frozen=True)
+class IrResponse:
+    request: IrRequest
+    irs: tuple[PartitionedIr, ...]
+    """One per emitter of the request."""
+
+
+def compute_irs(levels: FieldsByLevel, request: IrRequest, hearing: Hearing) -> IrResponse:
+    """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
+    field, direct = levels[request.level], request.direct_sound
+    hearing.prepare_hearing(request.channels)
+    is_whole = all(emitter.effects.late and emitter.effects.early for emitter in request.emitters)
+    bakes_direct = any(emitter.effects.bakes_direct for emitter in request.emitters)
+    if field.level.reuse is not None and is_whole and not bakes_direct and request.channels == 2:
+        early = direct.early_reflections
+        kept = prepared_irs(field, levels.kept, early, hearing, request.listener, request.emitters)
+        return IrResponse(request, kept)
+    ask = partial(field.impulse_responses, remember=True)
+    irs = composed_irs(field, direct, request.listener, request.emitters, request.channels, ask=ask)
+    return IrResponse(request, tuple(hearing.prepare(ir if is_whole else _without_end(ir)) for ir in irs))
+
+
+def composed_irs(
+    field: Field,
+    direct: DirectSound,
+    listener: Pose,
+    emitters: Sequence[Asked],
+    channels: int = 2,
+    *,
+    ask: Ask | None = None,
+) -> npt.NDArray[np.float32]:
+    """(B, channel, sample) the responses of emitters, of the parts that their effects call for: the field is asked for
+    none but those whose late part is, or somebody else in its place is if there is one to `ask`."""
+    count = len(emitters)
+    held = _held(field, direct, listener, emitters, ask or field.impulse_responses)
+    if direct.binauralization is not None:
+        places = [emitter.pose.position for emitter in emitters]
+        return direct.binauralization.binauralize(held, listener, places) if channels == 2 else held
+    irs = binaural_to_mono(held, field.sample_rate) if channels == 1 else held
+    early = direct.early(channels)
+    mirrored = [row for row, emitter in enumerate(emitters) if emitter.effects.early]
+    if early is not None and 0 < len(mirrored) == count:
+        add_first_reflections(field, early, irs, listener, emitters)
+    elif early is not None and mirrored:
+        reflected = irs[mirrored]
+        add_first_reflections(field, early, reflected, listener, [emitters[row] for row in mirrored])
+        irs[mirrored] = reflected
+    standing = [row for row, emitter in enumerate(emitters) if emitter.effects.bakes_direct]
+    if standing:
+        whole = irs[standing]
+        direct.add(whole, listener, [emitters[row] for row in standing])
+        irs[standing] = whole
+    return irs
+
+
+def _held(
+    field: Field, direct: DirectSound, listener: Pose, emitters: Sequence[Asked], ask: Ask
+) -> npt.NDArray[np.float32]:
+    """(B, channel, sample) of the field, an array of its own; zeros for those whose late part is off."""
+    late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
+    channels = 2 if direct.binauralization is None else 1
+    if not late:
+        return np.zeros((len(emitters), channels, field.ir_samples), np.float32)
+    heads = np.tile(np.asarray(listener.position), (len(late), 1))
+    answer = ask(heads, np.array([emitters[row].pose.position for row in late]), np.full(len(late), listener.yaw))
+    if direct.field_gain != 1.0:
+        answer *= np.float32(direct.field_gain)
+    if len(late) == len(emitters):
+        return answer
+    held = np.zeros((len(emitters), channels, field.ir_samples), np.float32)
+    held[late] = answer
+    return held
+
+
+def _without_end(ir: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """(channel, sample) up to the last sample that is not zero, one at least."""
+    if ir[:, -1].any():
+        return ir  # nearly always, and at once
+    heard = ir != 0
+    ends = [ir.shape[1] - int(np.argmax(channel[::-1])) for channel in heard if channel.any()]
+    return ir[:, : max(ends, default=1)]

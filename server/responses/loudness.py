@@ -1,0 +1,132 @@
+"""How loud an emitter is everywhere in a scene: a map of listener positions, for people to look at.
+
+Level is that of both ears together, averaged over head orientations, in dB relative to the emitter's free field at one
+metre. It is of white sound, of all frequencies up to half of the scene's rate. Heads are levelled so that white sound
+up to 12 kHz from everywhere keeps its energy: in the open such a level is 1/r. A scene at 48 kHz is 2.7 dB beneath
+that, since a unit impulse has half of its energy above 12 kHz there, of which KEMAR's ears get 11 dB less.
+"""
+
+import io
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+
+from server.acoustics.decibels import power_to_db
+from server.acoustics.geometry import Vector3
+from server.field.field import AcousticField
+from server.responses.full_response import FullResponse
+from server.runtime.pace import Checkpoint, no_checkpoint
+from server.scene.bundle import Bundle
+
+# Ears of two opposite heads face four ways.
+_YAWS = 2
+MAX_POINTS = 2_000
+"""Of a map; a point costs milliseconds."""
+FINEST_M = 0.1
+_USUAL_M = 0.25
+_POINTS_ACROSS = 8
+_CHUNK = 4
+"""Cells between two checkpoints: some 15 ms of work."""
+_PIXELS_PER_METRE = 80
+_RANGE_DB = 30.0
+# Perceptually even, dark to bright, legible under dark and light drawings (a subset of the CAM02-UCS path of
+# "viridis").
+_COLOURS = np.array(
+    [(46, 30, 92), (58, 82, 139), (44, 113, 142), (33, 144, 141), (66, 190, 113), (163, 218, 55), (250, 230, 60)],
+    dtype=float,
+)
+
+
+@dataclass(frozen=True)
+class LoudnessMap:
+    """`levels_db` (row, column), NaN outside the room; row 0 is the southernmost. `origin` is the centre of cell (0,
+    0), metres."""
+
+    levels_db: npt.NDArray[np.float64]
+    origin: tuple[float, float]
+    spacing_m: float
+    height_m: float
+
+    def to_json(self) -> dict[str, object]:
+        rows = [[None if np.isnan(level) else round(float(level), 2) for level in row] for row in self.levels_db]
+        return {
+            "levels_db": rows,
+            "origin": list(self.origin),
+            "spacing_m": self.spacing_m,
+            "height_m": self.height_m,
+            "loudest_db": round(float(np.nanmax(self.levels_db)), 2),
+            "quietest_db": round(float(np.nanmin(self.levels_db)), 2),
+        }
+
+    def to_png(self) -> bytes:
+        """North up, transparent outside the room; the brightest colour is the loudest, 30 dB above the darkest."""
+        outside = np.isnan(self.levels_db)
+        # Cells outside take the level of the nearest inside, or they would bleed into the room in the enlarged picture.
+        nearest = distance_transform_edt(outside, return_distances=False, return_indices=True)
+        levels = self.levels_db[tuple(nearest)].astype(np.float32)
+        scale = self.spacing_m * _PIXELS_PER_METRE
+        size = (max(1, round(levels.shape[1] * scale)), max(1, round(levels.shape[0] * scale)))
+        enlarged = np.asarray(Image.fromarray(levels[::-1]).resize(size, Image.Resampling.BILINEAR))
+        mask = Image.fromarray(np.where(outside, 0, 255).astype(np.uint8)[::-1]).resize(size, Image.Resampling.NEAREST)
+        share = np.clip(1 - (levels.max() - enlarged) / _RANGE_DB, 0, 1)
+        steps = np.linspace(0, 1, len(_COLOURS))
+        colour = np.stack([np.interp(share, steps, _COLOURS[:, channel]) for channel in range(3)], axis=-1)
+        image = Image.fromarray(colour.astype(np.uint8), "RGB")
+        image.putalpha(mask)
+        buffer = io.BytesIO()
+        image.save(buffer, "PNG")
+        return buffer.getvalue()
+
+
+def usual_spacing_m(bundle: Bundle) -> float:
+    """Between map points where none was asked for: 0.25 m; less in a small scene, so that at least eight points lie
+    across it, and more in a large one, so that MAX_POINTS suffice. Whole centimetres."""
+    low, high = np.asarray(bundle.manifest.bounds.minimum[:2]), np.asarray(bundle.manifest.bounds.maximum[:2])
+    fitting = max(FINEST_M, min(_USUAL_M, float((high - low).min()) / _POINTS_ACROSS))
+    affordable = math.sqrt(bundle.floor_plan.area_m2 / MAX_POINTS)
+    return math.ceil(100 * max(fitting, affordable) - 1e-9) / 100
+
+
+def loudness_map(
+    field: FullResponse,
+    emitter: Vector3,
+    *,
+    listener_height_m: float,
+    spacing_m: float = 0.25,
+    checkpoint: Checkpoint = no_checkpoint,
+) -> LoudnessMap:
+    """Asks the field for every cell in the floor plan, on a grid centred in the bounds; some milliseconds each. Every
+    few cells it is at a `checkpoint`, and raises what that does."""
+    bundle = field.bundle
+    low, high = np.asarray(bundle.manifest.bounds.minimum[:2]), np.asarray(bundle.manifest.bounds.maximum[:2])
+    columns, rows = np.maximum(1, np.floor((high - low) / spacing_m + 1e-6).astype(int))
+    centre = (low + high) / 2
+    x = centre[0] + (np.arange(columns) - (columns - 1) / 2) * spacing_m
+    y = centre[1] + (np.arange(rows) - (rows - 1) / 2) * spacing_m
+    cells = np.stack([*np.meshgrid(x, y), np.full((rows, columns), listener_height_m)], axis=-1)
+    inside = bundle.floor_plan.contains(cells)
+    levels = np.full((rows, columns), np.nan)
+    listeners = cells[inside]
+    whole = np.empty(len(listeners))
+    for start in range(0, len(listeners), _CHUNK):
+        checkpoint()
+        part = slice(start, start + _CHUNK)
+        power = field.path_power(listeners[part], emitter) + _reflected_power(field.field, listeners[part], emitter)
+        whole[part] = power_to_db(power)
+    levels[inside] = whole - bundle.manifest.reference_level_db
+    return LoudnessMap(levels, (float(x[0]), float(y[0])), spacing_m, listener_height_m)
+
+
+def _reflected_power(
+    field: AcousticField, listeners: npt.NDArray[np.float64], emitter: Vector3
+) -> npt.NDArray[np.float64]:
+    """(listener,) energy per channel, averaged over channels and head orientations, straight from what the field
+    says."""
+    yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
+    positions, heads = np.repeat(listeners, _YAWS, axis=0), np.tile(yaws, len(listeners))
+    power = field.energy(positions, np.broadcast_to(emitter, positions.shape), heads).mean(axis=-1)
+    return np.asarray(power.reshape(-1, _YAWS).mean(axis=1))

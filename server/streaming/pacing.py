@@ -1,0 +1,68 @@
+"""When a block is due, and how many may be on their way.
+
+Seconds of one monotonic clock. Block k of a stream plays from `origin_s + k * block_s`; the server renders it `lead`
+blocks earlier. Everything is measured from the origin, so the error of one sleep never adds to the next.
+"""
+
+import math
+
+from server.core.errors import RequestError
+
+
+class StreamClock:
+    """Due times and deadlines of one stream's blocks."""
+
+    def __init__(self, *, origin_s: float, block_s: float, lead: int) -> None:
+        self._origin_s = origin_s
+        self._block_s = block_s
+        self._lead = lead
+
+    def due_s(self, block: int) -> float:
+        """When block `block` should be rendered."""
+        return self._origin_s + (block - self._lead) * self._block_s
+
+    def deadline_s(self, block: int) -> float:
+        """When a player that keeps `lead` blocks in hand needs block `block`: later is late."""
+        return self._origin_s + block * self._block_s
+
+    def ahead_s(self, block: int, now_s: float) -> float:
+        """How far ahead of real time a stream is whose next block is `block`; negative when it is behind."""
+        return self.deadline_s(block) - now_s
+
+    def slip(self, block: int, now_s: float) -> None:
+        """Move the origin by whole blocks so that `block` is due next: after a stall, sound resumes instead of arriving
+        in a burst, and other streams' blocks still fall due between this one's."""
+        self._origin_s += math.ceil((now_s - self.due_s(block)) / self._block_s) * self._block_s
+
+
+class SendWindow:
+    """At most `size` blocks sent and not yet acknowledged.
+
+    Awaiting a socket tells nothing about what the client has: seconds of audio fit in the buffers between.
+    Acknowledgements do.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.sent = 0
+        self._acknowledged = 0
+
+    @property
+    def unacknowledged(self) -> int:
+        return self.sent - self._acknowledged
+
+    @property
+    def is_full(self) -> bool:
+        return self.unacknowledged >= self.size
+
+    def take_sequences(self, blocks: int) -> range:
+        """The sequence numbers of so many blocks, or of the first of them for which the window has room."""
+        first = self.sent
+        self.sent += max(0, min(blocks, self.size - self.unacknowledged))
+        return range(first, self.sent)
+
+    def acknowledge(self, sequence: int) -> None:
+        """Blocks up to and including `sequence` arrived. Raises RequestError for one that was never sent."""
+        if sequence >= self.sent:
+            raise RequestError("unknown_sequence", f"block {sequence} has not been sent yet", field="sequence")
+        self._acknowledged = max(self._acknowledged, sequence + 1)

@@ -1,0 +1,387 @@
+"""One listener's stream as a state machine without input, output or waiting.
+
+Messages go in, messages and audio blocks come out. The direct paths of each block follow the newest poses. What follows
+the direct sound comes later: `take_request` hands out what impulse responses (IRs) to compute, and whoever computes
+them brings the answer back through `accept` between two blocks. Sound never waits for it.
+
+Blocks are rendered in three steps, so that many sessions' can be rendered in one call: `begin_block`, rendering
+`renderer`, `finish_blocks`.
+
+A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+from server.acoustics.decibels import db_to_amplitude
+from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.acoustics.geometry import Pose
+from server.core.errors import RequestError
+from server.field.fields_by_level import FieldsByLevel
+from server.planning.planned_effects import PlannedEffects, PlanRequest
+from server.planning.planner import Costs
+from server.planning.scene_acoustics import SceneAcoustics
+from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.client_messages import (
+    PROTOCOL,
+    Acknowledge,
+    AddEmitter,
+    ClientMessage,
+    Hello,
+    ListenerPose,
+    MoveEmitter,
+    RemoveEmitter,
+    SetEffects,
+    SetGain,
+)
+from server.protocol.server_messages import EmitterRemoved, Error, LiveStatus, PlanChanged, ServerMessage
+from server.rendering.hrtf import HeadFilters
+from server.rendering.ingest import DryAudio
+from server.rendering.output import Rendered
+from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
+from server.rendering.sources import ClipPlayer, Source
+from server.responses.direct_sound import DirectSound
+from server.responses.ir_request import IrRequest, IrResponse
+from server.responses.radiation import reverberation_gain
+from server.scene.bundle import Bundle
+from server.scene.effects import read_overrides, require_effect
+from server.scene.plan import Plan
+from server.streaming.active_effects import ActiveEffects
+from server.streaming.direct_path_tracker import DirectPathTracker
+from server.streaming.emitters import Emitter, LiveInput
+from server.streaming.load import QualityStep, Reason
+from server.streaming.pacing import SendWindow
+from server.streaming.plan_audit import PlanAudit, Regret
+from server.streaming.response_scheduler import ResponseScheduler
+
+
+def _start_pose(bundle: Bundle) -> Pose:
+    start = bundle.manifest.start
+    return Pose.from_yaw(start.listener, math.radians(start.listener_yaw_deg))
+
+
+class Session:
+    """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
+
+    `levels` are the scene's, and `rung` is what to hear of them first.
+    `filters` are the head it hears through. `load_clip` gives audio at the scene's rate, and is quick: it is
+    called on the rendering thread.
+    Raises RequestError for a hello that cannot be served.
+    """
+
+    def __init__(
+        self,
+        hello: Hello,
+        levels: FieldsByLevel,
+        filters: HeadFilters,
+        load_clip: Callable[[str], DryAudio],
+        *,
+        rung: QualityStep,
+        max_emitters: int = 16,
+        shared_tail: bool = False,
+        window: int = 40,
+        place: SceneAcoustics | None = None,
+        costs: Callable[[], Costs] = dict,
+    ) -> None:
+        field = levels.default
+        if hello.protocol != PROTOCOL:
+            raise RequestError(
+                "unsupported_protocol",
+                f"this server speaks protocol {PROTOCOL}, not {hello.protocol}",
+                field="protocol",
+            )
+        if hello.sample_rate not in {None, field.sample_rate}:
+            raise RequestError(
+                "unsupported_sample_rate",
+                f"scene {hello.scene!r} is rendered at {field.sample_rate} Hz: ask for that, or leave sample_rate out",
+                field="sample_rate",
+            )
+        self.window = SendWindow(window)
+        self.ir_exchanges = 0
+        self.blocks_dropped = 0
+        self.blocks_limited = 0
+        self._bundle = levels.bundle
+        self._sample_rate = field.sample_rate
+        self._load_clip = load_clip
+        self._direct_sound = DirectSound.of(self._bundle, filters)
+        self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
+        self._bundle.require_inside(self._listener.position, "listener.position")
+        planned = None
+        if place is not None:
+            scene, own = self._bundle.manifest.effects, read_overrides(hello.effects)
+            planned = PlannedEffects(place, self._listener, output=hello.output, scene=scene, own=own, costs=costs)
+        self.renderer = self._direct_sound.renderer(
+            block_size=hello.block_size,
+            ir_samples=max(level.ir_samples for level in levels.values()),
+            sample_rate=field.sample_rate,
+            max_emitters=max_emitters,
+            shared_tail=shared_tail,
+            switches_tail=planned is not None or any(level.level.shared_tail for level in levels.values()),
+            outputs=1 if hello.output == "mono" else 2,
+            has_head=planned is None or planned.shared.head,
+        )
+        self._effects = ActiveEffects(
+            self.renderer,
+            planned,
+            sample_rate=field.sample_rate,
+            has_early=self._direct_sound.early_reflections is not None,
+            has_late=bool(self._bundle.manifest.fields),
+        )
+        self._emitters: dict[str, Emitter] = {}
+        self._aim = DirectPathTracker(self._direct_sound, self.renderer, self._emitters)
+        self._responses = ResponseScheduler(
+            self.renderer, self._effects, self._emitters, levels=levels, direct_sound=self._direct_sound, rung=rung
+        )
+        self._next_serial = 0
+        self._followed_pose_id = 0  # by the direct paths
+        self._checked = 0
+
+    @property
+    def sample_clock(self) -> int:
+        """Samples rendered so far: the clock of the next block's first frame."""
+        return self.renderer.sample_clock
+
+    @property
+    def rung(self) -> QualityStep:
+        """The quality that is heard."""
+        return self._responses.heard
+
+    @property
+    def awaits_irs(self) -> bool:
+        """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
+        return self._responses.are_awaited
+
+    def set_quality(self, rung: QualityStep, reason: Reason) -> list[ServerMessage]:
+        """Have what follows the direct sound come from another rung: from now on, or, where it takes another level's
+        IRs, from when they are there."""
+        return self._responses.set_quality(rung, reason)
+
+    def set_ir_interval(self, interval_s: float) -> None:
+        """Have so much time pass from one request for IRs to the next, unless an emitter waits for its first."""
+        self._responses.space(interval_s)
+
+    def space_plans(self, interval_s: float) -> None:
+        """Have so much time pass from one plan of effects to the next, unless something calls for one at once."""
+        if self._effects.planned is not None:
+            self._effects.planned.space(interval_s)
+
+    def receive(self, message: ClientMessage) -> list[ServerMessage]:
+        """Take in one message; what is wrong with it comes back as an `Error`, and nothing has changed then."""
+        try:
+            match message:
+                case ListenerPose():
+                    self._move_listener(message)
+                case MoveEmitter():
+                    self._move_emitter(message)
+                case AddEmitter():
+                    self._add_emitter(message)
+                case SetGain():
+                    self._require_emitter(message.id).gain_db = message.gain_db
+                    self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)))
+                case DryBlock():
+                    self._push(message)
+                case SetEffects():
+                    self._wish(message)
+                case RemoveEmitter():
+                    return self._remove_emitter(message)
+                case Acknowledge():
+                    self.window.acknowledge(message.sequence)
+                case _:
+                    raise RequestError(f"unexpected_{message.type}", f"{message.type} has no place in a running stream")
+        except RequestError as refusal:
+            return [Error.from_refusal(refusal)]
+        return []
+
+    @property
+    def wants_irs(self) -> bool:
+        """Whether there was something to ask for when `take_request` looked last, and it is time to."""
+        return self._responses.are_wanted
+
+    def take_request(self, *, only_first: bool = False) -> IrRequest | None:
+        """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
+        `only_first` ones may be asked for and none is the first of an emitter."""
+        return self._responses.take_request(self._listener, only_first=only_first)
+
+    def accept(self, response: IrResponse) -> list[ServerMessage]:
+        """Put the answer of the last request into effect, with the block that follows."""
+        return self._responses.accept(response)
+
+    def give_up(self, request: IrRequest) -> list[ServerMessage]:
+        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
+        return self._responses.give_up(request)
+
+    def take_plan_request(self) -> PlanRequest | None:
+        """The plan of effects to make now. None while an earlier one is unanswered, or where nothing has changed."""
+        planned = self._effects.planned
+        if planned is None:
+            return None
+        return planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+
+    def adopt(self, plan: Plan) -> list[ServerMessage]:
+        """Put the plan asked for last into effect, with the block that follows."""
+        planned = self._effects.planned
+        assert planned is not None
+        is_other = planned.accept(plan)
+        events = self._responses.enforce_plan()
+        return [*events, PlanChanged.of(plan, self.sample_clock)] if is_other else events
+
+    def take_check(self) -> PlanAudit | None:
+        """A check of the plan in effect, of one emitter after the other; None where everything is on."""
+        planned = self._effects.planned
+        if planned is None or planned.plan is None:
+            return None
+        named = [name for name, emitter in self._emitters.items() if emitter.is_decided]
+        if not named:
+            return None
+        self._checked += 1
+        emitter = self._emitters[named[self._checked % len(named)]]
+        whole, head = self._effects.whole()
+        check = PlanAudit(
+            self.rung.level,
+            self._listener,
+            dataclasses.replace(emitter),
+            whole,
+            self.renderer.channels,
+            2 if head else self.renderer.channels,
+            self._direct_sound,
+        )
+        return check if check.finds_anything else None
+
+    def learn(self, regret: Regret) -> None:
+        """Correct the plan by what a check found."""
+        if regret.corrections and self._effects.planned is not None:
+            self._effects.planned.correct(regret.corrections)
+
+    def keep_effects(self) -> list[ServerMessage]:
+        """No plan came of the one asked for last: what is on stays on; of who has just come, everything."""
+        planned = self._effects.planned
+        assert planned is not None
+        planned.give_up()
+        for emitter in self._emitters.values():
+            emitter.is_decided = True
+        self._responses.retry()
+        return [Error(code="plan_failure", message="no plan of effects could be made")]
+
+    def begin_block(self) -> None:
+        """Have the direct paths of the next block follow the newest poses."""
+        self._aim.follow(self._listener)
+        self.renderer.set_orientation(self._listener.orientation)
+        self._followed_pose_id = self._responses.newest_pose_id
+
+    def finish_blocks(self, sample_clock: int, rendered: Sequence[Rendered]) -> list[AudioBlock]:
+        """The blocks just rendered at once, the first of which began at `sample_clock`; fewer where the window is full,
+        so that the last are not to be sent.
+
+        A block that is not sent was rendered all the same: clips and reverberation keep their place on the clock.
+        """
+        self._responses.follow_renderer()
+        sequences = self.window.take_sequences(len(rendered))
+        self.blocks_dropped += len(rendered) - len(sequences)
+        pose_ids = self._followed_pose_id, self._responses.applied_pose_id
+        size = self.renderer.block_size
+        clocks = range(sample_clock, sample_clock + len(rendered) * size, size)
+        blocks = []
+        for number, (samples, is_exchange, is_limited) in enumerate(rendered):
+            self.ir_exchanges += is_exchange
+            self.blocks_limited += is_limited
+            if number < len(sequences):
+                place = sequences[number], clocks[number]
+                blocks.append(AudioBlock(*place, *pose_ids, samples, is_exchange=is_exchange, is_limited=is_limited))
+        return blocks
+
+    def render_block(self) -> AudioBlock | None:
+        """All three steps for this session alone."""
+        self.begin_block()
+        sample_clock = self.sample_clock
+        return next(iter(self.finish_blocks(sample_clock, render_all([self.renderer]))), None)
+
+    def live_statuses(self) -> tuple[LiveStatus, ...]:
+        return tuple(emitter.live.status for emitter in self._emitters.values() if emitter.live)
+
+    def complaints(self) -> list[ServerMessage]:
+        """What was wrong with live samples since this was asked last."""
+        refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
+        return [Error.from_refusal(refusal) for refusal in refusals if refusal]
+
+    def _follow(self, identifier: str, emitter: Emitter) -> None:
+        if self._effects.planned is not None:
+            self._effects.planned.follow_emitter(identifier, emitter.pose, self._effects.clock_s)
+
+    def _wish(self, message: SetEffects) -> None:
+        if self._effects.planned is not None:
+            wishes = {require_effect(name): is_on for name, is_on in message.effects.items()}
+            self._effects.planned.wish(wishes, message.output)
+
+    def _move_listener(self, message: ListenerPose) -> None:
+        pose = message.pose
+        self._bundle.require_inside(pose.position, "position")
+        self._responses.advance(message.pose_id)
+        moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
+        shared = self._effects.shared
+        for identifier, emitter in self._emitters.items():
+            emitter.is_outdated |= moves or (turns and shared.head and shared.head_rotation)
+            if moves or (turns and shared.head):
+                self._effects.unbake(identifier, emitter)
+        self._listener = pose
+        if self._effects.planned is not None:
+            self._effects.planned.follow_listener(pose, self._effects.clock_s)
+
+    def _move_emitter(self, message: MoveEmitter) -> None:
+        emitter = self._require_emitter(message.id)
+        self._bundle.require_inside(message.position, "position")
+        self._responses.advance(message.pose_id)
+        before = emitter.pose.orientation
+        emitter.move(message)
+        # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
+        is_mirrored = self._direct_sound.early_reflections is not None and emitter.directivity != OMNIDIRECTIONAL
+        emitter.is_outdated |= is_mirrored and emitter.pose.orientation != before
+        self._effects.unbake(message.id, emitter)
+        self._follow(message.id, emitter)
+
+    def _add_emitter(self, message: AddEmitter) -> None:
+        self._bundle.require_inside(message.position, "position")
+        if self._bundle.manifest.direct_sound == "field" and message.directivity is not None:
+            problem = f"scene {self._bundle.id} holds the direct sound, with how its emitters beamed; leave it out"
+            raise RequestError("fixed_directivity", problem, field="directivity")
+        live, source = self._open_source(message)
+        try:
+            self.renderer.add_emitter(message.id, source, gain=float(db_to_amplitude(message.gain_db)))
+        except DuplicateEmitterError as exc:
+            raise RequestError("duplicate_emitter", f"emitter {message.id!r} is already there", field="id") from exc
+        except RendererFullError as exc:
+            raise RequestError("too_many_emitters", str(exc)) from exc
+        emitter = Emitter.added_by(message, self._next_serial, live)
+        emitter.is_decided = self._effects.planned is None
+        if emitter.directivity != OMNIDIRECTIONAL:
+            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.directivity))
+        self._emitters[message.id] = emitter
+        self._follow(message.id, emitter)
+        self._next_serial += 1
+        self._responses.retry()
+
+    def _open_source(self, message: AddEmitter) -> tuple[LiveInput | None, Source]:
+        if message.clip is not None:
+            return None, ClipPlayer(self._load_clip(message.clip), loop=message.loop)
+        live = LiveInput.opened(message.id, sample_rate=self._sample_rate, block_size=self.renderer.block_size)
+        return live, live.source
+
+    def _push(self, block: DryBlock) -> None:
+        live = self._require_emitter(block.id).live
+        if live is None:
+            raise RequestError("not_live", f"emitter {block.id!r} plays a clip", field="id")
+        live.push(block)
+
+    def _remove_emitter(self, message: RemoveEmitter) -> list[ServerMessage]:
+        self._require_emitter(message.id)
+        del self._emitters[message.id]
+        if self._effects.planned is not None:
+            self._effects.planned.forget_emitter(message.id)
+        self.renderer.remove_emitter(message.id)
+        self._responses.retry()
+        return [EmitterRemoved(id=message.id), *self._responses.change_rung_unheard()]
+
+    def _require_emitter(self, identifier: str) -> Emitter:
+        if identifier not in self._emitters:
+            raise RequestError("unknown_emitter", f"there is no emitter {identifier!r}", field="id", status=404)
+        return self._emitters[identifier]

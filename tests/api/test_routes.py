@@ -1,0 +1,342 @@
+import io
+import json
+import re
+import threading
+import time
+
+import numpy as np
+import pytest
+import soundfile
+from PIL import Image
+from starlette.testclient import TestClient
+
+from server.api import app
+from server.api.app import create_app
+from server.api.settings import Settings
+from server.field.fields_by_level import FieldsByLevel
+from server.responses.impulse_response import ImpulseResponse, IrQuery
+from tests.killing import kill, threads_may_die
+
+IR = "/v1/scenes/flat/impulse-response"
+PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
+
+
+def wait_until_ready(client):
+    for _ in range(3_600):  # the first time ever, everything is compiled
+        if client.get("/readyz").status_code == 200:
+            return
+        time.sleep(0.05)
+    raise AssertionError("never ready")
+
+
+@pytest.fixture
+def client(field, hrtfs):
+    settings = Settings(ir_workers=1, max_waiting_requests=1)
+    with TestClient(
+        create_app(settings, scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs), raise_server_exceptions=False
+    ) as client:
+        wait_until_ready(client)
+        yield client
+
+
+def check_problem(response, status, code, field=None):
+    assert response.status_code == status
+    assert response.headers["content-type"] == "application/problem+json"
+    body = response.json()
+    assert {name: body[name] for name in ("status", "code", "field")} == {
+        "status": status,
+        "code": code,
+        "field": field,
+    }
+    assert body["title"]
+    assert body["detail"]
+
+
+def test_health(client):
+    assert client.get("/livez").json() == {"status": "live"}
+    assert client.get("/readyz").json() == {"status": "ready"}
+
+
+def test_ready_only_after_the_field_has_been_used(field, hrtfs):
+    compute, may_go_on = field.impulse_responses, threading.Event()
+
+    def held_up(*arguments, **options):
+        may_go_on.wait(5)
+        return compute(*arguments, **options)
+
+    field.impulse_responses = held_up
+    with TestClient(create_app(Settings(), scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+        assert client.get("/livez").status_code == 200
+        check_problem(client.get("/readyz"), 503, "not_ready")
+        may_go_on.set()
+        wait_until_ready(client)
+
+
+def test_a_failing_warm_up_leaves_the_server_live_and_not_ready(field, hrtfs, caplog):
+    def broken(*_, **__):
+        raise RuntimeError("the field broke")
+
+    field.impulse_responses = broken
+    with TestClient(create_app(Settings(), scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+        for _ in range(3_600):
+            if "warm-up failed" in caplog.text:
+                break
+            time.sleep(0.05)
+        assert client.get("/livez").status_code == 200
+        check_problem(client.get("/readyz"), 503, "not_ready")
+
+
+def test_scenes(client):
+    listed = client.get("/v1/scenes").json()
+    (scene,) = listed["scenes"]
+    assert listed["max_emitters"] == Settings().max_emitters
+    assert scene == client.get("/v1/scenes/flat").json()
+    assert (scene["id"], scene["sample_rate"], scene["height_m"]) == ("flat", 24_000, 2.8)
+    assert scene["bounds"] == {"minimum": [0.3, 0.3, 0.5], "maximum": [7.7, 4.7, 2.3]}
+    assert scene["listener"] == {"position": [2.0, 2.5, 1.5], "yaw": pytest.approx(np.pi / 2)}
+
+
+def test_clips(client):
+    clips = client.get("/v1/clips").json()["clips"]
+    assert "woman-reading" in {clip["name"] for clip in clips}
+    assert all(clip["duration_s"] > 0 and clip["title"] for clip in clips)
+
+
+def test_heads_are_named_and_kemar_is_the_default(client):
+    assert client.get("/v1/hrtfs").json() == {"default": "kemar", "hrtfs": ["kemar"]}
+
+
+def test_a_clip_that_cannot_be_decoded_is_left_out_and_the_log_says_why(field, hrtfs, tmp_path, caplog):
+    (tmp_path / "noise.flac").write_bytes(b"not audio")
+    settings = Settings(clips=(tmp_path / "noise.flac",))
+    with TestClient(create_app(settings, scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+        names = {clip["name"] for clip in client.get("/v1/clips").json()["clips"]}
+    assert "noise" not in names
+    assert "noise.flac" in caplog.text
+
+
+def test_an_impulse_response_is_what_the_command_line_would_write(client, field):
+    query = IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5), 90.0)
+    expected = ImpulseResponse.compute(field, query)
+    for name, media_type in [("wav", "audio/wav"), ("npy", "application/octet-stream"), ("json", "application/json")]:
+        response = client.get(IR, params={**PLACES, "yaw_deg": 90, "format": name})
+        assert response.headers["content-type"] == media_type
+        assert response.content == expected.encode(name)
+    samples, rate = soundfile.read(
+        io.BytesIO(client.get(IR, params={**PLACES, "yaw_deg": 90}).content), dtype="float32"
+    )
+    assert rate == 24_000
+    np.testing.assert_array_equal(samples.T, expected.samples)
+
+
+def test_what_a_client_has_is_not_sent_again(client, field):
+    first = client.get(IR, params=PLACES)
+    assert first.headers["cache-control"].startswith("public, max-age=")
+    tag = first.headers["etag"]
+    # A 304 costs no computation.
+    field.impulse_responses = None
+    for header in (tag, f"W/{tag}", f'"other", {tag}', "*"):
+        again = client.get(IR, params=PLACES, headers={"If-None-Match": header})
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+        assert again.headers["cache-control"] == first.headers["cache-control"]
+    assert client.get(IR, params=PLACES, headers={"If-None-Match": '"other"'}).content == first.content
+
+
+def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_another(client):
+    def tag(**changes):
+        return client.get(IR, params={**PLACES, **changes}).headers["etag"]
+
+    assert tag() == tag(listener="1.0, 2.0,1.50", yaw_deg="0.0", format="wav")
+    assert len({tag(), tag(yaw_deg=1), tag(format="npy"), tag(listener="1,2,1.6")}) == 4
+
+
+@pytest.mark.parametrize(
+    ("path", "params", "status", "code", "at_fault"),
+    [
+        ("/v1/scenes/moon", {}, 404, "unknown_scene", "scene"),
+        ("/v1/scenes/moon/impulse-response", PLACES, 404, "unknown_scene", "scene"),
+        ("/v1/scenes/moon/loudness", {"emitter": "6,3,1.5"}, 404, "unknown_scene", "scene"),
+        (IR, {"listener": "1,2,1.5"}, 422, "malformed_pose", "emitter"),
+        (IR, {**PLACES, "listener": "1,2"}, 422, "malformed_pose", "listener"),
+        (IR, {**PLACES, "listener": "1,2,three"}, 422, "malformed_pose", "listener"),
+        (IR, {**PLACES, "emitter": "nan,2,1"}, 422, "malformed_pose", "emitter"),
+        (IR, {**PLACES, "emitter": "1,2,inf"}, 422, "malformed_pose", "emitter"),
+        (IR, {**PLACES, "yaw_deg": "nan"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "listener": "0_1,2,1.5"}, 422, "malformed_pose", "listener"),
+        (IR, {**PLACES, "listener": "١,2,1.5"}, 422, "malformed_pose", "listener"),
+        (IR, {**PLACES, "yaw_deg": "1_0"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "yaw_deg": "٩"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "level": "finest"}, 404, "unknown_level", "level"),
+        ("/v1/scenes/flat/plan", {"effect": ["hrtf=on", "hrtf=off"]}, 409, "doubled_effect", "effect"),
+        (IR, {**PLACES, "yaw_deg": "north"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "listener": "1,2,99"}, 404, "position_out_of_bounds", "listener"),
+        (IR, {**PLACES, "emitter": "-1,2,1"}, 404, "position_out_of_bounds", "emitter"),
+        (IR, {**PLACES, "format": "mp3"}, 422, "unknown_format", "format"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3"}, 422, "malformed_pose", "emitter"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,9"}, 404, "position_out_of_bounds", "emitter"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "height_m": 9}, 404, "position_out_of_bounds", "height_m"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "spacing_m": 0.01}, 422, "malformed_request", "spacing_m"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "spacing_m": 0.1}, 409, "map_too_fine", "spacing_m"),
+        ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "format": "gif"}, 422, "unknown_format", "format"),
+        ("/v1/nothing", {}, 404, "not_found", None),
+        ("/nothing", {}, 404, "not_found", None),
+    ],
+)
+def test_bad_requests_are_answered_with_a_problem(client, path, params, status, code, at_fault):
+    check_problem(client.get(path, params=params), status, code, at_fault)
+    # And the server goes on.
+    assert client.get(IR, params=PLACES).status_code == 200
+
+
+def test_a_wrong_method_is_a_problem_too(client):
+    response = client.post("/v1/scenes")
+    check_problem(response, 405, "method_not_allowed")
+    assert "GET" in response.headers["allow"]
+
+
+def test_a_crash_is_a_problem_that_tells_nothing_of_the_inside(client, field):
+    def broken(*_, **__):
+        raise RuntimeError("secret")
+
+    field.impulse_responses = broken
+    response = client.get(IR, params=PLACES)
+    check_problem(response, 500, "internal_error")
+    assert "secret" not in response.text
+
+
+def test_the_loudness_map_is_a_picture_or_numbers_and_loudest_at_the_emitter(client):
+    params = {"emitter": "6,3,1.5", "spacing_m": 0.5}
+    picture = client.get("/v1/scenes/flat/loudness", params=params)
+    assert picture.headers["content-type"] == "image/png"
+    assert Image.open(io.BytesIO(picture.content)).format == "PNG"
+    numbers = client.get("/v1/scenes/flat/loudness", params={**params, "format": "json"})
+    assert numbers.headers["etag"] != picture.headers["etag"]
+    levels = np.array(json.loads(numbers.content)["levels_db"], float)
+    row, column = np.unravel_index(np.nanargmax(levels), levels.shape)
+    x, y = json.loads(numbers.content)["origin"]
+    assert abs(x + column * 0.5 - 6) <= 0.5
+    assert abs(y + row * 0.5 - 3) <= 0.5
+
+
+def test_too_many_waiting_requests_are_turned_away_and_health_is_answered_meanwhile(client, field):
+    compute, may_go_on = field.impulse_responses, threading.Event()
+
+    def held_up(*arguments, **options):
+        may_go_on.wait(10)
+        return compute(*arguments, **options)
+
+    field.impulse_responses = held_up
+    statuses = []
+
+    def ask(height):
+        statuses.append(client.get(IR, params={**PLACES, "listener": f"1,2,{height}"}).status_code)
+
+    # Two are computed at once and one may wait; the rest is turned away.
+    askers = [threading.Thread(target=ask, args=(1 + number / 10,)) for number in range(6)]
+    for asker in askers:
+        asker.start()
+    try:
+        for _ in range(500):
+            if len(statuses) == 3:
+                break
+            time.sleep(0.02)
+        assert statuses == [503] * 3
+        assert client.get("/livez").status_code == 200
+    finally:
+        may_go_on.set()
+        for asker in askers:
+            asker.join()
+    assert sorted(statuses) == [200] * 3 + [503] * 3
+
+
+def test_the_interface_describes_itself(client):
+    paths = client.get("/openapi.json").json()["paths"]
+    assert IR.replace("flat", "{scene}") in paths
+
+
+@pytest.mark.parametrize("path", ["/livez", "/readyz"])
+def test_load_balancers_may_probe_with_head(client, path):
+    assert client.head(path).status_code == 200
+
+
+def wait_for_status(client, path, status):
+    """The answer, and how many seconds it took until the status was that."""
+    began_s = time.monotonic()
+    while (answer := client.get(path)).status_code != status:
+        assert time.monotonic() - began_s < 10
+        time.sleep(0.02)
+    return answer, time.monotonic() - began_s
+
+
+def metric(client, name):
+    return float(re.search(rf"^{re.escape(name)} (.*)$", client.get("/metrics").text, re.MULTILINE)[1])
+
+
+@threads_may_die
+@pytest.mark.parametrize("group", ["audio", "ir"])
+def test_a_thread_that_dies_is_replaced_within_two_seconds_and_counted(client, group):
+    host = client.app_state["host"]
+    threads = (lambda: host.audio.threads) if group == "audio" else (lambda: host.readiness.watch._groups[1].threads)
+    dead = threads()[0]
+    restarts = f'nafir_thread_restarts_total{{thread="{dead.name}"}}'
+    assert metric(client, restarts) == 0
+    kill(dead._thread)
+    if group == "audio":
+        dead._wake.set()
+    began_s = time.monotonic()
+    while metric(client, restarts) == 0:
+        if group == "ir":  # a waiting worker dies with the next work, which is not lost
+            host.audio._workers.submit(int, kind="plan").result(timeout=5)
+        assert time.monotonic() - began_s < 2
+    assert dead not in threads()
+    assert metric(client, f'nafir_thread_healthy{{thread="{dead.name}"}}') == 1
+    assert client.get("/readyz").status_code == 200
+
+
+def test_a_thread_that_is_stuck_leaves_readiness_within_two_seconds_until_it_goes_on(client):
+    stuck, release = client.app_state["host"].audio.threads[0], threading.Event()
+    tick = stuck.tick
+    stuck.tick = lambda: release.wait(20) and tick()
+    stuck._wake.set()
+    answer, waited_s = wait_for_status(client, "/readyz", 503)
+    assert waited_s < 2
+    check_problem(answer, 503, "not_ready")
+    assert stuck.name in answer.json()["detail"]
+    assert int(answer.headers["retry-after"]) >= 1
+    assert metric(client, "nafir_ready") == 0
+    assert metric(client, f'nafir_thread_healthy{{thread="{stuck.name}"}}') == 0
+    with client.websocket_connect("/v1/stream") as stream:
+        assert json.loads(stream.receive_text())["code"] == "not_ready"
+    release.set()
+    wait_for_status(client, "/readyz", 200)
+
+
+def test_a_failed_warm_up_is_told_apart_from_one_under_way(field, hrtfs, caplog):
+    def broken(*_, **__):
+        raise RuntimeError("the field broke")
+
+    field.impulse_responses = broken
+    with TestClient(create_app(Settings(), scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+        began_s = time.monotonic()
+        while "has failed" not in (detail := client.get("/readyz").json()["detail"]):
+            assert "still warming up" in detail
+            assert time.monotonic() - began_s < 180
+            time.sleep(0.05)
+    assert "the field broke" in caplog.text
+
+
+def test_effects_whose_cost_cannot_be_measured_leave_the_server_ready_and_the_log_says_why(
+    field, hrtfs, caplog, monkeypatch
+):
+    def broken(*_, **__):
+        raise RuntimeError("no clock")
+
+    monkeypatch.setattr(app, "measure_costs", broken)
+    monkeypatch.setattr(app, "_COSTS_AFTER_S", 0.0)
+    with TestClient(create_app(Settings(), scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+        wait_until_ready(client)
+        began_s = time.monotonic()
+        while "no clock" not in caplog.text:
+            assert time.monotonic() - began_s < 10
+            time.sleep(0.02)
+        assert client.get("/readyz").status_code == 200

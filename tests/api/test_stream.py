@@ -1,0 +1,284 @@
+import json
+import math
+import struct
+import time
+
+import numpy as np
+import pytest
+import soundfile
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from server.api.app import create_app
+from server.api.settings import Settings
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter
+from server.protocol.server_messages import (
+    EmitterAdded,
+    EmitterRemoved,
+    Error,
+    Pong,
+    Status,
+    Welcome,
+    parse_server_message,
+)
+
+HELLO = Hello(protocol=PROTOCOL, scene="flat")
+TALKER = AddEmitter(id="talker", clip="tone", position=(6.0, 3.0, 1.5))
+
+
+@pytest.fixture
+def clip_files(tmp_path):
+    tone = tmp_path / "tone.wav"
+    soundfile.write(tone, np.sin(np.arange(24_000) * 0.1) / 4, 24_000)
+    broken = tmp_path / "broken.wav"
+    broken.write_bytes(b"RIFF but not really")
+    return tone, broken
+
+
+@pytest.fixture
+def client(field, hrtfs, clip_files):
+    settings = Settings(clips=clip_files, hello_timeout_s=0.5, max_streams=2)
+    with TestClient(create_app(settings, scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+        for _ in range(3_600):  # the first time ever, everything is compiled
+            if client.get("/readyz").status_code == 200:
+                break
+            time.sleep(0.05)
+        yield client
+
+
+class Ears:
+    """A client that says hello, acknowledges every block, and can wait for what it wants to hear."""
+
+    def __init__(self, socket, hello=HELLO):
+        self.socket, self.encoding = socket, hello.encoding
+        self.send(hello)
+        self.welcome = self.until(Welcome)
+
+    def send(self, message):
+        self.socket.send_text(message if isinstance(message, str) else message.serialize())
+
+    def receive(self):
+        message = self.socket.receive()
+        if message["type"] == "websocket.close":
+            raise WebSocketDisconnect(message["code"], message.get("reason"))
+        if message.get("text") is not None:
+            return parse_server_message(message["text"])
+        block = AudioBlock.parse(message["bytes"], self.encoding)
+        self.send(Acknowledge(sequence=block.sequence))
+        return block
+
+    def until(self, kind, condition=lambda _: True):
+        for _ in range(2_000):
+            message = self.receive()
+            if isinstance(message, kind) and condition(message):
+                return message
+        raise AssertionError(f"no {kind.__name__} came")
+
+    def until_sound(self):
+        return self.until(AudioBlock, lambda block: block.samples.any())
+
+
+@pytest.fixture
+def ears(client):
+    with client.websocket_connect("/v1/stream") as socket:
+        yield Ears(socket)
+
+
+def test_from_hello_to_sound(ears):
+    assert (ears.welcome.sample_rate, ears.welcome.block_size, ears.welcome.channels) == (24_000, 256, 2)
+    assert ears.welcome.scene.id == "flat"
+    assert ears.welcome.max_emitters == Settings().max_emitters
+    first = ears.until(AudioBlock)
+    assert (first.sequence, first.sample_clock, first.samples.shape) == (0, 0, (2, 256))
+    # Half a metre away, so that the direct sound arrives within the first block.
+    ears.send(AddEmitter(id="talker", clip="tone", position=(2.0, 3.0, 1.5)))
+    added = ears.until(EmitterAdded)
+    assert ears.until_sound().sample_clock == added.sample_clock
+    ears.send(RemoveEmitter(id="talker"))
+    assert ears.until(EmitterRemoved).id == "talker"
+    ears.until(AudioBlock, lambda block: not block.samples.any())
+
+
+def test_turning_the_head_swaps_the_louder_ear(ears):
+    ears.send(TALKER)
+
+    def louder_ear(yaw, pose_id):
+        ears.send(ListenerPose(pose_id=pose_id, position=(6.0, 1.0, 1.5), yaw=yaw))
+        ears.until(AudioBlock, lambda block: block.reverberation_pose_id == pose_id and not block.is_exchange)
+        energy = sum(np.sum(ears.until(AudioBlock).samples ** 2, axis=1) for _ in range(40))
+        return int(np.argmax(energy))
+
+    # The talker stands to the north; who looks east has it on the left.
+    assert (louder_ear(0.0, 1), louder_ear(math.pi, 2)) == (0, 1)
+
+
+def test_integer_samples_and_other_block_sizes_are_negotiated(client):
+    hello = Hello(protocol=PROTOCOL, scene="flat", encoding="s16", block_size=512, sample_rate=24_000, buffer_blocks=2)
+    with client.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, hello)
+        assert ears.until(AudioBlock).samples.shape == (2, 512)
+        ears.send(TALKER)
+        assert 0.001 < np.abs(ears.until_sound().samples).max() <= 1
+
+
+def test_binary_poses_are_heard(ears):
+    ears.send(TALKER)
+    ears.until_sound()  # an IR that comes before the first block is not faded to
+    ears.socket.send_bytes(ListenerPose(pose_id=5, position=(3.0, 2.0, 1.5)).serialize_binary())
+    exchange = ears.until(AudioBlock, lambda block: block.reverberation_pose_id == 5)
+    assert exchange.is_exchange
+    assert exchange.pose_id == 5
+
+
+def test_what_a_client_sends_live_comes_back_from_where_its_emitter_is(ears):
+    ears.send(ListenerPose(pose_id=1, position=(2.0, 2.5, 1.5), yaw=0.0))
+    ears.send(AddEmitter(id="voice", live=True, position=(2.0, 3.5, 1.5)))
+    ears.until(EmitterAdded)
+    assert not ears.until(AudioBlock).samples.any()
+    tone = np.sin(np.arange(256) * 2 * np.pi * 8 / 256).astype(np.float32)
+    energy = np.zeros(2)
+    for sequence in range(60):
+        ears.socket.send_bytes(DryBlock("voice", sequence, tone).serialize("s16"))
+        energy += np.sum(ears.until(AudioBlock).samples ** 2, axis=1)
+    assert energy[0] > 2 * energy[1] > 0  # it stands to the left
+    (live,) = ears.until(Status, lambda status: status.live and status.live[0].underruns).live
+    assert (live.id, live.samples_queued, live.samples_gated) == ("voice", 0, 0)
+
+
+def test_pings_and_status(ears):
+    ears.send(Ping(id=77))
+    assert ears.until(Pong) == Pong(id=77)
+    status = ears.until(Status)
+    assert status.sample_clock >= 24_000
+    assert status.blocks_dropped == 0
+
+
+BAD_TEXT = [
+    ("{", "malformed_message"),
+    ('{"type": "levitate"}', "unknown_message"),
+    ('{"type": "listener", "pose_id": 1, "position": [1, NaN, 1]}', "malformed_pose"),
+    ('{"type": "listener", "pose_id": 1, "position": [1, 2]}', "malformed_pose"),
+    ('{"type": "listener", "pose_id": 1, "position": [1, 2, 1], "orientation": [0, 0, 0, 0]}', "malformed_pose"),
+    ('{"type": "listener", "pose_id": 1, "position": [100, 2, 1]}', "position_out_of_bounds"),
+    ('{"type": "listener", "pose_id": 0, "position": [1, 2, 1]}', "stale_pose"),
+    ('{"type": "add_emitter", "id": "x", "clip": "kazoo", "position": [1, 2, 1]}', "unknown_clip"),
+    ('{"type": "add_emitter", "id": "x", "clip": "broken", "position": [1, 2, 1]}', "undecodable_clip"),
+    ('{"type": "add_emitter", "id": "x", "clip": "tone", "position": [1, 2, 10]}', "position_out_of_bounds"),
+    ('{"type": "add_emitter", "id": "talker", "clip": "tone", "position": [1, 2, 1]}', "duplicate_emitter"),
+    ('{"type": "move_emitter", "id": "ghost", "position": [1, 2, 1], "pose_id": 1}', "unknown_emitter"),
+    ('{"type": "remove_emitter", "id": "ghost"}', "unknown_emitter"),
+    ('{"type": "acknowledge", "sequence": 4000000000}', "unknown_sequence"),
+    ('{"type": "add_emitter", "id": "x", "position": [1, 2, 1]}', "malformed_message"),
+    (
+        '{"type": "add_emitter", "id": "x", "clip": "tone", "position": [1, 2, 1], "directivity": {"pattern": "odd"}}',
+        "malformed_directivity",
+    ),
+    ('{"type": "set_gain", "id": "ghost", "gain_db": 0}', "unknown_emitter"),
+    ('{"type": "hello", "protocol": 2, "scene": "flat"}', "unexpected_hello"),
+    (json.dumps({"type": "ping", "id": 1, "padding": "x" * 70_000}), "message_too_large"),
+    # Few enough characters, too many bytes.
+    (json.dumps({"type": "ping", "id": 1, "padding": "é" * 40_000}, ensure_ascii=False), "message_too_large"),
+]
+BAD_BYTES = [
+    (b"", "unknown_message"),
+    (b"\xff" * 36, "unknown_message"),
+    (b"\x02" * 35, "malformed_pose"),
+    (struct.pack("<BBHI7f", 2, 0, 0, 1, math.inf, 0, 0, 0, 0, 0, 1), "malformed_pose"),
+    (b"\x03" * 40, "malformed_block"),
+    (DryBlock("ghost", 0, np.ones(4, np.float32)).serialize("f32"), "unknown_emitter"),
+    (DryBlock("talker", 0, np.ones(4, np.float32)).serialize("f32"), "not_live"),
+    (bytes(70_000), "message_too_large"),
+]
+
+
+def test_every_bad_message_gets_its_code_and_the_stream_goes_on(ears):
+    ears.send(TALKER)
+    ears.until_sound()
+    for bad, code in BAD_TEXT + BAD_BYTES:
+        ears.socket.send_bytes(bad) if isinstance(bad, bytes) else ears.socket.send_text(bad)
+        error = ears.until(Error)
+        assert error.code == code
+        assert error.message
+    before = ears.until(AudioBlock)
+    after = ears.until(AudioBlock, lambda block: block.sequence == before.sequence + 20)
+    assert after.sample_clock == before.sample_clock + 20 * 256
+    ears.send(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)))
+    ears.until(AudioBlock, lambda block: block.pose_id == 1)
+
+
+def test_a_clip_that_cannot_be_decoded_says_why(ears):
+    ears.send(AddEmitter(id="x", clip="broken", position=(1.0, 2.0, 1.0)))
+    error = ears.until(Error)
+    assert error.field == "clip"
+    assert "broken.wav" in error.message
+    assert len(error.message) > len("broken.wav: ")
+
+
+@pytest.mark.parametrize(
+    ("first", "code"),
+    [
+        (Ping(id=1).serialize(), "hello_expected"),
+        ("?", "malformed_message"),
+        (Hello(protocol=1, scene="flat").serialize(), "unsupported_protocol"),
+        (Hello(protocol=PROTOCOL, scene="flat", hrtf="moomin").serialize(), "unknown_hrtf"),
+        (Hello(protocol=PROTOCOL, scene="moon").serialize(), "unknown_scene"),
+        (Hello(protocol=PROTOCOL, scene="flat", sample_rate=48_000).serialize(), "unsupported_sample_rate"),
+        (
+            '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [99, 1, 1]}}',
+            "position_out_of_bounds",
+        ),
+        ('{"type": "hello", "protocol": 3, "scene": "flat", "spatial": true}', "unsupported_protocol"),
+        (b"", "hello_expected"),
+        (ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)).serialize_binary(), "hello_expected"),
+        (b"\xff" * 40, "hello_expected"),
+        (None, "hello_expected"),
+    ],
+)
+def test_a_bad_hello_is_answered_and_ends_the_connection(client, first, code):
+    with client.websocket_connect("/v1/stream") as socket:
+        if isinstance(first, bytes):
+            socket.send_bytes(first)
+        elif first is not None:
+            socket.send_text(first)
+        assert parse_server_message(socket.receive_text()).code == code
+        with pytest.raises(WebSocketDisconnect) as closed:
+            socket.receive_text()
+        assert (closed.value.code, closed.value.reason) == (1008, code)
+
+
+def test_a_full_server_says_so_and_has_room_again_when_someone_leaves(client):
+    with client.websocket_connect("/v1/stream") as first, client.websocket_connect("/v1/stream") as second:
+        Ears(first), Ears(second)
+        with client.websocket_connect("/v1/stream") as third:
+            assert parse_server_message(third.receive_text()).code == "server_busy"
+            with pytest.raises(WebSocketDisconnect) as closed:
+                third.receive_text()
+            assert closed.value.code == 1013
+        second.close()
+        for _ in range(100):
+            with client.websocket_connect("/v1/stream") as socket:
+                socket.send_text(HELLO.serialize())
+                if parse_server_message(socket.receive_text()).type == "welcome":
+                    return
+            time.sleep(0.02)
+    raise AssertionError("no room for a new stream")
+
+
+def test_a_client_that_never_acknowledges_gets_a_window_and_then_nothing(client):
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_text(HELLO.serialize())
+        window = parse_server_message(socket.receive_text()).window
+        sequences = []
+        while True:
+            message = socket.receive()
+            if message.get("text") is not None:
+                status = parse_server_message(message["text"])
+                if status.sample_clock >= 24_000:
+                    break
+            else:
+                sequences.append(AudioBlock.parse(message["bytes"], "f32").sequence)
+        assert sequences == list(range(window))
+        assert status.unacknowledged == window
+        assert status.blocks_dropped == pytest.approx(94 - window, abs=3)

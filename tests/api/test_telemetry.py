@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from server.api.stream_counts import StreamLedger
+from server.api.telemetry import ServerCollector, exposition
+from server.core.durations import DurationHistogram
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
+from server.runtime.drain import Drain
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
+from server.streaming.audio_engine import AudioEngine
+from server.streaming.load import Offer
+from server.streaming.session import Session
+from server.streaming.stream import Stream
+from tests.engine_stage import Patient
+
+BLOCK_S = 256 / 24_000
+
+
+class Clips:
+    names = ("knock", "speech")
+
+
+class Host:
+    def __init__(self, audio, offers):
+        self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
+        self.ledger = StreamLedger()
+        self.readiness = Readiness(Drain(8.0), ThreadWatch((audio,)), warm_up="done")
+
+
+@pytest.fixture
+def host(field):
+    offer = Offer((field.level,), {"standard": 2.5})
+    return Host(AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0), {"flat": offer})
+
+
+def open_stream(host, field, filters):
+    ladder = host.offers["flat"].ladder("auto", block_s=BLOCK_S)
+    hello = Hello(protocol=PROTOCOL, scene="flat")
+    session = Session(hello, FieldsByLevel([field]), filters, lambda _: np.ones(9, np.float32), rung=ladder.rung)
+    stream = Stream(
+        session,
+        FieldsByLevel([field]),
+        offer=host.offers["flat"],
+        ladder=ladder,
+        block_s=BLOCK_S,
+        lead=1,
+        deliver=lambda _: None,
+    )
+    host.ledger.open(stream)
+    host.audio.open(stream)
+    return stream
+
+
+def samples(host):
+    """Values by name and labels, as Prometheus would read them."""
+    text = exposition(ServerCollector(host)).decode()
+    return {
+        (sample.name, *sorted(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_a_server_without_streams_tells_what_it_is(host):
+    told = samples(host)
+    assert told["nafir_streams", ("level", "standard"), ("scene", "flat")] == 0
+    assert told["nafir_level_ir_seconds", ("level", "standard"), ("scene", "flat")] == pytest.approx(0.0025)
+    assert (told["nafir_clips",], told["nafir_ready",], told["nafir_blocks_sent_total",]) == (2, 1, 0)
+    assert any(name == "nafir_build_info" and value == 1 for (name, *_), value in told.items())
+
+
+def test_streams_are_counted_together_and_stay_counted_when_they_end(host, field, filters):
+    streams = [open_stream(host, field, filters) for _ in range(2)]
+    for stream in streams:
+        stream.session.receive(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
+        for _ in range(5):
+            stream.session.render_block()
+        stream.render_times.add(0.001)
+        stream.blocks_late += 1
+    streams[0].ladder.at = 1
+    told = samples(host)
+    assert told["nafir_streams", ("level", "standard"), ("scene", "flat")] == 2
+    assert told["nafir_streams_eased", ("scene", "flat")] == 1
+    assert (told["nafir_blocks_sent_total",], told["nafir_blocks_late_total",]) == (10, 2)
+    host.audio.close(streams[0])
+    host.ledger.close(streams[0])
+    after = samples(host)
+    assert after["nafir_streams", ("level", "standard"), ("scene", "flat")] == 1
+    assert {name: value for name, value in after.items() if name[0].startswith("nafir_block")} == {
+        name: value for name, value in told.items() if name[0].startswith("nafir_block")
+    }
+
+
+def test_durations_are_buckets_that_contain_each_other(host, field, filters):
+    times_s = [1e-4, 2e-4, 2e-4, 0.03, 100.0]
+    stream = open_stream(host, field, filters)
+    for time_s in times_s:
+        stream.render_times.add(time_s)
+    told = samples(host)
+    counts = sorted(
+        (float(dict(labels)["le"]), value)
+        for (name, *labels), value in told.items()
+        if name == "nafir_block_render_seconds_bucket"
+    )
+    assert [value for _, value in counts] == sorted(value for _, value in counts)
+    assert counts[-1] == (float("inf"), len(times_s))
+    for bound_s, value in counts[:-1]:
+        assert value == sum(time_s < bound_s for time_s in times_s)
+    assert told["nafir_block_render_seconds_sum",] == pytest.approx(sum(times_s))
+
+
+def test_steps_are_counted_by_reason(host):
+    host.audio.threads[0].steps["load"] += 3
+    told = samples(host)
+    assert told["nafir_level_steps_total", ("reason", "load")] == 3
+    assert told["nafir_level_steps_total", ("reason", "recovered")] == 0
+
+
+def test_how_many_blocks_are_rendered_at_once_is_told(host):
+    assert samples(host)["nafir_blocks_at_once",] == 1
+    host.audio.threads[0]._at_once.count = 4
+    assert samples(host)["nafir_blocks_at_once",] == 4
+
+
+def test_a_histogram_sums_what_it_counts():
+    first, second = DurationHistogram(), DurationHistogram()
+    first.add(0.5)
+    second.add(0.25)
+    first.merge(second)
+    assert first.total_s == pytest.approx(0.75)
+    assert first.cumulative()[-1][1] == 2

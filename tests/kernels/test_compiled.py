@@ -1,0 +1,128 @@
+"""Compiled code is kept on disk, never outlives its source, and where it works in place allocates nothing."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba.core.errors import NumbaError
+
+import server
+from server.kernels.compiled import compiled, compiled_in_place
+
+MODULES = {
+    "server/__init__.py": "",
+    "server/inner.py": "from server.kernels.compiled import compiled\n\n@compiled\ndef inner(x):\n    return x + 1\n",
+    "server/outer.py": (
+        "from server.kernels.compiled import compiled\nfrom server.inner import inner\n\n"
+        "@compiled\ndef outer(x):\n    return 10 * inner(x)\n"
+    ),
+}
+RUN = "from server.outer import outer; print(outer(1), sum(outer.stats.cache_hits.values()))"
+
+
+@pytest.fixture
+def package(tmp_path):
+    for name, source in MODULES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(source)
+    shutil.copy(Path(server.__file__).parent / "compiled.py", tmp_path / "server")
+    return tmp_path
+
+
+def run(package, **environment):
+    """What `outer(1)` gives, and whether it came from disk."""
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
+    environment["PYTHONPATH"] = str(package)
+    output = subprocess.run(
+        [sys.executable, "-c", RUN], cwd=package, env=environment, check=True, capture_output=True, text=True
+    )
+    value, hits = output.stdout.split()
+    return int(value), int(hits)
+
+
+def test_a_second_start_compiles_nothing(package):
+    assert run(package) == (20, 0)
+    assert run(package) == (20, 1)
+    assert list((package / "server" / "__pycache__").glob("outer.outer-*.nbc"))
+
+
+def test_a_change_in_a_function_called_is_heeded(package):
+    assert run(package) == (20, 0)
+    inner = package / "server" / "inner.py"
+    inner.write_text(inner.read_text().replace("x + 1", "x + 2"))
+    assert run(package) == (30, 0)
+
+
+def test_the_folder_can_be_chosen(package, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cache")
+    assert run(package, NUMBA_CACHE_DIR=str(folder)) == (20, 0)
+    assert run(package, NUMBA_CACHE_DIR=str(folder)) == (20, 1)
+    assert list(folder.glob("**/*.nbc"))
+    assert not list(package.glob("**/*.nbc"))
+
+
+def test_where_nothing_can_be_written_what_is_there_is_read(package):
+    """A folder is made unwritable for anyone, root too, by a file in its place, or by what fills it being elsewhere."""
+    assert run(package) == (20, 0)
+    check = (
+        "import server.kernels.compiled as c; c._is_writable = lambda folder: False; "
+        "import server.outer as o; print(o.outer(1), sum(o.outer.stats.cache_hits.values()))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(package)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    files = sorted(package.glob("**/*.nb?"))
+    for expected, prepare in (("20 1", lambda: None), ("20 0", lambda: [path.unlink() for path in files])):
+        prepare()
+        output = subprocess.run(
+            [sys.executable, "-c", check], cwd=package, env=environment, check=True, capture_output=True, text=True
+        )
+        assert output.stdout.strip() == expected
+    assert not list(package.glob("**/*.nbc"))
+
+
+def test_scipys_linear_algebra_is_not_imported_and_can_be(tmp_path):
+    """It takes as long as a third of all else before the first block. Whoever multiplies matrices finds it."""
+    (tmp_path / "product.py").write_text("import numba\n\n@numba.njit\ndef square(a):\n    return a @ a\n")
+    check = (
+        "import sys\nimport numpy as np\nfrom server.rendering.convolver import Convolver\n"
+        "convolver = Convolver(sources=1, channels=2, block_size=128, ir_samples=1_000)\n"
+        "convolver.process(np.zeros((1, 128), np.float32))\n"
+        "print('scipy.linalg' in sys.modules)\n"
+        "from product import square\nprint(square(np.full((2, 2), 3.0))[0, 0])\n"
+        "import scipy.linalg\nprint(scipy.linalg.det(np.eye(2)))"
+    )
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(server.__file__).parent.parent)])
+    }
+    output = subprocess.run([sys.executable, "-c", check], env=environment, check=True, capture_output=True, text=True)
+    assert output.stdout.split() == ["False", "18.0", "1.0"]
+
+
+def test_what_works_in_place_changes_what_it_is_given_and_cannot_allocate():
+    @compiled_in_place
+    def double(values):
+        for i in range(values.size):
+            values[i] *= 2
+
+    @compiled
+    def one_of_copy(values):
+        copy = np.empty_like(values)
+        copy[:] = values
+        return copy[1]
+
+    @compiled_in_place
+    def one_of_copy_in_place(values):
+        copy = np.empty_like(values)
+        copy[:] = values
+        return copy[1]
+
+    values = np.arange(5.0)
+    double(values[1:4])
+    assert values.tolist() == [0, 2, 4, 6, 4]
+    assert one_of_copy(values) == 2
+    with pytest.raises(NumbaError):
+        one_of_copy_in_place(values)

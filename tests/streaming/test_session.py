@@ -1,0 +1,374 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from numpy.testing import assert_allclose
+
+from server.acoustics.geometry import Pose
+from server.core.errors import RequestError
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.blocks import DryBlock
+from server.protocol.client_messages import (
+    PROTOCOL,
+    Acknowledge,
+    AddEmitter,
+    DirectivityPattern,
+    Hello,
+    ListenerPose,
+    ListenerStart,
+    MoveEmitter,
+    Ping,
+    RemoveEmitter,
+    SetGain,
+)
+from server.protocol.server_messages import EmitterAdded, Error
+from server.responses.full_response import FullResponse
+from server.responses.ir_request import compute_irs
+from server.streaming.load import QualityStep
+from server.streaming.session import Session
+
+# Quiet enough that no limiter acts.
+CLIP = 0.005 * np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
+HELLO = Hello(protocol=PROTOCOL, scene="flat")
+FULL = QualityStep("standard", None, False, 1.0)
+HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
+
+
+def load_clip(name):
+    if name != "noise":
+        raise RequestError("unknown_clip", "no such clip", field="clip", status=404)
+    return CLIP
+
+
+@pytest.fixture
+def session(field, filters):
+    return Session(HELLO, FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000)
+
+
+def add(session, identifier="talker", **changes):
+    return session.receive(AddEmitter(**{"id": identifier, "clip": "noise", "position": THERE, **changes}))
+
+
+def answer(session, field):
+    """Compute what the session wants, at once, and hand it in."""
+    request = session.take_request()
+    return [] if request is None else session.accept(compute_irs(FieldsByLevel([field]), request, session.renderer))
+
+
+def codes(events):
+    return [event.code for event in events if isinstance(event, Error)]
+
+
+def dead(field):
+    """Nothing follows the direct sound any more."""
+    field.impulse_responses = lambda listeners, *_, **__: np.zeros((len(listeners), 2, field.ir_samples), np.float32)
+    return field
+
+
+def hear(session, blocks):
+    """(2, n)"""
+    return np.concatenate([session.render_block().samples for _ in range(blocks)], axis=1).astype(float)
+
+
+def level_db(samples):
+    return 10 * np.log10(np.mean(samples**2))
+
+
+def test_sound_is_the_clip_along_the_direct_path_and_convolved_with_the_fields_ir(field, filters):
+    def heard(field):
+        session = Session(
+            Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000
+        )
+        session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
+        add(session, loop=False, gain_db=-6.0)
+        assert answer(session, field) == [EmitterAdded(id="talker", sample_clock=0)]
+        return hear(session, 40)
+
+    ir = field.impulse_responses([HERE], [THERE], [0.5])[0]
+    whole, direct = heard(field), heard(dead(field))
+    assert np.any(direct)
+    expected = [np.convolve(CLIP * 10 ** (-6 / 20), ear)[: whole.shape[1]] for ear in ir.astype(float)]
+    assert_allclose(whole - direct, [np.pad(ear, (0, whole.shape[1] - len(ear))) for ear in expected], atol=1e-7)
+
+
+def test_the_direct_sound_follows_poses_that_no_ir_was_computed_for(session, field):
+    session.receive(ListenerPose(pose_id=1, position=(5.0, 3.0, 1.5), yaw=0.0))
+    add(session, gain_db=-6.0)
+    answer(session, dead(field))
+    near = hear(session, 100)
+    session.receive(ListenerPose(pose_id=2, position=(2.0, 3.0, 1.5), yaw=0.0))
+    session.take_request()  # and never answered
+    block = session.render_block()
+    assert (block.pose_id, block.reverberation_pose_id) == (2, 1)
+    hear(session, 30)
+    far = hear(session, 100)
+    # From one metre to four.
+    assert level_db(near[:, 2_000:]) - level_db(far) == pytest.approx(12.04, abs=0.5)
+    session.receive(ListenerPose(pose_id=3, position=(2.0, 3.0, 1.5), yaw=math.pi / 2))
+    hear(session, 10)
+    left, right = hear(session, 100)
+    assert level_db(right) > level_db(left) + 6
+
+
+def test_an_emitter_is_moved_and_turned(session, field):
+    session.receive(ListenerPose(pose_id=1, position=(2.0, 2.5, 1.5), yaw=0.0))
+    add(session, position=(4.0, 2.5, 1.5), yaw=math.pi, directivity=DirectivityPattern(pattern="cardioid"))
+    answer(session, dead(field))
+    hear(session, 10)
+    facing = hear(session, 100)
+    session.receive(MoveEmitter(id="talker", position=(4.0, 2.5, 1.5), yaw=0.0, pose_id=2))
+    hear(session, 10)
+    away = hear(session, 100)
+    assert level_db(away) < level_db(facing) - 40
+    # Without a front it keeps the one it had.
+    session.receive(MoveEmitter(id="talker", position=(3.0, 2.5, 1.5), pose_id=3))
+    hear(session, 30)
+    assert level_db(hear(session, 100)) < level_db(facing) - 30
+    session.receive(MoveEmitter(id="talker", position=(1.0, 2.5, 1.5), pose_id=4))
+    hear(session, 30)
+    assert level_db(hear(session, 100)) == pytest.approx(level_db(facing) + 6, abs=3)  # from behind
+
+
+def test_a_gain_scales_direct_sound_and_reverberation_alike(session, field):
+    add(session)
+    answer(session, field)
+    hear(session, 100)
+    before = hear(session, 100)
+    session.receive(SetGain(id="talker", gain_db=-20.0))
+    hear(session, 100)
+    assert level_db(before) - level_db(hear(session, 100)) == pytest.approx(20, abs=0.5)
+
+
+def test_what_is_sent_live_sounds_as_the_same_clip_does(field, filters):
+    def heard(message, blocks):
+        session = Session(
+            Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000
+        )
+        session.receive(message)
+        answer(session, field)
+        for sequence, block in enumerate(blocks):
+            assert session.receive(DryBlock("a", sequence, block)) == []
+        return hear(session, 40)
+
+    dry = np.concatenate([CLIP, CLIP])
+    live = heard(AddEmitter(id="a", live=True, position=THERE), np.split(dry, [500, 501, 3_000]))
+    clip = heard(AddEmitter(id="a", clip="noise", position=THERE), [])
+    samples = 5_000  # before it ends
+    assert_allclose(live[:, :samples], clip[:, :samples], atol=1e-8)
+
+
+def test_live_blocks_have_to_come_in_order(session, field):
+    session.receive(AddEmitter(id="a", live=True, position=THERE))
+    answer(session, field)
+    assert session.receive(DryBlock("a", 7, CLIP)) == []
+    assert codes(session.receive(DryBlock("a", 7, CLIP))) == ["stale_block"]
+    assert session.receive(DryBlock("a", 9, CLIP)) == []
+    (status,) = session.live_statuses()
+    assert (status.id, status.samples_queued) == ("a", 2 * CLIP.size)
+
+
+@pytest.mark.parametrize("name", ["field", "mirrored_field"])
+def test_who_stands_still_hears_the_scenes_whole_response(name, filters, request):
+    field = request.getfixturevalue(name)
+    session = Session(HELLO, FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000)
+    session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
+    add(session, loop=False)
+    answer(session, field)
+    heard = hear(session, 40)
+    ir = FullResponse(field, filters).impulse_responses([HERE], [THERE], [0.5])[0].astype(float)
+    expected = [np.pad(np.convolve(CLIP, ear), (0, 10_000))[: heard.shape[1]] for ear in ir]
+    assert_allclose(heard, expected, atol=1e-6)
+
+
+def test_a_full_window_drops_blocks_but_not_time(field, filters):
+    def run(acknowledged):
+        session = Session(
+            Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, window=4
+        )
+        add(session)
+        answer(session, field)
+        blocks = []
+        for _ in range(10):
+            block = session.render_block()
+            if block is not None:
+                blocks.append(block)
+                if acknowledged:
+                    session.receive(Acknowledge(sequence=block.sequence))
+        session.receive(Acknowledge(sequence=blocks[-1].sequence))
+        return session, session.render_block()
+
+    patient, expected = run(acknowledged=True)
+    silent, resumed = run(acknowledged=False)
+    assert (silent.blocks_dropped, patient.blocks_dropped) == (6, 0)
+    assert (resumed.sequence, resumed.sample_clock) == (4, 10 * 256)
+    np.testing.assert_array_equal(resumed.samples, expected.samples)
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        (ListenerPose(pose_id=9, position=(99.0, 2.0, 1.5)), "position_out_of_bounds"),
+        (ListenerPose(pose_id=0, position=HERE), "stale_pose"),
+        (MoveEmitter(id="talker", position=(2.0, 2.0, -1.0), pose_id=9), "position_out_of_bounds"),
+        (MoveEmitter(id="nobody", position=HERE, pose_id=9), "unknown_emitter"),
+        (RemoveEmitter(id="nobody"), "unknown_emitter"),
+        (AddEmitter(id="talker", clip="noise", position=HERE), "duplicate_emitter"),
+        (AddEmitter(id="new", clip="nothing", position=HERE), "unknown_clip"),
+        (AddEmitter(id="new", clip="noise", position=(0.0, 0.0, 9.0)), "position_out_of_bounds"),
+        (AddEmitter(id="talker", live=True, position=HERE), "duplicate_emitter"),
+        (SetGain(id="nobody", gain_db=-6.0), "unknown_emitter"),
+        (DryBlock("nobody", 0, CLIP), "unknown_emitter"),
+        (DryBlock("talker", 0, CLIP), "not_live"),
+        (Acknowledge(sequence=4_000), "unknown_sequence"),
+        (Hello(protocol=PROTOCOL, scene="flat"), "unexpected_hello"),
+        (Ping(id=1), "unexpected_ping"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.type,
+)
+def test_a_bad_message_changes_nothing_and_the_stream_goes_on(session, field, message, code):
+    add(session)
+    answer(session, field)
+    session.render_block()
+    assert codes(session.receive(message)) == [code]
+    assert session.take_request() is None
+    block = session.render_block()
+    assert np.any(block.samples)
+    assert not block.is_exchange
+    # The pose id of a refused pose is not used up.
+    assert session.receive(ListenerPose(pose_id=9, position=HERE)) == []
+
+
+def test_emitters_are_limited(field, filters):
+    session = Session(
+        Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, max_emitters=2
+    )
+    assert codes(add(session, "a") + add(session, "b") + add(session, "c")) == ["too_many_emitters"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"protocol": 1}, "unsupported_protocol"),
+        ({"protocol": 3}, "unsupported_protocol"),
+        ({"sample_rate": 44_100}, "unsupported_sample_rate"),
+        ({"listener": ListenerStart(position=(-5.0, 0.0, 0.0))}, "position_out_of_bounds"),
+    ],
+)
+def test_a_hello_that_cannot_be_served_is_refused(field, filters, changes, code):
+    with pytest.raises(RequestError) as refusal:
+        Session(
+            Hello(**{"protocol": PROTOCOL, "scene": "flat", **changes}),
+            FieldsByLevel([field]),
+            filters,
+            load_clip,
+            rung=FULL,
+        )
+    assert refusal.value.code == code
+
+
+def test_a_listener_starts_where_the_scene_says_unless_hello_says_otherwise(field, filters):
+    for hello, expected in [
+        (Hello(protocol=PROTOCOL, scene="flat"), Pose.from_yaw((2.0, 2.5, 1.5), math.pi / 2)),
+        (
+            Hello(protocol=PROTOCOL, scene="flat", listener=ListenerStart(position=HERE, yaw=1.0)),
+            Pose.from_yaw(HERE, 1.0),
+        ),
+    ]:
+        session = Session(hello, FieldsByLevel([field]), filters, load_clip, rung=FULL)
+        add(session)
+        assert session.take_request().listener == expected
+
+
+def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
+    class AnyOrder(RuleBasedStateMachine):
+        @initialize()
+        def begin(self):
+            self.session = Session(
+                Hello(protocol=PROTOCOL, scene="flat", block_size=128),
+                FieldsByLevel([field]),
+                filters,
+                load_clip,
+                rung=FULL,
+                window=6,
+            )
+            self.pose_id = self.sequence = 0
+            self.request = None
+            self.blocks = []
+
+        @rule(identifier=st.sampled_from("abc"))
+        def add(self, identifier):
+            add(self.session, identifier)
+
+        @rule(identifier=st.sampled_from("abc"))
+        def remove(self, identifier):
+            self.session.receive(RemoveEmitter(id=identifier))
+
+        @rule(x=st.floats(0.0, 9.0), yaw=st.floats(-4, 4))
+        def turn(self, x, yaw):
+            if not self.session.receive(ListenerPose(pose_id=self.pose_id + 1, position=(x, 2.0, 1.5), yaw=yaw)):
+                self.pose_id += 1
+
+        @rule(identifier=st.sampled_from("abc"))
+        def move(self, identifier):
+            if not self.session.receive(MoveEmitter(id=identifier, position=HERE, pose_id=self.pose_id + 1)):
+                self.pose_id += 1
+
+        @rule(identifier=st.sampled_from("abc"))
+        def add_live(self, identifier):
+            self.session.receive(AddEmitter(id=identifier, live=True, position=HERE))
+
+        @rule(identifier=st.sampled_from("abc"), frames=st.integers(1, 5_000), value=st.floats(width=32))
+        def speak(self, identifier, frames, value):
+            self.sequence += 1
+            self.session.receive(DryBlock(identifier, self.sequence, np.full(frames, value, np.float32)))
+
+        @rule(identifier=st.sampled_from("abc"), gain_db=st.floats(-80, 24))
+        def make_louder(self, identifier, gain_db):
+            self.session.receive(SetGain(id=identifier, gain_db=gain_db))
+
+        @rule()
+        def ask(self):
+            self.request = self.session.take_request() or self.request
+
+        @rule(succeeds=st.booleans())
+        def answer(self, succeeds):
+            if self.request is None:
+                return
+            request, self.request = self.request, None
+            if succeeds:
+                self.session.accept(compute_irs(FieldsByLevel([field]), request, self.session.renderer))
+            else:
+                self.session.give_up(request)
+
+        @rule(sequence=st.integers(0, 20))
+        def acknowledge(self, sequence):
+            self.session.receive(Acknowledge(sequence=sequence))
+
+        @rule()
+        def render(self):
+            block = self.session.render_block()
+            if block is not None:
+                self.blocks.append(block)
+
+        @invariant()
+        def blocks_are_finite_and_in_order(self):
+            assert all(np.isfinite(block.samples).all() for block in self.blocks[-1:])
+            assert [block.sequence for block in self.blocks] == list(range(len(self.blocks)))
+            assert all(a.sample_clock < b.sample_clock for a, b in zip(self.blocks, self.blocks[1:], strict=False))
+            assert all(
+                a.pose_id <= b.pose_id and a.reverberation_pose_id <= b.reverberation_pose_id
+                for a, b in zip(self.blocks, self.blocks[1:], strict=False)
+            )
+            assert all(block.reverberation_pose_id <= block.pose_id <= self.pose_id for block in self.blocks)
+
+    run_state_machine_as_test(AnyOrder, settings=settings(max_examples=60, stateful_step_count=40, deadline=None))
+
+
+def test_a_shared_tail_is_the_operators_choice(field, filters):
+    hello = Hello(protocol=PROTOCOL, scene="flat")
+    for wanted in (False, True):
+        session = Session(hello, FieldsByLevel([field]), filters, load_clip, rung=FULL, shared_tail=wanted)
+        assert session.renderer._mixers.preparer(2)._has_shared_tail is wanted

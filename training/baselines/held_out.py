@@ -1,0 +1,195 @@
+"""The held-out pairs of a dataset, simulated or measured: what every method is asked for and may look at.
+
+Axes: one pair's impulse responses are `(yaw, channel, sample)`, whole, the direct sound included. Metres, radians.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from server.core.errors import NafirError
+from server.scene.bundle import Bundle
+from training.baselines.baselines import PairResponses, TrainingPairs
+from training.data.dataset import Dataset, DatasetError
+from training.data.responses import ImportedDataset, SimulatedResponses, open_responses
+from training.simulation.references import References
+
+Responses = npt.NDArray[np.floating]
+_Floats = npt.NDArray[np.float64]
+_Integers = npt.NDArray[np.integer]
+
+
+class EvaluationError(NafirError):
+    """What was asked to be evaluated cannot be."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out pairs by index, counted from 0.
+
+    pairs: all pairs of the dataset, and which a method may look at; held_out: (index,) their numbers among those;
+    repeats: a second independent take of each pair, if there is one; delays_s: (pair,) when sound can first arrive;
+    yaws: (yaw,) of all responses, and heard: (n,) those that are measured, indices into yaws; visible: (index,).
+    """
+
+    folder: Path
+    name: str
+    sample_rate: int
+    samples: int
+    channels: int
+    pairs: TrainingPairs
+    held_out: _Integers
+    repeats: PairResponses | None
+    delays_s: _Floats
+    yaws: _Floats
+    heard: _Integers
+    visible: npt.NDArray[np.bool_]
+    simulated: Dataset | None
+    left_out: int = 0
+    """Pairs that could not be used: without a response at every orientation that the others have."""
+
+    def __post_init__(self) -> None:
+        if not len(self.held_out):
+            raise EvaluationError(f"{self.name}: no pair is held out")
+
+    def __len__(self) -> int:
+        return len(self.held_out)
+
+    @property
+    def emitters(self) -> _Floats:
+        """(index, 3)"""
+        return self.pairs.emitter_positions[self.pairs.pair_emitter[self.held_out]]
+
+    @property
+    def listeners(self) -> _Floats:
+        """(index, 3)"""
+        return self.pairs.listener_positions[self.pairs.pair_listener[self.held_out]]
+
+    def reference(self, index: int) -> Responses:
+        """At the orientations that are heard."""
+        return self.pairs.response(int(self.held_out[index]))[self.heard]
+
+    def sample(self, *, pairs: int | None, yaws: int | None, seed: int) -> "HeldOut":
+        """A random subset of as many pairs, and as many orientations spread evenly, or all where there are no more."""
+        chosen = np.arange(len(self))
+        if pairs is not None and pairs < len(self):
+            chosen = np.sort(np.random.default_rng([seed, 11]).choice(len(self), pairs, replace=False))
+        heard = self.heard
+        if yaws is not None and yaws < len(heard):
+            heard = heard[np.linspace(0, len(heard), yaws, endpoint=False).astype(int)]
+        return replace(self, held_out=self.held_out[chosen], heard=heard, visible=self.visible[chosen])
+
+
+@contextmanager
+def open_held_out(folder: Path) -> Iterator[HeldOut]:
+    """The held-out pairs of a dataset folder of either kind, its responses read from disk as they are asked for.
+
+    Raises DatasetError or ResponsesError if the folder holds no dataset, EvaluationError if none of it is held out.
+    """
+    responses = open_responses(folder)
+    if isinstance(responses, SimulatedResponses):
+        with h5py.File(folder / "pairs.h5", "r") as file:
+            yield _of_simulation(responses.dataset, file)
+    else:
+        yield _of_measurement(responses)
+
+
+def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
+    """Raises DatasetError if the dataset is of another scene than the bundle."""
+    codec = bundle.manifest.codec.codec
+    of_bundle = bundle.manifest.geometry, codec.sample_rate, codec.samples
+    if of_bundle != (dataset.scene.geometry, dataset.sample_rate, dataset.samples):
+        raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
+
+
+def _of_simulation(dataset: Dataset, file: h5py.File) -> HeldOut:
+    probes = dataset.probes
+    emitter, listener = np.divmod(np.arange(len(probes) ** 2), len(probes))
+    held_out = np.flatnonzero(dataset.held_out.ravel())
+    training = ~dataset.held_out.ravel() & (emitter != listener)
+    return HeldOut(
+        folder=dataset.folder,
+        name=f"{dataset.scene.id} (simulated)",
+        sample_rate=dataset.sample_rate,
+        samples=dataset.samples,
+        channels=2,
+        pairs=TrainingPairs(References(dataset, file), listener, emitter, probes, probes, training),
+        held_out=held_out,
+        repeats=References(dataset, file, "repeats"),
+        delays_s=dataset.onset_s.ravel(),
+        yaws=dataset.yaws,
+        heard=np.arange(len(dataset.yaws)),
+        visible=dataset.plan.is_visible(probes[emitter[held_out]], probes[listener[held_out]]),
+        simulated=dataset,
+    )
+
+
+@dataclass(frozen=True)
+class _MeasuredResponses:
+    """rows: (pair, yaw) rows of the dataset."""
+
+    dataset: ImportedDataset
+    rows: _Integers
+
+    def __getitem__(self, pair: int) -> npt.NDArray[np.float32]:
+        return self.dataset.read(self.rows[pair])
+
+
+@dataclass(frozen=True)
+class MeasuredPairs:
+    """A measurement by pairs: those with a response at every one of the `yaws` (yaw,), which all others lack
+    (`left_out` of them). delays_s: (pair,) along the straight line, for of a measurement no walls are known."""
+
+    pairs: TrainingPairs
+    delays_s: _Floats
+    yaws: _Floats
+    left_out: int
+
+
+def measured_pairs(dataset: ImportedDataset) -> MeasuredPairs:
+    """Raises EvaluationError where no pair was measured at all orientations."""
+    whole_turn = np.round(2 * np.pi, 6)
+    yaws, turn = np.unique(np.round(dataset.yaw % (2 * np.pi), 6) % whole_turn, return_inverse=True)
+    rows = np.full((int(dataset.pair.max()) + 1, len(yaws)), -1)
+    rows[dataset.pair, turn.reshape(-1)] = np.arange(len(dataset.pair))
+    complete = (rows >= 0).all(axis=1)
+    rows = rows[complete]
+    if not len(rows):
+        raise EvaluationError(f"{dataset.folder}: no pair was measured at all of the {len(yaws)} orientations")
+    emitters, pair_emitter = _points(dataset.emitter[rows[:, 0]])
+    listeners, pair_listener = _points(dataset.listener[rows[:, 0]])
+    responses, training = _MeasuredResponses(dataset, rows), ~dataset.held_out[rows[:, 0]]
+    pairs = TrainingPairs(responses, pair_listener, pair_emitter, listeners, emitters, training)
+    return MeasuredPairs(pairs, dataset.onset_s[rows[:, 0]], yaws, int((~complete).sum()))
+
+
+def _of_measurement(dataset: ImportedDataset) -> HeldOut:
+    """Every pair counts as in sight."""
+    measured = measured_pairs(dataset)
+    held_out = np.flatnonzero(~measured.pairs.training)
+    return HeldOut(
+        folder=dataset.folder,
+        name=f"{dataset.folder.name} (measured, {dataset.layout})",
+        sample_rate=dataset.sample_rate,
+        samples=dataset.samples,
+        channels=dataset.channels,
+        pairs=measured.pairs,
+        held_out=held_out,
+        repeats=None,
+        delays_s=measured.delays_s,
+        yaws=measured.yaws,
+        heard=np.arange(len(measured.yaws)),
+        visible=np.ones(len(held_out), dtype=bool),
+        simulated=None,
+        left_out=measured.left_out,
+    )
+
+
+def _points(positions: _Floats) -> tuple[_Floats, _Integers]:
+    points, index = np.unique(positions, axis=0, return_inverse=True)
+    return points, index.reshape(-1)

@@ -1,0 +1,385 @@
+"""Fields to a scene bundle: trained ones, and measured responses themselves. Every graph is checked against torch
+before anything is written."""
+
+import io
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+import torch
+from rich.progress import Progress
+from torch import nn
+
+from server.acoustics.cells import Axis
+from server.acoustics.codec import Codec
+from server.core.errors import NafirError
+from server.field.graph import INPUTS, OUTPUTS, RESPONSE
+from server.field.runtime import open_session
+from server.health.check import Effort, Health, check, check_fields
+from server.health.findings import LAWS
+from server.scene.bundle import Bundle, write_bundle
+from server.scene.manifest import ARRAYS_FILE, AcceptedLaw, CodecParameters, FieldFile, QualityLevel
+from training.baselines.held_out import measured_pairs
+from training.baselines.shaped import ShapedNearest
+from training.bundling.data_reference import reference_of
+from training.bundling.graphs import halve_weights, pose_by_pose, to_int8, to_onnx, with_weights
+from training.bundling.manifests import Fields, measured_manifest, simulated_manifest
+from training.bundling.noise import choose_noise
+from training.bundling.shaped_graph import ShapedNearestGraph
+from training.data.responses import FILE, ImportedDataset, ResponseSet, SimulatedResponses
+from training.learning.factorised import FactorisedLearner
+from training.learning.learner import Learner
+from training.learning.naf import NafLearner
+from training.learning.runs import Configuration
+from training.learning.train import load_learner
+from training.models.factorised import GEOMETRY, ExportedField
+from training.models.frozen_noise import even_noise
+from training.models.naf_graph import NafGraph
+from training.models.targets import LEAD_SAMPLES, codec_of
+
+Precision = Literal["float32", "int8"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+MODEL_FILE = "factorised.onnx"
+DEFAULT_LEVEL = "standard"
+SHAPED_NEAREST = "shaped-nearest"
+EFFORT = Effort()
+"""Of the health check that a bundle has to pass."""
+
+_CHECK_POSES = {"factorised": 64, "naf": 2, SHAPED_NEAREST: 8}
+_INT8_LEAST_WEIGHTS = 100_000
+_TRUNCATION_POSES = 3000
+# Rounded weights are the only difference; phases of uncertain bins may turn, so frequency is compared where it matters.
+# Largest differences for float32 (float16 weights), root mean squares for int8.
+_TOLERANCES: dict[Precision, dict[str, float]] = {
+    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, RESPONSE: 1e-3},
+    "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, RESPONSE: 0.05},
+}
+_PHASE_TOLERANCE: dict[Precision, float] = {"float32": 0.05, "int8": 0.2}
+TABLED_TOLERANCE = 1e-4
+"""Largest difference in log-magnitude between the plain graph of a `naf` and the tabled one."""
+
+
+class ExportError(NafirError):
+    """A field that fits into no bundle, or an exported graph that does not compute what the trained field computes."""
+
+
+@dataclass(frozen=True)
+class _Exported:
+    name: str
+    model: onnx.ModelProto
+    architecture: str
+    rank: int | None
+    codec: CodecParameters
+
+
+def export(
+    responses: ResponseSet,
+    runs: Sequence[Path],
+    folder: Path,
+    *,
+    precisions: Sequence[Precision] = ("float32",),
+    ranks: Sequence[int] = (),
+    exact_tables: bool = False,
+    accepted: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
+) -> Bundle:
+    """Writes finished runs on one scene as the fields of one bundle, each in every precision; the first field is the
+    default. Factorised fields are also written at every lower one of `ranks`, with the least loss. With `exact_tables`
+    a `naf` is also written with less arithmetic for the same numbers. The folder of measured responses in place of a
+    run stands for the field that needs no training, `ShapedNearest`, in one precision.
+
+    Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it, and so does
+    `naf-whole`. The frozen noise of a simulated scene whose first field is factorised is chosen
+    (`training.bundling.noise`), all others' is drawn.
+
+    Factorised fields of another width than the first one's have it in their names.
+
+    What fields do beside what their data do (`training.bundling.data_reference`) is checked before the noise is chosen.
+    `accepted` are reasons, by name of a law, to offer the scene although its fields break it; of those that they do
+    break the manifest keeps a record.
+
+    Raises RunError for an unfinished run, ExportError for a graph that disagrees, for a dataset folder that is not of
+    `responses` or not measured, for fields of which only some hold the direct sound, for ranks, tables or precisions
+    that none of the fields has, and for a law that does not exist or that nobody may accept, and HealthError for
+    fields that break a law of `nafir check`: nothing is written.
+    """
+    accepting = _accepting(accepted or {})
+    exported: list[_Exported] = []
+    # All are opened, and told apart, before the first graph is made, which takes a while.
+    opened = [(_opened(responses, place), place) for place in runs]
+    usual_width = next((field.field.width for field, _ in opened if isinstance(field, FactorisedLearner)), 0)
+    _require_different([_name_of(field, place, usual_width) for field, place in opened])
+    whole = _hold_direct_sound([field for field, _ in opened])
+    _require_used([field for field, _ in opened], precisions, ranks, exact_tables=exact_tables)
+    for field, place in opened:
+        if isinstance(field, ImportedDataset):
+            exported.append(_shaped(field))
+        elif isinstance(field, FactorisedLearner):
+            exported += _factorised(field, Configuration.read(place), precisions, ranks, usual_width=usual_width)
+        elif isinstance(field, NafLearner):
+            exported += _naf(field, Configuration.read(place), precisions, exact_tables=exact_tables)
+        else:
+            raise TypeError(f"{type(field)} has no graph")
+    names = [each.name for each in exported]
+    _require_different(names)  # of lower ranks, too
+    codec = exported[0].codec
+    seed = 0 if exported[0].architecture == SHAPED_NEAREST else Configuration.read(runs[0]).seed
+    # The default field is called by its kind alone, whatever its rank, unless it is less than exact.
+    titles = [exported[0].architecture if precisions[0] == "float32" else names[0], *names[1:]]
+    files = {f"{title}.onnx": each.model.SerializeToString() for title, each in zip(titles, exported, strict=True)}
+    fields = {
+        title: FieldFile(
+            file=f"{title}.onnx",
+            architecture=each.architecture,
+            rank=each.rank,
+            codec=None if each.codec == codec else each.codec,
+        )
+        for title, each in zip(titles, exported, strict=True)
+    }
+    levels = tuple(
+        QualityLevel(name=title if number else DEFAULT_LEVEL, field=title) for number, title in enumerate(titles)
+    )
+    files[ARRAYS_FILE] = _arrays(even_noise(codec.codec, np.random.default_rng([seed, 6])))
+    described = Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
+    if isinstance(responses, SimulatedResponses):
+        manifest = simulated_manifest(responses, described, whole=whole)
+    else:
+        assert isinstance(responses, ImportedDataset)
+        manifest = measured_manifest(responses, described)
+    manifest = manifest.model_copy(update={"reference": reference_of(responses, manifest), "accepted": accepting})
+    with tempfile.TemporaryDirectory() as trial:
+        bundle = write_bundle(Path(trial), manifest, files)
+        found = check_fields(bundle, EFFORT)
+        found.health.require()
+        if isinstance(responses, SimulatedResponses) and exported[0].architecture == "factorised":
+            files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
+            bundle = write_bundle(Path(trial), manifest, files)
+        health = check(bundle, EFFORT, fields=found)
+        health.require()
+    return write_bundle(folder, manifest.model_copy(update={"accepted": _needed(accepting, health)}), files)
+
+
+def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
+    known = [law.name for law in LAWS if law.can_be_accepted]
+    for name, reason in reasons.items():
+        if name not in known:
+            raise ExportError(
+                f"accept: {name}: is no law that may be broken for a reason; those are {', '.join(known)}"
+            )
+        if not reason.strip():
+            raise ExportError(f"accept: {name}: needs a reason, which the bundle keeps")
+    return tuple(AcceptedLaw(law=name, reason=reason.strip()) for name, reason in reasons.items())
+
+
+def _needed(accepting: tuple[AcceptedLaw, ...], health: Health) -> tuple[AcceptedLaw, ...]:
+    """Of the laws that are accepted those that are broken."""
+    broken = {finding.law.name for finding in health.accepted}
+    return tuple(entry for entry in accepting if entry.law in broken)
+
+
+def _arrays(noise: npt.NDArray[np.float32]) -> bytes:
+    """The bundle's file of arrays."""
+    arrays = io.BytesIO()
+    np.savez(arrays, frozen_noise=noise)
+    return arrays.getvalue()
+
+
+def _opened(responses: ResponseSet, place: Path) -> Learner | ImportedDataset:
+    if not (place / FILE).is_file():
+        if (place / "pairs.h5").is_file():
+            raise ExportError(f"{place}: is a simulated dataset; train a field on it, and export the run")
+        return load_learner(responses, place)
+    if not isinstance(responses, ImportedDataset) or place.resolve() != responses.folder.resolve():
+        raise ExportError(f"{place}: holds other responses than those of the other fields")
+    return responses
+
+
+def _name_of(field: Learner | ImportedDataset, place: Path, usual_width: int) -> str:
+    if isinstance(field, ImportedDataset):
+        return SHAPED_NEAREST
+    if isinstance(field, FactorisedLearner):
+        return _factorised_name(len(field.field.basis), field.field.width, usual_width)
+    return Configuration.read(place).name
+
+
+def _factorised_name(rank: int, width: int, usual_width: int) -> str:
+    """With the width, where it is another than that of the bundle's first factorised field."""
+    return f"factorised-r{rank}" if width == usual_width else f"factorised-w{width}-r{rank}"
+
+
+def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
+    """Whether these fields of a simulated scene do. Raises ExportError where only some of them do."""
+    holding = [isinstance(field, NafLearner) and field.recipe.whole for field in fields]
+    if any(holding) and not all(holding):
+        raise ExportError("naf-whole holds the direct sound, other fields leave it out: export it to its own bundle")
+    return all(holding)
+
+
+def _require_used(
+    fields: Sequence[Learner | ImportedDataset],
+    precisions: Sequence[Precision],
+    ranks: Sequence[int],
+    *,
+    exact_tables: bool,
+) -> None:
+    """Raises ExportError for what is asked for and none of the fields has."""
+    if ranks and not any(isinstance(field, FactorisedLearner) for field in fields):
+        raise ExportError("ranks: none of the runs is a factorised field, which alone has them; leave it out")
+    if exact_tables and not any(isinstance(field, NafLearner) for field in fields):
+        raise ExportError("exact-tables: none of the runs is a naf, which alone has them; leave it out")
+    if list(precisions) != ["float32"] and all(isinstance(field, ImportedDataset) for field in fields):
+        raise ExportError("precision: measured responses themselves are kept in float32 alone; leave it out")
+
+
+def _require_different(names: list[str]) -> None:
+    if doubled := {name for name in names if names.count(name) > 1}:
+        raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
+
+
+def _factorised(
+    learner: FactorisedLearner,
+    configuration: Configuration,
+    precisions: Sequence[Precision],
+    ranks: Sequence[int],
+    *,
+    usual_width: int,
+) -> list[_Exported]:
+    """All graphs of a run, each checked."""
+    cells, whole = learner.cells, learner.field
+    trained_at = _tensors(_poses(learner.responses, _TRUNCATION_POSES, configuration.seed), _TRUNCATION_POSES)
+    lower = sorted({rank for rank in ranks if rank < len(whole.basis)}, reverse=True)
+    poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
+    codec = _codec_parameters(cells.codec, cells.known_frames, cells.all_frames)
+    outputs = _outputs(learner)
+    traced = to_onnx(ExportedField(whole, cells).eval(), _tensors(poses, 2), outputs)
+    exported = []
+    for field in (whole, *(whole.truncated(rank, *trained_at) for rank in lower)):
+        rank = len(field.basis)
+        module = ExportedField(field, cells).eval()
+        graph = traced if field is whole else with_weights(traced, module)
+        for precision in precisions:
+            least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
+            small = to_int8(graph, least_weights=least_weights, exact=GEOMETRY) if precision == "int8" else graph
+            model = halve_weights(small, exact=GEOMETRY)
+            _check(model, module, poses, outputs, precision)
+            name = f"{_factorised_name(rank, field.width, usual_width)}{_suffix(precision)}"
+            exported.append(_Exported(name, model, "factorised", rank, codec))
+    return exported
+
+
+def _naf(
+    learner: NafLearner, configuration: Configuration, precisions: Sequence[Precision], *, exact_tables: bool
+) -> list[_Exported]:
+    """All graphs of a run, each checked."""
+    field = learner.field
+    time_domain = field.shape.domain == "time"
+    outputs = (RESPONSE,) if time_domain else _outputs(learner)
+    codec = _codec_parameters(learner.codec, 0 if time_domain else learner.codec.frames)
+    poses = _poses(learner.responses, _CHECK_POSES["naf"], configuration.seed)
+    exported = []
+    for tabled in (False, True)[: 1 + exact_tables]:
+        module = NafGraph(field, learner.codec, tabled=tabled).eval()
+        graph = to_onnx(module, _tensors(poses, 1), outputs, free_batch=False)
+        for precision in precisions:
+            small = to_int8(graph, least_weights=field.shape.width**2) if precision == "int8" else graph
+            model = pose_by_pose(small)
+            _check(model, module, poses, outputs, precision)
+            name = f"{configuration.name}{'-tables' if tabled else ''}{_suffix(precision)}"
+            exported.append(_Exported(name, model, configuration.name, None, codec))
+    if exact_tables:
+        _check_tables(learner, poses)
+    return exported
+
+
+def _shaped(dataset: ImportedDataset) -> _Exported:
+    measured = measured_pairs(dataset)
+    shaped = ShapedNearest(measured.pairs, measured.delays_s, dataset.sample_rate)
+    module = ShapedNearestGraph(shaped, measured.yaws, lead=LEAD_SAMPLES).eval()
+    poses = _poses(dataset, _CHECK_POSES[SHAPED_NEAREST], seed=0)
+    model = pose_by_pose(to_onnx(module, _tensors(poses, 1), (RESPONSE,), free_batch=False))
+    _check(model, module, poses, (RESPONSE,), "float32")
+    return _Exported(SHAPED_NEAREST, model, SHAPED_NEAREST, None, _codec_parameters(codec_of(dataset), 0))
+
+
+def _suffix(precision: Precision) -> str:
+    return "" if precision == "float32" else f"-{precision}"
+
+
+def _outputs(learner: FactorisedLearner | NafLearner) -> tuple[str, ...]:
+    """Of one channel there is no coherence between ears."""
+    return OUTPUTS[: 2 + learner.responses.channels]
+
+
+def _codec_parameters(codec: Codec, known_frames: int, frames: Axis | None = None) -> CodecParameters:
+    return CodecParameters(
+        sample_rate=codec.sample_rate,
+        n_fft=codec.n_fft,
+        hop=codec.hop,
+        samples=codec.samples,
+        lead_samples=LEAD_SAMPLES,
+        known_frames=known_frames,
+        log_floor=codec.log_floor,
+        frame_cells=None if frames is None else tuple(frames.widths.tolist()),
+    )
+
+
+def _poses(responses: ResponseSet, count: int, seed: int) -> tuple[npt.NDArray[np.float32], ...]:
+    """Random listener, emitter and yaw in the neighbourhoods of those measured."""
+    rng = np.random.default_rng(seed)
+    listener, emitter = (
+        end[rng.integers(0, len(end), count)] + rng.uniform(-0.05, 0.05, (count, 3))
+        for end in (responses.listener, responses.emitter)
+    )
+    yaw = rng.uniform(-np.pi, np.pi, count)
+    return listener.astype(np.float32), emitter.astype(np.float32), yaw.astype(np.float32)
+
+
+def _tensors(poses: tuple[npt.NDArray[np.float32], ...], count: int) -> tuple[torch.Tensor, ...]:
+    return tuple(torch.from_numpy(part[:count]) for part in poses)
+
+
+def _check(
+    model: onnx.ModelProto,
+    module: nn.Module,
+    poses: tuple[npt.NDArray[np.float32], ...],
+    outputs: tuple[str, ...],
+    precision: Precision,
+) -> None:
+    session = open_session(model.SerializeToString())
+    found = dict(zip(outputs, session.run(list(outputs), dict(zip(INPUTS, poses, strict=True))), strict=True))
+    with torch.no_grad():
+        # One at a time: a batch of `naf` would not fit into memory.
+        rows = [module(*(torch.from_numpy(part[row : row + 1]) for part in poses)) for row in range(len(poses[0]))]
+    expected = {name: np.concatenate([row[number] for row in rows]) for number, name in enumerate(outputs)}
+    for name, tolerance in _TOLERANCES[precision].items():
+        if name not in outputs:
+            continue
+        error = np.abs(found[name] - expected[name])
+        scale = np.std(expected[name]) if name == RESPONSE else 1.0
+        difference = float(np.max(error) if precision == "float32" else np.sqrt(np.mean(error**2))) / scale
+        if not difference < tolerance:
+            raise ExportError(
+                f"{name}: the exported graph differs from torch by {difference:.3g}, more than {tolerance}"
+            )
+    if "instantaneous_frequency" not in outputs:
+        return
+    phases = [np.cumsum(values["instantaneous_frequency"], axis=-1) for values in (found, expected)]
+    weight = np.minimum(found["phase_certainty"], expected["phase_certainty"]) ** 2
+    difference = float(np.mean(np.abs(np.exp(1j * phases[0]) - np.exp(1j * phases[1])) * weight))
+    if not difference < _PHASE_TOLERANCE[precision]:
+        raise ExportError(f"instantaneous_frequency: the exported graph's phase differs from torch by {difference:.3g}")
+
+
+def _check_tables(learner: NafLearner, poses: tuple[npt.NDArray[np.float32], ...]) -> None:
+    with torch.no_grad():
+        plain, tabled = (
+            NafGraph(learner.field, learner.codec, tabled=tabled)(*_tensors(poses, 1))[0] for tabled in (False, True)
+        )
+    difference = float((plain - tabled).abs().max())
+    if not difference < TABLED_TOLERANCE:
+        raise ExportError(f"exact tables: differ from the plain network by {difference:.3g}")

@@ -1,0 +1,113 @@
+"""What a bundle says of its scene: of a simulated one all that its file says, of a measured one what can be known."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from server.acoustics.decibels import power_to_db
+from server.scene.effects import EffectName
+from server.scene.geometry import Point
+from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
+from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.data.responses import ImportedDataset, ResponsesError, SimulatedResponses
+
+_MARGIN_M = 0.1
+_LEVELLED_ROWS = 500
+_DIRECT_S = (-0.001, 0.0025)  # about when geometry has it arrive
+
+
+@dataclass(frozen=True)
+class Fields:
+    """What a manifest says of the bundle's own files."""
+
+    codec: CodecParameters
+    fields: dict[str, FieldFile]
+    levels: tuple[QualityLevel, ...]
+    files: dict[str, str]
+
+
+def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: bool = False) -> Manifest:
+    """`whole` where the fields hold the direct sound and the first reflections."""
+    scene = responses.dataset.scene
+    low, high = np.min(scene.geometry.corners, axis=0), np.max(scene.geometry.corners, axis=0)
+    return Manifest(
+        id=scene.id,
+        name=scene.name,
+        description=scene.description,
+        geometry=scene.geometry,
+        bounds=Bounds(
+            minimum=(float(low[0]), float(low[1]), scene.probes.heights_m[0]),
+            maximum=(float(high[0]), float(high[1]), scene.probes.heights_m[1]),
+        ),
+        speed_of_sound=SPEED_OF_SOUND,
+        air=scene.air,
+        image_order=0 if whole else GEOMETRIC_ORDER,
+        direct_sound="field" if whole else "geometry",
+        transmission=responses.dataset.effects.transmission,
+        start=scene.start,
+        effects={name: scene.effects[name] for name in EffectName if name in scene.effects},
+        codec=fields.codec,
+        fields=fields.fields,
+        levels=fields.levels,
+        files=fields.files,
+    )
+
+
+def measured_manifest(responses: ImportedDataset, fields: Fields) -> Manifest:
+    """Named after the source. The bounds are a box around all positions, with a little room: what lies in it but far
+    from where was measured is a guess. A visitor finds the most usual distance, and faces the emitter."""
+    positions = np.concatenate([responses.listener, responses.emitter])
+    name = Path(responses.source).stem
+    offset = responses.emitter - responses.listener
+    distance = np.linalg.norm(offset, axis=-1)
+    usual = int(np.argmin(np.abs(distance - np.median(distance))))
+    counts = (len(np.unique(each, axis=0)) for each in (responses.listener, responses.emitter))
+    listeners, emitters = counts
+    return Manifest(
+        id=re.sub("[^a-z0-9_-]+", "-", name.lower()).strip("-_") or "measured",
+        name=name.replace("_", " ").replace("-", " ").strip().capitalize() or "Measured",
+        description=f"Measured ({responses.layout}): {listeners} places of the listener, {emitters} of the emitter.",
+        bounds=Bounds(
+            minimum=_point(positions.min(axis=0) - _MARGIN_M), maximum=_point(positions.max(axis=0) + _MARGIN_M)
+        ),
+        speed_of_sound=SPEED_OF_SOUND,
+        direct_sound="field",
+        reference_level_db=round(_reference_level_db(responses), 2),
+        channels=("mono",) if responses.channels == 1 else ("left", "right"),
+        start=Start(
+            listener=_point(responses.listener[usual]),
+            listener_yaw_deg=round(float(np.degrees(np.arctan2(offset[usual, 1], offset[usual, 0]))), 1),
+            emitter=_point(responses.emitter[usual]),
+        ),
+        codec=fields.codec,
+        fields=fields.fields,
+        levels=fields.levels,
+        files=fields.files,
+    )
+
+
+def _reference_level_db(responses: ImportedDataset) -> float:
+    """Median of what the direct sound has one metre from the emitter, were it to spread in the open.
+
+    Raises ResponsesError where most responses are silent when it should arrive.
+    """
+    rows = np.sort(np.random.default_rng(0).permutation(len(responses.yaw))[:_LEVELLED_ROWS])
+    energies = []
+    for row in rows:
+        first, last = (round((responses.onset_s[row] + offset) * responses.sample_rate) for offset in _DIRECT_S)
+        direct = responses.read([row])[0, :, max(first, 0) : last].astype(np.float64)
+        distance_m = np.linalg.norm(responses.emitter[row] - responses.listener[row])
+        energies.append(np.square(direct).sum(axis=-1).mean() * distance_m**2)
+    median = float(np.median(energies))
+    if not median > 0:
+        problem = "are silent when distance has the direct sound arrive; import them anew: is the equipment late?"
+        raise ResponsesError(responses.file, "responses", problem)
+    return float(power_to_db(median))
+
+
+def _point(position: np.ndarray) -> Point:
+    """To the tenth of a millimetre."""
+    x, y, z = (round(float(coordinate), 4) for coordinate in position)
+    return x, y, z

@@ -1,0 +1,84 @@
+"""Which frozen noise a scene is given: of several draws, the one with which responses come nearest to simulated ones.
+
+All responses of a scene share one noise, and with it what that happens to be like: how much its two signals have in
+common (a few hundredths of interaural cross-correlation, on every response alike) and how loud its first milliseconds
+are. Simulated responses have such chance in them too, each its own, so that no property of noise by itself would do to
+choose by.
+
+Draws are compared on the same pairs, a few at a time, and those that are behind the best by more than chance explains
+are out of the race: most are told apart by a part of the pairs.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from rich.progress import Progress
+
+from server.acoustics.phase import FrozenNoise
+from server.core.errors import FieldError
+from server.field.field import AcousticField
+from server.field.graph import FieldGraph, open_graph
+from server.scene.bundle import Bundle
+from training.data.dataset import Dataset
+from training.frontier.accuracy import Estimate, SampledPairs, Scores
+from training.models.frozen_noise import even_noise
+
+DRAWS = 16
+_PAIRS, _YAWS = 80, 3
+_ROUND_PAIRS = 10
+_BEHIND_ERRORS = 3.0
+"""Standard errors of the mean difference to the best draw."""
+
+
+def choose_noise(
+    bundle: Bundle, dataset: Dataset, *, seed: int, progress: Progress | None = None
+) -> npt.NDArray[np.float32]:
+    """(2, sample) of DRAWS: that with the least mean audible error of the bundle's first level over pairs that training
+    saw; of those with which more could not be measured, none. The first, where responses are finite with none."""
+    progress = progress or Progress(disable=True)
+    manifest = bundle.manifest
+    codec = manifest.codec.codec
+    level = manifest.levels[0]
+    graph = FieldGraph(bundle, level.field, open_graph(bundle, manifest.fields[level.field].file))
+    sample = SampledPairs(dataset, codec, pairs=_PAIRS, yaws=_YAWS, seed=seed, held_out=False)
+    draws = [even_noise(codec, draw) for draw in np.random.default_rng([seed, 6]).spawn(DRAWS)]
+    fields = [AcousticField(bundle, level, graph, FrozenNoise.from_signal(codec, noise)) for noise in draws]
+    order = np.random.default_rng([seed, 9]).permutation(len(sample.entries))
+    rounds = [order[start : start + _ROUND_PAIRS] for start in range(0, len(order), _ROUND_PAIRS)]
+    return draws[race([partial(_errors, sample, Estimate(field)) for field in fields], rounds, progress)]
+
+
+def race(
+    contestants: Sequence[Callable[[npt.NDArray[np.int64]], Scores]],
+    rounds: Sequence[npt.NDArray[np.int64]],
+    progress: Progress,
+) -> int:
+    """The number of the contestant with the least mean error, of those with the least share missing. Each is asked for
+    the scores of the pairs of one round after the other, until it is out of the race."""
+    running = list(range(len(contestants)))
+    scores: list[list[Scores]] = [[] for _ in contestants]
+    for pairs in progress.track(rounds, description="choosing the noise"):
+        for number in running:
+            scores[number].append(contestants[number](pairs))
+        running = _still_running({number: Scores.joined(scores[number]) for number in running})
+        if len(running) == 1:
+            break
+    return running[0]
+
+
+def _still_running(scores: dict[int, Scores]) -> list[int]:
+    """The best first, and those that are not behind it for certain."""
+    best = min(scores, key=lambda number: (scores[number].missing, scores[number].mean))
+    if not np.isfinite(scores[best].mean):
+        return sorted(scores)[:1]
+    behind = {number: each.behind(scores[best]) for number, each in scores.items() if number != best}
+    return [best, *(number for number, errors in behind.items() if errors < _BEHIND_ERRORS)]
+
+
+def _errors(sample: SampledPairs, estimate: Estimate, pairs: npt.NDArray[np.int64]) -> Scores:
+    try:
+        return sample.scores_of(estimate, pairs)
+    except FieldError:
+        return Scores.unmeasurable(len(pairs))

@@ -1,0 +1,151 @@
+"""`ShapedNearest` as a graph: measured responses are constants, everything else is arithmetic on one pose.
+
+The graph answers with the response itself, aligned like any other. Axes: P training pairs, Y measured orientations;
+then (channel, band, stretch, sample) as in `training.baselines.shaped`.
+"""
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from training.baselines.regression import SAME_M
+from training.baselines.shaped import (
+    EDGES_S,
+    FADE,
+    KERNEL_BETA,
+    KERNEL_REACH,
+    LARGEST_GAIN,
+    NEAREST_M,
+    ShapedNearest,
+    bands,
+)
+
+
+class ShapedNearestGraph(nn.Module):
+    """One pose at a time; sample `lead` of the answer (1, channel, sample) is when geometry has the sound arrive.
+
+    What is expected at a pose is a sum of weights that all but cancel, so arithmetic is of double precision until
+    samples are made. Responses are kept in half precision, each at a peak of one, in bands: what rounding adds is 66 dB
+    below each sample, and no band has to be filtered again.
+    """
+
+    def __init__(self, shaped: ShapedNearest, yaws: npt.NDArray[np.floating], *, lead: int) -> None:
+        super().__init__()
+        pairs, expected = shaped.pairs, shaped.expected
+        regressions = (*expected.scalars, expected.shares)
+        scalars = list(zip(expected.scalars, expected.scalar_scales, strict=True))
+        known = expected.shares.known
+        training = np.flatnonzero(pairs.training)
+        responses = np.stack([pairs.response(int(pair)) for pair in training])
+        peaks = np.abs(responses).max(axis=-1)  # pair, yaw, channel
+        described = [shaped.described(int(pair)) for pair in training]
+        constants = {
+            "yaws": yaws,
+            "emitters": pairs.emitter_positions[pairs.pair_emitter[training]],
+            "listeners": pairs.listener_positions[pairs.pair_listener[training]],
+            "delays_s": shaped.delays_s[training],
+            "peaks": peaks,
+            "lateness_s": np.stack([each.lateness_s for each in described]),
+            "energies": np.stack([each.energy for each in described]),
+            "known_emitters": known.emitter,
+            "known_listeners": known.listener,
+            "covariances": np.exp([each.parameters for each in regressions])[..., np.newaxis],
+            "scalar_mean": np.stack([scale * each.mean for each, scale in scalars]),
+            "scalar_weights": np.stack([scale * each.weights for each, scale in scalars]),
+            "share_mean": expected.shares.mean * expected.share_scale,
+            "share_weights": expected.shares.weights * expected.share_scale,
+            "kaiser": np.kaiser(2 * KERNEL_REACH + 1, KERNEL_BETA),
+        }
+        for name, values in constants.items():
+            kept = np.float32 if name in {"peaks", "kaiser"} else np.float64
+            self.register_buffer(f"_{name}", torch.tensor(np.asarray(values, dtype=kept)))
+        split = bands(responses / peaks[..., np.newaxis], shaped.sample_rate)
+        self.register_buffer("_bands", torch.tensor(split.astype(np.float16)))
+        self._spread = expected.shares.spread
+        self._shape = expected.shape
+        self._rate, self._lead = float(shaped.sample_rate), lead
+
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
+        listener, emitter, yaw = listener.double(), emitter.double(), yaw.double()
+        to_emitters, to_listeners = (
+            torch.linalg.vector_norm(known - end, dim=-1)
+            for known, end in ((self._emitters, emitter), (self._listeners, listener))
+        )
+        near = torch.argmin(to_emitters**2 + to_listeners**2, dim=0, keepdim=True)
+        turn = torch.argmax(torch.cos((self._yaws - yaw).float()), dim=0, keepdim=True)
+
+        def of_near(constant: Tensor) -> Tensor:
+            return constant[near, turn][0]
+
+        lateness_s, energy = self._expected(listener, emitter, turn)
+        distance = torch.linalg.vector_norm(listener - emitter, dim=-1)
+        near_delay_s, near_lateness_s = self._delays_s[near], of_near(self._lateness_s)
+        change = energy + self._spreading(distance) - of_near(self._energies)
+        gain = torch.clamp(torch.exp(0.5 * change), 1.0 / LARGEST_GAIN, LARGEST_GAIN).float()
+        weights = self._stretches(near_delay_s + near_lateness_s)
+        shaped = torch.sum(of_near(self._bands).float() * (gain @ weights), dim=-2)
+        later = self._lead + (lateness_s - near_lateness_s - near_delay_s) * self._rate
+        return ((of_near(self._peaks)[:, None] * self._moved(shaped, later))[None],)
+
+    def _expected(self, listener: Tensor, emitter: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+        """(channel,) lateness and (channel, band, stretch) energy."""
+        covariance = self._covariance(listener, emitter)
+        scalars = self._scalar_mean + (covariance[:-1, None] @ self._scalar_weights)[:, 0]
+        shares = self._share_mean + covariance[-1] @ self._share_weights
+        of_yaw = scalars.reshape(-1, *self._shape[:2])[:, turn[0]]
+        shares = shares.reshape(self._shape)[turn][0]
+        direct = of_yaw[1:2]
+        of_stretch = torch.cat([direct, direct + of_yaw[2:]]).T
+        return of_yaw[0], (shares - torch.logsumexp(shares, dim=-2, keepdim=True)) + of_stretch[:, None]
+
+    def _covariance(self, listener: Tensor, emitter: Tensor) -> Tensor:
+        """(regression, P) as in `training.baselines.regression`."""
+        both, at_emitter, at_listener, one_listener, one_emitter, along, of_listener, across, _ = (
+            self._covariances.unbind(1)
+        )
+        emitters = torch.linalg.vector_norm(self._known_emitters - emitter, dim=-1)
+        listeners = torch.linalg.vector_norm(self._known_listeners - listener, dim=-1)
+        same_emitter, same_listener = (emitters < SAME_M).double(), (listeners < SAME_M).double()
+        emitters, listeners = emitters / self._spread[0], listeners / self._spread[1]
+
+        def near(distance: Tensor, length: Tensor) -> Tensor:
+            return torch.exp(-0.5 * (distance / length) ** 2)
+
+        return (
+            both * near(emitters, at_emitter) * near(listeners, at_listener)
+            + one_listener * same_listener
+            + one_emitter * same_emitter * near(listeners, along)
+            + of_listener * same_listener * near(emitters, across)
+        )
+
+    def _spreading(self, distance_m: Tensor) -> Tensor:
+        """(stretch,) of a distance (1,)."""
+        direct = -2.0 * torch.log(torch.clamp(distance_m, min=NEAREST_M))
+        return torch.cat([direct, torch.zeros(self._shape[-1] - 1, dtype=torch.float64)])
+
+    def _stretches(self, arrival_s: Tensor) -> Tensor:
+        """(channel, stretch, sample)"""
+        after_s = (torch.arange(self._bands.shape[-1]) / self._rate - arrival_s[:, None]).float()
+        count = self._shape[-1]
+        later = [_rise((after_s / edge - 1 + FADE) / (2 * FADE)) for edge in EDGES_S[: count - 1]]
+        bounds = [torch.ones_like(after_s), *later, torch.zeros_like(after_s)]
+        return torch.stack([bounds[index] - bounds[index + 1] for index in range(count)], dim=-2)
+
+    def _moved(self, responses: Tensor, later: Tensor) -> Tensor:
+        """(channel, sample) later by fractions of samples (channel,); at the open end the outermost sample goes on."""
+        channels, samples = responses.shape
+        whole = torch.round(later)
+        taps = torch.arange(-KERNEL_REACH, KERNEL_REACH + 1)
+        angle = torch.pi * (taps - (later - whole).float()[:, None])
+        is_centre = angle.abs() < 1e-6
+        kernel = torch.where(is_centre, 1.0, torch.sin(angle) / torch.where(is_centre, 1.0, angle)) * self._kaiser
+        at = torch.arange(-KERNEL_REACH, samples + KERNEL_REACH) - whole.to(torch.int64)[:, None]
+        placed = torch.gather(responses, 1, torch.clamp(at, 0, samples - 1))
+        filtered = nn.functional.conv1d(placed[None], torch.flip(kernel, (1,))[:, None], groups=channels)
+        return filtered[0]
+
+
+def _rise(x: Tensor) -> Tensor:
+    """Raised cosine from 0 to 1 over the unit interval."""
+    return 0.5 - 0.5 * torch.cos(torch.pi * torch.clamp(x, 0.0, 1.0))

@@ -1,0 +1,180 @@
+"""`nafir-train simulate` and `nafir-train plan`: what a scene's simulation calls for, and that simulation."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from server.core.errors import NafirError
+from training.cli.options import Seed
+
+if TYPE_CHECKING:
+    from training.data.scene_file import SceneFile
+    from training.data.simulation_plan import SimulationPlan
+    from training.simulation.check import PlanCheck
+    from training.simulation.pairs import PairSimulation
+
+# A caption is wrapped to its table.
+_CHECK_WIDTH = 100
+_TAIL_RAYS_TRIED = 2_000
+
+Scene = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
+Effects = Annotated[
+    str,
+    typer.Option(
+        metavar="plan|all|NAME=on|off,...",
+        help="What the scene calls for; everything; or what it calls for but for these, as in the scene file's "
+        "[effects].",
+    ),
+]
+
+
+def wide_console(*, stderr: bool = False) -> Console:
+    """As wide as the table where nobody's terminal is narrower."""
+    return Console(stderr=stderr, width=None if Console(stderr=stderr).is_terminal else 150)
+
+
+def simulation_of(scene: Path, seed: int, effects: str) -> "PairSimulation":
+    """Ready, by a plan that says what it will cost on this host."""
+    from training.simulation.cost import is_brief, with_costs
+    from training.simulation.run import prepared
+
+    read, decided = _decided(scene, seed, effects)
+    simulation = prepared(read, seed=seed, plan=decided)
+    return replace(simulation, plan=with_costs(simulation)) if is_brief(read) else simulation
+
+
+def _decided(scene: Path, seed: int, effects: str) -> "tuple[SceneFile, SimulationPlan]":
+    """What a scene calls for, at costs that nobody measured."""
+    from training.data.scene_file import SceneFile
+    from training.data.simulation_plan import overrides_among
+    from training.simulation.planner import planner_of
+    from training.simulation.size import SimulationSize
+
+    named = _named(effects)
+    read = SceneFile.read(scene)
+    planner = planner_of(read, seed)
+    decided = planner.everything if effects == "all" else planner.plan(overrides_among({**read.effects, **named}))
+    return read, replace(decided, cost_s=60 * SimulationSize(read).core_minutes)
+
+
+def _named(effects: str) -> dict[str, bool]:
+    from training.data.simulation_plan import SimulatedEffect
+
+    if effects == "plan":
+        return {}
+    named = {}
+    for part in effects.split(","):
+        name, _, state = (piece.strip() for piece in part.partition("="))
+        if name not in list(SimulatedEffect) or state not in {"on", "off"}:
+            known = ", ".join(SimulatedEffect)
+            raise typer.BadParameter(f"{part!r}: NAME=on or NAME=off, of {known}", param_hint="--effects")
+        if name in named:
+            raise NafirError(f"--effects: {name} is there twice: give it once")
+        named[name] = state == "on"
+    return named
+
+
+def plan(
+    scene: Scene,
+    effects: Effects = "plan",
+    check: Annotated[
+        int | None,
+        typer.Option(min=1, help="Simulate so many emitters by the plan and with everything on, and compare."),
+    ] = None,
+    seed: Seed = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """What simulating a scene calls for, why, and what it will take."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from training.simulation.cost import is_brief, with_costs
+    from training.simulation.run import prepared
+
+    read, planned = _decided(scene, seed, effects)
+    if is_brief(read):
+        planned = with_costs(prepared(read, seed=seed, plan=planned, most_tail_rays=_TAIL_RAYS_TRIED))
+    checked = None if check is None else _check(scene, planned, check, seed)
+    if as_json:
+        content = planned.to_json() if checked is None else {"plan": planned.to_json(), "check": checked.to_json()}
+        typer.echo(json.dumps(content, indent=2))
+        return
+    console = wide_console()
+    print_plan(console, read, planned)
+    if checked is not None:
+        console.print(_check_table(checked))
+
+
+def _check(scene: Path, planned: "SimulationPlan", emitters: int, seed: int) -> "PlanCheck":
+    from rich.progress import track
+
+    from training.data.scene_file import SceneFile
+    from training.simulation.check import check_plan
+    from training.simulation.planner import planner_of
+
+    read, console = SceneFile.read(scene), Console(stderr=True)
+    return check_plan(
+        read,
+        planned,
+        planner_of(read, seed).everything,
+        emitters=emitters,
+        seed=seed,
+        track=lambda steps: track(steps, "simulating emitters", console=console),
+    )
+
+
+def _check_table(checked: "PlanCheck") -> Table:
+    title = f"{checked.pairs} pairs of {checked.emitters} emitters against everything on"
+    seconds = (
+        f"{checked.plan_s:.1f} s for these emitters and {checked.once_s:.1f} s once, with everything on "
+        f"{checked.everything_s:.1f} s: the whole scene {checked.speedup:.1f} times as fast"
+    )
+    table = Table(title=title, title_justify="left", caption=seconds, caption_justify="left", min_width=_CHECK_WIDTH)
+    table.add_column("mean error")
+    for column in ("plan", "floor"):
+        table.add_column(column, justify="right")
+    for name, error in checked.errors.items():
+        table.add_row(name, f"{error:.3g}", f"{checked.floor[name]:.3g}")
+    return table
+
+
+def print_plan(console: Console, scene: "SceneFile", plan: "SimulationPlan") -> None:
+    """The table, how much it comes to, and what the scene file will not get."""
+    from training.simulation.size import SimulationSize
+
+    console.print(plan_table(plan))
+    console.print(f"{SimulationSize(scene).extent} at most", highlight=False)
+    for note in plan.notes:
+        console.print(f"note: {note}", highlight=False)
+
+
+def plan_table(plan: "SimulationPlan") -> Table:
+    table = Table(title=_summary(plan), title_justify="left", caption=_caption(plan), caption_justify="left")
+    for column, justify in (("effect", "left"), ("", "left"), ("JND", "right"), ("of", "left"), ("s", "right")):
+        table.add_column(column, justify="right" if justify == "right" else "left", no_wrap=True)
+    table.add_column("why")
+    for each in plan.decisions:
+        state = ("on" if each.called_for else "off") + (" (as asked)" if each.overridden else "")
+        cost = "" if each.cost_s is None else f"{each.cost_s:.0f}"
+        change = f"{each.change_jnd:.2f}"
+        table.add_row(each.name.replace("_", " "), state, change, each.parameter, cost, each.reason)
+    return table
+
+
+def _summary(plan: "SimulationPlan") -> str:
+    parts = [f"images of up to {plan.image_order} surfaces", f"{plan.rays} rays per emitter"]
+    if plan.tail_start_s is not None:
+        parts.append(f"one tail for all from {1e3 * plan.tail_start_s:.0f} ms on, of {plan.tail_rays} rays")
+    return "; ".join(parts)
+
+
+def _caption(plan: "SimulationPlan") -> str:
+    if plan.cost_s is None:
+        return ""
+    measured = any(each.cost_s is not None for each in plan.decisions)
+    how = "by short runs of its parts here" if measured else "at most, by its numbers alone"
+    return f"about {plan.cost_s:,.0f} s of one core, {how}"

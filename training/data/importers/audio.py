@@ -1,0 +1,33 @@
+"""Responses in audio files."""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from server.assets.audio_file import AudioFileError, read_audio
+from training.data.importers.report import ImportReport
+
+
+class UnreadableError(Exception):
+    """A file that stands for a missing response; says what is wrong in a word or two."""
+
+
+def read_response(path: Path, channels: int, report: ImportReport) -> tuple[npt.NDArray[np.float32], int]:
+    """(channel, sample) and the rate. Raises UnreadableError, also for a file whose end is missing: the rest of its
+    decay would be learned as silence. Of a header that tells of less than the file holds, the report has a note."""
+    if not path.is_file():
+        raise UnreadableError("no such file")
+    if path.stat().st_size == 0:
+        raise UnreadableError("empty file")
+    try:
+        recording = read_audio(path)
+    except AudioFileError as exc:
+        raise UnreadableError("unreadable") from exc
+    if recording.is_cut:
+        raise UnreadableError("cut off: it holds less than its header promises")
+    if recording.samples.shape[1] != channels:
+        raise UnreadableError(f"not {channels} channel{'s' if channels > 1 else ''}")
+    if recording.finding:
+        report.note("some headers do not tell how much sound follows; all that does was read")
+    return recording.samples.T, recording.sample_rate

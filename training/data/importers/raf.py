@@ -1,0 +1,79 @@
+"""Real Acoustic Fields: a room measured with an array of omnidirectional microphones and a tracked loudspeaker.
+
+Each folder of `data/` holds a response: `rir.wav`; `rx_pos.txt` "x,y,z" of the microphone; `tx_pos.txt`
+"qx,qy,qz,qw,x,y,z", orientation and then position of the loudspeaker, the quaternion's real part last. Metres.
+(README of https://github.com/facebookresearch/real-acoustic-fields, Chen et al., CVPR 2024.) The axes are x ahead,
+y up, z left, a left-handed frame; x, z, y is the right-handed one used here, as in AVR's loader of these data.
+"""
+
+from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from server.core.numerals import parse_decimal
+from training.data.importers.audio import UnreadableError, read_response
+from training.data.importers.conditioning import SourceError
+from training.data.importers.report import ImportReport
+from training.data.responses import SAME_POINT_M, Measurement
+
+_Vector = tuple[float, float, float]
+_SAME_WAY = 0.999  # cosine of half the angle between orientations: 5 degrees
+
+
+def read(
+    folder: Path, report: ImportReport, *, track: Callable[[list[Path]], Iterable[Path]] = iter
+) -> Generator[tuple[str, Measurement]]:
+    """Reads a room's folder, or its `data` folder.
+
+    Fields know no orientation of emitters: of several that a loudspeaker had at one place, the first is kept.
+    Raises SourceError for a folder without responses.
+    """
+    inside = folder / "data" if (folder / "data").is_dir() else folder
+    entries = sorted(inside.iterdir())
+    responses = [path for path in entries if path.is_dir() and (path / "tx_pos.txt").exists()]
+    if not responses:
+        raise SourceError(inside, "responses", "no folder has a tx_pos.txt")
+    for path in sorted({*entries} - {*responses}):
+        report.skip(path.name, "a folder without tx_pos.txt" if path.is_dir() else "a file beside the folders")
+    first_orientation: dict[tuple[int, ...], npt.NDArray[np.float64]] = {}
+    for path in track(responses):
+        try:
+            listener = _position(_numbers(path / "rx_pos.txt", 3))
+            *orientation, x, y, z = _numbers(path / "tx_pos.txt", 7)
+            response, rate = read_response(path / "rir.wav", channels=1, report=report)
+        except UnreadableError as exc:
+            report.skip(path.name, str(exc))
+            continue
+        quaternion = np.array(orientation)
+        if not 0.9 < np.linalg.norm(quaternion) < 1.1:
+            report.skip(path.name, "tx_pos.txt does not begin with a unit quaternion")
+            continue
+        emitter = _position((x, y, z))
+        place = tuple(round(coordinate / SAME_POINT_M) for coordinate in emitter)
+        kept = first_orientation.setdefault(place, quaternion)
+        if abs(kept @ quaternion) < _SAME_WAY * np.linalg.norm(kept) * np.linalg.norm(quaternion):
+            report.skip(path.name, "loudspeaker turned another way than at first")
+            continue
+        yield path.name, Measurement(listener, emitter, response, rate)
+
+
+def _position(values: tuple[float, ...]) -> _Vector:
+    x, y, z = values
+    return x, z, y
+
+
+def _numbers(path: Path, count: int) -> tuple[float, ...]:
+    """Raises UnreadableError for anything but `count` finite numbers."""
+    try:
+        words = path.read_text(encoding="utf-8").replace(",", " ").split()
+    except (OSError, UnicodeDecodeError) as exc:
+        raise UnreadableError(f"{path.name} unreadable") from exc
+    try:
+        values = tuple(map(parse_decimal, words))
+    except ValueError as exc:
+        raise UnreadableError(f"{path.name} has not {count} finite numbers") from exc
+    if len(values) != count:
+        raise UnreadableError(f"{path.name} has not {count} finite numbers")
+    return values

@@ -1,0 +1,142 @@
+"""SoundSpaces 1.0: binaural responses between the points of a scene, heads turned to a few azimuths.
+
+A scene's `points.txt` has a row "index, x, y, z" for each point, in the mesh's coordinates: metres, x right, y forward,
+z up, the height that of the ears. (Habitat's y-up coordinates are derived from them, and not used here.)
+`<azimuth>/<receiver>_<source>.wav` are the responses. The azimuth is the heading in degrees, 0 along +y and clockwise
+seen from above, so 90 is +x: yaw = 90 degrees - azimuth. Files that are empty or cannot be read stand for zeros there
+(Chen et al., "SoundSpaces: audio-visual navigation in 3D environments", ECCV 2020; `azimuth_angle` and
+`load_metadata` in https://github.com/facebookresearch/sound-spaces); here they are missing.
+"""
+
+import math
+import re
+from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
+
+from server.core.numerals import parse_decimal, parse_integer
+from training.data.importers.audio import UnreadableError, read_response
+from training.data.importers.conditioning import SourceError
+from training.data.importers.report import ImportReport
+from training.data.responses import Measurement
+
+_PAIR = re.compile(r"[0-9]+_[0-9]+\.wav")
+_Point = tuple[float, float, float]
+
+
+def read(
+    folder: Path,
+    report: ImportReport,
+    *,
+    points: Path | None = None,
+    track: Callable[[list[Path]], Iterable[Path]] = iter,
+) -> Generator[tuple[str, Measurement]]:
+    """Reads the scene folder that holds the azimuths. Without `points`, points.txt is looked for in it, and in the
+    place it has in a SoundSpaces download (`metadata` beside `binaural_rirs`).
+
+    Raises SourceError for missing or malformed points, or a folder without azimuths.
+    """
+    positions = read_points(points or _points_file(folder))
+    azimuths = _azimuths(folder, report)
+    by_azimuth: dict[Path, set[str]] = {}
+    for azimuth in azimuths:
+        names = {path.name for path in azimuth.iterdir()}
+        by_azimuth[azimuth] = {name for name in names if _PAIR.fullmatch(name)}
+        for name in sorted(names - by_azimuth[azimuth]):
+            report.skip(f"{azimuth.name}/{name}", "not named <receiver>_<source>.wav")
+        for name in _doubled(by_azimuth[azimuth]):
+            by_azimuth[azimuth].remove(name)
+            report.skip(f"{azimuth.name}/{name}", "a pair that another file is named by too")
+    everywhere = set().union(*by_azimuth.values())
+    for azimuth, names in by_azimuth.items():
+        for name in sorted(everywhere - names):
+            report.skip(f"{azimuth.name}/{name}", "missing at this azimuth")
+    for path in track([azimuth / name for azimuth, names in by_azimuth.items() for name in sorted(names)]):
+        name = f"{path.parent.name}/{path.name}"
+        receiver, source = (int(index) for index in path.stem.split("_"))
+        if receiver not in positions or source not in positions:
+            report.skip(name, "a point that points.txt does not have")
+            continue
+        try:
+            response, rate = read_response(path, channels=2, report=report)
+        except UnreadableError as exc:
+            report.skip(name, str(exc))
+            continue
+        yaw = heading_to_yaw(_azimuth(path.parent))
+        yield name, Measurement(positions[receiver], positions[source], response, rate, yaw)
+
+
+def heading_to_yaw(azimuth_deg: float) -> float:
+    """Clockwise from +y in degrees to counter-clockwise from +x in radians, within [-pi, pi)."""
+    return math.radians((90.0 - azimuth_deg + 180.0) % 360.0 - 180.0)
+
+
+def read_points(path: Path) -> dict[int, _Point]:
+    """Positions by index. Raises SourceError naming the line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as exc:
+        raise SourceError(path, "file", f"cannot be read ({exc})") from exc
+    points: dict[int, _Point] = {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            index, x, y, z = line.split()
+            key, point = parse_integer(index), (parse_decimal(x), parse_decimal(y), parse_decimal(z))
+        except ValueError as exc:
+            raise SourceError(path, f"line {number}", f"{line!r} is not an index and three numbers") from exc
+        if key in points:
+            raise SourceError(path, f"line {number}", f"index {key} is there twice")
+        points[key] = point
+    if not points:
+        raise SourceError(path, "points", "none")
+    return points
+
+
+def _azimuths(folder: Path, report: ImportReport) -> list[Path]:
+    """Folders that are named by a heading in degrees, in its order, counted from 0 to 360. What else there is, the
+    report lists. Raises SourceError for no such folder, or two of one heading."""
+    found: dict[float, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if not path.is_dir():
+            if path.name != "points.txt":
+                report.skip(path.name, "a file beside the azimuths")
+            continue
+        try:
+            azimuth = _azimuth(path)
+        except ValueError:
+            inside = sum(1 for each in path.rglob("*") if each.is_file())
+            report.skip(f"{path.name}/", "in a folder that is not named by an azimuth in degrees", inside)
+            continue
+        other = found.setdefault(azimuth, path)
+        if other != path:
+            problem = f"{other.name!r} and {path.name!r} are one azimuth; leave one out"
+            raise SourceError(folder, "azimuths", problem)
+    if not found:
+        raise SourceError(folder, "azimuths", "no folder is named by an azimuth in degrees")
+    return [found[azimuth] for azimuth in sorted(found)]
+
+
+def _doubled(names: set[str]) -> list[str]:
+    """Names of pairs that a shorter name stands for already: `00_1.wav` beside `0_1.wav`."""
+    pairs: set[tuple[int, ...]] = set()
+    doubled = []
+    for name in sorted(names, key=lambda each: (len(each), each)):
+        pair = tuple(int(index) for index in name.removesuffix(".wav").split("_"))
+        if pair in pairs:
+            doubled.append(name)
+        pairs.add(pair)
+    return doubled
+
+
+def _azimuth(folder: Path) -> float:
+    """In degrees, from 0 up to 360. Raises ValueError."""
+    return parse_decimal(folder.name) % 360.0
+
+
+def _points_file(folder: Path) -> Path:
+    beside = folder / "points.txt"
+    parts = folder.resolve().parts
+    if beside.is_file() or "binaural_rirs" not in parts:
+        return beside
+    return Path(*("metadata" if part == "binaural_rirs" else part for part in parts)) / "points.txt"

@@ -1,0 +1,117 @@
+"""Does a lever pay? One run per lever on the same data, all else equal, and their errors side by side.
+
+Every run is resumable, and so is the whole: finished runs are not trained again. Errors are those of the pairs held out
+from all training, against the responses themselves, in units that do not depend on what a run was trained with.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from rich.progress import Progress
+
+from server.core.errors import NafirError
+from training.data.responses import ResponseSet, SimulatedResponses
+from training.learning.factorised import FactorisedLearner
+from training.learning.runs import Configuration, FactorisedRecipe
+from training.learning.train import load_learner, train
+from training.models.factorised import ExportedField
+from training.models.targets import align, delay_samples
+
+_MOST_ROWS = 600
+_BATCH = 32
+_DECAY_RANGE_DB = 40.0
+
+
+class AblationError(NafirError):
+    """An ablation that has nothing to measure."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run and its errors: `spectral` the mean absolute error in ln magnitude, `level_db` that of each response's
+    energy, `decay_db` that of the decay curves over their first 40 dB."""
+
+    name: str
+    configuration: Configuration
+    spectral: float
+    level_db: float
+    decay_db: float
+
+
+def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) -> dict[str, Configuration]:
+    """The base and, by name, it with one lever moved: of those that these data allow."""
+    recipe = base.recipe
+    if not isinstance(recipe, FactorisedRecipe):
+        raise AblationError(f"field: {base.name} has no levers; the factorised field has")
+    changed = {
+        "no level correction": replace(recipe, level_correction=False),
+        "no error of energies": replace(recipe, energy_weight=0.0),
+        "half the fine frames": replace(recipe, fine_frames=recipe.fine_frames // 2),
+    }
+    if isinstance(responses, SimulatedResponses):
+        changed["drawn responses"] = replace(recipe, expected=False)
+    if responses.channels == 1:
+        changed["swapped ends"] = replace(recipe, swap=True)
+    if teacher is not None:
+        changed["taught by naf"] = replace(recipe, teacher=str(teacher.resolve()))
+    return {"as it is": base, **{name: replace(base, recipe=each) for name, each in changed.items()}}
+
+
+def ablate(
+    responses: ResponseSet, folder: Path, configurations: dict[str, Configuration], progress: Progress
+) -> list[Row]:
+    """Trains what is not yet trained, in folders of its own, and measures all.
+
+    Raises AblationError if nothing is held out.
+    """
+    rows = np.flatnonzero(responses.held_out)
+    if not len(rows):
+        raise AblationError("data: no pair is held out, so nothing can be measured; import them with a share held out")
+    rows = rows[:: -(-len(rows) // _MOST_ROWS)]
+    results = []
+    for name, configuration in configurations.items():
+        run = folder / name.replace(" ", "-")
+        train(responses, run, configuration, progress)
+        learner = load_learner(responses, run)
+        if not isinstance(learner, FactorisedLearner):
+            raise TypeError(f"{run} holds no factorised field")
+        results.append(Row(name, configuration, *_errors(learner, rows)))
+    return results
+
+
+@torch.no_grad()
+def _errors(learner: FactorisedLearner, rows: npt.NDArray[np.int64]) -> tuple[float, float, float]:
+    """Spectral, level and decay error on these rows of the responses."""
+    responses, codec = learner.responses, learner.cells.codec
+    graph = ExportedField(learner.field, learner.cells).eval()
+    spectral, level, decay = [], [], []
+    for start in range(0, len(rows), _BATCH):
+        some = rows[start : start + _BATCH]
+        ends = (part[some].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw))
+        predicted = graph.of_frames(*map(torch.from_numpy, ends))[0].numpy().astype(np.float64)
+        read = responses.read(some)
+        truth = np.stack([align(one, delay_samples(responses, row)) for one, row in zip(read, some, strict=True)])
+        power = np.abs(codec.transform(truth)) ** 2
+        spectral.append(np.abs(predicted - codec.log_magnitude(np.sqrt(power))).mean(axis=(1, 2, 3)))
+        curves = [_decay_db(each) for each in (codec.magnitude(predicted) ** 2, power)]
+        level.append(np.abs(curves[0][..., 0] - curves[1][..., 0]).mean(axis=1))
+        relative = [curve - curve[..., :1] for curve in curves]
+        within = relative[1] > -_DECAY_RANGE_DB
+        decay.append((np.abs(relative[0] - relative[1]) * within).sum(axis=(1, 2)) / within.sum(axis=(1, 2)))
+    return tuple(float(np.mean(np.concatenate(part))) for part in (spectral, level, decay))
+
+
+def _decay_db(power: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """(..., frequency, frame) power to (..., frame) energy from each frame on, over all frequencies."""
+    energy = power.sum(axis=-2)
+    return 10 * np.log10(np.maximum(np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1], 1e-30))
+
+
+def table(rows: Iterable[Row]) -> list[tuple[str, ...]]:
+    """Header and rows of text."""
+    lines = [(row.name, f"{row.spectral:.4f}", f"{row.level_db:.2f}", f"{row.decay_db:.2f}") for row in rows]
+    return [("lever", "spectral (ln)", "level (dB)", "decay (dB)"), *lines]

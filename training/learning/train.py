@@ -1,0 +1,337 @@
+"""The one training loop: for every kind of field, on one processor or several, on a GPU where there is one.
+
+A run can be interrupted anywhere and goes on when it is started again; with the same seed and number of threads it ends
+at the same field as one that was not, where its length is given in epochs. Given in minutes, the length counts time
+spent computing, over all pieces: steps and looks at what is held back, the last of which may end later.
+"""
+
+import dataclasses
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import Progress
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from server.core.errors import NafirError
+from training.data.responses import ResponseSet
+from training.learning.kinds import learner_of
+from training.learning.learner import Learner, Rows
+from training.learning.pairs import split
+from training.learning.precision import autocast, bfloat16_gains
+from training.learning.processes import Processes
+from training.learning.runs import (
+    CHECKPOINT,
+    Configuration,
+    append_log,
+    claim,
+    keep_log,
+    load_checkpoint,
+    require_same_data,
+    restore,
+    save_checkpoint,
+)
+
+_CHECKPOINT_S = 60.0
+_ROUNDS = 20
+_BATCHES_AHEAD = 2
+_PROBE_ROWS = 2
+_LARGEST_GRADIENT = 1.0
+_EXPLODED = 1000.0
+"""Times the first loss, or one where that is less: normalised targets have errors of about one to begin with."""
+
+
+class DivergedError(NafirError):
+    """A loss or gradient that is not finite, or far above what it was at first."""
+
+
+def train(responses: ResponseSet, run: Path, configuration: Configuration, progress: Progress) -> None:
+    """Trains to the end, from where it was if the run was interrupted. Under `torchrun`, all processes together.
+
+    Raises RunError if the folder holds a run of another configuration or on other data, RecipeError if the
+    configuration does not fit the data, and DivergedError if the loss stops being finite; the last checkpoint stays.
+    """
+    with Processes.joined() as processes:
+        if processes.first:
+            claim(run, responses, configuration)
+        processes.wait()
+        torch.manual_seed(configuration.seed)
+        learner = learner_of(responses, configuration)
+        # The first process computes what is missing, the others find it.
+        if processes.first:
+            learner.prepare(progress)
+        processes.wait()
+        if not processes.first:
+            learner.prepare(progress)
+        learner.field.to(processes.device)
+        loop = _Loop(
+            learner, run, configuration, processes, split(responses, share=configuration.share, seed=configuration.seed)
+        )
+        loop.run_to_the_end(progress)
+
+
+def load_learner(responses: ResponseSet, run: Path) -> Learner:
+    """The learner of a finished run, its trained field on the CPU. Raises RunError if the run is missing, unfinished or
+    of other data."""
+    configuration = Configuration.read(run)
+    require_same_data(responses, run)
+    learner = learner_of(responses, configuration)
+    restore(learner.field, run, configuration)
+    return learner
+
+
+@dataclass
+class _State:
+    """Where a run is: steps taken, seconds that they and validation took and, at the end, those of preparing; what the
+    current round's losses add up to, the smallest error on what is held back with the rounds since, and the field to
+    keep so far."""
+
+    step: int = 0
+    epochs: float = 0.0
+    seconds: float = 0.0
+    prepared_s: float = 0.0
+    rounds: int = 0
+    round_loss: float = 0.0
+    round_steps: int = 0
+    best_loss: float = float("inf")
+    kept: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+    stale: int = 0
+    bfloat16: bool = False
+    finished: bool = False
+    first_loss: float | None = None
+
+
+class _Loop:
+    def __init__(
+        self,
+        learner: Learner,
+        run: Path,
+        configuration: Configuration,
+        processes: Processes,
+        rows: tuple[Rows, Rows],
+    ) -> None:
+        self._learner, self._run, self._configuration, self._processes = learner, run, configuration, processes
+        self._rows, held_back = rows
+        self._held_back = learner.validation(held_back)
+        self._optimiser = torch.optim.AdamW(learner.parameter_groups(), configuration.learning_rate, fused=True)
+        visited = len(self._order(0))
+        # Small scenes have fewer rows than a batch; processes have equal shares of one.
+        size = min(configuration.batch, visited)
+        self._batch = max(size - size % processes.count, processes.count)
+        self._steps_per_epoch = max(1, visited // self._batch)
+        if (run / CHECKPOINT).exists():
+            state = load_checkpoint(run, processes.device)
+            learner.field.load_state_dict(state.pop("field"))
+            self._optimiser.load_state_dict(state.pop("optimiser"))
+            self._state = _State(**state)
+            if processes.first and not self._state.finished:
+                keep_log(run, self._state.rounds)
+        else:
+            if processes.first:
+                keep_log(run, 0)
+            learner.initialise(self._rows, configuration.seed)
+            self._state = _State(bfloat16=self._choose_precision())
+
+    def run_to_the_end(self, progress: Progress) -> None:
+        state = self._state
+        if state.finished:
+            return
+        parallel = self._processes.parallel(self._learner.field)
+        task = progress.add_task("training", total=self._total(), completed=math.floor(self._measure()))
+        writer = SummaryWriter(self._run / "tensorboard", purge_step=state.step) if self._processes.first else None
+        saved_s = state.seconds
+        round_ends = self._next_round()
+        batches = self._batches(state.step)
+        try:
+            while self._fraction() < 1 and not self._stopped():
+                start = time.perf_counter()
+                due = state.seconds - saved_s > _CHECKPOINT_S
+                self._step(parallel, *next(batches), save=due)
+                saved_s = state.seconds if due else saved_s
+                (state.seconds,) = self._processes.agreed(state.seconds + time.perf_counter() - start)
+                if self._measure() >= round_ends:
+                    summary = self._end_round(writer)
+                    state.rounds += 1
+                    self._save()
+                    saved_s = state.seconds
+                    round_ends = self._next_round()
+                    done = math.floor(self._measure())
+                    progress.update(task, completed=done, description=f"training  held back: {summary}")
+        finally:
+            batches.close()
+            if writer is not None:
+                writer.close()
+        self._finish()
+
+    def _fraction(self) -> float:
+        """Of the training that is done."""
+        configuration, state = self._configuration, self._state
+        if configuration.minutes is not None:
+            return state.seconds / (60 * configuration.minutes)
+        return state.step / (configuration.epochs * self._steps_per_epoch)
+
+    def _stopped(self) -> bool:
+        patience = self._configuration.patience
+        return patience is not None and self._state.stale >= patience
+
+    def _measure(self) -> float:
+        """How far training is, in rounds of steps or of time."""
+        if self._configuration.minutes is None:
+            return self._state.step / self._steps_per_epoch
+        return self._fraction() * _ROUNDS
+
+    def _next_round(self) -> int:
+        """The measure at which the current round ends: later than now, however long the last look at what is held back
+        took, so that every round trains."""
+        return min(math.floor(self._measure()) + 1, self._total())
+
+    def _total(self) -> int:
+        """Rounds there are at most."""
+        return self._configuration.epochs if self._configuration.minutes is None else _ROUNDS
+
+    def _step(
+        self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, save: bool
+    ) -> None:
+        """With `save`, parameters are kept as they are before the step, when their loss has shown them to be good."""
+        state, configuration = self._state, self._configuration
+        beta, share = self._learner.momentum_and_rate(self._fraction())
+        for group in self._optimiser.param_groups:
+            group["lr"], group["betas"] = configuration.learning_rate * share, (beta, 0.999)
+        loss = self._loss(parallel, inputs, targets, bfloat16=state.bfloat16)
+        self._optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self._learner.field.parameters(), _LARGEST_GRADIENT)
+        mean_loss, mean_norm = (float(value) for value in self._processes.mean(torch.stack([loss.detach(), norm])))
+        state.first_loss = mean_loss if state.first_loss is None else state.first_loss
+        if not np.isfinite(mean_norm) or not self._is_plausible(mean_loss):
+            raise self._diverged(f"the loss is {mean_loss:g} and its gradient {mean_norm:g} in step {state.step + 1}")
+        if save:
+            self._save()
+        self._optimiser.step()
+        state.step += 1
+        state.epochs = state.step / self._steps_per_epoch
+        state.round_loss += mean_loss
+        state.round_steps += 1
+
+    def _is_plausible(self, loss: float) -> bool:
+        """Neither is one that has left all numbers behind, nor one so far above the first that nothing is learned."""
+        first = self._state.first_loss
+        return bool(np.isfinite(loss)) and (first is None or loss <= _EXPLODED * max(first, 1.0))
+
+    def _diverged(self, problem: str) -> DivergedError:
+        rate = self._configuration.learning_rate
+        kept = "the last checkpoint is kept" if (self._run / CHECKPOINT).exists() else "there is no checkpoint yet"
+        return DivergedError(f"{self._run}: {problem}; {kept}. Train with a lower learning rate than {rate:g}")
+
+    def _loss(
+        self, model: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, bfloat16: bool
+    ) -> Tensor:
+        model.train()
+        with autocast(self._processes.device, bfloat16=bfloat16):
+            prediction = model(*inputs)
+        return torch.stack(list(self._learner.losses(prediction.float(), targets).values())).sum()
+
+    def _end_round(self, writer: SummaryWriter | None) -> str:
+        """Looks at what is held back, remembers the field to keep, writes the logs; one line for people."""
+        state = self._state
+        start = time.perf_counter()
+        parts = self._validate() if self._processes.first else {}
+        seconds = state.seconds + time.perf_counter() - start
+        held_back, state.seconds = self._processes.agreed(sum(parts.values()), seconds)
+        if not self._is_plausible(held_back):  # before it is kept, and saved
+            raise self._diverged(f"the error on what is held back is {held_back:g} after step {state.step}")
+        if held_back < state.best_loss:
+            state.best_loss, state.stale = held_back, 0
+        else:
+            state.stale += 1
+        if self._configuration.patience is None or not state.stale:
+            state.kept = {name: value.detach().clone() for name, value in self._learner.field.state_dict().items()}
+        training = state.round_loss / max(1, state.round_steps)
+        state.round_loss, state.round_steps = 0.0, 0
+        if writer is not None:
+            append_log(self._run, {"epoch": state.epochs, "seconds": state.seconds, "training": training, **parts})
+            rate = self._optimiser.param_groups[0]["lr"]
+            writer.add_scalar("training/loss", training, state.step)
+            writer.add_scalar("training/learning_rate", rate, state.step)
+            for name, value in {**parts, "sum": held_back}.items():
+                writer.add_scalar(f"held_back/{name}", value, state.step)
+        return " ".join(f"{name} {value:.4f}" for name, value in parts.items())
+
+    @torch.no_grad()
+    def _validate(self) -> dict[str, float]:
+        field = self._learner.field.eval()
+        totals: dict[str, float] = {}
+        for start in range(0, len(self._held_back), self._configuration.batch):
+            rows = self._held_back[start : start + self._configuration.batch]
+            inputs, targets = self._on_device(*self._learner.batch(rows, None))
+            for name, value in self._learner.losses(field(*inputs), targets).items():
+                totals[name] = totals.get(name, 0.0) + float(value) * len(rows) / len(self._held_back)
+        return totals
+
+    def _finish(self) -> None:
+        state = self._state
+        self._learner.field.load_state_dict(state.kept)
+        self._learner.field.eval()
+        self._learner.finish(self._rows)
+        state.finished, state.kept, state.prepared_s = True, {}, self._learner.prepared_s
+        self._save()
+        self._processes.wait()
+
+    def _save(self) -> None:
+        if self._processes.first:
+            state: dict[str, Any] = vars(self._state) | {
+                "field": self._learner.field.state_dict(),
+                "optimiser": self._optimiser.state_dict(),
+            }
+            save_checkpoint(self._run, state)
+
+    def _choose_precision(self) -> bool:
+        processes = self._processes
+        inputs, targets = self._on_device(*self._learner.batch(self._order(0)[:_PROBE_ROWS], None))
+        gains = processes.first and bfloat16_gains(
+            lambda bfloat16: self._loss(self._learner.field, inputs, targets, bfloat16=bfloat16).backward(),
+            processes.device,
+        )
+        self._optimiser.zero_grad(set_to_none=True)
+        return bool(processes.agreed(float(gains))[0])
+
+    def _order(self, epoch: int) -> Rows:
+        return self._learner.epoch(self._rows, np.random.default_rng([self._configuration.seed, 5, epoch]))
+
+    def _on_device(
+        self, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...]
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        device = self._processes.device
+        return tuple(part.to(device) for part in inputs), tuple(part.to(device) for part in targets)
+
+    def _batches(self, first_step: int) -> Iterator[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
+        """This process's share of every batch from a step on, without end, made ready a little ahead of its use."""
+        processes, seed = self._processes, self._configuration.seed
+        orders: dict[int, Rows] = {}
+
+        def make(step: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+            epoch, number = divmod(step, self._steps_per_epoch)
+            if epoch not in orders:
+                orders.clear()
+                orders[epoch] = self._order(epoch)
+            start = number * self._batch
+            rows = orders[epoch][start + processes.rank : start + self._batch : processes.count]
+            return self._learner.batch(rows, np.random.default_rng([seed, 8, step, processes.rank]))
+
+        with ThreadPoolExecutor(1) as pool:
+            ahead: deque[Future[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]] = deque(
+                pool.submit(make, first_step + number) for number in range(_BATCHES_AHEAD)
+            )
+            step = first_step + _BATCHES_AHEAD
+            while True:
+                yield self._on_device(*ahead.popleft().result())
+                ahead.append(pool.submit(make, step))
+                step += 1

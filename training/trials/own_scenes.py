@@ -1,0 +1,126 @@
+"""Scenes of many kinds, from their files to checked bundles with default settings, and how long they reverberate beside
+what others say: `python -m training.trials.own_scenes FOLDER [SCENE.toml ...]`, `make own-scenes`.
+
+A scene that is finished is kept as `report.json` in its folder, and gone on with where an earlier run stopped. At the
+end one table is printed, and written to FOLDER.md. Exit code 1 where a scene has no bundle, or a reverberation time is
+beyond a limit.
+"""
+
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from training.data.scene_file import SceneFile
+from training.trials.reverberation import Comparison, compare, worst_of
+
+OWN = Path(__file__).parent / "scenes" / "own"
+_TRAIN = "import sys; from training.cli.main import main; sys.argv[0] = 'nafir-train'; main()"
+_CHECK = "import sys; from server.cli.main import main; sys.argv[0] = 'nafir'; main()"
+
+
+@dataclass(frozen=True)
+class Report:
+    """Of one scene. `minutes` of the wall clock for each step; `problem` is what stopped it, if anything did."""
+
+    scene: str
+    minutes: dict[str, float]
+    problem: str | None
+    comparison: Comparison | None
+
+    @property
+    def passed(self) -> bool:
+        return self.problem is None and self.comparison is not None and not self.comparison.beyond()
+
+
+def make(scene: Path, folder: Path) -> Report:
+    """All steps of one scene, with the settings that a command has by default; those that are finished are kept."""
+    digest = hashlib.sha256(scene.read_bytes()).hexdigest()
+    kept = folder / "report.json"
+    if kept.is_file():
+        document = json.loads(kept.read_text())
+        if document.pop("scene_sha256") == digest:
+            comparison = document.pop("comparison")
+            return Report(**document, comparison=None if comparison is None else _read(comparison))
+    folder.mkdir(parents=True, exist_ok=True)
+    data, run, bundle = (str(folder / name) for name in ("data", "run", "bundle"))
+    commands = {
+        "simulate": (_TRAIN, "simulate", str(scene), "-o", data),
+        "train": (_TRAIN, "train", data, "-o", run),
+        "export": (_TRAIN, "export", run, "-o", bundle),
+        "check": (_CHECK, "check", bundle),
+    }
+    minutes: dict[str, float] = {}
+    for step, (program, *arguments) in commands.items():
+        began_s = time.monotonic()
+        done = subprocess.run(
+            [sys.executable, "-c", program, *arguments], check=False, stdout=subprocess.PIPE, text=True
+        )
+        minutes[step] = round((time.monotonic() - began_s) / 60, 2)
+        if done.returncode:
+            # Not kept: whoever mends it runs this again.
+            return Report(scene.stem, minutes, f"{step} failed with exit code {done.returncode}", None)
+    report = Report(scene.stem, minutes, None, compare(SceneFile.read(scene)))
+    kept.write_text(json.dumps({"scene_sha256": digest, **asdict(report)}, indent=2) + "\n")
+    return report
+
+
+def _read(document: dict[str, Any]) -> Comparison:
+    return Comparison(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
+
+
+def table(reports: Sequence[Report]) -> str:
+    """As Markdown."""
+    bands = " | ".join(f"{hz / 1000:g}k" if hz >= 1000 else f"{hz:g}" for hz in OCTAVE_BANDS_HZ)
+    lines = [
+        "Reverberation times of our simulation by octave band, and by how much they differ from the median of several "
+        "simulations by pyroomacoustics, with the scattering of the scene and with mirrors only, and from Eyring's "
+        "formula. Brackets: told, and not judged (see training/trials/reverberation.py).",
+        "",
+        f"| scene | minutes | {bands} | others | mirrors | Eyring | |",
+        f"| --- | --- |{' --- |' * (len(OCTAVE_BANDS_HZ) + 4)}",
+    ]
+    for report in reports:
+        minutes = f"{sum(report.minutes.values()):.1f}"
+        if report.comparison is None:
+            lines.append(f"| {report.scene} | {minutes} |{' |' * (len(OCTAVE_BANDS_HZ) + 3)} {report.problem} |")
+            continue
+        of = report.comparison
+        times = " | ".join(f"{value:.2f}" for value in of.ours_s)
+        told = (
+            _percent(of.from_others, judged=of.judges_others),
+            _percent(of.from_mirrors, judged=True),
+            _percent(of.from_eyring, judged=of.is_diffuse),
+        )
+        verdict = "; ".join(of.beyond()) or "ok"
+        lines.append(f"| {report.scene} | {minutes} | {times} | {' | '.join(told)} | {verdict} |")
+    return "\n".join(lines) + "\n"
+
+
+def _percent(shares: Sequence[float], *, judged: bool) -> str:
+    worst = f"{100 * worst_of(shares):.1f} %"
+    return worst if judged else f"({worst})"
+
+
+def main(arguments: Sequence[str]) -> int:
+    folder, *chosen = map(Path, arguments)
+    scenes = chosen or sorted(OWN.glob("*.toml"))
+    reports = []
+    for number, scene in enumerate(scenes, 1):
+        sys.stdout.write(f"{scene.stem} ({number} of {len(scenes)})\n")
+        sys.stdout.flush()
+        reports.append(make(scene, folder / scene.stem))
+    text = table(reports)
+    folder.with_suffix(".md").write_text(text)
+    sys.stdout.write(text)
+    return 0 if all(report.passed for report in reports) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,204 @@
+"""How long a scene reverberates: by our rays, by those of pyroomacoustics, and by Eyring's formula.
+
+Both simulations have the same walls, air, emitters and receivers, and the same estimator: the energies of all pairs are
+added up by octave band, integrated backwards (Schroeder), and a line is fitted from -5 to -35 dB (ISO 3382-2:2008,
+ensemble averages of decay curves, 8.2).
+
+What scatters does so in another way there: a surface of ours mirrors all but the share s of a ray, as ISO 17497-1
+defines the coefficient; one of pyroomacoustics turns every ray a little, by the mean of s over octaves (`room.cpp`,
+simul_ray: the direction becomes s times a Lambertian one plus 1 - s times the mirrored one). The two agree where fields
+are diffuse however walls scatter, and where nothing scatters. So with a scene's own scattering they are judged where
+the field is diffuse, as Eyring's formula is, and s the same in all octaves; with mirrors only everywhere.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.decibels import db_to_power, power_to_db
+from server.scene.geometry import Geometry, Material
+from training.data.dataset import SPEED_OF_SOUND
+from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.simulation.diffuse_room import DiffuseRoom
+from training.simulation.rays import RayTracer, sphere_directions
+
+_Floats = npt.NDArray[np.float64]
+
+MOST_FROM_OTHERS = 0.05
+MOST_FROM_EYRING = 0.10
+_EMITTERS, _RECEIVERS = 1, 5
+_RAYS, _RUNS = 10_000, 3
+_FITTED_DB = -5.0, -35.0
+_RADIUS_M = 0.4
+# Below a third, surfaces that scatter by share and such that turn every ray are two different rooms.
+_ALIKE_SCATTERING = 1 / 3
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """By octave band: reverberation times of our rays in seconds, and relative differences."""
+
+    ours_s: Sequence[float]
+    from_others: Sequence[float]
+    """From the median of pyroomacoustics, with the scene's own scattering."""
+    from_mirrors: Sequence[float]
+    """The same where nothing scatters, in both."""
+    from_eyring: Sequence[float]
+    judges_others: bool
+    is_diffuse: bool
+
+    def beyond(self) -> list[str]:
+        """Which limits it is beyond."""
+        judged = (
+            ("pyroomacoustics", self.from_others, MOST_FROM_OTHERS, self.judges_others),
+            ("pyroomacoustics, mirrors only", self.from_mirrors, MOST_FROM_OTHERS, True),
+            ("Eyring", self.from_eyring, MOST_FROM_EYRING, self.is_diffuse),
+        )
+        return [
+            f"{name}: {100 * worst_of(shares):.1f} %"
+            for name, shares, most, counts in judged
+            if counts and not worst_of(shares) <= most
+        ]
+
+
+def worst_of(shares: Sequence[float]) -> float:
+    """The greatest of the bands in which sound falls far enough to have a reverberation time, in both; NaN of none."""
+    known = np.abs(shares)[np.isfinite(shares)]
+    return float(np.max(known)) if len(known) else np.nan
+
+
+def compare(scene: SceneFile) -> Comparison:
+    emitters, receivers = _places(scene)
+    ours = _ours_s(scene, scene.geometry, emitters, receivers)
+    others = _others_s(scene, scene.geometry, emitters, receivers)
+    smooth = scene.geometry.without_scattering()
+    mirrors = _ours_s(scene, smooth, emitters, receivers), _others_s(scene, smooth, emitters, receivers)
+    room = DiffuseRoom(scene.geometry, scene.air, SPEED_OF_SOUND)
+    return Comparison(
+        ours_s=tuple(ours.tolist()),
+        from_others=tuple((ours / others - 1).tolist()),
+        from_mirrors=tuple((mirrors[0] / mirrors[1] - 1).tolist()),
+        from_eyring=tuple((ours / room.reverberation_time_s - 1).tolist()),
+        judges_others=is_diffuse(scene.geometry) and _scatters_alike(scene.geometry),
+        is_diffuse=is_diffuse(scene.geometry),
+    )
+
+
+def reverberation_time_s(energy: npt.ArrayLike) -> _Floats:
+    """(band,) of (band, bin) energy in bins of HISTOGRAM_BIN_S; NaN where it does not fall by 35 dB."""
+    remaining = np.cumsum(np.asarray(energy, np.float64)[:, ::-1], axis=-1)[:, ::-1]
+    upper_db, lower_db = _FITTED_DB
+    times = np.full(len(remaining), np.nan)
+    for band, of_band in enumerate(remaining):
+        level_db = power_to_db(of_band[of_band > 0] / of_band[0])
+        if not len(level_db) or level_db[-1] > lower_db:
+            continue
+        fitted = (level_db <= upper_db) & (level_db >= lower_db)
+        slope = np.polyfit(np.flatnonzero(fitted) * HISTOGRAM_BIN_S, level_db[fitted], 1)[0]
+        times[band] = -60 / slope
+    return times
+
+
+def is_diffuse(geometry: Geometry) -> bool:
+    """Whether Eyring's formula may be expected to hold within a tenth: one convex room, no side of which is more than
+    three times another (Kuttruff, Room Acoustics, 5.5), whose surfaces absorb alike, within a factor of four, and no
+    more than a third (paths of different lengths count there), and scatter a third of what they reflect, at least."""
+    plan, materials = geometry.floor_plan, geometry.materials
+    sides = *np.ptp(np.asarray(geometry.corners), axis=0), geometry.height_m
+    surfaces = (materials.walls, materials.floor, materials.ceiling)
+    absorption = np.array([surface.absorption for surface in surfaces])
+    scattering = np.array([surface.scattering for surface in surfaces])
+    return bool(
+        not len(plan.bend_corners)
+        and max(sides) <= 3 * min(sides)
+        and (absorption.max(axis=0) <= 4 * absorption.min(axis=0)).all()
+        and absorption.max() <= _ALIKE_SCATTERING
+        and scattering.min() >= _ALIKE_SCATTERING
+    )
+
+
+def _scatters_alike(geometry: Geometry) -> bool:
+    materials = geometry.materials
+    scattering = np.array([each.scattering for each in (materials.walls, materials.floor, materials.ceiling)])
+    return bool((np.ptp(scattering, axis=-1) == 0).all() and scattering.min() >= _ALIKE_SCATTERING)
+
+
+def _places(scene: SceneFile) -> tuple[_Floats, _Floats]:
+    """Emitters and receivers (n, 3) among the probes, spread over the scene."""
+    probes = scene.probe_positions(0)
+    order = np.random.default_rng(0).permutation(len(probes))
+    chosen = probes[order[: _EMITTERS + _RECEIVERS]]
+    return chosen[:_EMITTERS], chosen[_EMITTERS:]
+
+
+def _in_air(scene: SceneFile, energy: npt.ArrayLike) -> _Floats:
+    """(..., band, bin) energy with what the air takes."""
+    energy = np.asarray(energy, np.float64)
+    bins_m = (np.arange(energy.shape[-1]) + 0.5) * HISTOGRAM_BIN_S * SPEED_OF_SOUND
+    return np.asarray(energy * db_to_power(-scene.air.absorption_db_per_m[:, None] * bins_m))
+
+
+def _ours_s(scene: SceneFile, geometry: Geometry, emitters: _Floats, receivers: _Floats) -> _Floats:
+    tracer = RayTracer(
+        geometry,
+        receivers,
+        duration_s=scene.simulation.duration_s,
+        image_order=0,
+        arrival_directions=sphere_directions(scene.simulation.arrival_directions),
+    )
+    times = []
+    for run in range(_RUNS):
+        rng = np.random.default_rng([run, 10])
+        energy = sum(tracer.trace(emitter, rays=_RAYS, rng=rng).sum(axis=(0, 1)) for emitter in emitters)
+        times.append(reverberation_time_s(_in_air(scene, energy)))
+    return np.asarray(np.median(times, axis=0))
+
+
+def _others_s(scene: SceneFile, geometry: Geometry, emitters: _Floats, receivers: _Floats) -> _Floats:
+    import pyroomacoustics as pra
+
+    def material(of: Material) -> "pra.Material":
+        absorption, scattering = (
+            {"coeffs": list(shares), "center_freqs": list(OCTAVE_BANDS_HZ)} for shares in (of.absorption, of.scattering)
+        )
+        return pra.Material(absorption, scattering)
+
+    bins = round(scene.simulation.duration_s / HISTOGRAM_BIN_S)
+    room = pra.Room.from_corners(
+        np.array(geometry.corners).T,
+        fs=24_000,  # at this rate its octave bands are ours, and its bins
+        max_order=1,
+        materials=material(geometry.materials.walls),
+        ray_tracing=True,
+    )
+    caps = {name: material(getattr(geometry.materials, name)) for name in ("floor", "ceiling")}
+    room.extrude(geometry.height_m, materials=caps)
+    room.set_ray_tracing(
+        receiver_radius=_RADIUS_M,
+        energy_thres=1e-12,
+        time_thres=scene.simulation.duration_s,
+        hist_bin_size=HISTOGRAM_BIN_S,
+    )
+    room.add_microphone_array(receivers.T)
+    times = []
+    for run in range(_RUNS):
+        rng = np.random.default_rng([run, 11])
+        total = np.zeros((len(OCTAVE_BANDS_HZ), bins))
+        for emitter in emitters:
+            turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+            directions = (sphere_directions(_RAYS) @ turn).astype(np.float32)
+            # Its public class would draw the direct path through walls.
+            engine = room.room_engine
+            engine.image_source_model(emitter.astype(np.float32))
+            engine.reset_mics()
+            engine.ray_tracing(
+                directions, np.ones((_RAYS, len(OCTAVE_BANDS_HZ)), np.float32), emitter.astype(np.float32)
+            )
+            for microphone in engine.microphones:
+                energy = microphone.histograms[0].get_hist()[:, :bins]
+                total[:, : energy.shape[1]] += energy
+        times.append(reverberation_time_s(_in_air(scene, total)))
+    return np.asarray(np.median(times, axis=0))
