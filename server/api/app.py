@@ -28,7 +28,7 @@ from server.core.entity_tags import fingerprint
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.effect_costs import measure_costs
 from server.planning.places import place_of_field
-from server.protocol.client_messages import PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
+from server.protocol.client_messages import AUTO, PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
 from server.rendering.warm_up import warm_up
 from server.responses.ir_request import compute_irs
 from server.runtime.drain import Drain
@@ -40,14 +40,14 @@ from server.runtime.thread_watch import ThreadWatch
 from server.runtime.workers import Workers
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
-from server.streaming.load import AUTO, Offer
+from server.streaming.load import Offer
 from server.streaming.session import Session
 
 _CALIBRATION_POSES = 3
 _COSTS_AFTER_S = 5.0
 _COSTS_SHARE = 0.05
 """Of a core."""
-WEB = Path(__file__).parent / "web"
+WEB = Path(__file__).parents[1] / "web"
 
 _logger = logging.getLogger(__name__)
 

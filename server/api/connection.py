@@ -41,6 +41,7 @@ from server.planning.planner import Costs
 from server.planning.scene_acoustics import SceneAcoustics
 from server.protocol.blocks import Encoding
 from server.protocol.client_messages import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
+from server.protocol.codes import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, SERVICE_RESTART, TRY_AGAIN_LATER
 from server.protocol.server_messages import Error, Pong, ServerMessage, Welcome
 from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
@@ -50,7 +51,6 @@ from server.streaming.load import Offer, QualityStep
 from server.streaming.session import Session
 from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
-NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
 MAX_WAITING_ANSWERS = 256
 _GOODBYE_S = 1.0
 """Even closing waits for room in the socket, and a client that does not read makes none."""

@@ -13,10 +13,13 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import uvicorn
 
+from server.api.connection_limits import ConnectionLimits
+from server.api.http_protocol import limited_http
+from server.api.settings import Settings
 from server.core.errors import NafirError
 from server.runtime.drain import Drain
 
@@ -74,6 +77,20 @@ def url(listener: socket.socket, host: str) -> str:
     """Where a listening socket is reached that was bound to `host`."""
     shown = f"[{host}]" if ":" in host else host
     return f"http://{shown}:{listener.getsockname()[1]}"
+
+
+def uvicorn_options(settings: Settings) -> dict[str, Any]:
+    """How uvicorn has to run the application."""
+    return {
+        "http": limited_http(ConnectionLimits.of(settings)),
+        "timeout_keep_alive": settings.keep_alive_s,
+        "host": settings.host,
+        "port": settings.port,
+        "loop": "auto",  # uvloop wherever it exists
+        "ws": "server.api.web_socket:WebSocketProtocol",
+        "ws_max_size": settings.max_frame_bytes,
+        "ws_per_message_deflate": False,
+    }
 
 
 class Server(uvicorn.Server):

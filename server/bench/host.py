@@ -31,11 +31,11 @@ def serve() -> None:
     import uvicorn
 
     from server.api.app import create_app
+    from server.api.serving import uvicorn_options
     from server.api.settings import Settings
     from server.bench.gauge import Gauge
     from server.bench.rooms import noise
     from server.bench.scene import CLIP, SAMPLE_RATE, SCENE, BankField
-    from server.cli.main import server_options
     from server.field.fields_by_level import FieldsByLevel
     from server.runtime.memory import give_back_large_arrays
 
@@ -45,7 +45,7 @@ def serve() -> None:
         soundfile.write(clip, 0.05 * noise(0, _CLIP_S * SAMPLE_RATE), SAMPLE_RATE, subtype="FLOAT")
         settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS)
         app = Gauge(create_app(settings, scenes={SCENE: FieldsByLevel([BankField()])}))
-        server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
+        server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)))
         listener.bind((settings.host, 0))
         threading.Thread(target=_stop_with_input, args=(server,), daemon=True).start()
         sys.stdout.write(json.dumps({"port": listener.getsockname()[1]}) + "\n")

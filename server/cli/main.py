@@ -26,7 +26,6 @@ from server.rendering.partitions import BLOCK_SIZES, is_block_size
 from server.soak.cli import soak
 
 if TYPE_CHECKING:
-    from server.api.settings import Settings
     from server.field.field import AcousticField
     from server.offline.render import RenderedEmitter
 
@@ -107,28 +106,11 @@ def serve(
         url = serving.url(listeners[0], settings.host)
         said = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
         serving.serve(
-            uvicorn.Config(application, **server_options(settings)),
+            uvicorn.Config(application, **serving.uvicorn_options(settings)),
             listeners,
             drain,
             on_start=lambda: Console().print(said, highlight=False),
         )
-
-
-def server_options(settings: "Settings") -> dict[str, Any]:
-    """How uvicorn has to run the application."""
-    from server.api.connection_limits import ConnectionLimits
-    from server.api.http_protocol import limited_http
-
-    return {
-        "http": limited_http(ConnectionLimits.of(settings)),
-        "timeout_keep_alive": settings.keep_alive_s,
-        "host": settings.host,
-        "port": settings.port,
-        "loop": "auto",  # uvloop wherever it exists
-        "ws": "server.api.web_socket:WebSocketProtocol",
-        "ws_max_size": settings.max_frame_bytes,
-        "ws_per_message_deflate": False,
-    }
 
 
 @app.command()

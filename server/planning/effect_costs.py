@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.directivity import CARDIOID, Directivity
+from server.acoustics.directivity import CARDIOID, OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
@@ -25,12 +25,11 @@ from server.rendering.convolver import FloatArray
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.effect_flags import EmitterEffects
+from server.responses.effect_flags import ALL_ON, EmitterEffects
 from server.responses.full_response import kemar
 from server.responses.ir_request import composed_irs
 from server.responses.radiation import departure_gain_db
 from server.scene.effects import EffectName
-from server.streaming.emitters import Emitter
 
 RESPONSES_PER_S = 30.0
 """Of an emitter that moves, or a listener."""
@@ -50,7 +49,8 @@ def _no_rest() -> None:
 
 class _Placed(NamedTuple):
     pose: Pose
-    directivity: Directivity
+    directivity: Directivity = OMNIDIRECTIONAL
+    effects: EmitterEffects = ALL_ON
 
 
 class _Lane:
@@ -253,7 +253,7 @@ def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: R
             rest()
             meanwhile()
             started_s = time.thread_time()
-            composed_irs(field, direct, listener, [Emitter(0, Pose(start.emitter), effects=effects)])
+            composed_irs(field, direct, listener, [_Placed(Pose(start.emitter), effects=effects)])
             of_it.append(1e6 * (time.thread_time() - started_s))
         if turn and sum(map(sum, times_us.values())) > 1e6 * _LONGEST_S:
             break

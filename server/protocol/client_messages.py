@@ -27,9 +27,10 @@ from server.planning.scene_acoustics import Output
 from server.protocol.blocks import DryBlock, Encoding
 from server.protocol.layout import Layout
 from server.protocol.message import WHOLE, Integer, Message, Position
-from server.streaming.load import AUTO
 
 PROTOCOL: Final = 2
+AUTO = "auto"
+"""The level that leaves the choice to the server."""
 
 BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]

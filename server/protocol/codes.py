@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Final
 
-from server.api.connection import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, SERVICE_RESTART, TRY_AGAIN_LATER
+NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
+"""Codes of RFC 6455, 7.4.1, that the server closes streams with."""
 
 ERROR_CODES: Final[Mapping[str, str]] = {
     "not_ready": "the server is still warming up, or a thread of its own has failed; the message says which",

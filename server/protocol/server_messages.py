@@ -12,7 +12,9 @@ from server.protocol.message import Message, Position
 from server.scene.geometry import Opening
 from server.scene.manifest import AcceptedLaw, Bounds, QualityLevel
 from server.scene.plan import Plan
-from server.streaming.load import Reason
+
+LevelReason = Literal["chosen", "load", "recovered"]
+"""Why a stream has another quality level: its client chose it, or the server's load rose or fell."""
 
 
 class Place(Message):
@@ -94,7 +96,7 @@ class LevelChanged(Message):
 
     type: Literal["level_changed"] = "level_changed"
     level: str
-    reason: Reason
+    reason: LevelReason
     ir_rate_hz: float | None
     shared_tail: bool
     sample_clock: int

@@ -26,9 +26,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
+from server.kernels import right_angle
 from server.kernels.compiled import compiled
 from server.kernels.simd import add, broadcast, load, load_int, multiply_add, pointer, store
-from server.rendering import products, right_angle
+from server.rendering import products
 from server.rendering.convolver_records import CONVOLVER, STAGE
 from server.rendering.partitions import TURNS
 

@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from server.core.errors import NafirError
 from server.protocol.blocks import AudioBlock, DryBlock, FloatArray
 from server.protocol.client_messages import (
+    AUTO,
     PROTOCOL,
     Acknowledge,
     AddEmitter,
@@ -34,7 +35,6 @@ from server.protocol.client_messages import (
 )
 from server.protocol.server_messages import Error, Pong, Welcome, parse_server_message
 from server.scene.effects import EffectName
-from server.streaming.load import AUTO
 
 _Floats = npt.NDArray[np.float64]
 

@@ -36,11 +36,12 @@ from itertools import islice
 from operator import attrgetter
 from typing import NamedTuple, get_args
 
+from server.protocol.server_messages import LevelReason
 from server.rendering.renderer import render_all
 from server.runtime.priority import become_real_time
 from server.runtime.thread_watch import Watched
 from server.runtime.workers import Workers
-from server.streaming.load import PERIOD_S, LoadControl, Reason, ir_share
+from server.streaming.load import PERIOD_S, LoadControl, ir_share
 from server.streaming.render_ahead import NUMBERS as NUMBERS_AT_ONCE
 from server.streaming.render_ahead import RenderAhead
 from server.streaming.request_queue import RequestQueue
@@ -122,7 +123,7 @@ class AudioEngine:
         return tuple(self._thread_of)
 
     @property
-    def steps(self) -> Counter[Reason]:
+    def steps(self) -> Counter[LevelReason]:
         """How often streams were moved to other quality, by reason."""
         return sum((thread.steps for thread in self.threads), Counter())
 
@@ -194,7 +195,7 @@ class AudioThread:
         self._ir_share = ir_share
         self._time_s = time_s
         # All reasons from the start: whoever reads it on another thread must not find it growing.
-        self.steps: Counter[Reason] = Counter(dict.fromkeys(get_args(Reason), 0))
+        self.steps: Counter[LevelReason] = Counter(dict.fromkeys(get_args(LevelReason), 0))
         """Times that streams were moved to other quality."""
         self._load = LoadControl()
         self._busy_s = 0.0

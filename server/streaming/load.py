@@ -15,17 +15,15 @@ are first fewer IRs, then cheaper levels, then levels whose emitters share a tai
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Self
+from typing import Self
 
 from server.core.errors import RequestError
+from server.protocol.client_messages import AUTO
+from server.protocol.server_messages import LevelReason
 from server.scene.manifest import QualityLevel
 
-AUTO = "auto"
-"""What a client asks for that leaves the choice of its level to the server."""
 PERIOD_S = 0.25
 """How often streams are looked at."""
-
-Reason = Literal["chosen", "load", "recovered"]
 
 _RATES_HZ = (12.0, 5.0)
 _LEAST_RATE_HZ = 2.0
@@ -193,7 +191,7 @@ class LoadControl:
 
     def decide(
         self, now_s: float, busy: float, strains: Mapping[Ladder, LoadSample], *, can_make_time: bool = False
-    ) -> dict[Ladder, Reason]:
+    ) -> dict[Ladder, LevelReason]:
         """Every `PERIOD_S`: which ladders have been moved by a rung, and why. `busy` is the share of the period in
         which the thread rendered; one that `can_make_time` otherwise strains nobody as long as no block is late."""
         worst = max((strain.lateness for strain in strains.values()), default=0.0)
@@ -203,7 +201,7 @@ class LoadControl:
             self._well_since_s = None
         elif self._well_since_s is None:
             self._well_since_s = now_s
-        moved: dict[Ladder, Reason] = {}
+        moved: dict[Ladder, LevelReason] = {}
         for ladder, strain in strains.items():
             if ladder._note(strain, now_s) and ladder._is_settled(now_s) and ladder._fall(now_s):
                 moved[ladder] = "load"

@@ -11,14 +11,14 @@ from collections.abc import Hashable, Iterable, Mapping
 from server.acoustics.geometry import Pose
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
-from server.protocol.server_messages import EmitterAdded, Error, LevelChanged, ServerMessage
+from server.protocol.server_messages import EmitterAdded, Error, LevelChanged, LevelReason, ServerMessage
 from server.rendering.renderer import Renderer
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_cache import Shared, shared_response
 from server.responses.ir_request import EmitterSnapshot, IrRequest, IrResponse
 from server.streaming.active_effects import ActiveEffects, as_asked
 from server.streaming.emitters import Emitter
-from server.streaming.load import QualityStep, Reason
+from server.streaming.load import QualityStep
 
 
 class ResponseScheduler:
@@ -46,7 +46,7 @@ class ResponseScheduler:
         self._sample_rate = levels.default.sample_rate
         self._direct_sound = direct_sound
         self._wanted = rung
-        self._reason: Reason = "chosen"
+        self._reason: LevelReason = "chosen"
         self._accepted_pose_id = 0
         self._in_flight: IrRequest | None = None
         self._is_partial = False
@@ -68,7 +68,7 @@ class ResponseScheduler:
         """Whether there was something to ask for when it was looked last, and it is time to."""
         return self._has_looked and not self.are_awaited and not self._waits_for_change
 
-    def set_quality(self, rung: QualityStep, reason: Reason) -> list[ServerMessage]:
+    def set_quality(self, rung: QualityStep, reason: LevelReason) -> list[ServerMessage]:
         """Have IRs come from another rung: from now on, or, where it takes another level's, from when they are
         there."""
         if rung.level != self._wanted.level:

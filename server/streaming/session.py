@@ -35,7 +35,7 @@ from server.protocol.client_messages import (
     SetEffects,
     SetGain,
 )
-from server.protocol.server_messages import EmitterRemoved, Error, LiveStatus, PlanChanged, ServerMessage
+from server.protocol.server_messages import EmitterRemoved, Error, LevelReason, LiveStatus, PlanChanged, ServerMessage
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.rendering.output import Rendered
@@ -50,7 +50,7 @@ from server.scene.plan import Plan
 from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
 from server.streaming.emitters import Emitter, LiveInput
-from server.streaming.load import QualityStep, Reason
+from server.streaming.load import QualityStep
 from server.streaming.pacing import SendWindow
 from server.streaming.plan_audit import PlanAudit, Regret
 from server.streaming.response_scheduler import ResponseScheduler
@@ -152,7 +152,7 @@ class Session:
         """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
         return self._responses.are_awaited
 
-    def set_quality(self, rung: QualityStep, reason: Reason) -> list[ServerMessage]:
+    def set_quality(self, rung: QualityStep, reason: LevelReason) -> list[ServerMessage]:
         """Have what follows the direct sound come from another rung: from now on, or, where it takes another level's
         IRs, from when they are there."""
         return self._responses.set_quality(rung, reason)

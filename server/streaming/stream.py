@@ -23,12 +23,12 @@ from server.planning.planned_effects import SHARE_OF_ALL as PLAN_SHARE
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
-from server.protocol.server_messages import Durations, Error, ServerMessage, Status
+from server.protocol.server_messages import Durations, Error, LevelReason, ServerMessage, Status
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, IrResponse, compute_irs
 from server.runtime.workers import Workers
 from server.scene.plan import Plan
-from server.streaming.load import Ladder, LoadSample, Offer, Reason, ir_interval_s
+from server.streaming.load import Ladder, LoadSample, Offer, ir_interval_s
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
 from server.streaming.request_queue import RequestQueue
@@ -300,7 +300,7 @@ class Stream:
         self._worst_lateness_s, self._longest_wait_s = 0.0, None
         return strain
 
-    def step(self, reason: Reason, now_s: float) -> list[Outgoing]:
+    def step(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
         """Hear what the ladder, which has been moved, now stands on."""
         self._forget_waits(now_s)
         return [*self.session.set_quality(self.ladder.rung, reason)]

@@ -15,9 +15,9 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["server"]):
-    from server import blocks, protocol  # noqa: F401  what is instrumented is what is imported here
     from server.core import npy  # noqa: F401
     from server.field import external_data  # noqa: F401
+    from server.protocol import blocks, client_messages  # noqa: F401  what is instrumented is what is imported here
     from server.scene import bundle, geometry, manifest  # noqa: F401
 
 from doors import (  # beside this script

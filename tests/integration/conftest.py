@@ -11,16 +11,16 @@ import pytest
 import uvicorn
 
 from server.api.app import create_app
+from server.api.serving import uvicorn_options
 from server.api.settings import Settings
 from server.assets.hrtfs import HrtfLibrary
-from server.cli.main import server_options
 from server.field.fields_by_level import FieldsByLevel
 
 
 @contextmanager
 def _serving(levels: FieldsByLevel, hrtfs: HrtfLibrary) -> Iterator[str]:
     app = create_app(settings := Settings(port=0), scenes={levels.bundle.id: levels}, hrtfs=hrtfs)
-    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **server_options(settings)))
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)))
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
