@@ -23,12 +23,6 @@ SWEEP ?= --phases-of none --reuse-of factorised-r16
 MEASURE ?=
 # How long either fuzzer runs, in seconds.
 FUZZ_SECONDS ?= 60
-# Tests that watch the clock, and so have the machine to themselves.
-TIMED := tests/integration tests/bench/test_sessions.py tests/streaming/test_audio_engine.py tests/api/test_stream.py tests/runtime/test_priority.py
-
-# Tests that attack a server beside a listener for minutes.
-ATTACKS := $(addprefix tests/integration/attacks/test_,abandoned_work.py churn.py connect_loops.py floods.py http_requests.py)
-
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
@@ -46,12 +40,13 @@ serve: $(VENV)/installed-server ## install the server and open a scene at http:/
 	$(BIN)/nafir serve --host $(HOST) --port $(PORT)
 
 test: lint ## install what tests need, then lint, check types and run every test
-	$(BIN)/pytest --numprocesses auto --dist loadfile $(TIMED:%=--ignore %)
-	$(BIN)/pytest $(TIMED) $(ATTACKS:%=--ignore %)
+	$(BIN)/pytest --numprocesses auto --dist loadfile -m 'not timed'
+	$(BIN)/pytest -m 'timed and not attack'
 
-lint: $(VENV)/installed-dev ## lint and check types
+lint: $(VENV)/installed-dev ## lint, check what imports what, and check types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/mypy
 
 format: $(VENV)/installed-dev ## format the code and apply safe lint fixes
@@ -81,7 +76,7 @@ own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kin
 	$(BIN)/python -m training.trials.own_scenes runs/own-scenes
 
 attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
-	$(BIN)/pytest -rs $(ATTACKS)
+	$(BIN)/pytest -m attack
 
 hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
 	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md

@@ -24,6 +24,8 @@ from server.protocol.server_messages import (
     parse_server_message,
 )
 
+pytestmark = pytest.mark.timed
+
 HELLO = Hello(protocol=PROTOCOL, scene="flat")
 TALKER = AddEmitter(id="talker", clip="tone", position=(6.0, 3.0, 1.5))
 

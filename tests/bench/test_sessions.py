@@ -11,6 +11,8 @@ from server.bench import sessions as bench
 from server.bench.cli import app
 from server.bench.sessions import Plan, failures, find_most, judge, measure_sessions
 
+pytestmark = pytest.mark.timed
+
 
 @pytest.mark.parametrize("capacity", [0, 1, 3, 4, 5, 17, 23, 40, 199, 511, 512, 10_000])
 def test_the_most_is_found_to_within_five_percent(capacity):

@@ -6,6 +6,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import pytest
 import uvicorn
@@ -15,6 +16,16 @@ from server.api.serving import uvicorn_options
 from server.api.settings import Settings
 from server.assets.hrtfs import HrtfLibrary
 from server.field.fields_by_level import FieldsByLevel
+
+HERE = Path(__file__).parent
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Servers and browsers here are measured while they run: every test is `timed`."""
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker(pytest.mark.timed)
 
 
 @contextmanager

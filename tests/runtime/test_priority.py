@@ -8,6 +8,8 @@ import pytest
 
 from server.runtime.priority import DutyCycle, become_background, become_prompt, become_real_time
 
+pytestmark = pytest.mark.timed
+
 on_linux = pytest.mark.skipif(sys.platform != "linux", reason="priorities of single threads are Linux's")
 
 

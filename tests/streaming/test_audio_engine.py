@@ -19,6 +19,8 @@ from server.streaming.stream import MAX_WAITING_MESSAGES, PAUSE_AFTER_S, StreamF
 from tests.engine_stage import BLOCK_S, Clock, Patient, Stage, blocks, open_stream, spy_on_batches
 from tests.killing import kill, threads_may_die
 
+pytestmark = pytest.mark.timed
+
 
 @pytest.fixture
 def stage(field, filters):

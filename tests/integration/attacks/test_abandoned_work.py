@@ -6,6 +6,10 @@ import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+
+pytestmark = pytest.mark.attack
+
 LOUDNESS = "/v1/scenes/apartment/loudness?emitter={x:.3f},2,1.5&spacing_m=0.15"
 IR = "/v1/scenes/apartment/impulse-response?listener={x:.4f},2,1.5&emitter=6,3,1.5"
 

@@ -17,6 +17,8 @@ from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, Ping, SetGain
 from server.protocol.server_messages import parse_server_message
 
+pytestmark = pytest.mark.attack
+
 FLOOD_S = 5.0
 AT_ONCE = 500
 

@@ -7,6 +7,8 @@ import time
 
 import pytest
 
+pytestmark = pytest.mark.attack
+
 ENVIRONMENT = {"NAFIR_REQUEST_TIMEOUT_S": "2", "NAFIR_RESPONSE_TIMEOUT_S": "2"}
 MEBIBYTE = 1024 * 1024
 MOST_BYTES = 60 * MEBIBYTE
