@@ -70,7 +70,7 @@ def _there_is_no_blas() -> None:
 
 @cache
 def _digest_of_sources() -> str:
-    """Of every module beside this one that says "compiled"."""
+    """Of every module of the server that says "compiled"."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].glob("**/*.py")):
         source = path.read_bytes()

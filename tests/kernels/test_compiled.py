@@ -15,21 +15,23 @@ from server.kernels.compiled import compiled, compiled_in_place
 
 MODULES = {
     "server/__init__.py": "",
+    "server/kernels/__init__.py": "",
     "server/inner.py": "from server.kernels.compiled import compiled\n\n@compiled\ndef inner(x):\n    return x + 1\n",
     "server/outer.py": (
         "from server.kernels.compiled import compiled\nfrom server.inner import inner\n\n"
         "@compiled\ndef outer(x):\n    return 10 * inner(x)\n"
     ),
 }
+COMPILED = Path(server.__file__).parent / "kernels" / "compiled.py"
 RUN = "from server.outer import outer; print(outer(1), sum(outer.stats.cache_hits.values()))"
 
 
 @pytest.fixture
 def package(tmp_path):
     for name, source in MODULES.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(source)
-    shutil.copy(Path(server.__file__).parent / "compiled.py", tmp_path / "server")
+    shutil.copy(COMPILED, tmp_path / "server" / "kernels")
     return tmp_path
 
 
