@@ -83,7 +83,7 @@ class Codec:
         """(..., sample) to complex (..., frequency, frame)."""
         return np.asarray(self._transform.stft(signal, p1=self._transform.p_max(self.samples)))
 
-    def log_magnitude(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.float64]:
+    def log_magnitude(self, spectrogram: npt.NDArray[np.inexact]) -> npt.NDArray[np.float64]:
         return np.asarray(np.log(np.abs(spectrogram).astype(np.float64) + self.log_floor))
 
     def magnitude(self, log_magnitude: Array) -> Array:

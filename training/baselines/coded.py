@@ -130,7 +130,7 @@ class CodedResponses:
                 self._decoded.move_to_end(file)
                 while len(self._decoded) > _OPEN_FILES:
                     self._decoded.popitem(last=False)
-        return decoded[position]
+        return np.asarray(decoded[position])
 
     def _digest(self) -> str:
         held_out = self._held_out
@@ -177,4 +177,5 @@ class CodedResponses:
         whole[:kept] = signal[:kept, : held_out.channels]
         responses = np.swapaxes(whole.reshape(len(gains), self._slot, -1)[:, : held_out.samples], 1, 2)
         responses = responses * gains[:, None, None]
-        return responses.reshape(len(self._pairs[number]), len(held_out.yaws), *responses.shape[1:]).astype(np.float16)
+        rows = responses.reshape(len(self._pairs[number]), len(held_out.yaws), *responses.shape[1:])
+        return np.asarray(rows, np.float16)

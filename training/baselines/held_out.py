@@ -15,7 +15,8 @@ import numpy.typing as npt
 from server.core.errors import NafirError
 from server.scene.bundle import Bundle
 from training.baselines.baselines import PairResponses, TrainingPairs
-from training.data.dataset import Dataset, DatasetError
+from training.data.dataset import Dataset
+from training.data.dataset_check import DatasetError
 from training.data.responses import ImportedDataset, SimulatedResponses, open_responses
 from training.simulation.references import References
 
@@ -63,12 +64,12 @@ class HeldOut:
     @property
     def emitters(self) -> _Floats:
         """(index, 3)"""
-        return self.pairs.emitter_positions[self.pairs.pair_emitter[self.held_out]]
+        return np.asarray(self.pairs.emitter_positions[self.pairs.pair_emitter[self.held_out]])
 
     @property
     def listeners(self) -> _Floats:
         """(index, 3)"""
-        return self.pairs.listener_positions[self.pairs.pair_listener[self.held_out]]
+        return np.asarray(self.pairs.listener_positions[self.pairs.pair_listener[self.held_out]])
 
     def reference(self, index: int) -> Responses:
         """At the orientations that are heard."""

@@ -93,7 +93,7 @@ class HelmholtzInterpolation:
             for number, regularisation in enumerate(REGULARISATIONS):
                 left_out = np.abs(left_out_errors(matrix, spectra, regularisation)) ** 2
                 errors[:, number] += np.bincount(octaves(frequency[used]), left_out.sum(axis=(1, 2)), count)
-        return np.array(REGULARISATIONS)[np.argmin(errors, axis=1)]
+        return np.asarray(np.array(REGULARISATIONS)[np.argmin(errors, axis=1)])
 
 
 def octaves(frequency: _Floats) -> npt.NDArray[np.int64]:

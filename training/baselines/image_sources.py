@@ -22,7 +22,8 @@ from server.responses.full_response import kemar
 from server.scene.geometry import Geometry
 from server.scene.manifest import Air
 from training.data.dataset import SPEED_OF_SOUND, Dataset
-from training.simulation.rays import HISTOGRAM_BIN_S, sphere_directions, surface_shares
+from training.data.scene_file import HISTOGRAM_BIN_S
+from training.simulation.rays import sphere_directions, surface_shares
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import Arrivals, RoomTracer
 
@@ -94,7 +95,8 @@ class ImageSources:
         self._dataset = dataset
         self._directions = sphere_directions(settings.arrival_directions)
         diffuse = DiffuseField(dataset.scene.geometry, dataset.scene.air)
-        time_s = (np.arange(round(settings.duration_s / HISTOGRAM_BIN_S)) + 0.5) * HISTOGRAM_BIN_S
+        bins = np.arange(round(settings.duration_s / HISTOGRAM_BIN_S)) + 0.5
+        time_s = np.asarray(bins * HISTOGRAM_BIN_S, np.float64)
         tail = diffuse.energy_per_s(time_s) * diffuse.share_beyond(settings.image_order, time_s) * HISTOGRAM_BIN_S
         shape = (len(self._directions), *tail.shape)
         self._tail = np.broadcast_to(tail / len(self._directions), shape).astype(np.float32)

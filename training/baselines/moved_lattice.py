@@ -20,7 +20,8 @@ def with_moved_lattice(field: AcousticField, rng: np.random.Generator) -> Acoust
     if reuse is None or nodes is None:
         return field
     most = min(_MOST_OFFSET_M, reuse.spacing_m / 2)
-    x, y, z, turned = (*rng.uniform(-most, most, 3).tolist(), rng.uniform(-math.pi, math.pi))
+    x, y, z = map(float, rng.uniform(-most, most, 3))
+    turned = rng.uniform(-math.pi, math.pi)
     paths = SoundPathFinder(field.bundle.floor_plan, field.bundle.manifest.speed_of_sound)
     moved = copy.copy(field)
     moved.nodes = copy.copy(nodes)

@@ -78,12 +78,12 @@ class PairRegression:
             likelihood = 0.5 * rows * count * np.log(np.square(white).sum()) + count * np.log(np.diag(lower)).sum()
             return float(likelihood + 0.5 * np.square((parameters - _START) / _PRIOR_SPREAD).sum())
 
-        found = minimize(cost, _START, method="L-BFGS-B", bounds=_BOUNDS, options={"maxiter": _ITERATIONS})
+        found = minimize(cost, _START, method="L-BFGS-B", bounds=_BOUNDS.tolist(), options={"maxiter": _ITERATIONS})
         return np.asarray(found.x)
 
     def _of_known(self, ends: Ends) -> _Floats:
         covariance = self._covariance(ends, ends)
-        return covariance + np.exp(self.parameters[-1]) * np.eye(len(covariance))
+        return np.asarray(covariance + np.exp(self.parameters[-1]) * np.eye(len(covariance)))
 
     def _covariance(self, a: Ends, b: Ends) -> _Floats:
         both, at_emitter, at_listener, one_listener, one_emitter, along, of_listener, across, _ = np.exp(

@@ -36,6 +36,7 @@ def to_onnx(
             dynamo=True,
             verbose=False,
         )
+    assert program is not None  # by `dynamo`
     model = program.model_proto
     graph = model.graph
     for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):

@@ -30,6 +30,23 @@ class ShapedNearestGraph(nn.Module):
     below each sample, and no band has to be filtered again.
     """
 
+    _bands: Tensor
+    _yaws: Tensor
+    _emitters: Tensor
+    _listeners: Tensor
+    _delays_s: Tensor
+    _peaks: Tensor
+    _lateness_s: Tensor
+    _energies: Tensor
+    _known_emitters: Tensor
+    _known_listeners: Tensor
+    _covariances: Tensor
+    _scalar_mean: Tensor
+    _scalar_weights: Tensor
+    _share_mean: Tensor
+    _share_weights: Tensor
+    _kaiser: Tensor
+
     def __init__(self, shaped: ShapedNearest, yaws: npt.NDArray[np.floating], *, lead: int) -> None:
         super().__init__()
         pairs, expected = shaped.pairs, shaped.expected
@@ -112,12 +129,13 @@ class ShapedNearestGraph(nn.Module):
         def near(distance: Tensor, length: Tensor) -> Tensor:
             return torch.exp(-0.5 * (distance / length) ** 2)
 
-        return (
+        covariance: Tensor = (
             both * near(emitters, at_emitter) * near(listeners, at_listener)
             + one_listener * same_listener
             + one_emitter * same_emitter * near(listeners, along)
             + of_listener * same_listener * near(emitters, across)
         )
+        return covariance
 
     def _spreading(self, distance_m: Tensor) -> Tensor:
         """(stretch,) of a distance (1,)."""

@@ -9,7 +9,7 @@ from contextlib import closing
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 from rich.console import Console
@@ -209,7 +209,7 @@ def _conditioning(
 ) -> "Conditioning":
     from training.data.importers.conditioning import Conditioning
 
-    axis = None if mirror is None else mirror.value
+    axis: Literal["x", "y"] | None = None if mirror is None else mirror.value
     return Conditioning(latency_samples, sample_rate, duration_s, position_scale, axis, swap_ears, accept_ears)
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from server.core.errors import NafirError
-from training.data.dataset import SPEED_OF_SOUND, Dataset, DatasetError
+from training.data.dataset import SPEED_OF_SOUND, Dataset
+from training.data.dataset_check import DatasetError
 from training.data.importers.report import ImportReport
 
 FORMAT = 1
@@ -375,11 +376,11 @@ def _array(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     return values
 
 
-def _rows(path: Path, file: h5py.File, name: str, shape: tuple[int, ...]) -> npt.NDArray[np.generic]:
+def _rows(path: Path, file: h5py.File, name: str, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
     values = _array(path, file, name)
     if values.shape != shape:
         raise ResponsesError(path, name, f"has shape {values.shape}, expected {shape}")
-    content = values[()]
+    content = np.asarray(values[()])
     if not np.isfinite(content).all():
         raise ResponsesError(path, name, "has values that are not finite")
     return content

@@ -102,13 +102,14 @@ def _errors(learner: FactorisedLearner, rows: npt.NDArray[np.int64]) -> tuple[fl
         relative = [curve - curve[..., :1] for curve in curves]
         within = relative[1] > -_DECAY_RANGE_DB
         decay.append((np.abs(relative[0] - relative[1]) * within).sum(axis=(1, 2)) / within.sum(axis=(1, 2)))
-    return tuple(float(np.mean(np.concatenate(part))) for part in (spectral, level, decay))
+    of_spectrum, of_level, of_decay = (float(np.mean(np.concatenate(part))) for part in (spectral, level, decay))
+    return of_spectrum, of_level, of_decay
 
 
 def _decay_db(power: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """(..., frequency, frame) power to (..., frame) energy from each frame on, over all frequencies."""
     energy = power.sum(axis=-2)
-    return 10 * np.log10(np.maximum(np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1], 1e-30))
+    return np.asarray(10 * np.log10(np.maximum(np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1], 1e-30)))
 
 
 def table(rows: Iterable[Row]) -> list[tuple[str, ...]]:

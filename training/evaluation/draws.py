@@ -20,6 +20,7 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -121,7 +122,8 @@ class _Draws:
         path = self._file(draw, emitter)
         partial = path.with_suffix(f".{os.getpid()}.partial")  # another process may be at it
         with partial.open("wb") as file:
-            np.savez(file, **{name: np.stack([of_pair[name] for of_pair in measured]) for name in _NAMES})
+            columns: dict[str, Any] = {name: np.stack([of_pair[name] for of_pair in measured]) for name in _NAMES}
+            np.savez(file, **columns)
         partial.replace(path)
 
 

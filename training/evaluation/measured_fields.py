@@ -85,8 +85,9 @@ def decoded(answers: Answers, codec: Codec, noise: FrozenNoise) -> npt.NDArray[n
         spectrogram = _with_phase(magnitude, phase, certainty, coherence, noise)
     else:
         # A lone microphone is the left of two ears that have nothing to do with each other.
-        twice = (np.repeat(values, 2, axis=1) for values in (magnitude, phase, certainty))
-        spectrogram = _with_phase(*twice, np.zeros(magnitude[:, 0].shape, np.complex64), noise)[:, :1]
+        magnitude, phase, certainty = (np.repeat(values, 2, axis=1) for values in (magnitude, phase, certainty))
+        unlike = np.zeros(magnitude[:, 0].shape, np.complex64)
+        spectrogram = _with_phase(magnitude, phase, certainty, unlike, noise)[:, :1]
     return codec.synthesise(spectrogram).astype(np.float32)
 
 

@@ -184,7 +184,7 @@ def _mean_rows(results: Sequence[SceneResult]) -> list[str]:
         means[name] = [math.fsum(column) / len(column) for column in values]
     compared = [of_name for name, of_name in means.items() if name not in _NOT_METHODS]
     smallest = [min(filter(math.isfinite, column), default=math.nan) for column in zip(*compared, strict=True)]
-    rows = []
+    rows: list[str] = []
     for name, of_name in means.items():
         cells = [
             _number(mean, is_bold=number < len(METRICS) and name not in _NOT_METHODS and mean == smallest[number])

@@ -140,7 +140,7 @@ def _added_mb(folder: Path, level: str) -> float:
     second = _serving(bundle, level)
     added = psutil.Process().memory_info().rss - before
     del first, second
-    return max(0.0, added / 1e6)
+    return max(0.0, float(added) / 1e6)
 
 
 def _serving(bundle: Bundle, level: str | None) -> AcousticField:

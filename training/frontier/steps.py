@@ -32,7 +32,8 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
     if field.nodes is not None:
         nodes = [field.snap(pose.position, emitter, pose.yaw) for pose in poses]
         steps = [step for step, (one, other) in zip(steps, itertools.pairwise(nodes), strict=True) if one != other]
-    chosen = np.unique(np.linspace(0, len(steps) - 1, min(count, len(steps))).astype(int)) if steps else []
+    spread = np.linspace(0, len(steps) - 1, min(count, len(steps))).astype(int) if steps else np.array([], int)
+    chosen = np.unique(spread)
     whole = FullResponse.through_kemar(field)
     largest: dict[str, float] = {}
     for number in chosen:
@@ -49,4 +50,4 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
 
 def _response(whole: FullResponse, pose: Pose) -> npt.NDArray[np.float32]:
     emitter = whole.bundle.manifest.start.emitter
-    return whole.impulse_responses([pose.position], [emitter], [pose.yaw])[0]
+    return np.asarray(whole.impulse_responses([pose.position], [emitter], [pose.yaw])[0])

@@ -1,5 +1,7 @@
 """The frontier as a table for people."""
 
+from collections.abc import Mapping
+
 from rich.table import Table
 
 from server.acoustics.audibility import THRESHOLDS
@@ -41,5 +43,5 @@ def report(frontier: Frontier) -> Table:
     return table
 
 
-def _cell(errors: dict[str, float], audible: "dict[str, float]", name: str) -> str:
+def _cell(errors: Mapping[str, float], audible: Mapping[str, float], name: str) -> str:
     return f"{errors[name]:.3g} ({audible[name]:.2g})" if name in errors else "none"

@@ -29,6 +29,10 @@ class EnergyError(nn.Module):
     `deficit` is by how much predicted levels of single bins lie below those of their expected power.
     """
 
+    _of_bins: Tensor
+    _of_cells: Tensor
+    _widths: Tensor
+
     def __init__(self, cells: Cells, heads: Heads, *, deficit: float) -> None:
         super().__init__()
         self._shapes = {name: (heads.slices[name], heads.shapes[name]) for name in ("fine", "late")}

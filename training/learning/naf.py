@@ -111,7 +111,8 @@ class NafLearner:
             reach = frames if padded else min(frames, self._sounding(row))
             points = [rng.integers(0, size, recipe.points) for size in (*across, reach)]
             indices[:, number] = points
-            values[number] = self._values(self._aligned(row))[:, *points]
+            of_ears: Any = self._values(self._aligned(row))
+            values[number] = of_ears[:, *points]
         poses = [part[chosen] for part in (self.responses.listener, self.responses.emitter, self.responses.yaw)]
         if not validating:
             for position in poses[:2]:

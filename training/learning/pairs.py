@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from training.data.dataset import DatasetError
+from training.data.dataset_check import DatasetError
 from training.data.responses import SAME_POINT_M, ResponseSet
 
 _HELD_BACK_SHARE = 0.05

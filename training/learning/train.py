@@ -9,7 +9,7 @@ import dataclasses
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -312,7 +312,7 @@ class _Loop:
         device = self._processes.device
         return tuple(part.to(device) for part in inputs), tuple(part.to(device) for part in targets)
 
-    def _batches(self, first_step: int) -> Iterator[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
+    def _batches(self, first_step: int) -> Generator[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
         """This process's share of every batch from a step on, without end, made ready a little ahead of its use."""
         processes, seed = self._processes, self._configuration.seed
         orders: dict[int, Rows] = {}

@@ -54,6 +54,8 @@ class FeatureGrid(nn.Module):
     that it cannot underflow to 0/0 far from every node.
     """
 
+    _nodes: Tensor
+
     def __init__(self, plan: FloorPlan, spacing_m: float, features: int) -> None:
         super().__init__()
         low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
@@ -78,6 +80,17 @@ class PoseEncoder(nn.Module):
     Beyond its `reach` a network would go on as it pleases, so places are read as the nearest within it, and ends that
     are nearer to each other as that near. Directions and sight are those of the places themselves.
     """
+
+    _low: Tensor
+    _high: Tensor
+    _centre: Tensor
+    _half_size: Tensor
+    _octaves: Tensor
+    _octave_phases: Tensor
+    _yaw_multiples: Tensor
+    _yaw_phases: Tensor
+    _turns: Tensor
+    _turns_back: Tensor
 
     def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
         super().__init__()
@@ -155,6 +168,8 @@ class PoseEncoder(nn.Module):
 class Heads(nn.Module):
     """Slices of the basis: where each head's numbers lie in the flat output."""
 
+    areas: Tensor
+
     def __init__(self, cells: Cells, channels: int = 2) -> None:
         super().__init__()
         codec = cells.codec
@@ -183,6 +198,10 @@ class FactorisedField(nn.Module):
     `level_correction` (2, heads.size) is what predicted levels lack, of pairs out of sight and in sight
     (`training.models.level_correction`).
     """
+
+    mean: Tensor
+    spread: Tensor
+    level_correction: Tensor
 
     def __init__(
         self, plan: FloorPlan, cells: Cells, shape: FieldShape, channels: int = 2, *, reach: Reach | None = None
@@ -219,7 +238,8 @@ class FactorisedField(nn.Module):
         hidden = nn.functional.gelu(self._inputs(features))
         for layer in self._hidden:
             hidden = hidden + nn.functional.gelu(layer(hidden))
-        return self._coefficients(hidden)
+        coefficients: Tensor = self._coefficients(hidden)
+        return coefficients
 
     @torch.no_grad()
     def truncated(self, rank: int, listener: Tensor, emitter: Tensor, yaw: Tensor) -> "FactorisedField":
@@ -262,6 +282,11 @@ class ExportedField(nn.Module):
 
     What is spread over frequency alike lies side by side in the basis, so that few nodes move large arrays.
     """
+
+    _bands: Tensor
+    _basis: Tensor
+    _offset: Tensor
+    _nominal_advance: Tensor
 
     def __init__(self, field: FactorisedField, cells: Cells) -> None:
         super().__init__()

@@ -25,4 +25,4 @@ def even_noise(codec: Codec, rng: np.random.Generator, *, iterations: int = 200)
         signal = codec.synthesise(ahead)
         before, spectrogram = spectrogram, transform_at_once(codec, signal)
     power = np.mean(np.abs(spectrogram) ** 2, dtype=np.float64) / codec.window_energy
-    return (signal / np.sqrt(power)).astype(np.float32)
+    return np.asarray(signal / np.sqrt(power), np.float32)

@@ -25,6 +25,11 @@ class LevelsInterpolated(nn.Module):
     by the factor sinh(2x) / 2x above that of its centre: read as it is, late sound decays too slowly where cells widen.
     """
 
+    _to_bins: Tensor
+    _of_bins: Tensor
+    _to_frames: Tensor
+    _of_frames: Tensor
+
     def __init__(self, cells: Cells, channels: int) -> None:
         super().__init__()
         self._fine = (channels, cells.codec.bins, cells.fine_frames)

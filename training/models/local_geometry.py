@@ -30,6 +30,8 @@ class GaussianGrid(nn.Module):
     than a few metres from every cell.
     """
 
+    _cells: Tensor
+
     def __init__(
         self, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], spacing_m: float, features: int
     ) -> None:
@@ -58,6 +60,10 @@ class GaussianGrid(nn.Module):
 class OrientationEmbedding(nn.Module):
     """A learned vector per layer for each measured head orientation, interpolated between the two nearest: at measured
     ones the paper's embedding, and defined at all others."""
+
+    _yaws: Tensor
+    _after: Tensor
+    _before: Tensor
 
     def __init__(self, yaws: npt.NDArray[np.float64], layers: int, width: int) -> None:
         super().__init__()

@@ -14,7 +14,7 @@ Axes: B poses, ear, N points; metres, radians.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -48,6 +48,12 @@ class Naf(nn.Module):
     """Normalised predictions (B, ear, N, outputs) at points given by their index along each of `axes`, the sizes
     (frequency, frame) or (sample,)."""
 
+    mean: Tensor
+    spread: Tensor
+    coherence: Tensor
+    _low: Tensor
+    _high: Tensor
+
     def __init__(self, site: Site, axes: tuple[int, ...], channels: int, shape: NafShape) -> None:
         super().__init__()
         self.shape, self.axes, self.channels = shape, axes, channels
@@ -77,9 +83,15 @@ class Naf(nn.Module):
             # Mean complex interaural coherence of the training set (real and imaginary, *axes).
             self.register_buffer("coherence", torch.zeros(2, *axes))
 
+    @property
+    def entries(self) -> tuple[nn.Linear, nn.Linear]:
+        """The layers that read the inputs: the first, and that which carries them past the first half."""
+        return self.first, cast(nn.Linear, self.skip[0])
+
     def encoding(self, axis: int) -> Tensor:
         """(size, ENCODED) encodings of all indices along an axis."""
-        return getattr(self, f"_axis_{axis}")
+        encodings: Tensor = getattr(self, f"_axis_{axis}")
+        return encodings
 
     def pose_features(self, listener: Tensor, emitter: Tensor) -> Tensor:
         """(B, features) of where the two ends are."""
@@ -106,12 +118,14 @@ class Naf(nn.Module):
         """`indices` (B, N) along each axis."""
         features = self.pose_features(listener, emitter)
         starts = []
-        for layer in (self.first, self.skip[0]):
+        for layer in self.entries:
             start = self.of_pose(layer, features)[:, None]
             for table, index in zip(self.tables(layer), indices, strict=True):
                 start = start + table[index]
             starts.append(start)
-        return self.last(self.trunk(*starts, self.orientations(yaw), self.inner))
+        first, skipped = starts
+        values: Tensor = self.last(self.trunk(first, skipped, self.orientations(yaw), self.inner))
+        return values
 
     def trunk(self, first: Tensor, skipped: Tensor, orientation: Tensor, inner: nn.ModuleList) -> Tensor:
         """From both input layers' (B, N, width), all through `inner`, the inner layers or the first of them, to

@@ -5,6 +5,8 @@ is a sum over its inputs: the shares of frequency and frame are tables, made onc
 per pose; and two layers in a row with nothing in between are one. Both compute the same numbers up to rounding.
 """
 
+from typing import cast
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -20,6 +22,10 @@ class NafGraph(nn.Module):
     The certainty is nothing throughout. The paper's network does not say how sure it is of a phase, and the paper's
     own evaluation puts random phase in its place; a level that integrates the frequency does not ask."""
 
+    _points: Tensor
+    _weight: Tensor
+    _bias: Tensor
+
     def __init__(self, field: Naf, codec: Codec, *, tabled: bool) -> None:
         super().__init__()
         self._field = field
@@ -28,10 +34,10 @@ class NafGraph(nn.Module):
         sizes = field.axes
         if tabled:
             with torch.no_grad():
-                for number, layer in enumerate((field.first, field.skip[0])):
+                for number, layer in enumerate(field.entries):
                     for axis, table in enumerate(field.tables(layer)):
                         self.register_buffer(f"_table_{number}_{axis}", table.clone(), persistent=False)
-                last, folded = field.last, field.inner[-1]
+                last, folded = field.last, cast(nn.Linear, field.inner[-1])
                 self.register_buffer("_weight", last.weight @ folded.weight, persistent=False)
                 self.register_buffer("_bias", last(folded.bias + field.ears[-1]), persistent=False)
         else:
@@ -59,18 +65,20 @@ class NafGraph(nn.Module):
             [features[:, None].expand(-1, count, -1), self._points.expand(len(features), -1, -1)], dim=-1
         )
         hidden = field.trunk(field.first(inputs), field.skip[0](inputs), orientation, field.inner)
-        return field.last(hidden)
+        values: Tensor = field.last(hidden)
+        return values
 
     def _from_tables(self, features: Tensor, orientation: Tensor) -> Tensor:
         field = self._field
         starts = []
-        for number, layer in enumerate((field.first, field.skip[0])):
+        for number, layer in enumerate(field.entries):
             start = field.of_pose(layer, features)
             for axis in range(len(field.axes)):
                 table = getattr(self, f"_table_{number}_{axis}")
                 start = start[..., None, :] + table.reshape(1, *([1] * axis), len(table), -1)
             starts.append(start.flatten(1, -2))
-        hidden = field.trunk(*starts, orientation, field.inner[:-1])
+        first, skipped = starts
+        hidden = field.trunk(first, skipped, orientation, field.inner[:-1])
         turned = nn.functional.linear(orientation[:, -1], field.last.weight)
         last = nn.functional.linear(nn.functional.leaky_relu(hidden, SLOPE), self._weight)
         return last + (self._bias + turned[:, None])[:, :, None]

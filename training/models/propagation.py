@@ -43,6 +43,15 @@ class Propagation(nn.Module):
     to see round, there is nothing to compute.
     """
 
+    _apart: Tensor
+    _turn_left: Tensor
+    _corners: Tensor
+    _bends: Tensor
+    _bends_across: Tensor
+    _between: Tensor
+    _of_place: Tensor
+    _of_all_places: Tensor
+
     def __init__(self, plan: FloorPlan) -> None:
         super().__init__()
         walls = np.asarray(plan.walls, dtype=np.float64)

@@ -63,4 +63,5 @@ class Site:
         axes = [(0, 1, 2) if np.ptp(end[:, 2]) > _MOVES_M else (0, 1) for end in ends]
         # Rounded, so that one heading written as several floats stays one.
         yaws = np.unique(np.round(np.remainder(responses.yaw, 2 * np.pi), 6))
-        return cls(plan, low, high, yaws[yaws < 2 * np.pi - 1e-5], axes[0], axes[1])
+        headings = np.asarray(yaws[yaws < 2 * np.pi - 1e-5], np.float64)
+        return cls(plan, low, high, headings, axes[0], axes[1])

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
-from training.data.dataset import DatasetError
+from training.data.dataset_check import DatasetError
 from training.data.responses import ResponseSet, SimulatedResponses
 from training.models.cells import Cells
 from training.models.expected_targets import ExpectedTargets
@@ -62,8 +62,10 @@ def load_targets(
         raise DatasetError(f"{path}: another process is computing these targets; wait for it") from exc
     except OSError as exc:
         raise DatasetError(f"{path}: not a file of targets; delete it, and it is computed anew ({exc})") from exc
-    poses = (part[rows].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw))
-    return Targets(*poses, np.memmap(path, np.float16, "r", offset, shape), seconds)
+    listener, emitter, yaw = (
+        part[rows].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw)
+    )
+    return Targets(listener, emitter, yaw, np.memmap(path, np.float16, "r", offset, shape), seconds)
 
 
 def _complete(

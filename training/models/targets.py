@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.codec import Codec
-from training.data.dataset import DatasetError
+from training.data.dataset_check import DatasetError
 from training.data.responses import ResponseSet
 from training.models.cells import Cells
 

@@ -121,10 +121,15 @@ class GeometricResponses:
     def responses(self, emitter: int, listeners: npt.NDArray[np.integer]) -> _Responses:
         """(listener, yaw, ear, sample)"""
         place, reflections = self._probes[emitter], self._tracer.images(self._probes[emitter])
+
+        def heard(images: tuple[_Floats, _Floats], receiver: _Floats) -> npt.NDArray[np.float32]:
+            positions, amplitudes = images
+            return self._synthesis.specular(positions, amplitudes, receiver)
+
         return np.stack(
             [
-                self._synthesis.specular(*self._direct.images(place, self._probes[listener]), self._probes[listener])
-                + self._synthesis.specular(*reflections[listener], self._probes[listener])
+                heard(self._direct.images(place, self._probes[listener]), self._probes[listener])
+                + heard(reflections[listener], self._probes[listener])
                 for listener in listeners
             ]
         )

@@ -62,7 +62,8 @@ class DiffuseRoom:
         reflected, scattered = surface_shares(self.geometry)
         weights = self.areas_m2[:, None] * reflected
         total = weights.sum(axis=0)
-        return np.divide((weights * scattered).sum(axis=0), total, out=np.zeros_like(total), where=total > 0)
+        shares = np.divide((weights * scattered).sum(axis=0), total, out=np.zeros_like(total), where=total > 0)
+        return np.asarray(shares)
 
     @cached_property
     def reverberation_time_s(self) -> _Floats:

@@ -46,7 +46,7 @@ class DirectPaths:
     def images(self, emitter: _Floats, listener: _Floats) -> tuple[_Floats, _Floats]:
         positions, amplitudes = [], []
         is_seen = bool(self.floor_plan.is_visible(emitter, listener))
-        straight = free_field_amplitude(np.linalg.norm(emitter - listener), self.air)
+        straight = free_field_amplitude(np.asarray(np.linalg.norm(emitter - listener), np.float64), self.air)
         if self.finder is not None:
             paths = self.finder.find(listener, emitter[None])
             positions.append(listener + paths.length_m[0] * paths.arrival[0])

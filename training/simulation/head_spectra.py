@@ -91,7 +91,7 @@ class HeadSpectra:
     def _band_logs(self) -> _Singles:
         """(band, part, bin and room) logarithms of minimum-phase filters that are e in one band: times ln gains, those
         of what was met."""
-        weights = band_weights(np.fft.rfftfreq(self.n_fft, 1 / self.head.sample_rate))
+        weights = band_weights(np.asarray(np.fft.rfftfreq(self.n_fft, 1 / self.head.sample_rate), np.float64))
         return self._in_parts(np.fft.rfft(folded_cepstrum(weights), self.n_fft))
 
     def _in_parts(self, spectra: npt.NDArray[np.complexfloating]) -> _Singles:

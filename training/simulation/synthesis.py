@@ -85,7 +85,7 @@ class BinauralSynthesis:
 
     def direct(self, emitter: _Floats, receiver: _Floats, air: Air) -> _Singles:
         """Direct sound of an emitter in sight; sample 0 is emission."""
-        amplitude = free_field_amplitude(np.linalg.norm(emitter - receiver, keepdims=True), air)
+        amplitude = free_field_amplitude(np.array([np.linalg.norm(emitter - receiver)]), air)
         return self.specular(emitter[None], amplitude, receiver)
 
     def late_covariance(
@@ -96,7 +96,9 @@ class BinauralSynthesis:
         `arrival_products`."""
         step_s = self._n_fft // 2 / self._sample_rate
         frames = -(-self.samples // (self._n_fft // 2)) + 1
-        per_sample = power_at(np.arange(frames) * step_s, energy) / np.float32(self._sample_rate)
+        per_sample = power_at(np.asarray(np.arange(frames) * step_s, np.float64), energy) / np.float32(
+            self._sample_rate
+        )
         frequencies_hz = np.linspace(0, self._sample_rate / 2, heard.shape[0])
         power = np.einsum("dbt,bn->ndt", per_sample, band_weights(frequencies_hz).astype(np.float32), optimize=True)
         # Windows overlap on the same noise: their amplitudes add up, and neighbours have a product too.
@@ -171,7 +173,9 @@ class BinauralSynthesis:
     @cached_property
     def _band_weights(self) -> _Singles:
         """(band, bin)"""
-        return band_weights(np.fft.rfftfreq(self._n_fft, 1 / self._sample_rate)).astype(np.float32)
+        return band_weights(np.asarray(np.fft.rfftfreq(self._n_fft, 1 / self._sample_rate), np.float64)).astype(
+            np.float32
+        )
 
     @cached_property
     def _ears(self) -> HeadSpectra:

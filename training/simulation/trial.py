@@ -270,4 +270,4 @@ def _root_mean_square(difference: _Floats) -> _Floats:
     told = np.isfinite(product)
     count = told.sum(axis=0)
     mean = np.divide(np.where(told, product, 0.0).sum(axis=0), count, out=np.zeros(count.shape), where=count > 0)
-    return np.sqrt(np.maximum(0.0, mean))
+    return np.asarray(np.sqrt(np.maximum(0.0, mean)))

@@ -72,7 +72,10 @@ def make(scene: Path, folder: Path) -> Report:
 
 
 def _read(document: dict[str, Any]) -> Comparison:
-    return Comparison(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
+    fields: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in document.items()
+    }
+    return Comparison(**fields)
 
 
 def table(reports: Sequence[Report]) -> str:

@@ -119,8 +119,9 @@ def _room(
 
 def rooms() -> tuple[SceneFile, ...]:
     ell = ((0.0, 0.0), (9.0, 0.0), (9.0, 7.6), (7.4, 7.6), (7.4, 1.6), (0.0, 1.6))
-    coupled = ((0.0, 0.0), (4.0, 0.0), (4.0, 1.8), (4.1, 1.8), (4.1, 0.0), (9.0, 0.0), (9.0, 5.0))
-    coupled += ((4.1, 5.0), (4.1, 2.7), (4.0, 2.7), (4.0, 5.0), (0.0, 5.0))
+    left = (0.0, 0.0), (4.0, 0.0), (4.0, 1.8)
+    right = (4.1, 1.8), (4.1, 0.0), (9.0, 0.0), (9.0, 5.0), (4.1, 5.0), (4.1, 2.7)
+    coupled = (*left, *right, (4.0, 2.7), (4.0, 5.0), (0.0, 5.0))
     door = Opening(name="door", start=(4.05, 1.8), end=(4.05, 2.7))
     dull, hard = (0.9, 0.3), (0.03, 0.1)
     return (
@@ -260,7 +261,8 @@ def table(rows: list[Compared]) -> Table:
 
 def main() -> int:
     """1 where an effect is off that is heard."""
-    rows, began_s, progress = [], process_time(), Console(stderr=True)
+    rows: list[Compared] = []
+    began_s, progress = process_time(), Console(stderr=True)
     for scene in rooms():
         rows += compare(scene, emitters=3, rays=6_000)
         progress.print(f"{scene.id}: {process_time() - began_s:.0f} s of one core so far")
