@@ -1,7 +1,8 @@
 """Impulse responses to log-magnitude and instantaneous frequency, and back.
 
-Axes: (..., frequency, frame) for spectrograms, (..., sample) for signals. The transform is `scipy.signal.ShortTimeFFT`
-with a periodic Hann window; frame 0 is the first that touches the signal.
+Axes: (..., frequency, frame) for spectrograms, (..., sample) for signals. The transform is that of
+`scipy.signal.ShortTimeFFT` with a periodic Hann window, to the bit, without the half second that its import takes;
+frame 0 is the first that touches the signal.
 
 Instantaneous frequency is the phase advance from one frame to the next *less* that of the bin's centre frequency,
 wrapped to [-pi, pi): without the subtraction every fourth bin would sit on the branch cut (hop = n_fft / 4). Frame 0
@@ -10,14 +11,10 @@ holds the absolute phase.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import irfft
-
-if TYPE_CHECKING:
-    from scipy.signal import ShortTimeFFT
+from scipy.fft import irfft, rfft
 
 Array = npt.NDArray[np.floating]
 
@@ -39,19 +36,19 @@ class Codec:
 
     @property
     def frames(self) -> int:
-        return int(self._transform.p_max(self.samples) - self._transform.p_min)
+        # The last window begins before the signal's last sample; its own first sample is zero.
+        reached = -(-(self.samples - 1 + self.n_fft // 2) // self.hop)
+        return max(reached, self.samples // self.hop + 1) - self._first_frame
 
-    @cached_property
-    def _transform(self) -> "ShortTimeFFT":
-        from scipy.signal import ShortTimeFFT  # takes longer to import than all else that reads a scene
-        from scipy.signal.windows import hann
-
-        return ShortTimeFFT(hann(self.n_fft, sym=False), self.hop, self.sample_rate, phase_shift=None)
+    @property
+    def _first_frame(self) -> int:
+        """Where the window of frame n is centred at sample n * hop, the first that reaches into the signal."""
+        return 1 - -(-(self.n_fft - self.n_fft // 2) // self.hop)
 
     @cached_property
     def frame_times_s(self) -> npt.NDArray[np.float64]:
         """(frame,) centre of each window; the first is negative."""
-        first = int(self._transform.p_min)
+        first = self._first_frame
         return np.arange(first, first + self.frames, dtype=np.float64) * self.hop / self.sample_rate
 
     @cached_property
@@ -59,20 +56,26 @@ class Codec:
         """(frequency, 1) radians by which a bin-centred tone advances per frame."""
         return np.asarray(2 * np.pi * self.hop / self.n_fft * np.arange(self.bins, dtype=np.float64)[:, None])
 
-    @property
+    @cached_property
     def window(self) -> npt.NDArray[np.float64]:
         """(n_fft,)"""
-        return np.asarray(self._transform.win)
+        return (0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, self.n_fft + 1)))[:-1]
 
-    @property
+    @cached_property
     def dual_window(self) -> npt.NDArray[np.float64]:
-        """(n_fft,) with which slices are weighted before they are added up again."""
-        return np.asarray(self._transform.dual_win.real)
+        """(n_fft,) with which slices are weighted before they are added up again: the canonical dual (Groechenig,
+        Foundations of Time-Frequency Analysis, 2001, 7.6)."""
+        power = self.window**2
+        overlapped = power.copy()
+        for shift in range(self.hop, self.n_fft, self.hop):
+            overlapped[shift:] += power[:-shift]
+            overlapped[:-shift] += power[shift:]
+        return np.asarray(self.window / overlapped)
 
     @property
     def frame_lead_samples(self) -> int:
         """Samples of the first frame that lie before the signal."""
-        return self.n_fft // 2 - int(self._transform.p_min) * self.hop
+        return self.n_fft // 2 - self._first_frame * self.hop
 
     @cached_property
     def window_energy(self) -> float:
@@ -81,7 +84,16 @@ class Codec:
 
     def transform(self, signal: Array) -> npt.NDArray[np.complex128]:
         """(..., sample) to complex (..., frequency, frame)."""
-        return np.asarray(self._transform.stft(signal, p1=self._transform.p_max(self.samples)))
+        signal = np.asarray(signal)
+        lead, frames = self.frame_lead_samples, self.frames
+        padded = np.zeros((*signal.shape[:-1], (frames - 1) * self.hop + self.n_fft), signal.dtype)
+        heard = min(signal.shape[-1], padded.shape[-1] - lead)
+        padded[..., lead : lead + heard] = signal[..., :heard]
+        spectrogram = np.empty((*signal.shape[:-1], self.bins, frames), np.complex128)
+        for frame in range(frames):
+            start = frame * self.hop
+            spectrogram[..., frame] = rfft(padded[..., start : start + self.n_fft] * self.window, axis=-1)
+        return spectrogram
 
     def log_magnitude(self, spectrogram: npt.NDArray[np.inexact]) -> npt.NDArray[np.float64]:
         return np.asarray(np.log(np.abs(spectrogram).astype(np.float64) + self.log_floor))

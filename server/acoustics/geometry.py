@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse.csgraph import shortest_path
 
 Points = npt.NDArray[np.float64]
 Vector3 = tuple[float, float, float]
@@ -145,7 +144,11 @@ class FloorPlan:
         points = np.concatenate([bends, np.zeros((len(bends), 1))], axis=-1)
         distance = np.linalg.norm(bends[:, None] - bends[None], axis=-1)
         direct = np.where(self.is_visible(points[:, None], points[None]), distance, np.inf)
-        return np.asarray(shortest_path(direct, method="D", directed=False)) if len(bends) else direct
+        if not len(bends):
+            return direct
+        from scipy.sparse.csgraph import shortest_path  # a tenth of a second, which convex rooms do not need
+
+        return np.asarray(shortest_path(direct, method="D", directed=False))
 
     def contains(self, points: Points) -> npt.NDArray[np.bool_]:
         """(...,) True inside the room or on its surfaces."""

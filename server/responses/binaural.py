@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import oaconvolve
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db
@@ -55,6 +54,8 @@ class Binauralization:
 
     def binauralize(self, responses: _Float32, listener: Pose, emitters: Sequence[Vector3]) -> _Float32:
         """(B, 2, sample) of responses (B, 1, sample) from emitters (B, 3)."""
+        from scipy.signal import oaconvolve  # takes half a second to import
+
         samples = responses.shape[-1]
         offsets = np.asarray(emitters, dtype=np.float64) - np.asarray(listener.position)
         distances_m = np.linalg.norm(offsets, axis=-1)

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from numpy.testing import assert_allclose
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import ShortTimeFFT
 from scipy.signal.windows import hann
 
@@ -39,6 +41,22 @@ def test_measured_binaural_responses_survive_the_round_trip(path: Path) -> None:
     response, sample_rate = soundfile.read(path, always_2d=True)
     codec = Codec(sample_rate, 512, 128, len(response), 1e-3)
     assert_allclose(codec.decode(*codec.encode(response.T)), response.T, atol=1e-10)
+
+
+@given(
+    n_fft=st.sampled_from([16, 64, 250, 256, 512]),
+    hops=st.sampled_from([2, 4, 8]),
+    samples=st.integers(256, 3_000),
+    single=st.booleans(),
+)
+def test_the_transform_is_scipys_to_the_bit(n_fft: int, hops: int, samples: int, single: bool) -> None:
+    codec = Codec(24_000, n_fft, n_fft // hops, samples, 1e-5)
+    transform = ShortTimeFFT(hann(n_fft, sym=False), codec.hop, codec.sample_rate, phase_shift=None)
+    signal = np.random.default_rng(samples).standard_normal((2, samples)).astype(np.float32 if single else np.float64)
+    assert_array_equal(codec.window, transform.win)
+    assert_array_equal(codec.dual_window, transform.dual_win)
+    assert_array_equal(codec.transform(signal), transform.stft(signal, p1=transform.p_max(samples)))
+    assert codec.frame_times_s[0] == transform.p_min * codec.hop / codec.sample_rate
 
 
 @pytest.mark.parametrize("codec", CODECS)
