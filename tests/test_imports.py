@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 SERVER = ROOT / "server"
 
@@ -52,3 +54,30 @@ def test_what_the_image_imports_while_it_is_built_is_there() -> None:
     assert imports
     for module, name in imports:
         assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
+
+
+SLOW = ("matplotlib", "numba", "onnxruntime", "scipy.signal", "scipy.stats", "fastapi", "uvicorn")
+RUN_AND_TELL = """
+import sys
+from server.cli.main import main
+slow, sys.argv = sys.argv[1].split(","), ["nafir", *sys.argv[2:]]
+try:
+    main()
+except SystemExit as exc:
+    assert not exc.code, exc.code
+sys.stderr.write(",".join(name for name in slow if name in sys.modules))
+"""
+IR = "ir apartment --listener 1.5,2,1.5 --emitter 3,2,1.5 --output"
+
+
+@pytest.mark.parametrize(
+    ("command", "needed"),
+    [("--help", set()), ("serve --help", set()), (IR, {"numba", "onnxruntime"})],
+    ids=["help", "help of a command", "ir"],
+)
+def test_a_command_imports_nothing_slow_that_it_does_not_need(command, needed, tmp_path):
+    """Each of these takes a tenth of a second to a whole one."""
+    arguments = command.split() + ([str(tmp_path / "response.wav")] if command == IR else [])
+    run = [sys.executable, "-c", RUN_AND_TELL, ",".join(SLOW), *arguments]
+    result = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert set(filter(None, result.stderr.split(","))) == needed
