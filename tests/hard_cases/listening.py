@@ -3,6 +3,8 @@
 Oracles are float64 and know nothing of blocks, partitions or filters.
 """
 
+from functools import partial
+
 import numpy as np
 from scipy.signal import fftconvolve
 
@@ -16,20 +18,14 @@ from server.rendering.sources import ClipPlayer
 from server.responses.ir_request import compute_irs
 from server.streaming.load import QualityStep
 from server.streaming.session import Session
+from tests.signals import decaying_noise, noise
 
 RATE, SIZE, IR_SAMPLES = 24_000, 256, 6_000
 FLAT = np.zeros(7)
 AHEAD = (1.0, 0.0, 0.0)
 HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 SECOND = RATE // SIZE
-
-
-def noise(seed, *shape):
-    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-
-
-def room(seed, samples=IR_SAMPLES, decay=800):
-    return (0.1 * noise(seed, 2, samples) * np.exp(-np.arange(samples) / decay)).astype(np.float32)
+room = partial(decaying_noise, samples=IR_SAMPLES, decay_samples=800, gain=0.1)
 
 
 def tone(frequency_hz=997, samples=RATE, amplitude=0.2):
@@ -79,11 +75,6 @@ def played(clip, samples, *, loop=True):
 
 def decibels(ratio):
     return 20 * np.log10(ratio + 1e-15)
-
-
-def error_db(actual, expected):
-    """Of the largest error beside the largest sample expected."""
-    return decibels(np.abs(actual - expected).max() / np.abs(expected).max())
 
 
 def energy_db(samples):

@@ -12,21 +12,8 @@ from server.core.errors import RequestError
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import Acknowledge, ListenerPose, parse_client_message
 from server.streaming.pacing import SendWindow, StreamClock
-from tests.hard_cases.listening import (
-    HERE,
-    RATE,
-    SIZE,
-    Listening,
-    ahead,
-    convolved,
-    error_db,
-    hear,
-    noise,
-    play,
-    played,
-    renderer,
-    room,
-)
+from tests.hard_cases.listening import HERE, RATE, SIZE, Listening, ahead, convolved, hear, play, played, renderer, room
+from tests.signals import error_db, noise
 
 LONG = 2**32 // SIZE - 2
 """Blocks: in the third from now the sample clock passes 2^32, after two days at 24 kHz."""

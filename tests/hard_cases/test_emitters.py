@@ -14,15 +14,14 @@ from tests.hard_cases.listening import (
     Listening,
     ahead,
     convolved,
-    error_db,
     hear,
-    noise,
     not_finite,
     play,
     played,
     renderer,
     room,
 )
+from tests.signals import error_db, noise
 
 
 def test_one_added_and_removed_in_every_block(measured, filters):
@@ -134,7 +133,7 @@ _STEPS = st.lists(
 
 @given(_STEPS)
 def test_any_order_of_calls_is_finite_bounded_and_the_same_twice(measured, filters, script):
-    irs = [room(seed, decay=100) for seed in range(4)]
+    irs = [room(seed, decay_samples=100) for seed in range(4)]
     clip = np.sign(noise(7, 700))
     gains = (0.0, -1.0, 1.0, 0.5)
 

@@ -18,15 +18,14 @@ from tests.hard_cases.listening import (
     Listening,
     ahead,
     convolved,
-    error_db,
     hear,
-    noise,
     not_finite,
     play,
     played,
     renderer,
     room,
 )
+from tests.signals import error_db, noise
 
 TOO_MUCH = [1e30, -1e30, math.nan, math.inf, -math.inf, 1.01 * LOUDEST_GAIN]
 RUNG_OUT = (IR_SAMPLES + 4096) // SIZE + 40

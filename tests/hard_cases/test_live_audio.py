@@ -27,9 +27,7 @@ from tests.hard_cases.listening import (
     convolved,
     decibels,
     energy_db,
-    error_db,
     hear,
-    noise,
     not_finite,
     passive_energy_db,
     play,
@@ -37,6 +35,7 @@ from tests.hard_cases.listening import (
     room,
     tone,
 )
+from tests.signals import error_db, noise
 
 NO_AUDIO = {
     "not a number": math.nan,

@@ -14,7 +14,8 @@ from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
 from server.rendering.limiter import CEILING, Limiter
 from server.responses.direct_sound import DirectSound
-from tests.hard_cases.listening import HERE, SIZE, THERE, Listening, decibels, noise, not_finite
+from tests.hard_cases.listening import HERE, SIZE, THERE, Listening, decibels, not_finite
+from tests.signals import noise
 
 LOUD = 20 * noise(1, 10_000)
 

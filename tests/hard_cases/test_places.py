@@ -20,7 +20,8 @@ from server.rendering.direct_path import PathTarget
 from server.rendering.still_paths import StillPaths
 from server.responses.radiation import reverberation_gain
 from server.scene.bundle import BUNDLED, Bundle
-from tests.hard_cases.listening import AHEAD, FLAT, Listening, hear, noise, not_finite, play, renderer
+from tests.hard_cases.listening import AHEAD, FLAT, Listening, hear, not_finite, play, renderer
+from tests.signals import noise
 
 # A room with one reflex corner, and a flat of two rooms with a doorway.
 CORNER = FloorPlan(((0, 0), (8, 0), (8, 3), (4, 3), (4, 6), (0, 6)), 2.7)

@@ -25,13 +25,13 @@ from tests.hard_cases.listening import (
     ahead,
     decibels,
     hear,
-    noise,
     not_finite,
     play,
     renderer,
     splatter_db,
     tone,
 )
+from tests.signals import noise
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 AXES = {

@@ -11,9 +11,7 @@ from tests.hard_cases.listening import (
     SIZE,
     convolved,
     energy_db,
-    error_db,
     hear,
-    noise,
     not_finite,
     passive_energy_db,
     play,
@@ -21,6 +19,7 @@ from tests.hard_cases.listening import (
     renderer,
     room,
 )
+from tests.signals import error_db, noise
 
 ENDURANCE = 2 * SIZE + IR_SAMPLES
 """After so many samples whatever was heard before has left."""
@@ -136,7 +135,7 @@ def test_a_tone_at_the_loudest_frequency_comes_as_near_to_the_bound_as_can_be(me
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(1, 5)), min_size=1, max_size=20))
 def test_exchanges_at_any_rate_stay_within_the_loudest_of_their_responses(measured, script):
     """Fades are convex: each sample of a response is never heard louder than the loudest response has it."""
-    irs = [room(seed, decay=10.0**seed) for seed in range(4)]
+    irs = [room(seed, decay_samples=10.0**seed) for seed in range(4)]
     irs.append(-irs[2])
     engine, clip = renderer(), np.sign(noise(1, 5_000)).astype(np.float32)
     play(engine, clip, irs[0])
@@ -177,7 +176,7 @@ def test_exchanging_a_response_for_itself_changes_nothing(measured):
 
 def test_a_short_response_takes_over_from_a_long_one_and_the_tail_leaves(measured):
     engine, clip = renderer(), noise(1, 5_000)
-    play(engine, clip, room(8, decay=3_000))
+    play(engine, clip, room(8, decay_samples=3_000))
     hear(engine, 40)
     short = room(9)[:, :5]
     engine.set_ir("a", short)

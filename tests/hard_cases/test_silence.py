@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 
 from server.kernels.compiled import HAS_NUMBA
-from tests.hard_cases.listening import (
-    IR_SAMPLES,
-    SIZE,
-    ahead,
-    hear,
-    noise,
-    not_finite,
-    play,
-    renderer,
-    room,
-)
+from tests.hard_cases.listening import IR_SAMPLES, SIZE, ahead, hear, not_finite, play, renderer, room
+from tests.signals import noise
 
 RUNG_OUT = IR_SAMPLES // SIZE + 40
 

@@ -11,15 +11,14 @@ from tests.hard_cases.listening import (
     ahead,
     convolved,
     decibels,
-    error_db,
     hear,
-    noise,
     not_finite,
     play,
     played,
     renderer,
     room,
 )
+from tests.signals import error_db, noise
 
 
 def test_the_first_block_of_nothing_is_silence(measured, filters):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from server.kernels import right_angle
+from tests.signals import noise
 
 SIZES = [64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384]
 
@@ -47,10 +48,6 @@ def second_half(bins):
         address(tables.lanes),
     )
     return out
-
-
-def noise(seed, samples):
-    return np.random.default_rng(seed).standard_normal(samples).astype(np.float32)
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -17,6 +17,7 @@ from server.responses.ir_request import compute_irs
 from server.scene.manifest import QualityLevel
 from server.streaming.load import QualityStep
 from server.streaming.session import Session
+from tests.signals import error_db
 
 SAMPLE_RATE = 24_000
 SIZE = 256
@@ -76,10 +77,6 @@ def heard(emitter, at, samples):
     """Oracle of the reverberation: the clip in one room throughout, float64."""
     ir = FIELD.one(at.pose.position, emitter.pose.position, at.pose.yaw).astype(float)
     return fftconvolve(emitter.clip[np.newaxis].astype(float), ir, axes=1)[:, :samples]
-
-
-def error_db(actual, expected):
-    return 20 * np.log10(np.abs(actual - expected).max() / np.abs(expected).max() + 1e-30)
 
 
 def level_db(samples):

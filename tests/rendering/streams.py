@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
+from tests.signals import noise
+
 SAMPLE_RATE = 24_000
 BLOCK_SIZES = (64, 128, 256)
 
@@ -12,10 +14,6 @@ BOTH_KINDS = [
     pytest.mark.usefixtures("numba_is_there"),
 ]
 """Of convolver: a test takes `is_compiled`."""
-
-
-def noise(seed, *shape):
-    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
 
 
 def decaying_ir(seed, samples, channels=2, t60_s=0.4):
@@ -38,8 +36,3 @@ def stream(convolver, dry, changes=()):
                 convolver.set_ir(source, ir)
         blocks.append(convolver.process(dry[:, index * size : (index + 1) * size]))
     return np.concatenate(blocks, axis=1)
-
-
-def error_db(actual, expected):
-    """Largest error, relative to the largest sample."""
-    return 20 * np.log10(np.abs(actual - expected).max() / np.abs(expected).max() + 1e-30)

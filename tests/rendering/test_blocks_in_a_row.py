@@ -1,5 +1,7 @@
 """Several blocks of one listener in one call are those that as many calls make."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -7,16 +9,10 @@ from server.rendering.direct_path import PathTarget
 from server.rendering.limiter import CEILING
 from server.rendering.renderer import Renderer, render_all
 from server.rendering.sources import ClipPlayer, LiveSource
+from tests.signals import decaying_noise, noise
 
 SIZE, IR_SAMPLES, SAMPLE_RATE = 64, 500, 24_000
-
-
-def noise(seed, *shape):
-    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-
-
-def room(seed):
-    return (0.1 * noise(seed, 2, IR_SAMPLES) * np.exp(-np.arange(IR_SAMPLES) / 100)).astype(np.float32)
+room = partial(decaying_noise, samples=IR_SAMPLES, decay_samples=100, gain=0.1)
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from server.rendering.convolver import Convolver
 from server.rendering.partitions import Partitioning
-from tests.rendering.streams import BLOCK_SIZES, BOTH_KINDS, convolve, decaying_ir, error_db, noise, stream
+from tests.rendering.streams import BLOCK_SIZES, BOTH_KINDS, convolve, decaying_ir, stream
+from tests.signals import error_db, noise
 
 pytestmark = BOTH_KINDS
 

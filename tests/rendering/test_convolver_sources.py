@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from server.rendering.convolver import Convolver
 from server.rendering.partitions import TURNS, Partitioning
-from tests.rendering.streams import BOTH_KINDS, convolve, decaying_ir, error_db, noise, stream
+from tests.rendering.streams import BOTH_KINDS, convolve, decaying_ir, stream
+from tests.signals import error_db, noise
 
 pytestmark = BOTH_KINDS
 

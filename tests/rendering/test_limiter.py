@@ -8,12 +8,9 @@ import pytest
 from scipy.signal import resample_poly
 
 from server.rendering.limiter import CEILING, Limiter
+from tests.signals import noise
 
 RATE, SIZE = 48_000, 256
-
-
-def noise(seed, *shape):
-    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
 
 
 def tone(frequency_hz, samples, amplitude=1.0, phase=0.0):

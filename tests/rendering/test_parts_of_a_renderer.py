@@ -1,6 +1,8 @@
 """What nobody asked for is not there, and comes and goes without a click: convolvers, heads, and direct sound that is
 heard by itself or not."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.signal import fftconvolve
@@ -11,6 +13,7 @@ from server.rendering.direct_path import PathTarget
 from server.rendering.fade import raised_cosine
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
+from tests.signals import decaying_noise, error_db, noise
 
 RATE, SIZE = 24_000, 256
 IR_SAMPLES = 6_000
@@ -19,6 +22,7 @@ AIR = np.array([0.0003, 0.001, 0.002, 0.004, 0.008, 0.02, 0.07])
 AHEAD = (1.0, 0.0, 0.0)
 FLAT = np.zeros(7)
 SECOND = RATE // SIZE
+room = partial(decaying_noise, samples=IR_SAMPLES, decay_samples=800, gain=0.1)
 
 
 @pytest.fixture
@@ -38,15 +42,6 @@ def engine(kemar_at):
     return make
 
 
-def noise(seed, *shape):
-    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-
-
-def room(seed, channels=2):
-    decay = np.exp(-np.arange(IR_SAMPLES) / 800)
-    return (0.1 * noise(seed, channels, IR_SAMPLES) * decay).astype(np.float32)
-
-
 def tone():
     """One second of 997 Hz, which loops without a seam."""
     return np.sin(2 * np.pi * 997 * np.arange(RATE) / RATE).astype(np.float32)
@@ -61,10 +56,6 @@ def add(renderer, clip, ir=None, target=None, name="a"):
 
 def run(renderer, blocks):
     return np.concatenate([renderer.process() for _ in range(blocks)], axis=1)
-
-
-def error_db(actual, expected):
-    return 20 * np.log10(np.abs(actual - expected).max() / np.abs(expected).max() + 1e-30)
 
 
 def splatter_db(heard):
@@ -186,7 +177,7 @@ def test_one_ear_is_heard_alike_by_both_of_a_stereo_output(engine):
 @pytest.mark.parametrize("has_ir", [False, True])
 def test_a_head_is_put_on_and_taken_off_by_a_fade_of_what_goes_in(engine, first, has_ir):
     clip, second = noise(9, 9_000), 3 - first
-    irs = {channels: room(10, channels) if has_ir else None for channels in (1, 2)}
+    irs = {channels: room(10, channels=channels) if has_ir else None for channels in (1, 2)}
 
     def always(channels, weight):
         renderer = engine(has_head=channels == 2)
@@ -249,7 +240,7 @@ def test_a_source_that_changes_its_ears_is_asked_once_per_block(engine):
 def toggles(renderer):
     """Each with what it takes to switch it off and on again, by name."""
     bands = np.array([0, -2, -4, -6, -9, -12, -15.0])
-    irs = {channels: renderer.prepare(room(13, channels)) for channels in (1, 2)}
+    irs = {channels: renderer.prepare(room(13, channels=channels)) for channels in (1, 2)}
     shorter = renderer.prepare(room(13)[:, :500])
 
     def ears(channels):

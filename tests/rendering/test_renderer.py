@@ -2,6 +2,7 @@
 
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,18 +19,12 @@ from server.rendering.renderer import (
     render_all,
 )
 from server.rendering.sources import ClipPlayer
+from tests.signals import decaying_noise, error_db, noise
 
 SIZE = 64
 IR_SAMPLES = 500
 RING_OUT_BLOCKS = Partitioning(SIZE, IR_SAMPLES).quiet_blocks
-
-
-def noise(seed, *shape):
-    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-
-
-def room(seed):
-    return (noise(seed, 2, IR_SAMPLES) * np.exp(-np.arange(IR_SAMPLES) / 100)).astype(np.float32)
+room = partial(decaying_noise, samples=IR_SAMPLES, decay_samples=100)
 
 
 def renderer(**options):
@@ -52,10 +47,6 @@ def run(engine, blocks):
 
 def convolve(dry, ir, samples):
     return fftconvolve(dry[np.newaxis].astype(float), ir.astype(float), axes=1)[:, :samples]
-
-
-def error_db(actual, expected):
-    return 20 * np.log10(np.abs(actual - expected).max() / np.abs(expected).max() + 1e-30)
 
 
 def test_every_emitter_is_its_clip_in_its_room():

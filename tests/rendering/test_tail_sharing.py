@@ -6,6 +6,7 @@ import pytest
 from server.kernels.compiled import HAS_NUMBA
 from server.rendering.convolver import Convolver
 from server.rendering.partitions import Partitioning
+from tests.signals import error_db
 
 SIZE, SAMPLES, SOURCES = 64, 4_000, 3
 SETTLED = SAMPLES + 4 * 16 * SIZE
@@ -38,10 +39,6 @@ def stream(convolver, dry, switches=(), irs=()):
             convolver.set_ir(*irs[block])
         output.append(convolver.process(dry[:, block * SIZE : (block + 1) * SIZE]))
     return np.concatenate(output, axis=1).astype(float)
-
-
-def error_db(actual, expected):
-    return 20 * np.log10(np.max(np.abs(actual - expected)) / np.max(np.abs(expected)) + 1e-30)
 
 
 def test_before_and_after_a_switch_it_is_as_if_it_had_always_been_so(is_compiled):
