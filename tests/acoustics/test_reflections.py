@@ -189,7 +189,7 @@ def assert_same(a, b):
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_in_any_room_the_same_is_found_with_a_compiler_and_without(seed):
     plan = star(seed)
     finder = ReflectionFinder(plan, GAINS_DB)

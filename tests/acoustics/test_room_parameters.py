@@ -198,7 +198,7 @@ class TestOnset:
 
 class TestDecayCurve:
     @given(st.integers(0, 2**32 - 1), st.floats(0.05, 2.0), st.floats(-100.0, 0.0))
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=30)
     def test_never_rises_and_is_finite(self, seed: int, t60_s: float, noise_db: float) -> None:
         ir = decaying_noise(t60_s, seed=seed, duration_s=0.3)
         ir += np.random.default_rng(seed).standard_normal(ir.shape) * 10.0 ** (noise_db / 20.0)
@@ -271,7 +271,7 @@ class TestMeasure:
                 assert_array_equal(values, getattr(both, name)[:, :1])
 
     @given(st.integers(0, 2**32 - 1), st.floats(-60.0, 60.0))
-    @settings(max_examples=20, deadline=None)
+    @settings(max_examples=20)
     def test_gain_changes_the_level_only(self, seed: int, gain_db: float) -> None:
         ir = decaying_noise(0.3, seed=seed)
         plain, scaled = measure(ir, RATE), measure(ir * 10.0 ** (gain_db / 20.0), RATE)
@@ -280,7 +280,7 @@ class TestMeasure:
             assert_allclose(getattr(scaled, name), values + shift, rtol=1e-6, atol=1e-9, err_msg=name)
 
     @given(st.integers(0, 2**32 - 1), st.integers(0, 3_000))
-    @settings(max_examples=20, deadline=None)
+    @settings(max_examples=20)
     def test_delay_changes_the_onset_only(self, seed: int, delay: int) -> None:
         ir = decaying_noise(0.3, seed=seed, duration_s=0.4)
         ir[:, 0] = 4.0

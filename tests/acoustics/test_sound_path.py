@@ -340,7 +340,7 @@ def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_in_any_room_the_shortest_path_is_found_whichever_way_it_is_computed(seed: int) -> None:
     plan = star(seed)
     finder = SoundPathFinder(plan, SPEED_OF_SOUND)

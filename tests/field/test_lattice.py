@@ -32,7 +32,6 @@ def inside(*poses):
     return bool(np.all(PLAN.contains(np.array(poses))))
 
 
-@settings(deadline=None)
 @given(places, places, st.sampled_from(SPACINGS_M), shares)
 def test_a_node_is_in_the_room_and_in_the_sight_of_the_poses_and_as_hidden_as_they(listener, emitter, spacing_m, at):
     assume(inside(listener, emitter))
@@ -45,7 +44,6 @@ def test_a_node_is_in_the_room_and_in_the_sight_of_the_poses_and_as_hidden_as_th
     assert np.all((ends[1] >= LOW) & (ends[1] <= HIGH))
 
 
-@settings(deadline=None)
 @given(places, places, st.sampled_from(SPACINGS_M))
 def test_a_node_is_within_half_a_spacing_along_each_axis(listener, emitter, spacing_m):
     assume(inside(listener, emitter))
@@ -53,7 +51,6 @@ def test_a_node_is_within_half_a_spacing_along_each_axis(listener, emitter, spac
     assert np.abs(np.array([listener, emitter]) - [node.listener, node.emitter]).max() <= spacing_m / 2 + 1e-9
 
 
-@settings(deadline=None)
 @given(places, places, st.sampled_from(SPACINGS_M))
 def test_reflected_sound_follows_the_direct_sound_as_it_does_at_the_node(listener, emitter, spacing_m):
     """To half a step of a quarter of a metre, or of a quarter of the spacing, and half a sample."""
@@ -65,7 +62,6 @@ def test_reflected_sound_follows_the_direct_sound_as_it_does_at_the_node(listene
     assert error_m <= max(0.25, spacing_m / 4) / 2 + metres_per_sample / 2 + 1e-9
 
 
-@settings(deadline=None)
 @given(st.floats(-20, 20), st.sampled_from([5.0, 40.0, 120.0, 360.0]))
 def test_a_heading_is_within_half_a_turn_of_its_nodes_and_whole_turns_are_no_other(yaw, turn_deg):
     nodes = lattice(1.0, turn_deg)
@@ -97,7 +93,7 @@ SIXTEEN_WAYS = np.vstack([np.random.default_rng(1).standard_normal((10, 3)), np.
 SIXTEEN_WAYS /= np.linalg.norm(SIXTEEN_WAYS, axis=1, keepdims=True)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(places, places, headings, st.sampled_from(SPACINGS_M), turns, shares, st.floats(-1, 1))
 def test_all_listeners_of_a_neighbourhood_are_given_what_its_middle_was(
     listener, emitter, yaw, spacing_m, turn_deg, at, turned

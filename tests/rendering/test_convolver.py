@@ -5,7 +5,7 @@ Each holds for the compiled convolver and for the one in NumPy.
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from server.rendering.convolver import Convolver
@@ -54,7 +54,6 @@ def test_many_sources_are_added_up_as_exactly_as_few(is_compiled):
     assert many_db < few_db + 3
 
 
-@settings(deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     sources=st.integers(1, 4),
@@ -104,7 +103,6 @@ def test_a_unit_impulse_passes_at_once_and_unchanged(is_compiled):
     np.testing.assert_allclose(convolver.process(dry), dry, atol=2e-6)
 
 
-@settings(deadline=None)
 @given(a=st.floats(-4, 4), b=st.floats(-4, 4), seed=st.integers(0, 2**32 - 1))
 def test_linear(is_compiled, a, b, seed):
     x, y = noise(seed, 2, 1, 30 * 64)

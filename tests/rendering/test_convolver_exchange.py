@@ -49,7 +49,7 @@ def expected_with_exchanges(dry, schedule, partitioning):
     return expected
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     changes=st.lists(st.tuples(st.integers(0, 90), st.integers(0, 1)), max_size=12),
@@ -145,7 +145,7 @@ def test_an_exchange_of_some_partitions_leaves_the_others_bit_for_bit(is_compile
     assert error_db(with_exchange[:, 20 * 64 :], without[:, 20 * 64 :]) < -120
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), change=st.integers(1, 80))
 def test_energy_of_an_exchange_is_bounded(is_compiled, seed, change):
     """A crossfade is a convex mix at every instant: never above the larger of the two, stage by stage."""

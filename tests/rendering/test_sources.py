@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from server.rendering.ingest import LOUDEST
@@ -16,7 +16,6 @@ SIZE = 256
     block_sizes=st.lists(st.integers(1, 100), max_size=20),
     loop=st.booleans(),
 )
-@settings(deadline=None)
 def test_player_repeats_or_falls_silent(clip_samples, block_sizes, loop):
     clip = 1 + np.arange(clip_samples, dtype=np.float32)
     player = ClipPlayer(clip, loop=loop)
@@ -68,7 +67,6 @@ STEEPEST = 0.05 + np.pi / 2 / FADE_SAMPLES * 2  # of a full-scale tone crossfade
 
 
 @given(pieces=st.lists(st.integers(1, 700), min_size=20, max_size=40))
-@settings(deadline=None)
 def test_every_sample_is_played_once_and_in_order_however_unevenly_it_comes(pieces):
     source, sent, played = live(), 0, []
     for piece in pieces:
@@ -159,7 +157,6 @@ def test_what_is_no_audio_becomes_silence_and_is_counted():
         max_size=60,
     )
 )
-@settings(deadline=None)
 def test_it_stays_finite_bounded_and_smooth_whatever_happens(steps):
     source, sent, heard = live(), 0, [np.zeros(1)]
     for step in steps:

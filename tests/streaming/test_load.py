@@ -183,7 +183,7 @@ def test_a_stream_does_not_rise_to_a_level_whose_responses_would_be_slow():
     assert eased.at == 0
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.integers(0, 4), min_size=2, max_size=6), st.integers(1, 12))
 def test_streams_of_a_strained_thread_become_equal_and_stay_so(starts, capacity):
     """What a thread can bear is shared: its streams end within a rung of each other, wherever they began."""
@@ -203,7 +203,6 @@ def test_streams_of_a_strained_thread_become_equal_and_stay_so(starts, capacity)
     assert {ladder.at for ladder in ladders} == {0}
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.floats(0, 3), st.floats(0, 2), st.floats(0, 1.5)), min_size=1, max_size=300),
 )

@@ -364,7 +364,7 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
             )
             assert all(block.reverberation_pose_id <= block.pose_id <= self.pose_id for block in self.blocks)
 
-    run_state_machine_as_test(AnyOrder, settings=settings(max_examples=60, stateful_step_count=40, deadline=None))
+    run_state_machine_as_test(AnyOrder, settings=settings(max_examples=60, stateful_step_count=40))
 
 
 def test_a_shared_tail_is_the_operators_choice(field, filters):
