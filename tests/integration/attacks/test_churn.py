@@ -11,6 +11,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from server.scene.bundle import bundled_scenes
 from tests.integration.churn import churn
 
+pytestmark = pytest.mark.attack
+
 SCENE = "apartment"
 VISITS, STEP = 1_000, 200
 AT_ONCE, EMITTERS, BLOCKS = 16, 4, 12

@@ -8,6 +8,8 @@ from websockets.frames import Frame, Opcode
 
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
 
+pytestmark = pytest.mark.attack
+
 PER_S = 200
 ATTACK_S = 5.0
 UPGRADE = (
