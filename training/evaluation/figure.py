@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,7 +41,7 @@ _LOGARITHMIC_FROM = 10.0
 """Ratio between the largest and the smallest 5 to 95 % of a metric, from which on a linear axis would flatten half of
 it."""
 _MOST_DECADES = 4.0
-_BELOW = {"marker": "<", "markeredgecolor": "white", "markersize": 9}
+_BELOW: Mapping[str, Any] = {"marker": "<", "markeredgecolor": "white", "markersize": 9}
 
 
 def draw_figure(
