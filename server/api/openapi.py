@@ -5,6 +5,8 @@ from typing import Any, Final
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from server.api.problem_codes import PROBLEM_CODES
+
 Object = dict[str, Any]
 
 _REFUSED: Final[dict[str, str]] = {
@@ -33,7 +35,10 @@ _PROBLEM: Final[Object] = {
         "title": {"type": "string"},
         "status": {"type": "integer"},
         "detail": {"type": "string"},
-        "code": {"type": "string"},
+        "code": {
+            "type": "string",
+            "description": "\n".join(f"- `{code}`: {meaning}" for code, meaning in PROBLEM_CODES.items()),
+        },
         "field": {"anyOf": [{"type": "string"}, {"type": "null"}]},
     },
 }

@@ -62,7 +62,9 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix=_PREFIX, frozen=True)
 
     host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 is every IPv4 address of the machine."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    """Port to listen on; 0 takes a free one."""
     allowed_hosts: Names = ()
     """Names by which the server may be asked for, beside `host`, localhost and addresses in numbers; `*` is any."""
     allowed_origins: Origins = ()
@@ -84,6 +86,7 @@ class Settings(BaseSettings):
     """Cores' worth of impulse responses that streams of one audio thread may take between them under load, or less
     where rendering leaves less."""
     max_streams: Annotated[int, Field(ge=1)] = 64
+    """Live streams that may be open at once; one more is told `server_busy`."""
     shared_tail: bool = False
     """Let all emitters of a stream share one late tail, each at the level of its own: many cost less, and only what
     comes after 32 blocks is another's."""
@@ -94,7 +97,9 @@ class Settings(BaseSettings):
     max_message_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
     """A longer WebSocket message is refused; one longer than `max_frame_bytes` closes the connection."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
+    """A longer WebSocket message closes the connection with code 1009."""
     hello_timeout_s: Annotated[float, Field(gt=0)] = 10.0
+    """How long a WebSocket client may take to send its hello."""
     request_timeout_s: Annotated[float, Field(gt=0)] = 10.0
     """For a whole HTTP request to come, from the connection or from its first byte: half-sent requests are answered
     408, connections that say nothing are closed."""

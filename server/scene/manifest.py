@@ -254,35 +254,46 @@ class Manifest(Strict):
 
     format_version: Literal[2] = FORMAT_VERSION
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
+    """What clients ask for the scene by."""
     name: str
+    """What the page calls it."""
     description: str = ""
     geometry: Geometry | None = None
+    """Walls, openings and materials; absent where they are not known, as of measured places."""
     bounds: Bounds
     speed_of_sound: Annotated[float, Field(gt=100, lt=1000)]
+    """Metres per second."""
     air: Air = Air()
+    """What the absorption by air is computed from."""
     image_order: Literal[0, 1] = 0
-    """Mirrored reflections of up to so many surfaces are not in the fields: the server computes them from geometry."""
+    """The server computes reflections from so many surfaces from geometry, and the fields do not hold them."""
     transmission: bool = False
-    """So does it what goes straight through walls, as far as their mass lets it; where not, walls are solid."""
+    """Whether the server lets sound go straight through walls, as far as their mass lets it; else they are solid."""
     start: Start
+    """Where a visitor begins."""
     direct_sound: Literal["geometry", "field"] = "geometry"
-    """Where it comes from."""
+    """Whether the direct sound is computed from geometry or held by the fields' responses."""
     reference_level_db: Finite = 0.0
-    """Of the direct sound one metre from an emitter, in the unit of the fields' responses, whatever it was measured in:
-    sound is heard, and maps are drawn, as if it were 0."""
+    """Level of the direct sound one metre from an emitter, in the unit of the fields' responses. Sound is heard, and
+    maps are drawn, as if it were 0."""
     channels: tuple[Literal["left"], Literal["right"]] | tuple[Literal["mono"]] = ("left", "right")
+    """Channels of the fields' responses: two ears or one microphone."""
     codec: CodecParameters
+    """How the fields' spectrograms are read, unless a field has a codec of its own."""
     fields: dict[str, FieldFile]
-    """None where nothing reverberates: in the open, or in a room that is heard by its first reflections alone."""
+    """The trained networks by name; empty where nothing reverberates, as in the open."""
     levels: Annotated[tuple[QualityLevel, ...], Field(min_length=1)]
+    """The quality levels on offer, the default first."""
     frontier: tuple[FrontierPoint, ...] = ()
-    """Worth their time as the levels are, and so near one of them that they are not offered."""
+    """Levels that are worth their time, but so near one of `levels` that they are not offered."""
     effects: Mapping[EffectName, bool] = Field(default_factory=dict)
-    """On or off whatever the planner would decide; those that are not named are its to decide."""
+    """Effects that are on or off whatever the planner would decide; the planner decides about all others."""
     reference: DataReference | None = None
-    """None where nothing is known of the responses that fields were trained on."""
+    """What the responses are like that the fields were trained on; absent where that is not known."""
     accepted: tuple[AcceptedLaw, ...] = ()
+    """Laws of health that the scene breaks with a stated reason."""
     files: dict[FileName, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
+    """SHA-256 of every other file of the bundle."""
 
     @field_validator("format_version", mode="before")
     @classmethod
