@@ -30,7 +30,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
-.PHONY: mutants attacks
+.PHONY: mutants attacks docs docs-serve
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
 
 help: ## show this list
@@ -52,6 +52,12 @@ lint: $(VENV)/installed-dev ## lint, check what imports what, and check types
 format: $(VENV)/installed-dev ## format the code and apply safe lint fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: $(VENV)/installed-dev ## build the documentation into site/; a broken link fails
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+docs-serve: $(VENV)/installed-dev ## show the documentation at http://127.0.0.1:8001 while it is written
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve --dev-addr 127.0.0.1:8001
 
 bundle: $(RUNS)/measured ## simulate, train, export and measure a scene (SCENE=apartment); goes on where it stopped
 
@@ -95,7 +101,7 @@ predictions: $(VENV)/installed-training ## what plans predict of effects beside 
 	$(BIN)/python -m training.trials.rooms_tried
 
 clean: ## remove .venv and caches; keeps runs/
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SCENES:%=bundle-%): bundle-%: | $(VENV)/installed-training

@@ -1,0 +1,58 @@
+"""Markdown of tables and paragraphs."""
+
+import ast
+import html
+import inspect
+import json
+import textwrap
+from collections.abc import Iterable, Sequence
+
+
+def table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Without the columns in which no row says anything."""
+    rows = [*rows]
+    kept = [column for column in range(len(heading)) if any(row[column] for row in rows)]
+    lines = [[line[column] for column in kept] for line in (heading, ["---"] * len(heading), *rows)]
+    return "\n".join("| " + " | ".join(_cell(each) for each in line) + " |" for line in lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def code(text: object) -> str:
+    # In a table a bar ends the cell, in backquotes too.
+    return f"<code>{html.escape(str(text)).replace('|', '&#124;')}</code>" if "|" in str(text) else f"`{text}`"
+
+
+def default_text(value: object) -> str:
+    """As it is written in JSON, a text without its quotes."""
+    return code(value if isinstance(value, str) else json.dumps(value, default=str))
+
+
+def sentence(text: str) -> str:
+    """With a capital and a full stop."""
+    text = " ".join(text.split())
+    if not text:
+        return ""
+    return text[0].upper() + text[1:] + ("" if text[-1] in ".?!:" else ".")
+
+
+def paragraphs(docstring: str | None) -> str:
+    return inspect.cleandoc(docstring or "").replace("\b", "")
+
+
+def attribute_docstrings(kind: type) -> dict[str, str]:
+    """The text below each field of a class and of its bases, by the field's name."""
+    found: dict[str, str] = {}
+    for each in reversed(kind.__mro__[:-1]):
+        try:
+            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
+        except (OSError, TypeError):  # made without a source
+            continue
+        assert isinstance(tree, ast.ClassDef)
+        for field, text in zip(tree.body, tree.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                assert isinstance(field.target, ast.Name)
+                found[field.target.id] = " ".join(str(text.value.value).split())
+    return found

@@ -1,0 +1,129 @@
+"""The reference says all that the code has: settings, commands, routes, messages, codes, fields of bundles, metrics."""
+
+import ast
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from server.api.app import create_app
+from server.api.problem_codes import PROBLEM_CODES
+from server.api.settings import Settings
+from server.api.stream_counts import StreamLedger
+from server.api.telemetry import ServerCollector
+from server.cli.main import app as nafir
+from server.protocol.codes import CLOSE_CODES, ERROR_CODES
+from server.protocol.exchange import EXCHANGE
+from server.runtime.drain import Drain
+from server.runtime.readiness import Readiness
+from server.runtime.thread_watch import ThreadWatch
+from server.scene.manifest import Manifest
+from server.streaming.audio_engine import AudioEngine
+from tests.engine_stage import Patient
+from training.cli.main import app as nafir_train
+
+SERVER = Path(__file__).parents[2] / "server"
+Page = Callable[[str], str]
+
+
+def words(text: str) -> set[str]:
+    return set(re.findall(r"[A-Za-z0-9_-]+", text))
+
+
+def test_every_setting_is_listed_and_explained(site: Path, page: Page) -> None:
+    assert {f"NAFIR_{name.upper()}" for name in Settings.model_fields} <= words(page("reference/settings"))
+    rows = re.findall(r"<tr>.*?</tr>", (site / "reference/settings/index.html").read_text(), re.DOTALL)
+    cells = [re.findall(r"<td>(.*?)</td>", row, re.DOTALL) for row in rows]
+    assert [row[0] for row in cells if row and not row[-1].strip()] == []
+
+
+def commands(program: str, command: Any) -> Iterator[tuple[str, Any]]:
+    yield program, command
+    for name, each in getattr(command, "commands", {}).items():
+        yield from commands(f"{program} {name}", each)
+
+
+@pytest.mark.parametrize(("program", "app"), [("nafir", nafir), ("nafir-train", nafir_train)])
+def test_every_command_and_option_is_listed(page: Page, program: str, app: typer.Typer) -> None:
+    text = page(f"reference/{program}")
+    found = list(commands(program, typer.main.get_command(app)))
+    assert len(found) > 10
+    for path, command in found:
+        section = text[re.search(rf"^{re.escape(path)}¶", text, re.MULTILINE).end() :]
+        section = section.split("¶")[0]
+        if hasattr(command, "commands"):
+            continue
+        named = {name for each in command.params if each.param_type_name == "option" for name in each.opts}
+        assert named - {"--help"} <= words(section), path
+
+
+def test_every_route_is_listed_with_its_parameters(page: Page) -> None:
+    text = page("reference/http")
+    for path, operations in create_app(Settings()).openapi()["paths"].items():
+        for method, operation in operations.items():
+            assert f"{method.upper()} {path}" in text
+            assert {each["name"] for each in operation.get("parameters", ())} <= words(text)
+    assert {"/metrics", "/v1/stream", "/asyncapi.json"} <= set(re.findall(r"/[a-z0-9./]+", text))
+
+
+def test_every_message_of_the_stream_is_described(page: Page) -> None:
+    text = page("reference/stream")
+    assert all(re.search(rf"^{step.name}¶", text, re.MULTILINE) for step in EXCHANGE)
+
+
+def test_every_field_of_a_manifest_is_described(page: Page) -> None:
+    schema = Manifest.model_json_schema()
+    objects = [schema, *(each for each in schema["$defs"].values() if "properties" in each)]
+    assert {name for each in objects for name in each["properties"]} <= words(page("reference/bundle"))
+
+
+def test_every_code_is_listed(page: Page) -> None:
+    listed = words(page("reference/error-codes"))
+    assert {*PROBLEM_CODES, *ERROR_CODES, *map(str, CLOSE_CODES)} <= listed
+
+
+def codes_in(path: Path) -> set[str]:
+    """What the source gives errors, refusals and obstacles as their code."""
+    place = {"RequestError": 0, "Refusal": 1, "problem": 1, "Obstacle": 0}
+    found = set()
+    for call in ast.walk(ast.parse(path.read_text())):
+        name = getattr(call.func, "id", None) if isinstance(call, ast.Call) else None
+        if name in place and len(call.args) > place[name]:
+            given = call.args[place[name]]
+            found |= {each.value for each in ast.walk(given) if isinstance(each, ast.Constant)}
+    return {code for code in found if re.fullmatch(r"[a-z]+(_[a-z]+)+", str(code))}
+
+
+def test_every_code_in_the_source_has_a_meaning() -> None:
+    found = {code for path in SERVER.rglob("*.py") for code in codes_in(path)}
+    assert len(found) > 30
+    of_the_command_line = {"malformed_duration"}
+    assert found - of_the_command_line <= {*PROBLEM_CODES, *ERROR_CODES}
+    of_http = {
+        code for path in (SERVER / "api").glob("*.py") for code in codes_in(path) if path.name != "connection.py"
+    }
+    assert of_http <= {*PROBLEM_CODES, "not_found"}
+
+
+def test_every_meaning_is_of_a_code_in_the_source() -> None:
+    sources = [path.read_text() for path in SERVER.rglob("*.py") if path.name not in {"problem_codes.py", "codes.py"}]
+    assert [code for code in PROBLEM_CODES if not any(f'"{code}"' in source for source in sources)] == []
+
+
+class Host:
+    def __init__(self) -> None:
+        self.audio = AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0)
+        self.ledger = StreamLedger()
+        self.readiness = Readiness(Drain(8.0), ThreadWatch((self.audio,)), warm_up="done")
+        self.clips: dict[str, Any] = {}
+        self.offers: dict[str, Any] = {}
+
+
+def test_every_metric_is_listed(page: Page) -> None:
+    told = {family.name for family in ServerCollector(Host()).collect()}
+    listed = {re.sub(r"_(total|info)$", "", word) for word in words(page("reference/metrics"))}
+    assert len(told) > 15
+    assert told <= listed
