@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from reference_text import code, default_text, paragraphs, sentence, table
+from reference_text import code, default_text, number, paragraphs, sentence, table
 
 _DEFAULT = re.compile(r" ?\[default: (.*)\]$")
 
@@ -66,5 +66,5 @@ def _range(parameter: Any) -> str:
     if low is None and high is None:
         return ""
     if high is None:
-        return f" At least {low:g}."
-    return f" At most {high:g}." if low is None else f" From {low:g} to {high:g}."
+        return f" At least {number(low)}."
+    return f" At most {number(high)}." if low is None else f" From {number(low)} to {number(high)}."

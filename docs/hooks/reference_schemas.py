@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-from reference_text import attribute_docstrings, code, default_text, paragraphs, sentence, table
+from reference_text import attribute_docstrings, code, default_text, number, paragraphs, sentence, table
 from server.api.settings import Settings
 from server.scene import geometry
 from server.scene import manifest as manifests
@@ -75,7 +75,7 @@ def type_name(schema: Mapping[str, Any]) -> str:
     if kind == "object":
         of = schema.get("additionalProperties")
         return f"object of {type_name(of)}" if isinstance(of, Mapping) else "object"
-    bounds = [f"{sign} {schema[bound]:g}" for bound, sign in _BOUNDS.items() if bound in schema]
+    bounds = [f"{sign} {number(schema[bound])}" for bound, sign in _BOUNDS.items() if bound in schema]
     return " ".join([kind, " and ".join(bounds)]).strip().replace(" ", "\u00a0")
 
 

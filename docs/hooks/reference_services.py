@@ -24,34 +24,45 @@ _PATTERNED: Final = {"listener": "x,y,z", "emitter": "x,y,z", "effect": "NAME=on
 def http() -> str:
     """Every route of /openapi.json."""
     document = create_app(Settings()).openapi()
-    parts = [
-        _operation(method.upper(), path, operation)
+    routes = {
+        f"{method.upper()} {path}": operation
         for path, operations in document["paths"].items()
         for method, operation in operations.items()
-    ]
+    }
+    always = set.intersection(*(_refusals(operation) for operation in routes.values()))
+    described = next(iter(routes.values()))["responses"]
+    rows = ((status, described[status]["description"]) for status in sorted(always))
+    parts = [f"Whatever the route, a request may be refused:\n\n{table(['status', 'meaning'], rows)}"]
+    parts += [_operation(name, operation, always) for name, operation in routes.items()]
     parts += ["## Objects in answers\n"]
     for name, schema in document["components"]["schemas"].items():
         if "properties" in schema:
-            described = "\n\n".join(" ".join(each.split()) for each in schema.get("description", "").split("\n\n"))
-            rows = schema_rows(schema, {"code": "Every code is listed on the page of error codes"})
-            parts.append(f"### {name}\n\n{described}\n\n{table(_HEADING, rows)}")
+            prose = "\n\n".join(" ".join(each.split()) for each in schema.get("description", "").split("\n\n"))
+            body = schema_rows(schema, {"code": "Every code is listed on the page of error codes"})
+            parts.append(f"### {name}\n\n{prose}\n\n{table(_HEADING, body)}")
     return "\n".join(parts)
 
 
-def _operation(method: str, path: str, operation: Mapping[str, Any]) -> str:
+def _refusals(operation: Mapping[str, Any]) -> set[str]:
+    return {status for status in operation["responses"] if status >= "400"}
+
+
+def _operation(name: str, operation: Mapping[str, Any], always: set[str]) -> str:
     rows = []
     for parameter in operation.get("parameters", ()):
-        schema, name = parameter["schema"], parameter["name"]
+        schema = parameter["schema"]
         default = default_text(schema["default"]) if "default" in schema else ""
         if parameter.get("required"):
             default = "required"
-        kind = _PATTERNED.get(name) or type_name(schema)
-        rows.append((code(name), kind, default, sentence(parameter.get("description", ""))))
-    answers = ", ".join(sorted(operation["responses"]["200"].get("content", {})))
-    head = f"### `{method} {path}`\n\n{operation.get('description', '')}\n\nAnswer: {answers or 'see above'}. "
-    refused = ", ".join(sorted(status for status in operation["responses"] if status >= "400"))
-    head += f"Refusals: {refused}.\n"
-    return head if not rows else f"{head}\n{table(['parameter', 'type', 'default', 'meaning'], rows)}"
+        kind = _PATTERNED.get(parameter["name"]) or type_name(schema)
+        rows.append((code(parameter["name"]), kind, default, sentence(parameter.get("description", ""))))
+    answers = operation["responses"]["200"].get("content", {})
+    told = [f"Answers {', '.join(map(code, sorted(answers)))}."]
+    told += [
+        f"{status}: {operation['responses'][status]['description']}" for status in sorted(_refusals(operation) - always)
+    ]
+    head = f"### `{name}`\n\n{operation.get('description', '')}\n\n{' '.join(told)}\n"
+    return f"{head}\n{table(['parameter', 'type', 'default', 'meaning'], rows)}" if rows else head
 
 
 def stream() -> str:
@@ -92,9 +103,8 @@ def _message(message: Mapping[str, Any], schemas: Mapping[str, Any]) -> str:
         parts.append(table(_HEADING, _fields(message["name"], schemas[_last(message["payload"])])))
     for example in message["examples"][:1]:
         payload = example["payload"]
-        text = payload if isinstance(payload, str) else json.dumps(payload, ensure_ascii=False)
-        language = "text" if isinstance(payload, str) else "json"
-        parts.append(f"Example ({example['summary']}):\n\n```{language}\n{_wrapped(text)}\n```\n")
+        language, text = ("text", _wrapped(payload)) if isinstance(payload, str) else ("json", _json(payload))
+        parts.append(f"Example ({example['summary']}):\n\n```{language}\n{text}\n```\n")
     return "\n".join(parts)
 
 
@@ -106,11 +116,18 @@ def _fields(message: str, schema: Mapping[str, Any]) -> Iterator[Sequence[str]]:
             yield name, kind, default, meaning
 
 
-def _wrapped(text: str, width: int = 100) -> str:
+def _wrapped(text: str, width: int = 96) -> str:
     """Hexadecimal digits in lines."""
-    if " " in text or len(text) <= width:
-        return text
     return "\n".join(text[start : start + width] for start in range(0, len(text), width))
+
+
+def _json(payload: Mapping[str, Any]) -> str:
+    """In a line where it is short, else a line for each field."""
+    text = json.dumps(payload, ensure_ascii=False)
+    if len(text) <= 90:
+        return text
+    fields = (f"  {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}" for key, value in payload.items())
+    return "{\n" + ",\n".join(fields) + "\n}"
 
 
 @cache

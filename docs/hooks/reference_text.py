@@ -30,6 +30,11 @@ def default_text(value: object) -> str:
     return code(value if isinstance(value, str) else json.dumps(value, default=str))
 
 
+def number(value: float) -> str:
+    """Whole ones with all their digits."""
+    return str(int(value)) if value == int(value) else f"{value:g}"
+
+
 def sentence(text: str) -> str:
     """With a capital and a full stop."""
     text = " ".join(text.split())
