@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from server.api.settings import Settings
 from server.cli.main import app as nafir
 from training.cli.main import app as nafir_train
 
@@ -49,10 +50,22 @@ def test_make_targets_that_are_named_exist(document: Path) -> None:
 
 
 @names
-def test_commands_that_are_named_exist(document: Path) -> None:
+def test_commands_and_options_that_are_named_exist(document: Path) -> None:
     of = {"nafir": nafir, "nafir-train": nafir_train}
-    for program, name in re.findall(r"^(nafir|nafir-train) ([a-z]+)", code_in(document), re.MULTILINE):
-        assert name in typer.main.get_command(of[program]).commands
+    for program, rest in re.findall(r"^(nafir|nafir-train) ((?:[^\n#]|\\\n)+)", code_in(document), re.MULTILINE):
+        command, given = typer.main.get_command(of[program]), rest.split()
+        while hasattr(command, "commands") and re.fullmatch(r"[a-z-]+", given[0]) and not given[0].startswith("-"):
+            command, given = command.commands[given[0]], given[1:]
+            if not given:
+                break
+        known = {"--help"} | {name for each in command.params for name in each.opts}
+        assert {option for option in given if re.match(r"--?[a-z]", option)} <= known, rest
+
+
+@names
+def test_settings_that_are_named_exist(document: Path) -> None:
+    known = {f"NAFIR_{name.upper()}" for name in Settings.model_fields}
+    assert set(re.findall(r"NAFIR_[A-Z_]+[A-Z]", document.read_text())) <= known
 
 
 def test_every_document_is_checked() -> None:
