@@ -6,6 +6,7 @@ from typing import Final
 PROBLEM_CODES: Final[Mapping[str, str]] = {
     "body_too_large": "413: the body is longer than the server takes",
     "doubled_effect": "409: the query switches one effect twice",
+    "doubled_header": "400: `Host`, `Origin` or `Sec-Fetch-Site` is given several times",
     "doubled_parameter": "422: a parameter that may be given once is given several times",
     "handshake_refused": "4xx: a WebSocket is asked for wrongly, or by a site that may not use the server",
     "header_too_long": "431: one header is longer than the server takes",
@@ -23,6 +24,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "not_ready": "503: the server is warming up, or one of its threads has failed; the message says which",
     "origin_not_allowed": "403: pages of this site may not use the server; an operator can allow it",
     "position_out_of_bounds": "404: the position is outside the scene or inside a wall",
+    "preflight_refused": "400: pages of this site may not send such a request; the detail says what they may",
     "request_line_too_long": "414: the URL is longer than the server takes",
     "request_timeout": "408: the request did not arrive whole in time",
     "server_busy": "503: too many computations wait; ask again after `Retry-After`",

@@ -99,8 +99,8 @@ def asyncapi() -> Response:
 
 @api.get("/scenes")
 async def scenes(request: Request) -> dict[str, Any]:
-    """All scenes: where one can walk in each, its quality levels, and how accurate it is; and how many emitters a stream may
-    have at once."""
+    """All scenes: where one can walk in each, its quality levels, and how accurate it is; and how many emitters a
+    stream may have at once."""
     host = _host(request)
     listed = [describe_scene(levels).model_dump() for levels in host.scenes.values()]
     return {"scenes": listed, "max_emitters": host.settings.max_emitters}

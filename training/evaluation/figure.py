@@ -11,6 +11,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -86,9 +87,9 @@ def figure_of(
     """
     rows = len(evaluation.results)
     heights = 3.6, 2 * (0.9 + 0.22 * rows) + 1.0
-    figure = Figure(figsize=(15.0, sum(heights)), layout="constrained", facecolor="white")
+    layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06)
+    figure = Figure(figsize=(15.0, sum(heights)), layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
-    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.06)
     upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=heights)))
     panels = np.atleast_1d(upper.subplots(1, len(examples), sharey=True))
     for axes, (pair, title) in zip(panels, examples, strict=True):
@@ -103,20 +104,20 @@ def figure_of(
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("energy still to come (dB)")
     upper.suptitle(f"Energy decay of held-out pairs{', left ear' if evaluation.channels == 2 else ''}", fontsize=13)
-    _add_legend(upper, panels)
+    _add_legend(upper, list(panels))
     _draw_all_errors(lower, evaluation)
     return figure
 
 
 def _add_legend(part: SubFigure, panels: Sequence[Axes]) -> None:
     """One entry per name, whichever panels have it."""
-    entries = {}
+    entries: dict[str, Artist] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
     part.legend(
-        list(entries.values()),
-        list(entries),
+        handles=list(entries.values()),
+        labels=list(entries),
         loc="outside lower center",
         ncols=len(entries),
         frameon=False,
