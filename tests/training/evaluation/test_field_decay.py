@@ -32,12 +32,18 @@ def test_octaves_above_half_the_sample_rate_are_silent():
 
 
 def test_a_field_that_decays_faster_than_its_data_is_told_by_how_much(tiny_bundle, dataset, monkeypatch):
-    """Its answers are the data's own, with so many decibels a second more of decay: 1/T adds up."""
+    """Its answers are the data's own, of both takes, with so many decibels a second more of decay: 1/T adds up."""
     more_db_per_s = 40.0
 
     def source(_, held_out):
         gain = 10 ** (-more_db_per_s / 20 * np.arange(held_out.samples) / held_out.sample_rate)
-        return lambda index, turns: held_out.pairs.response(int(held_out.held_out[index]))[turns] * gain
+
+        def answer(index, turns):
+            pair = int(held_out.held_out[index])
+            takes = held_out.pairs.response(pair)[turns], held_out.repeats[pair][turns]
+            return np.concatenate(takes) * gain
+
+        return answer
 
     monkeypatch.setattr(module, "field_source", source)
     found = field_decay(tiny_bundle.folder, dataset.folder)
