@@ -10,7 +10,7 @@ its new direction is s times a Lambertian one plus 1 - s times the mirrored one,
 (`simul_ray` in its `room.cpp`, version 0.10.1). So a part of the sound that runs level along a corridor, under an
 absorbent ceiling, stays level here and lives long; there all of it is turned upwards soon. That this is the whole
 difference was tried: our tracer with their rule gives their times within 2 % in the booth, the corridors and the
-courtyard of `training/scenes/own`, where the two rules are 5 to 21 % apart.
+courtyard of `training/scenes/own`, where the two rules are 7 to 23 % apart.
 
 At both ends the definitions agree: with s = 0 all is mirrored, and with s = 1 every new direction is Lambertian. Both
 ends are judged in every scene, with its own geometry and absorption. The scene's own scattering is judged where the
