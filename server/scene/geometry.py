@@ -74,7 +74,11 @@ class Geometry(Strict):
 
     def without_scattering(self) -> "Geometry":
         """All that is reflected is mirrored."""
-        smooth = {"scattering": (0.0,) * len(OCTAVE_BANDS_HZ)}
+        return self.with_scattering(0.0)
+
+    def with_scattering(self, share: float) -> "Geometry":
+        """Every surface scatters this share of what it reflects, in all octave bands."""
+        scattering = {"scattering": (share,) * len(OCTAVE_BANDS_HZ)}
         names = type(self.materials).model_fields
-        materials = Materials(**{name: getattr(self.materials, name).model_copy(update=smooth) for name in names})
+        materials = Materials(**{name: getattr(self.materials, name).model_copy(update=scattering) for name in names})
         return self.model_copy(update={"materials": materials})

@@ -48,7 +48,7 @@ OF_CLIENTS = {each.type for each in get_args(ClientMessage)[-1:]} | {
     each.model_fields["type"].default for each in get_args(ClientMessage)[:-1]
 }
 OF_SERVER = {each.model_fields["type"].default for each in get_args(ServerMessage)}
-SERVER = Path(streaming.__file__).parent
+SERVER = Path(streaming.__file__).parents[1]
 CODES = {"B": "u8", "H": "u16", "I": "u32", "Q": "u64", "f": "f32"}
 
 # What the specification of AsyncAPI 3.0.0 lets the objects that are used here say.
@@ -272,7 +272,7 @@ def test_a_dry_block_is_read_by_the_document():
 
 
 # Where requests are refused that are no messages of a stream; what `errors` names is a field_failure in one.
-ELSEWHERE = {"cli.py", "errors.py", "impulse_response.py", "plan_query.py", "problems.py", "routes.py"}
+ELSEWHERE = {"main.py", "errors.py", "impulse_response.py", "plan_query.py", "problems.py", "routes.py"}
 
 
 def codes_refused_with():

@@ -10,8 +10,9 @@ from rich.progress import Progress
 
 from server.health.check import Effort
 from server.rendering.hrtf import HeadFilters
-from server.responses import full_response as whole_field
+from server.responses import full_response
 from server.scene.bundle import Bundle
+from tests.training.held_out import make_held_out  # noqa: F401  a fixture
 from training.bundling import noise
 from training.bundling.export import export
 from training.data.dataset import Dataset
@@ -42,7 +43,7 @@ def apartment() -> SceneFile:
 
 @pytest.fixture(scope="session")
 def kemar() -> HeadFilters:
-    return whole_field.kemar(24_000)
+    return full_response.kemar(24_000)
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,9 @@ bring decays, and what would change of that.
 Formulas of statistical acoustics take a diffuse field for granted, and many rooms have none: between smooth walls sound
 goes to and fro for long, and under an absorbent ceiling level sound outlives all other, so that how much is scattered
 decides how fast all of it decays (Hodgson, "Evidence of diffuse surface reflections in rooms", J. Acoust. Soc. Am. 89,
-1991). Rays tell, and for decays that many pairs have in common few of them do.
+1991). Rays tell, and for decays that many pairs have in common few of them do. In long or flat rooms the late sound is
+that of the rare rays that run level for long: few rays hold none of them, and reverberation seems to be half of what it
+is. So there are four times as many until the reverberation times stay.
 
 Axes: (take, pair, band, bin) energies relative to that of the direct sound at one metre, in bins of HISTOGRAM_BIN_S
 after emission. Takes are independent: what they agree on is no chance, so that the product of a change in one and the
@@ -36,10 +38,13 @@ _TAKES = 2
 _EMITTERS, _RECEIVERS = 6, 12
 # Of all pairs of a take, in each band.
 _MOST_BINS = 100_000
-# Reflections of all rays of an emitter and a take; ten million of them take about a second.
-_HITS = 400_000
+# Reflections of all rays of an emitter and a take, at first and at most; ten million of them take about a second.
+_FIRST_HITS, _MORE, _MOST_HITS = 400_000, 4, 6_400_000
+# Of a reverberation time from one number of rays to the next: a just-noticeable difference.
+_SAME_SHARE = 0.05
 # With more of them, each takes longer.
 _FEW_WALLS = 20
+# Of the first number of reflections.
 _FEWEST_RAYS, _MOST_RAYS = 50, 2_000
 _EARLY_S = 0.050
 # Of the room's reverberation time by Eyring; smooth rooms take longer, and are tried for longer.
@@ -111,26 +116,47 @@ class Trial:
         """Of one emitter's sound, at most of the receivers."""
         receivers = tuple(range(1, min(len(self.probes), 1 + _RECEIVERS)))
         geometry = self.scene.geometry.without_scattering()
-        energy = self._traced(geometry, 0, receivers, duration_s, np.random.default_rng(0))
+        energy = self._traced(geometry, 0, receivers, duration_s, np.random.default_rng(0), _MORE * _FIRST_HITS)
         to_come = np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1].sum(axis=0)
         last = to_come[..., -max(1, to_come.shape[-1] // 10)] / np.maximum(to_come[..., 0], _SILENCE)
         audible = bands_within(self.scene.simulation.sample_rate)
         return bool((power_to_db(last[:audible] + _SILENCE) < _DECAY_DB[1] - 5).all())
 
-    @cached_property
+    @property
     def scattered(self) -> Energies:
         """As the scene is; no air yet."""
-        return self._energies(self.scene.geometry)
+        return self._settled[1]
 
     @cached_property
     def mirrored(self) -> Energies:
         """Where nothing scatters; no air yet."""
-        return self._energies(self.scene.geometry.without_scattering())
+        return self._energies(self.scene.geometry.without_scattering(), self._settled[0])
+
+    @cached_property
+    def _settled(self) -> tuple[int, Energies]:
+        """As many reflections as reverberation times need to stay, and the energies of so many."""
+        hits = _FIRST_HITS
+        energies = self._energies(self.scene.geometry, hits)
+        while hits < _MOST_HITS:
+            hits, fewer = hits * _MORE, energies
+            energies = self._energies(self.scene.geometry, hits)
+            if self._rings_alike(fewer, energies):
+                break
+        return hits, energies
+
+    def _rings_alike(self, fewer: Energies, more: Energies) -> bool:
+        audible = bands_within(self.scene.simulation.sample_rate)
+        before_s, after_s = (self._times_s(each)[:audible] for each in (fewer, more))
+        is_same = np.abs(after_s - before_s) <= _SAME_SHARE * after_s
+        return bool((is_same | (np.isnan(before_s) & np.isnan(after_s))).all())
 
     @cached_property
     def reverberation_time_s(self) -> _Floats:
         """(band,) T30 of the scene, median over pairs; NaN where it cannot be told of most of them."""
-        times = decay_times_s(self.in_air(self.scattered).whole, self.scattered.onset, *_DECAY_DB)
+        return self._times_s(self.scattered)
+
+    def _times_s(self, energies: Energies) -> _Floats:
+        times = decay_times_s(self.in_air(energies).whole, energies.onset, *_DECAY_DB)
         by_band = np.moveaxis(times, -1, 0).reshape(times.shape[-1], -1)
         told = np.isfinite(by_band).sum(axis=-1) > by_band.shape[-1] / 2
         # An even number of pairs would have a middle between a time and none.
@@ -180,7 +206,7 @@ class Trial:
                 found = Change(jnd, name)
         return found
 
-    def _energies(self, geometry: Geometry) -> Energies:
+    def _energies(self, geometry: Geometry, reflections: int) -> Energies:
         """Through no air."""
         plan = SimulationPlan(GEOMETRIC_ORDER, 1, None, 0, True, False, True, False)
         scene = self.scene.model_copy(update={"geometry": geometry})
@@ -193,7 +219,7 @@ class Trial:
             here = slice(row, row + len(receivers))
             for take in range(_TAKES):
                 rng = np.random.default_rng([take, number])
-                late[take, here] = self._traced(geometry, emitter, receivers, self.duration_s, rng)
+                late[take, here] = self._traced(geometry, emitter, receivers, self.duration_s, rng, reflections)
             lengths_m = scene.geometry.floor_plan.path_length_m(place, heard_at)
             onset[here] = np.minimum(_bin_of(lengths_m), bins - 1)
             images = RoomTracer.of(scene, plan, heard_at, duration_s=self.duration_s).images(place)
@@ -208,9 +234,15 @@ class Trial:
         return Energies(direct, first, late, onset)
 
     def _traced(
-        self, geometry: Geometry, emitter: int, receivers: tuple[int, ...], duration_s: float, rng: np.random.Generator
+        self,
+        geometry: Geometry,
+        emitter: int,
+        receivers: tuple[int, ...],
+        duration_s: float,
+        rng: np.random.Generator,
+        reflections: int,
     ) -> _Floats:
-        """(receiver, band, bin)"""
+        """(receiver, band, bin), by rays that are reflected so many times, all together."""
         tracer = RoomTracer(
             geometry,
             None,
@@ -221,7 +253,7 @@ class Trial:
         )
         room = DiffuseRoom(geometry, None, SPEED_OF_SOUND)
         hits = duration_s * SPEED_OF_SOUND / room.mean_free_path_m * max(1, len(geometry.corners) / _FEW_WALLS)
-        rays = int(np.clip(_HITS / hits, _FEWEST_RAYS, _MOST_RAYS))
+        rays = int(np.clip(_FIRST_HITS / hits, _FEWEST_RAYS, _MOST_RAYS) * reflections / _FIRST_HITS)
         return tracer.energy(self.probes[emitter], rays=rays, rng=rng)[:, 0].astype(np.float64)
 
 
@@ -265,9 +297,14 @@ def decay_times_s(energy: _Floats, onset: npt.NDArray[np.int64], from_db: float,
 
 def _root_mean_square(difference: _Floats) -> _Floats:
     """(band,) over pairs of (take, pair, band), without what chance alone makes; pairs that cannot be told are left
-    out."""
-    product = difference[0] * difference[1]
-    told = np.isfinite(product)
-    count = told.sum(axis=0)
-    mean = np.divide(np.where(told, product, 0.0).sum(axis=0), count, out=np.zeros(count.shape), where=count > 0)
-    return np.asarray(np.sqrt(np.maximum(0.0, mean)))
+    out.
+
+    What all pairs have in common is told well; what they differ by counts as far as it is beyond its standard error:
+    of few pairs and rays, products of two takes are as often positive by chance."""
+    told = np.isfinite(difference).all(axis=0)
+    count = np.maximum(1, told.sum(axis=0))
+    common = np.where(told, difference, 0.0).sum(axis=1) / count
+    own = np.where(told, difference - common[:, None], 0.0).prod(axis=0)
+    variance = own.sum(axis=0) / count
+    error = np.sqrt(np.where(told, (own - variance) ** 2, 0.0).sum(axis=0)) / count
+    return np.asarray(np.sqrt(np.maximum(0.0, common.prod(axis=0)) + np.maximum(0.0, variance - error)))

@@ -16,27 +16,38 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
+
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from training.data.scene_file import SceneFile
+from training.trials.field_decay import FieldDecay, field_decay
 from training.trials.reverberation import Comparison, compare, worst_of
 
-OWN = Path(__file__).parent / "scenes" / "own"
+OWN = Path(__file__).parents[1] / "scenes" / "own"
 _TRAIN = "import sys; from training.cli.main import main; sys.argv[0] = 'nafir-train'; main()"
 _CHECK = "import sys; from server.cli.main import main; sys.argv[0] = 'nafir'; main()"
 
 
 @dataclass(frozen=True)
 class Report:
-    """Of one scene. `minutes` of the wall clock for each step; `problem` is what stopped it, if anything did."""
+    """Of one scene. `minutes` of the wall clock for each step; `problem` is what stopped it, if anything did, and then
+    there is neither a comparison of its rooms nor one of its field."""
 
     scene: str
     minutes: dict[str, float]
     problem: str | None
-    comparison: Comparison | None
+    comparison: Comparison | None = None
+    field: FieldDecay | None = None
 
     @property
     def passed(self) -> bool:
-        return self.problem is None and self.comparison is not None and not self.comparison.beyond()
+        return not self.faults()
+
+    def faults(self) -> list[str]:
+        """What stopped it, or which limits it is beyond."""
+        if self.comparison is None or self.field is None:
+            return [self.problem or "not compared"]
+        return self.comparison.beyond() + self.field.beyond()
 
 
 def make(scene: Path, folder: Path) -> Report:
@@ -46,8 +57,9 @@ def make(scene: Path, folder: Path) -> Report:
     if kept.is_file():
         document = json.loads(kept.read_text())
         if document.pop("scene_sha256") == digest:
-            comparison = document.pop("comparison")
-            return Report(**document, comparison=None if comparison is None else _read(comparison))
+            comparison = Comparison(**_with_tuples(document.pop("comparison")))
+            field = FieldDecay(**_with_tuples(document.pop("field")))
+            return Report(**document, comparison=comparison, field=field)
     folder.mkdir(parents=True, exist_ok=True)
     data, run, bundle = (str(folder / name) for name in ("data", "run", "bundle"))
     commands = {
@@ -65,17 +77,15 @@ def make(scene: Path, folder: Path) -> Report:
         minutes[step] = round((time.monotonic() - began_s) / 60, 2)
         if done.returncode:
             # Not kept: whoever mends it runs this again.
-            return Report(scene.stem, minutes, f"{step} failed with exit code {done.returncode}", None)
-    report = Report(scene.stem, minutes, None, compare(SceneFile.read(scene)))
+            return Report(scene.stem, minutes, f"{step} failed with exit code {done.returncode}")
+    comparison, field = compare(SceneFile.read(scene)), field_decay(Path(bundle), Path(data))
+    report = Report(scene.stem, minutes, None, comparison, field)
     kept.write_text(json.dumps({"scene_sha256": digest, **asdict(report)}, indent=2) + "\n")
     return report
 
 
-def _read(document: dict[str, Any]) -> Comparison:
-    fields: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in document.items()
-    }
-    return Comparison(**fields)
+def _with_tuples(document: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in document.items()}
 
 
 def table(reports: Sequence[Report]) -> str:
@@ -83,32 +93,45 @@ def table(reports: Sequence[Report]) -> str:
     bands = " | ".join(f"{hz / 1000:g}k" if hz >= 1000 else f"{hz:g}" for hz in OCTAVE_BANDS_HZ)
     lines = [
         "Reverberation times of our simulation by octave band, and by how much they differ from the median of several "
-        "simulations by pyroomacoustics, with the scattering of the scene and with mirrors only, and from Eyring's "
-        "formula. Brackets: told, and not judged (see training/trials/reverberation.py).",
+        "simulations by pyroomacoustics, with the scattering of the scene (others), with mirrors only, and where all "
+        "is scattered (rough), and from Eyring's formula; and by how much the bundle's field differs from its data. "
+        "Each in the band where it is most. Brackets: told, and not judged (see training/trials/reverberation.py, and "
+        "of the field training/trials/field_decay.py).",
         "",
-        f"| scene | minutes | {bands} | others | mirrors | Eyring | |",
-        f"| --- | --- |{' --- |' * (len(OCTAVE_BANDS_HZ) + 4)}",
+        f"| scene | minutes | {bands} | others | mirrors | rough | Eyring | field | |",
+        f"| --- | --- |{' --- |' * (len(OCTAVE_BANDS_HZ) + 6)}",
     ]
     for report in reports:
-        minutes = f"{sum(report.minutes.values()):.1f}"
-        if report.comparison is None:
-            lines.append(f"| {report.scene} | {minutes} |{' |' * (len(OCTAVE_BANDS_HZ) + 3)} {report.problem} |")
-            continue
-        of = report.comparison
-        times = " | ".join(f"{value:.2f}" for value in of.ours_s)
-        told = (
-            _percent(of.from_others, judged=of.judges_others),
-            _percent(of.from_mirrors, judged=True),
-            _percent(of.from_eyring, judged=of.is_diffuse),
-        )
-        verdict = "; ".join(of.beyond()) or "ok"
-        lines.append(f"| {report.scene} | {minutes} | {times} | {' | '.join(told)} | {verdict} |")
+        cells = [report.scene, f"{sum(report.minutes.values()):.1f}"]
+        if report.comparison is None or report.field is None:
+            cells += [""] * (len(OCTAVE_BANDS_HZ) + 5)
+        else:
+            of = report.comparison
+            cells += [f"{value:.2f}" for value in of.ours_s]
+            cells += [
+                _percent(of.from_others, judged=of.judges_others),
+                _percent(of.from_mirrors, judged=True),
+                _percent(of.from_rough, judged=True),
+                _percent(of.from_eyring, judged=of.is_diffuse),
+                _of_field(report.field),
+            ]
+        cells.append("; ".join(report.faults()) or "ok")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def _percent(shares: Sequence[float], *, judged: bool) -> str:
+def _percent(shares: npt.ArrayLike, *, judged: bool) -> str:
     worst = f"{100 * worst_of(shares):.1f} %"
     return worst if judged else f"({worst})"
+
+
+def _of_field(field: FieldDecay) -> str:
+    """Of the bands that are judged, and of the others where those differ more."""
+    judged, others = (field.differences[which] for which in (field.is_judged, ~field.is_judged))
+    told = [_percent(judged, judged=True)] if field.is_judged.any() else []
+    if not told or worst_of(others) > worst_of(judged):
+        told.append(_percent(others, judged=False))
+    return " ".join(told)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -130,7 +130,7 @@ def rooms() -> tuple[SceneFile, ...]:
         _room("dry-box", _box(3, 2.5), 2.4, duration_s=0.25, spacing_m=0.7, walls=(0.995, 0.3)),
         _room("flutter", _box(8, 3), 2.6, duration_s=1.6, spacing_m=1.5, walls=hard, floor=hard, ceiling=dull),
         _room("smooth-hall", _box(30, 20), 10, duration_s=3.0, spacing_m=6, walls=(0.2, 0.02)),
-        _room("tunnel", _box(60, 3), 3, duration_s=2.0, spacing_m=8, walls=(0.1, 0.1)),
+        _room("tunnel", _box(60, 3), 3, duration_s=6.0, spacing_m=8, walls=(0.1, 0.1)),
         _room("plate", _box(20, 20), 1.2, duration_s=1.2, spacing_m=5, walls=(0.2, 0.3)),
         _room("rough", _box(6, 5), 3, duration_s=0.6, spacing_m=1.5, walls=(0.3, 0.9)),
         _room(

@@ -1,5 +1,6 @@
 import json
 import subprocess
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -7,10 +8,20 @@ import pytest
 from server.scene.bundle import Bundle
 from training.data.scene_file import SceneFile
 from training.trials import own_scenes
+from training.trials.field_decay import FieldDecay
 from training.trials.own_scenes import OWN, Report, main, make, table
 from training.trials.reverberation import Comparison
 
-GOOD = Comparison((0.5,) * 7, (0.01,) * 7, (0.01,) * 7, (0.02,) * 7, judges_others=True, is_diffuse=True)
+GOOD = Comparison(
+    ours_s=(0.5,) * 7,
+    from_others=(0.01,) * 7,
+    from_mirrors=(0.01,) * 7,
+    from_rough=(0.01,) * 7,
+    from_eyring=(0.02,) * 7,
+    judges_others=True,
+    is_diffuse=True,
+)
+FIELD = FieldDecay((0.49,) * 7, (0.5,) * 7, window_s=0.01)
 
 
 @pytest.fixture
@@ -24,6 +35,7 @@ def steps(monkeypatch):
 
     monkeypatch.setattr(subprocess, "run", run)
     monkeypatch.setattr(own_scenes, "compare", lambda _: GOOD)
+    monkeypatch.setattr(own_scenes, "field_decay", lambda *_: FIELD)
     return asked
 
 
@@ -66,7 +78,7 @@ def test_the_table_is_written_and_a_scene_beyond_a_limit_fails(tmp_path, tiny_sc
     written = (tmp_path / "own.md").read_text()
     assert written in capsys.readouterr().out
     assert "| tiny |" in written
-    off = Comparison((0.5,) * 7, (0.2,) * 7, (0.01,) * 7, (0.02,) * 7, judges_others=True, is_diffuse=True)
+    off = replace(GOOD, from_others=(0.2,) * 7)
     monkeypatch.setattr(own_scenes, "compare", lambda _: off)
     assert main([str(tmp_path / "other"), str(tiny_scene)]) == 1
     assert "pyroomacoustics: 20.0 %" in (tmp_path / "other.md").read_text()
@@ -74,9 +86,19 @@ def test_the_table_is_written_and_a_scene_beyond_a_limit_fails(tmp_path, tiny_sc
 
 
 def test_what_is_not_judged_is_in_brackets():
-    told = Comparison((0.5,) * 7, (0.2,) * 7, (0.01,) * 7, (0.4,) * 7, judges_others=False, is_diffuse=False)
-    line = table([Report("some", {"train": 1.0}, None, told)]).splitlines()[-1]
-    assert "(20.0 %) | 1.0 % | (40.0 %) | ok" in line
+    told = replace(GOOD, from_others=(0.2,) * 7, from_eyring=(0.4,) * 7, judges_others=False, is_diffuse=False)
+    line = table([Report("some", {"train": 1.0}, None, told, FIELD)]).splitlines()[-1]
+    assert "(20.0 %) | 1.0 % | 1.0 % | (40.0 %) | 2.0 % | ok" in line
+
+
+def test_a_field_is_judged_in_bands_that_its_windows_tell_apart():
+    data_s = (0.5, 0.05, *(0.5,) * 5)
+    short = FieldDecay((0.51, 0.06, *(0.5,) * 5), data_s, window_s=0.01)
+    report = Report("some", {}, None, GOOD, short)
+    assert report.passed
+    assert "| 2.0 % (20.0 %) | ok |" in table([report])
+    off = FieldDecay((0.6, 0.05, *(0.5,) * 5), data_s, window_s=0.01)
+    assert Report("some", {}, None, GOOD, off).faults() == ["the field beside its data: 20.0 %"]
 
 
 def test_a_bundle_of_the_real_steps_is_checked(tiny_bundle):
