@@ -13,6 +13,9 @@ from training.simulation.pairs import PairSimulation
 from training.simulation.planner import planner_of
 from training.simulation.rays import RayTracer
 from training.simulation.synthesis import BinauralSynthesis
+from training.trials.field_decay import MOST_FROM_DATA
+from training.trials.own_scenes import OWN
+from training.trials.reverberation import reverberation_time_s
 
 YAWS = 2 * np.pi * np.arange(4) / 4
 EVERYTHING = SimulationPlan.everything(2, 500)
@@ -121,6 +124,16 @@ def test_one_tail_for_all_has_the_level_and_decay_of_own_ones(box):
     # 500 rays leave the end of a decay, 25 dB down, uncertain by more than its beginning.
     np.testing.assert_allclose(shared[: len(shared) // 2], own[: len(own) // 2], atol=0.6)
     np.testing.assert_allclose(shared, own, atol=1.5)
+
+
+def test_what_chance_makes_of_a_shared_tail_is_small():
+    """In a long corridor few rays run level, and late sound is theirs. Fields are held to a tenth of what their data's
+    decay is."""
+    corridor = SceneFile.read(OWN / "corridor-20m.toml")
+    plan = planner_of(corridor, 0).plan({SimulatedEffect.PER_SOURCE_TAIL: False})
+    energies = simulation_of(corridor, plan).tail.energies
+    one_s, other_s = (reverberation_time_s(take.sum(axis=0)) for take in energies)
+    np.testing.assert_allclose(one_s, other_s, rtol=MOST_FROM_DATA)
 
 
 def test_energies_of_a_shared_tail_are_as_loud_in_responses_as_own_ones(box):
