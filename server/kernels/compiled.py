@@ -122,6 +122,11 @@ if numba is not None:
     class _Cache(FunctionCache):  # type: ignore[misc]
         _impl_class = _CacheFiles
 
+        def __init__(self, function: Callable[..., Any]) -> None:
+            super().__init__(function)
+            # Read before anything is unpickled, which of other sources may name modules that are no more.
+            self._cache_file._version = f"{self._cache_file._version} {_digest_of_sources()}"
+
         def save_overload(self, signature: Any, result: Any) -> None:
             if _is_writable(Path(self.cache_path)):
                 super().save_overload(signature, result)
