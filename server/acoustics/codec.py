@@ -42,7 +42,7 @@ class Codec:
 
     @property
     def _first_frame(self) -> int:
-        """Where the window of frame n is centred at sample n * hop, the first that reaches into the signal."""
+        """Number of the first frame whose window reaches into the signal; frame n is centred at sample n * hop."""
         return 1 - -(-(self.n_fft - self.n_fft // 2) // self.hop)
 
     @cached_property

@@ -4,8 +4,8 @@ A simulation draws: its rays, and the noise that diffuse sound is made of. Two f
 expected than one simulation is cannot be told apart by it. Medians of parameters over many draws can tell them, and one
 draw whose direct sound happens to be mistaken for a reflection does not move them.
 
-Draws are simulations of the seeds that follow the dataset's, by the dataset's own plan. A tail that all pairs share has
-as many rays as plans give it today, whatever the dataset's had.
+Draws are simulations of the seeds that follow the dataset's, by the dataset's own plan but for the rays of a tail that
+all pairs share: what those happen to be like is the same error of every pair, and no median over pairs takes it away.
 Parameters are kept beside the dataset, a file per draw and emitter, so that what is interrupted goes on and nothing is
 drawn twice.
 
@@ -29,9 +29,7 @@ from server.acoustics.room_parameters import RoomParameters, measure
 from training.baselines.coded import Track
 from training.baselines.held_out import EvaluationError, HeldOut
 from training.data.dataset import TAKES, Dataset
-from training.data.simulation_plan import SimulationPlan
 from training.simulation.pairs import PairSimulation
-from training.simulation.planner import TAIL_RAYS
 from training.simulation.references import GeometricSound
 
 _FOLDER = "draws"
@@ -39,6 +37,7 @@ _FORMAT = 2
 """Another number wherever simulations or what is measured of them come to be another."""
 _WORKERS = 2
 # For one draw of 20,000 rays the reverberation times of a whole small room lie 0.9 % off.
+_TAIL_RAYS = 16
 _NAMES = tuple(field.name for field in fields(RoomParameters))
 _Floats = npt.NDArray[np.float64]
 
@@ -62,10 +61,6 @@ def median_parameters(
     ]
 
 
-def _with_a_sure_tail(plan: SimulationPlan, rays: int) -> SimulationPlan:
-    return replace(plan, tail_rays=max(plan.tail_rays, TAIL_RAYS * rays)) if plan.tail_rays else plan
-
-
 class _Draws:
     """Of one dataset; responses are whole, and measured with decays of `decay_db`."""
 
@@ -74,7 +69,7 @@ class _Draws:
         self._decay_db = decay_db
         self._geometric = GeometricSound(dataset)
         self._simulations: dict[int, PairSimulation] = {}
-        self._plan = _with_a_sure_tail(dataset.effects, dataset.scene.simulation.rays)
+        self._plan = replace(dataset.effects, tail_rays=_TAIL_RAYS * dataset.effects.tail_rays)
         simulated = hashlib.sha256((dataset.folder / "scene.toml").read_bytes())
         simulated.update(json.dumps([_FORMAT, dataset.seed, self._plan.to_json(), decay_db, _NAMES]).encode())
         self._folder = dataset.folder / _FOLDER / simulated.hexdigest()[:12]

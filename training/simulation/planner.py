@@ -11,9 +11,6 @@ from training.simulation.predictions import Prediction, Predictions
 from training.simulation.size import SimulationSize
 
 THRESHOLD_JND = 0.25
-TAIL_RAYS = 16
-"""Of a shared tail, times those of an emitter. The tail is part of every response: what chance makes of it is one error
-of all pairs, which no number of pairs evens out."""
 
 
 def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
@@ -73,7 +70,7 @@ class SimulationPlanner:
             image_order=order,
             rays=rays if has_rays else 0,
             tail_start_s=predicted.tail_start_s if shares_tail else None,
-            tail_rays=TAIL_RAYS * self._settings.rays if shares_tail else 0,
+            tail_rays=predicted.tail_rays() if shares_tail else 0,
             scattering=is_on[SimulatedEffect.SCATTERING],
             air_absorption=is_on[SimulatedEffect.AIR_ABSORPTION],
             diffraction=is_on[SimulatedEffect.DIFFRACTION],

@@ -4,6 +4,7 @@ rays before anything else is simulated: in just-noticeable differences, with a r
 Axes: (pair, band); metres. Power is squared pressure beside that of the direct sound at one metre.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,6 +37,10 @@ _RAY_VARIANCE = 1.1**2 - 1
 _CHORDS = 9 / 8
 _LEVEL_DB = JND_THRESHOLDS["level"].amount
 _EMITTERS_TRIED = 16
+# Standard error of a shared tail's reverberation time, as a share: a just-noticeable difference.
+_TAIL_ERROR = JND_THRESHOLDS["t60"].amount / 100
+# Of a shared tail, times the rays of an emitter.
+_MOST_TAIL_RAYS = 16
 # Of sequences of walls, each by a receiver, and of paths round corners, each by a wall.
 _MOST_IMAGE_TESTS, _MOST_PATH_TESTS = 30_000_000, 20_000_000
 
@@ -232,6 +237,16 @@ class Predictions:
         per_ray = SPEED_OF_SOUND * _EARLY_S * np.pi * receiver_radii(self.floor_plan, self.probes) ** 2
         rays = float(np.mean(crossings * self.room.volume_m3 / per_ray))
         return min(most, int(np.ceil(rays / 100)) * 100)
+
+    def tail_rays(self) -> int:
+        """Of a shared tail: as many as one emitter has, or as many more as its reverberation time needs to be known.
+
+        The tail is part of every response. So what chance makes of it is one error of all pairs, and no number of pairs
+        evens it out.
+        """
+        rays = self.scene.simulation.rays
+        needed = self.trial.tail_rays(self.tail_start_s, _TAIL_ERROR)
+        return int(np.clip(math.ceil(np.nan_to_num(needed, nan=rays)), rays, _MOST_TAIL_RAYS * rays))
 
     @cached_property
     def _ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

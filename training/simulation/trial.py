@@ -186,10 +186,34 @@ class Trial:
         """Where all places share their mean late sound from some time after emission on."""
         own = self.in_air(self.scattered)
         late = own.late.copy()
-        first = min(math.ceil(start_s / HISTOGRAM_BIN_S), late.shape[-1])
+        first = self._bins_before(start_s)
         # Of the other take: what places differ by must not be what rays do.
         late[..., first:] = own.late[::-1, :, :, first:].mean(axis=1, keepdims=True)
         return self.change(own, Energies(own.direct, own.first, late, own.onset))
+
+    def tail_rays(self, start_s: float, share: float) -> float:
+        """How many rays it takes to know the reverberation time of a tail that all places share, which begins `start_s`
+        after emission, with a standard error of such a `share` of it. In the median of octave bands; NaN where no band
+        has a reverberation time. The variance is taken to be inversely proportional to the number of rays.
+        """
+        hits, energies = self._settled
+        audible = bands_within(self.scene.simulation.sample_rate)
+        late = self.in_air(energies).late[..., :audible, self._bins_before(start_s) :]
+        ends = np.cumsum([len(receivers) for _, receivers in self.pairs])
+        of_emitters = np.stack([part.mean(axis=1) for part in np.split(late, ends[:-1], axis=1)], axis=1)
+        times_s = decay_times_s(of_emitters, np.zeros(len(ends), np.int64), *_DECAY_DB)
+        told = np.isfinite(times_s).all(axis=0)
+        one_s, other_s = np.where(told, times_s, 1.0)
+        # On average, the square of what two takes differ by is twice the variance of one.
+        squares = np.where(told, ((one_s - other_s) / (one_s + other_s)) ** 2 * 2, np.nan)
+        known = told.any(axis=0)
+        if not known.any():
+            return math.nan
+        variance = float(np.median(np.nanmean(squares[:, known], axis=0)))
+        return _rays(self.scene.geometry, self.duration_s, hits) * variance / share**2
+
+    def _bins_before(self, start_s: float) -> int:
+        return min(math.ceil(start_s / HISTOGRAM_BIN_S), round(self.duration_s / HISTOGRAM_BIN_S))
 
     def change(self, reference: Energies, other: Energies) -> Change:
         """Of level, clarity, early and late decay; those that neither has do not change."""
@@ -251,10 +275,15 @@ class Trial:
             image_order=GEOMETRIC_ORDER,
             arrival_directions=sphere_directions(1),
         )
-        room = DiffuseRoom(geometry, None, SPEED_OF_SOUND)
-        hits = duration_s * SPEED_OF_SOUND / room.mean_free_path_m * max(1, len(geometry.corners) / _FEW_WALLS)
-        rays = int(np.clip(_FIRST_HITS / hits, _FEWEST_RAYS, _MOST_RAYS) * reflections / _FIRST_HITS)
+        rays = _rays(geometry, duration_s, reflections)
         return tracer.energy(self.probes[emitter], rays=rays, rng=rng)[:, 0].astype(np.float64)
+
+
+def _rays(geometry: Geometry, duration_s: float, reflections: int) -> int:
+    """Of an emitter, that are reflected so many times, all together."""
+    room = DiffuseRoom(geometry, None, SPEED_OF_SOUND)
+    hits = duration_s * SPEED_OF_SOUND / room.mean_free_path_m * max(1, len(geometry.corners) / _FEW_WALLS)
+    return int(np.clip(_FIRST_HITS / hits, _FEWEST_RAYS, _MOST_RAYS) * reflections / _FIRST_HITS)
 
 
 def _bin_of(length_m: _Floats) -> npt.NDArray[np.int64]:

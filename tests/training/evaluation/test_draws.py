@@ -36,10 +36,12 @@ def medians(held_out) -> list[RoomParameters]:
 
 @pytest.fixture(scope="module")
 def simulated(held_out) -> list[list[RoomParameters]]:
-    """By pair and draw, from the simulation itself: two takes for each of the seeds after the dataset's."""
+    """By pair and draw, from the simulation itself: two takes for each of the seeds after the dataset's, with a tail of
+    more rays."""
     dataset: Dataset = held_out.simulated
+    plan = dataclasses.replace(dataset.effects, tail_rays=16 * dataset.effects.tail_rays)
     simulations = [
-        PairSimulation.prepare(dataset.scene, dataset.probes, dataset.yaws, seed=dataset.seed + n, plan=dataset.effects)
+        PairSimulation.prepare(dataset.scene, dataset.probes, dataset.yaws, seed=dataset.seed + n, plan=plan)
         for n in (1, 2)
     ]
     ends = [divmod(int(pair), len(dataset.probes)) for pair in held_out.held_out]

@@ -10,6 +10,7 @@ from server.scene.geometry import Geometry
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation.planner import planner_of
+from training.simulation.predictions import Predictions
 from training.simulation.rays import RayTracer, sphere_directions
 from training.simulation.trial import Trial, _root_mean_square
 from training.trials.reverberation import reverberation_time_s
@@ -40,6 +41,23 @@ def test_places_of_one_small_room_share_their_late_sound(name):
     """By sixty-four times as many rays sharing changes 0.09 JND in `small1`."""
     scene = SceneFile.read(SCENES / f"{name}.toml")
     assert planner_of(scene, 0).plan({}).tail_start_s is not None
+
+
+@pytest.mark.parametrize(("scene", "most"), [("small1", 20_000), ("own/stairwell", 10_000)])
+def test_a_tail_of_a_room_that_mixes_well_needs_few_rays(scene, most):
+    scene = SceneFile.read(SCENES / f"{scene}.toml")
+    predictions = Predictions(scene, scene.probe_positions(0))
+    assert 0 < predictions.trial.tail_rays(predictions.tail_start_s, 0.05) < most
+    assert predictions.tail_rays() == scene.simulation.rays
+
+
+def test_a_tail_needs_more_rays_where_few_of_them_run_level():
+    corridor = SceneFile.read(SCENES / "own" / "corridor-20m.toml")
+    predictions = Predictions(corridor, corridor.probe_positions(0))
+    needed = predictions.trial.tail_rays(predictions.tail_start_s, 0.05)
+    assert needed > 10 * corridor.simulation.rays
+    assert predictions.trial.tail_rays(predictions.tail_start_s, 0.1) == pytest.approx(needed / 4)
+    assert predictions.tail_rays() == 16 * corridor.simulation.rays
 
 
 def differences(common, spread, noise, pairs=60, takes=2, seed=0):
