@@ -190,7 +190,7 @@ def import_sofa(
         source,
         output,
         conditioning,
-        partial(read, receivers=receivers, asks_ears=not (swap_ears or accept_ears or mirror)),
+        partial(read, receivers=receivers, checks_ears=not (swap_ears or accept_ears or mirror)),
         held_out=held_out,
         seed=seed,
         as_json=as_json,
@@ -224,7 +224,7 @@ def _import(
     seed: int,
     as_json: bool,
 ) -> None:
-    from training.data.importers.conditioning import SourceError, conditioned, within_limits
+    from training.data.importers.conditioning import SourceError, condition, within_limits
     from training.data.importers.report import ImportReport
     from training.data.responses import ImportedDataset
 
@@ -238,7 +238,7 @@ def _import(
     report = ImportReport()
     # Closed at once where it ends early: its progress would be drawn behind the message.
     with closing(read(source, report, track=tracked)) as named:
-        measurements = conditioned(named, conditioning, report, source=source)
+        measurements = condition(named, conditioning, report, source=source)
         dataset = ImportedDataset.write(
             output,
             within_limits(measurements, source),

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from training.data.scene_file import HISTOGRAM_BIN_S
-from training.data.shared_tail import BANDS_AT_ONCE, SharedTail, shared_power
+from training.data.shared_tail import BAND_GROUP, SharedTail, shared_power
 from training.simulation.synthesis import BinauralSynthesis, power_at
 
 _NOISE_S = 2.0
@@ -34,7 +34,7 @@ def draw_tail(
     noise /= step[..., None]
     limits = np.iinfo(np.int16)
     np.clip(np.rint(noise, out=noise), limits.min, limits.max, out=noise)
-    silent = -len(noise) % BANDS_AT_ONCE
+    silent = -len(noise) % BAND_GROUP
     quantised = np.zeros((len(noise) + silent, *noise.shape[1:]), np.int16)
     quantised[: len(noise)] = noise
     return SharedTail(

@@ -10,7 +10,7 @@ from training.baselines.baselines import TrainingPairs, nearest
 from training.baselines.shaped import ShapedNearest, bands, moved, stretches
 from training.bundling.export import export
 from training.data.dataset import SPEED_OF_SOUND
-from training.data.importers.conditioning import Conditioning, conditioned
+from training.data.importers.conditioning import Conditioning, condition
 from training.data.importers.meshrir import read
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset
@@ -118,7 +118,7 @@ def test_it_is_the_best_answer_on_the_measured_office(tmp_path, held_out_share):
     if not office:
         pytest.skip("MEASURED_OFFICE names no folder")
     report = ImportReport()
-    rows = conditioned(read(Path(office), report), Conditioning(), report)
+    rows = condition(read(Path(office), report), Conditioning(), report)
     ImportedDataset.write(tmp_path, rows, report, layout="meshrir", source=office, held_out_share=held_out_share)
     others = ("nearest", "linear", "linear-aligned")
     bundle = export(ImportedDataset.open(tmp_path), [tmp_path], tmp_path / "bundle")
