@@ -141,7 +141,7 @@ def test_what_agrees_with_its_positions_is_imported(imported, layout):
     code, out, _ = imported(layout, "--json")
     assert code == 0
     assert not any("warning" in note for note in notes(out))
-    tells = "louder one in 100%" if layout in BINAURAL else "no ears tell whether coordinates are mirrored"
+    tells = "louder one in 100%" if layout in BINAURAL else "without ears, mirrored coordinates cannot be detected"
     assert any(tells in note for note in notes(out))
 
 
