@@ -138,7 +138,7 @@ def main() -> None:
     )
     parser.add_argument("--input", type=Path, help="audio file to send (default: claps)")
     parser.add_argument(
-        "--ahead", type=int, default=4, help="blocks sent ahead: more survives a worse network, fewer are heard sooner"
+        "--ahead", type=int, default=4, help="blocks sent ahead: more for a worse network, fewer to hear them sooner"
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("wet.wav"))
     arguments = parser.parse_args()
