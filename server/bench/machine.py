@@ -1,4 +1,4 @@
-"""The machine that a bench ran on: figures say nothing without it."""
+"""Description of the machine that a benchmark ran on."""
 
 import os
 import platform
@@ -18,11 +18,11 @@ _INSTRUCTION_SETS = {
     "sve": "SVE",
     "neon": "NEON",
 }
-"""By the feature of LLVM's that means them, the widest of each family first."""
+"""Instruction sets by LLVM's name of the feature, the widest of each family first."""
 
 
 def describe_machine() -> dict[str, Any]:
-    """What to tell with every figure; a load beyond a few tenths spoils them."""
+    """Properties of the host, for every report. A load above a few tenths makes measurements unreliable."""
     return {
         "processor": processor(),
         "instruction_set": instruction_set(),
@@ -34,7 +34,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def processor() -> str:
-    """As it names itself."""
+    """Name of the processor."""
     cpuinfo = Path("/proc/cpuinfo")
     names = re.findall(r"^model name\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else []
     return names[0] if names else platform.processor() or platform.machine()
