@@ -118,9 +118,9 @@ class Walker(asyncio.Protocol):
             self._begin()
         for opcode, payload in self._reader.feed(data):
             if opcode == _BINARY:
-                self._hear(payload)
+                self._receive_audio(payload)
             elif opcode == _TEXT:
-                self._read(payload)
+                self._receive_text(payload)
             elif opcode == _PING:
                 self._send(_PONG, payload)
             elif opcode == _CLOSE:
@@ -131,7 +131,7 @@ class Walker(asyncio.Protocol):
             self._fail(f"the connection was lost: {exc}")
 
     @property
-    def is_content(self) -> bool:
+    def hears_all(self) -> bool:
         """Whether all emitters are heard and the connection is open."""
         return self._silent == 0 and not self.is_lost
 
@@ -156,7 +156,7 @@ class Walker(asyncio.Protocol):
         if self._poses_per_s > 0:
             self._next_pose = asyncio.get_running_loop().call_later(self._phase / self._poses_per_s, self._walk)
 
-    def _read(self, payload: bytes) -> None:
+    def _receive_text(self, payload: bytes) -> None:
         message = json.loads(payload)
         if message["type"] == "emitter_added":
             self._silent -= 1
@@ -165,7 +165,7 @@ class Walker(asyncio.Protocol):
         elif message["type"] == "error":
             self.errors.append(message["code"])
 
-    def _hear(self, payload: bytes) -> None:
+    def _receive_audio(self, payload: bytes) -> None:
         if payload[0] != AudioBlock.KIND:
             return
         self.blocks += 1
@@ -214,7 +214,7 @@ class Crowd:
     async def resize(self, count: int) -> None:
         """Change to `count` walkers, and wait until all their emitters are heard. Raises ConnectionError or
         TimeoutError if that fails."""
-        kept = [walker for walker in self.walkers if walker.is_content][:count]
+        kept = [walker for walker in self.walkers if walker.hears_all][:count]
         for walker in self.walkers:
             if walker not in kept:
                 walker.close()

@@ -29,7 +29,7 @@ class _Waits:
     def send(self, pose_id: int, now_s: float) -> None:
         self._sent_s[pose_id] = now_s
 
-    def hear(self, pose_id: int, now_s: float) -> None:
+    def receive(self, pose_id: int, now_s: float) -> None:
         reached = [number for number in self._sent_s if number <= pose_id]
         self.waits_ms += [(now_s - self._sent_s.pop(number)) * 1000 for number in reached]
 
@@ -69,8 +69,8 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
             next_clock = block.sample_clock + answer.block_size
             late_at_s += [round(now_s - started_s, 1)] if block.is_late else []
             exchanges += block.is_exchange
-            to_block.hear(block.pose_id, now_s)
-            to_reverberation.hear(block.reverberation_pose_id, now_s)
+            to_block.receive(block.pose_id, now_s)
+            to_reverberation.receive(block.reverberation_pose_id, now_s)
             if blocks % _ACKNOWLEDGE_EVERY == 0:
                 await socket.send(Acknowledge(sequence=block.sequence).serialize())
             if now_s - started_s > pose_id / poses_per_second:

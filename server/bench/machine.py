@@ -41,8 +41,8 @@ def processor() -> str:
 
 
 def instruction_set(features: str | None = None) -> str:
-    """The widest that compiled code uses, of LLVM's `features` ("+avx2,-avx512f,..."): by default the processor's, or
-    NUMBA_CPU_FEATURES where that is set."""
+    """The widest instruction set that compiled code uses, by LLVM's `features` ("+avx2,-avx512f,..."). By default these
+    are NUMBA_CPU_FEATURES if that is set, or else the processor's."""
     if features is None:
         features = config.CPU_FEATURES
     if features is None:

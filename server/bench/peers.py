@@ -31,7 +31,7 @@ class Pedalboard:
 
 
 def find_pedalboard() -> ModuleType | None:
-    """None where it is not installed."""
+    """The module pedalboard; None if it is not installed."""
     try:
         import pedalboard
     except ImportError:

@@ -6,19 +6,21 @@ samples at 48 kHz, and impulse responses (IRs) of a second for each emitter. The
 listener sends 30 poses a second by default. Direct paths follow each pose, and IRs as fast as the core can.
 
 - A run passes if every session has a stream, gets the blocks that are sent to it and sees its poses followed, if there
-was no error, and if fewer than one block in a thousand was late. Only a run that passes can reach a goal. - A block is
-late if it reaches the socket later than a player with the usual reserve of 8 blocks needs it, or if it is never made.
-`late_share` is the share of late blocks among all blocks that were due. - `sessions`: the largest number that passes.
-Steps of a few seconds find it to within 5 %, and a long run confirms it; if that fails, a tenth less is tried, and so
-on. A step ends as soon as it has failed. Unless it fails by far, it is tried once more, since other tenants of the
-machine may have disturbed it. - `with_20_sessions`: the same with 16 emitters and the goal's number of listeners, if
-more are possible. Latency is judged there and not at the limit. - `block_ms`: time to render a block, or its share of
-blocks rendered together. `lateness_ms`: time from when a block was due until it was ready. - `pose_to_audio_ms`: time
-from a pose's arrival at the server until the first block that follows it is passed to the socket.
-`pose_to_reverberation_ms`: the same for the first block with IRs of that pose. `client_pose_to_audio_ms`: the former as
-a client measures it. - `server_load`, `client_load`: CPU time divided by wall time; the server's also by thread: audio,
-impulse responses, and the event loop (`MainThread`). If the clients' load is near 1, they limit the result and not the
-server.
+  was no error, and if fewer than one block in a thousand was late. Only a run that passes can reach a goal.
+- A block is late if it reaches the socket later than a player with the usual reserve of 8 blocks needs it, or if it is
+  never made. `late_share` is the share of late blocks among all blocks that were due.
+- `sessions`: the largest number that passes. Steps of a few seconds find it to within 5 %, and a long run confirms it;
+  if that fails, a tenth less is tried, and so on. A step ends as soon as it has failed. Unless it fails by far, it is
+  tried once more, since other tenants of the machine may have disturbed it.
+- `with_20_sessions`: the same with 16 emitters and the goal's number of listeners, if more are possible. Latency is
+  judged there and not at the limit.
+- `block_ms`: time to render a block, or its share of blocks rendered together. `lateness_ms`: time from when a block
+  was due until it was ready.
+- `pose_to_audio_ms`: time from a pose's arrival at the server until the first block that follows it is passed to the
+  socket. `pose_to_reverberation_ms`: the same for the first block with IRs of that pose. `client_pose_to_audio_ms`: the
+  former as a client measures it.
+- `server_load`, `client_load`: CPU time divided by wall time; the server's also by thread: audio, impulse responses,
+  and the event loop (`MainThread`). If the clients' load is near 1, they limit the result and not the server.
 """
 
 import asyncio

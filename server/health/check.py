@@ -258,7 +258,7 @@ def _check_field(
         share = laws.branch_cut_share(predictions.spectrograms(some).instantaneous_frequency)
         findings.append(Finding(BRANCH_CUT, graph.name, share, len(some)))
     worst = np.array([finding.pose for finding in findings if finding.pose is not None])
-    findings.insert(0, Finding(FINITE, graph.name, float(predictions.faults), predictions.asked))
+    findings.insert(0, Finding(FINITE, graph.name, float(predictions.faults), predictions.poses))
     evidence = FieldEvidence(
         poses,
         excess_db,

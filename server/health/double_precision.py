@@ -128,8 +128,8 @@ class DoubleGate(Gate):
             )
             given = _at(self._given, samples - opens, 0)
             squares = response.astype(np.float64) ** 2
-            taken, held = (squares * (1 - gain**2)).sum(axis=-1), (squares * gain**2 * given).sum(axis=-1)
-            share = np.divide(taken, held, out=np.full_like(held, MOST_GIVEN), where=taken < MOST_GIVEN * held)
+            taken, kept = (squares * (1 - gain**2)).sum(axis=-1), (squares * gain**2 * given).sum(axis=-1)
+            share = np.divide(taken, kept, out=np.full_like(kept, MOST_GIVEN), where=taken < MOST_GIVEN * kept)
             response *= gain * np.sqrt(1 + share[:, None] * given)
 
 
@@ -165,7 +165,7 @@ class DoubleStillPaths(StillPaths):
         out: _Float32,
     ) -> None:
         tables = self._tables
-        heard = np.zeros(out.shape)
+        total = np.zeros(out.shape)
         for length, arrival, gains_db in zip(lengths_m, arrivals, band_gains_db, strict=True):
             corners, weights = self._triangle(axes_of(orientation) @ arrival)
             levels_db = gains_db - tables.air_db_per_m * length
@@ -182,8 +182,8 @@ class DoubleStillPaths(StillPaths):
                 begin = whole + BEFORE - (TAPS - 1)
                 first, last = max(0, begin), min(out.shape[1], begin + part.size)
                 if last > first:
-                    heard[ear, first:last] += part[first - begin : last - begin]
-        out += heard
+                    total[ear, first:last] += part[first - begin : last - begin]
+        out += total
 
     def _triangle(self, direction: _Floats) -> tuple[npt.NDArray[np.int64], _Floats]:
         """The three measured directions around a direction, and their weights. It is the triangle whose least weight is
@@ -213,7 +213,7 @@ class DoubleFullResponse(FullResponse):
 
 
 def _at(curve: _Float32, index: Indices, after: float) -> _Floats:
-    """The curve's values, its first before it and `after` behind it."""
+    """Values of the curve at indices. Before its beginning it has its first value, and `after` after its end."""
     values = np.append(_double(curve), after)
     return np.asarray(values[np.clip(index, 0, len(curve))])
 

@@ -43,7 +43,7 @@ class Predictions:
 
     def __init__(self, graph: FieldGraph) -> None:
         self.graph = graph
-        self.asked = 0
+        self.poses = 0
         self.faults = 0
         """Number of values so far that were not finite."""
         self.windows = Windows(graph.parameters.codec)
@@ -59,7 +59,7 @@ class Predictions:
         return self.graph.spectrograms(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
 
     def _energies(self, poses: Poses) -> Energies:
-        self.asked += len(poses)
+        self.poses += len(poses)
         outputs = self.graph.run(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
         self.faults += sum(int(np.count_nonzero(~np.isfinite(output))) for output in outputs)
         codec = self.graph.parameters.codec

@@ -84,14 +84,14 @@ def judge(measured: dict[str, Any]) -> list[Judgement]:
     or no fault was sent, counts as not met."""
     silent = None if measured["blocks"] else "no hostile client heard a block"
     harmless = None if measured["faults"] else "no client did anything that had to be refused"
-    unheard = None if measured["witness"]["seconds"] else "the witness heard nothing"
+    unmeasured = None if measured["witness"]["seconds"] else "the witness heard nothing"
     return [
         _NOT_FINITE.judge(measured["samples_not_finite"], failure=silent),
         _CRASHES.judge(measured["crashes"]),
         _UNANSWERED.judge(measured["faults_unanswered"], failure=harmless),
         _judge_growth(measured),
-        _ERROR.judge(measured["witness"]["worst_error_db"], failure=unheard),
-        _DRIFT.judge(measured["witness"]["drift_db"], failure=unheard),
+        _ERROR.judge(measured["witness"]["worst_error_db"], failure=unmeasured),
+        _DRIFT.judge(measured["witness"]["drift_db"], failure=unmeasured),
         _SILENCE.judge(measured["silence_to_sound"]),
     ]
 
@@ -167,7 +167,7 @@ class _Soak:
                             witness.begin(event.sample_clock)
                         continue
                     block = AudioBlock.parse(message, welcome.encoding)
-                    witness.hear(block)
+                    witness.compare(block)
                     self._blocks += 1
                     self._blocks_late += block.is_late
                     self._not_finite += block.samples.size - int(np.count_nonzero(np.isfinite(block.samples)))

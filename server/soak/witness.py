@@ -69,23 +69,23 @@ class Witness:
         self._expected = _circular(clip, response.astype(np.float64))
         self._power = float(np.mean(self._expected**2))
         self._error_power = 0.0
-        self._heard = 0
+        self._compared = 0
 
     def begin(self, sample_clock: int) -> None:
         """Set the clock of the clip's first sample."""
         self._begins = sample_clock
 
-    def hear(self, block: AudioBlock) -> None:
+    def compare(self, block: AudioBlock) -> None:
         if self._begins is None or block.sample_clock - self._begins < self._ir_samples:
             return
         frames = block.samples.shape[1]
         at = (block.sample_clock - self._begins + np.arange(frames)) % self._expected.shape[1]
         difference: npt.NDArray[np.float64] = block.samples - self._expected[:, at]
         self._error_power += float(np.sum(difference**2))
-        self._heard += difference.size
-        if self._heard >= 2 * self._stretch_samples:
-            self.errors.db.append(float(power_to_db(self._error_power / self._heard / self._power)))
-            self._error_power, self._heard = 0.0, 0
+        self._compared += difference.size
+        if self._compared >= 2 * self._stretch_samples:
+            self.errors.db.append(float(power_to_db(self._error_power / self._compared / self._power)))
+            self._error_power, self._compared = 0.0, 0
 
 
 def _worst(errors_db: list[float]) -> float:
