@@ -102,12 +102,12 @@ def test_nothing_is_written_to_a_connection_that_closes():
     assert outcome == [False]
 
 
-def test_another_server_has_no_short_way():
+def test_another_server_has_no_fast_path():
     found = []
 
     async def speak(scope, _receive, send):
         found.append(fast_path(scope))
-        assert watched(scope, sent=found.append, heard=found.append) is scope
+        assert watched(scope, sent=found.append, received=found.append) is scope
         await send({"type": "websocket.close"})
 
     async def listen():
