@@ -344,7 +344,7 @@ class Connection:
         if isinstance(message, Ping):
             self._enqueue([Pong(id=message.id)])
         elif not stream.offer(message):
-            raise RequestError("too_many_messages", "too many messages in one block: this one was not heeded")
+            raise RequestError("too_many_messages", "too many messages in one block: this one was ignored")
 
     async def _receive(self) -> str | bytes:
         event = await self._websocket.receive()
