@@ -139,7 +139,7 @@ class _Tail:
 
 
 def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
-    """Lundeby's iteration over windows `(window,)`; None where the late response does not decay."""
+    """The late decay, by Lundeby's iteration over windows `(window,)`; None if the late response does not decay."""
     count = _after_last(block_power > 0.0)
     if count == 0:  # all energy lies before the first whole window or after the last
         return None
