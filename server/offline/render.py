@@ -189,6 +189,7 @@ def _pose(values: dict[str, float], where: str) -> Pose:
     try:
         return Pose(position, Quaternion(values["qx"], values["qy"], values["qz"], values["qw"]))
     except ValueError as exc:
+        # guard: a path file's orientation is refused by its line
         raise PathError(f"{where}, columns 'qx' to 'qw': {exc}") from exc
 
 

@@ -140,6 +140,7 @@ def export(
     with tempfile.TemporaryDirectory() as trial:
         bundle = write_bundle(Path(trial), manifest, files)
         found = check_fields(bundle, EFFORT)
+        # guard: ill bundles are not exported
         found.health.require()
         if isinstance(responses, SimulatedResponses) and exported[0].architecture == "factorised":
             files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
