@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
-from server.kernels import right_angle
+from server.kernels import odd_fft
 from server.kernels.compiled import compiled
 from server.kernels.simd import add, broadcast, load, load_int, multiply_add, pointer, store
 from server.rendering import products
@@ -274,7 +274,7 @@ def _transform(convolver, stage, job) -> None:
     history = stage.history + 4 * source * span
     second = (stage.window * size) % span
     first = (second - size) % span
-    right_angle.forward(
+    odd_fft.forward(
         history + 4 * first,
         history + 4 * second,
         convolver.scratch,
@@ -384,7 +384,7 @@ def _invert_column(convolver, stage, channel, column, out) -> None:
     """The samples (size,) of what is in a column of a channel's mix; zeros are left there, for a window to come."""
     mix = stage.mix + 4 * products.mix_offset(convolver.channels, 0, channel, column)
     step = products.mix_offset(convolver.channels, 1, 0, 0)
-    right_angle.inverse(mix, step, 8, convolver.scratch, out, stage.size, stage.twist, stage.passes, stage.lanes)
+    odd_fft.inverse(mix, step, 8, convolver.scratch, out, stage.size, stage.twist, stage.passes, stage.lanes)
     _clear_column(convolver, stage, channel, column)
 
 
