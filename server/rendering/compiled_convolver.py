@@ -9,9 +9,9 @@ from server.kernels.simd import LANES
 from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
+from server.rendering.multiply_accumulate import COLUMNS, GROUP, spectrum_stride
 from server.rendering.packed_filter import PackedFilter, address, pack
 from server.rendering.partitions import Partitioning, Stage
-from server.rendering.products import COLUMNS, GROUP, spectrum_stride
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from server.kernels import odd_fft
 from server.kernels.array_pool import ArrayPool
 from server.kernels.compiled import compiled
+from server.rendering.multiply_accumulate import filter_offset
 from server.rendering.partitions import Partitioning
-from server.rendering.products import filter_offset
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
