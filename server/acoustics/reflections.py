@@ -1,11 +1,11 @@
-"""First reflections: the sound that reaches a listener by way of one wall, the floor or the ceiling, mirrored.
+"""Early reflections: sound that is reflected once, by a wall, the floor or the ceiling.
 
-Each path comes from an image of the emitter behind the surface (Allen & Berkley, JASA 65(4), 1979; with the tests for
-rooms that are not boxes, Borish, JASA 75(6), 1984). Which surfaces mirror changes by steps as somebody passes the end
-of a wall: whoever renders these paths has to fade between them.
+Each path comes from an image source of the emitter behind the surface (Allen & Berkley, JASA 65(4), 1979; for rooms
+that are not boxes, Borish, JASA 75(6), 1984). A path appears or vanishes suddenly when a listener or emitter passes the
+end of a wall, so the renderer has to fade it.
 
-Points and unit vectors are (..., xyz) of the world in metres; bands are OCTAVE_BANDS_HZ; surfaces are 0 for any wall, 1
-for the floor, 2 for the ceiling.
+Points and unit vectors are (..., xyz) in world coordinates, in metres. Bands are OCTAVE_BANDS_HZ. Surfaces are 0 for
+any wall, 1 for the floor, 2 for the ceiling.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ from server.acoustics.reflections_kernel import find_first_echoes, find_reflecti
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# What mirrors less than this mirrors nothing; filters need a finite number.
+# A lower bound of reflected power, since filters need a finite level.
 _LEAST_POWER = 1e-10
 
 
 class FirstEcho:
-    """When a room can answer at the earliest: sound that has touched a surface has come at least as far as from the
-    emitter's image behind the nearest one that both ends are in front of. Safe to share between threads."""
+    """A lower bound of the path length of the first reflection: the distance from the nearest image source, over all
+    surfaces that face both emitter and listener. Safe to share between threads."""
 
     def __init__(self, plan: FloorPlan) -> None:
         start, end = plan.walls[:, 0], plan.walls[:, 1]
@@ -39,7 +39,7 @@ class FirstEcho:
         self.length_m(np.zeros((1, 3)), np.zeros((1, 3)))
 
     def length_m(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
-        """(n,) least length of such a path between points (n, 3) inside the room."""
+        """(n,) lower bounds for pairs of points (n, 3) inside the room."""
         listeners = np.ascontiguousarray(listeners, dtype=np.float64)
         emitters = np.ascontiguousarray(emitters, dtype=np.float64)
         length_m = np.empty(len(listeners))
@@ -48,19 +48,19 @@ class FirstEcho:
 
 
 def mirror_gain_db(absorption: npt.ArrayLike, scattering: npt.ArrayLike) -> Floats:
-    """(...) level of what a surface mirrors, from the energy shares it absorbs and, of the rest, scatters; -100 dB at
-    least."""
+    """(...) level of the specular reflection, at least -100 dB. `absorption` is the share of energy absorbed, and
+    `scattering` the share of the rest that is scattered."""
     mirrored = (1 - np.asarray(absorption, dtype=np.float64)) * (1 - np.asarray(scattering, dtype=np.float64))
     return power_to_db(np.maximum(mirrored, _LEAST_POWER))
 
 
 @dataclass(frozen=True)
 class Reflections:
-    """m paths by way of one surface, emitter after emitter.
+    """m paths of early reflections, ordered by emitter.
 
-    `emitter` (m,) is the index of the emitter; `length_m` (m,); `arrival` (m, 3) points from the listener to where the
-    path comes from, `departure` (m, 3) from the emitter to where it begins; `gain_db` (m, band) <= 0 is that of the
-    surface, on top of 1 / length.
+    `emitter` (m,) is the index of the emitter. `arrival` (m, 3) points from the listener along the arriving path,
+    `departure` (m, 3) from the emitter along the departing path. `gain_db` (m, band) <= 0 is the gain of the surface,
+    on top of 1 / length.
     """
 
     emitter: Integers
@@ -71,8 +71,8 @@ class Reflections:
 
 
 class ReflectionFinder:
-    """Finds the first reflections in one floor plan; `gains_db` (surface, band) is what walls, floor and ceiling
-    mirror. Safe to share between threads."""
+    """Finds the early reflections in one floor plan. `gains_db` (surface, band) are the specular gains of walls, floor
+    and ceiling. Safe to share between threads."""
 
     def __init__(self, plan: FloorPlan, gains_db: npt.ArrayLike) -> None:
         self._height_m = plan.height_m
