@@ -17,8 +17,8 @@ BLOCK_SIZES = f"a multiple of {BLOCK_STEP} from {SMALLEST_BLOCK} to {LARGEST_BLO
 """What a renderer takes. Of powers of two compiled code convolves; of others, 480 for one, NumPy does, which is slower
 and no path for what has to be in time."""
 TURNS = 4
-"""A source's filter is read once in so many windows, and multiplied for all of them (`server.rendering.products`);
-the source's number modulo TURNS says when."""
+"""A source's filter is read once in so many windows, and multiplied for all of them
+(`server.rendering.multiply_accumulate`); the source's number modulo TURNS says when."""
 NEAR = TURNS - 1
 """First partitions of a stage, which lie by themselves: they are multiplied in the windows between, too."""
 
