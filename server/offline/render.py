@@ -26,7 +26,7 @@ from server.planning.scene_acoustics import Output
 from server.rendering.ingest import DryAudio, require_gain
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.ir_request import EmitterSnapshot, Field, composed_irs
+from server.responses.ir_request import EmitterSnapshot, composed_irs
 from server.responses.radiation import reverberation_gain
 from server.scene.effects import EffectName, require_effect
 from server.streaming.active_effects import ActiveEffects, as_asked
@@ -193,7 +193,7 @@ def _pose(values: dict[str, float], where: str) -> Pose:
 
 
 def render(
-    field: Field,
+    field: AcousticField,
     direct_sound: DirectSound,
     emitters: Sequence[RenderedEmitter],
     path: Sequence[PathPoint],
@@ -202,7 +202,7 @@ def render(
     length: int | None = None,
     progress: Callable[[float], None] | None = None,
     planned: PlannedEffects | None = None,
-    levels: Mapping[str, Field] | None = None,
+    levels: Mapping[str, AcousticField] | None = None,
 ) -> FloatArray:
     """What a listener on `path` (one point or more, by rising sample) hears of `emitters` (one or more): (channel,
     length), two ears or, from a mono loudspeaker, one channel.
@@ -226,7 +226,7 @@ def render(
         for point, each in zip(path, fields, strict=True)
         if point.reverberation_sample is not None
     }
-    shares_tail = any(each.level.shared_tail for each in (field, *(levels or {}).values()))
+    shares_tail = any(each.kind.shares_tail for each in (field, *(levels or {}).values()))
     walk = _Walk(fields[0], direct_sound, emitters, path[0].pose, block_size, planned, ir_samples, shares_tail)
     blocks = -(-length // block_size)
     output = np.empty((walk.renderer.outputs, blocks, block_size), np.float32)
@@ -238,7 +238,9 @@ def render(
     return output.reshape(len(output), -1)[:, :length]
 
 
-def _fields(field: Field, path: Sequence[PathPoint], levels: Mapping[str, Field]) -> list[Field]:
+def _fields(
+    field: AcousticField, path: Sequence[PathPoint], levels: Mapping[str, AcousticField]
+) -> list[AcousticField]:
     """What gives the responses of each point; `field` before any names a level."""
     fields = []
     for point in path:
@@ -268,7 +270,7 @@ class _Walk:
 
     def __init__(
         self,
-        field: Field,
+        field: AcousticField,
         direct_sound: DirectSound,
         emitters: Sequence[RenderedEmitter],
         start: Pose,
@@ -288,7 +290,7 @@ class _Walk:
             has_head=planned is None or planned.shared.head,
         )
         self._field = field
-        self.renderer.share_tail(field.level.shared_tail)
+        self.renderer.share_tail(field.kind.shares_tail)
         self._direct_sound = direct_sound
         self._effects = ActiveEffects(
             self.renderer,
@@ -312,7 +314,7 @@ class _Walk:
             if planned is not None:
                 planned.follow_emitter(name, emitter.pose, 0.0)
 
-    def go_on(self, direct: Pose | None, reverberation: tuple[Pose, Field] | None) -> None:
+    def go_on(self, direct: Pose | None, reverberation: tuple[Pose, AcousticField] | None) -> None:
         """What is heard from the next block on: direct sound of this pose and responses of that, or as before."""
         if direct is not None:
             self._move(direct)
@@ -326,7 +328,7 @@ class _Walk:
             is_other, self._field = field is not self._field, field
             self._respond(pose)
             if is_other:
-                self._effects.share_tail(field.level.shared_tail, self._emitters)
+                self._effects.share_tail(field.kind.shares_tail, self._emitters)
         elif self._effects.planned is not None and self._has_begun:
             self._respond(self._listener)
 
@@ -348,7 +350,7 @@ class _Walk:
         if request is not None:
             planned.accept(request.plan())
             self._effects.enforce(self._emitters)
-            self._effects.share_tail(self._field.level.shared_tail, self._emitters)
+            self._effects.share_tail(self._field.kind.shares_tail, self._emitters)
 
     def _respond(self, listener: Pose) -> None:
         """Hand in the responses that are out of date."""

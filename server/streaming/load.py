@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from server.core.errors import RequestError
+from server.field.kinds.catalogue import kind_of
 from server.protocol.client_messages import AUTO
 from server.protocol.server_messages import LevelReason
 from server.scene.manifest import QualityLevel
@@ -86,10 +87,10 @@ class Offer:
             return (*self._slower(level), self._rung(level, _LEAST_RATE_HZ))
         fitting = [level for level in self.levels if self.ms_here[level.name] <= 1000 * block_s] or self.levels[:1]
         # The most expensive is the best, but what shares a tail comes last.
-        own_tails = [level for level in reversed(fitting) if not level.shared_tail]
-        best, *cheaper = (*own_tails, *(level for level in reversed(fitting) if level.shared_tail))
+        best_first = reversed(fitting)
+        best, *cheaper = sorted(best_first, key=lambda level: kind_of(level).shares_tail)
         # What reuses responses has fewer to compute, however often it is asked.
-        down = [self._rung(level, _RATES_HZ[-1] if level.reuse is None else _RATES_HZ[0]) for level in cheaper]
+        down = [self._rung(level, _RATES_HZ[0 if kind_of(level).reuses_responses else -1]) for level in cheaper]
         return (*self._slower(best), *down, self._rung((best, *cheaper)[-1], _LEAST_RATE_HZ))
 
     def _slower(self, level: QualityLevel) -> tuple[QualityStep, ...]:

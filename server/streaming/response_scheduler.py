@@ -111,7 +111,7 @@ class ResponseScheduler:
             raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")
         self.newest_pose_id = pose_id
         self._waits_for_change, self._has_changed = False, True
-        if self._levels[self._wanted.level].level.reuse is not None:
+        if self._levels[self._wanted.level].kind.reuses_responses:
             self._has_looked = False  # what is heard may be its response again
 
     def retry(self) -> None:

@@ -117,7 +117,7 @@ class Session:
             sample_rate=field.sample_rate,
             max_emitters=max_emitters,
             shared_tail=shared_tail,
-            switches_tail=planned is not None or any(level.level.shared_tail for level in levels.values()),
+            switches_tail=planned is not None or any(field.kind.shares_tail for field in levels.values()),
             outputs=1 if hello.output == "mono" else 2,
             has_head=planned is None or planned.shared.head,
         )
