@@ -26,12 +26,13 @@ from server.planning.scene_acoustics import Output
 from server.rendering.ingest import DryAudio, require_gain
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.ir_request import EmitterSnapshot, composed_irs
+from server.responses.emitter_state import EmitterState
+from server.responses.ir_request import composed_irs
 from server.responses.radiation import reverberation_gain
 from server.scene.effects import EffectName, require_effect
 from server.streaming.active_effects import ActiveEffects, as_asked
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import Stage, StreamedEmitter
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -301,7 +302,7 @@ class _Walk:
         )
         self._listener = start
         self._has_begun = False
-        self._emitters: dict[str, Emitter] = {}
+        self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(direct_sound, self.renderer, self._emitters)
         for number, emitter in enumerate(emitters):
             name = str(number)
@@ -309,8 +310,9 @@ class _Walk:
             if emitter.directivity != OMNIDIRECTIONAL:
                 self.renderer.set_reverberation_gain(name, reverberation_gain(emitter.directivity))
             gain_db = float(amplitude_to_db(max(emitter.gain, _LEAST_GAIN)))
-            self._emitters[name] = Emitter(number, emitter.pose, emitter.directivity, gain_db=gain_db)
-            self._emitters[name].is_decided = planned is None
+            state = EmitterState(emitter.pose, emitter.directivity, gain_db=gain_db)
+            stage = Stage.DECIDED if planned is None else Stage.UNDECIDED
+            self._emitters[name] = StreamedEmitter(number, state, stage=stage)
             if planned is not None:
                 planned.follow_emitter(name, emitter.pose, 0.0)
 
@@ -346,7 +348,8 @@ class _Walk:
         planned = self._effects.planned
         if planned is None:
             return
-        request = planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+        states = {name: emitter.state for name, emitter in self._emitters.items()}
+        request = planned.take_request(self._listener, states, self._effects.clock_s)
         if request is not None:
             planned.accept(request.plan())
             self._effects.enforce(self._emitters)
@@ -357,20 +360,17 @@ class _Walk:
         named = {
             name: emitter
             for name, emitter in self._emitters.items()
-            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_folding)
+            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_baking)
         }
         if self._effects.awaits_ears:
             self.renderer.set_channels(self._effects.channels)
         if not named:
             return
-        asked = [
-            EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity, effects=as_asked(emitter))
-            for emitter in named.values()
-        ]
+        asked = [as_asked(emitter) for emitter in named.values()]
         irs = composed_irs(self._field, self._direct_sound, listener, asked, self._effects.channels)
-        for (name, emitter), snapshot, ir in zip(named.items(), asked, irs, strict=True):
+        for (name, emitter), state, ir in zip(named.items(), asked, irs, strict=True):
             emitter.is_outdated = False
-            self._effects.accept_ir(name, emitter, self.renderer.prepare(ir), snapshot.effects, 0)
+            self._effects.accept_ir(name, emitter, self.renderer.prepare(ir), state.effects, 0)
 
 
 def _block_at(sample: int, block_size: int) -> int:

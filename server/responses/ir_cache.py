@@ -18,8 +18,8 @@ from server.field.node_responses import NodeCache
 from server.rendering.convolver import PartitionedIr
 from server.rendering.renderer import Renderer
 from server.responses.early_reflections import EarlyReflections
+from server.responses.emitter_state import EmitterState
 from server.responses.node_reflections import add_first_reflections
-from server.responses.radiation import Placed
 from server.scene.manifest import QualityLevel
 
 
@@ -37,7 +37,7 @@ class Shared(NamedTuple):
 
 
 def shared_response(
-    field: AcousticField, early: EarlyReflections | None, listener: Pose, emitter: Placed
+    field: AcousticField, early: EarlyReflections | None, listener: Pose, emitter: EmitterState
 ) -> Shared | None:
     """At a field's level; None where each pose has a response of its own."""
     if not field.kind.shares_whole_responses(has_reflections=early is not None):
@@ -46,7 +46,7 @@ def shared_response(
     return Shared(_identity(field.level, early, snapped, emitter), around)
 
 
-def _identity(level: QualityLevel, early: EarlyReflections | None, snapped: Snapped, emitter: Placed) -> Hashable:
+def _identity(level: QualityLevel, early: EarlyReflections | None, snapped: Snapped, emitter: EmitterState) -> Hashable:
     beam = None
     if early is not None and emitter.directivity != OMNIDIRECTIONAL:
         beam = emitter.directivity, emitter.pose.orientation
@@ -59,7 +59,7 @@ def prepared_irs(
     early: EarlyReflections | None,
     renderer: Renderer,
     listener: Pose,
-    emitters: Sequence[Placed],
+    emitters: Sequence[EmitterState],
 ) -> tuple[PartitionedIr, ...]:
     """One per emitter, at a level that reuses responses: taken from `cache` as far as they are there. Raises ValueError
     where the field is not finite."""
@@ -74,7 +74,7 @@ def _whole(
     early: EarlyReflections | None,
     renderer: Renderer,
     listener: Pose,
-    emitter: Placed,
+    emitter: EmitterState,
 ) -> PartitionedIr:
     snapped = field.snap(listener.position, emitter.pose.position, listener.yaw)
     identity = _identity(field.level, early, snapped, emitter)
@@ -95,7 +95,7 @@ def _with_first_reflections(
     early: EarlyReflections,
     renderer: Renderer,
     listener: Pose,
-    emitter: Placed,
+    emitter: EmitterState,
 ) -> PartitionedIr:
     snapped = field.snap(listener.position, emitter.pose.position, listener.yaw)
     key = field.level.name, *snapped, renderer.preparation

@@ -2,12 +2,10 @@
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
@@ -15,34 +13,19 @@ from server.rendering.convolver import PartitionedIr
 from server.rendering.renderer import Renderer
 from server.responses.direct_sound import DirectSound
 from server.responses.downmix import binaural_to_mono
-from server.responses.effect_flags import ALL_ON, EmitterEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_cache import prepared_irs
 from server.responses.node_reflections import add_first_reflections
 
 
-class Asked(Protocol):
-    """An emitter, as far as its response is concerned; `directivity` is the one that is heard."""
-
-    @property
-    def pose(self) -> Pose: ...
-
-    @property
-    def directivity(self) -> Directivity: ...
-
-    @property
-    def effects(self) -> EmitterEffects: ...
-
-
 @dataclass(frozen=True)
-class EmitterSnapshot:
-    """An emitter as it was when its IR was asked for; `serial` tells it from others of the same id."""
+class AskedIr:
+    """The response of one emitter as it was; `serial` tells it from others of the same id, and `identity` its response
+    from others where poses share responses."""
 
     serial: int
-    pose: Pose
-    directivity: Directivity
+    state: EmitterState
     identity: Hashable | None = None
-    """Of the response asked for, where poses share responses."""
-    effects: EmitterEffects = ALL_ON
 
 
 @dataclass(frozen=True)
@@ -53,8 +36,8 @@ class IrRequest:
     pose_id: int
     level: str
     listener: Pose
-    emitters: tuple[EmitterSnapshot, ...]
-    """Those whose IR is out of date."""
+    asked: tuple[AskedIr, ...]
+    """Of those emitters whose IR is out of date."""
     direct_sound: DirectSound
     """What the field's IRs leave out, as this session's head hears it."""
     channels: int = 2
@@ -66,20 +49,21 @@ class IrRequest:
 class IrResponse:
     request: IrRequest
     irs: tuple[PartitionedIr, ...]
-    """One per emitter of the request."""
+    """One for each that was asked for."""
 
 
 def compute_irs(levels: FieldsByLevel, request: IrRequest, renderer: Renderer) -> IrResponse:
     """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
     field, direct = levels[request.level], request.direct_sound
     renderer.prepare_hearing(request.channels)
-    is_whole = all(emitter.effects.late and emitter.effects.early for emitter in request.emitters)
-    bakes_direct = any(emitter.effects.bakes_direct for emitter in request.emitters)
+    emitters = [asked.state for asked in request.asked]
+    is_whole = all(emitter.effects.late and emitter.effects.early for emitter in emitters)
+    bakes_direct = any(emitter.effects.bakes_direct for emitter in emitters)
     if field.kind.reuses_responses and is_whole and not bakes_direct and request.channels == 2:
         early = direct.early_reflections
-        kept = prepared_irs(field, levels.node_cache, early, renderer, request.listener, request.emitters)
+        kept = prepared_irs(field, levels.node_cache, early, renderer, request.listener, emitters)
         return IrResponse(request, kept)
-    irs = composed_irs(field, direct, request.listener, request.emitters, request.channels, remember=True)
+    irs = composed_irs(field, direct, request.listener, emitters, request.channels, remember=True)
     return IrResponse(request, tuple(renderer.prepare(ir if is_whole else _without_end(ir)) for ir in irs))
 
 
@@ -87,7 +71,7 @@ def composed_irs(
     field: AcousticField,
     direct: DirectSound,
     listener: Pose,
-    emitters: Sequence[Asked],
+    emitters: Sequence[EmitterState],
     channels: int = 2,
     *,
     remember: bool = False,
@@ -117,7 +101,7 @@ def composed_irs(
 
 
 def _held(
-    field: AcousticField, direct: DirectSound, listener: Pose, emitters: Sequence[Asked], *, remember: bool
+    field: AcousticField, direct: DirectSound, listener: Pose, emitters: Sequence[EmitterState], *, remember: bool
 ) -> npt.NDArray[np.float32]:
     """(B, channel, sample) of the field, an array of its own; zeros for those whose late part is off."""
     late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]

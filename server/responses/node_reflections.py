@@ -4,22 +4,16 @@ Metres; responses (B, channel, sample).
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
 from server.field.lattice import delay_response
 from server.responses.early_reflections import EarlyReflections
-from server.responses.radiation import Placed
-
-
-class _AtNode(NamedTuple):
-    pose: Pose
-    directivity: Directivity
+from server.responses.emitter_state import EmitterState
 
 
 def add_first_reflections(
@@ -27,7 +21,7 @@ def add_first_reflections(
     early: EarlyReflections,
     responses: npt.NDArray[np.float32],
     listener: Pose,
-    emitters: Sequence[Placed],
+    emitters: Sequence[EmitterState],
 ) -> None:
     """As `EarlyReflections.add`, at a field's level: those of the poses, or those kept with the node's response."""
     if not field.kind.shares_reflections:
@@ -36,6 +30,6 @@ def add_first_reflections(
     for response, emitter in zip(responses, emitters, strict=True):
         node, later = field.snap(listener.position, emitter.pose.position, listener.yaw)
         there = np.zeros_like(response)
-        placed = _AtNode(Pose(node.emitter, emitter.pose.orientation), emitter.directivity)
-        early.add(there[np.newaxis], Pose.from_yaw(node.listener, node.yaw), [placed])
+        at_node = replace(emitter, pose=Pose(node.emitter, emitter.pose.orientation))
+        early.add(there[np.newaxis], Pose.from_yaw(node.listener, node.yaw), [at_node])
         response += delay_response(there, later)

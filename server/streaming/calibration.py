@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
@@ -14,8 +13,9 @@ from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.rendering.hrtf import HeadFilters
 from server.responses.direct_sound import DirectSound
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_cache import Shared, shared_response
-from server.responses.ir_request import EmitterSnapshot, IrRequest, compute_irs
+from server.responses.ir_request import AskedIr, IrRequest, compute_irs
 
 POSES = 5
 _BLOCK_SIZE = 256
@@ -45,7 +45,7 @@ class Listener:
         self._renderer = self._direct_sound.renderer(
             block_size=_BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
         )
-        self._emitter = EmitterSnapshot(0, Pose(field.bundle.manifest.start.emitter), OMNIDIRECTIONAL)
+        self._emitter = EmitterState(Pose(field.bundle.manifest.start.emitter))
         self._heard: Shared | None = None
 
     @property
@@ -58,7 +58,9 @@ class Listener:
         if self._heard is None or not self._heard.around.holds(listener):
             shared = shared_response(self._field, self._direct_sound.early_reflections, listener, self._emitter)
             if shared is None or self._heard is None or shared.identity != self._heard.identity:
-                request = IrRequest(0, self._field.level.name, listener, (self._emitter,), self._direct_sound)
+                request = IrRequest(
+                    0, self._field.level.name, listener, (AskedIr(0, self._emitter),), self._direct_sound
+                )
                 compute_irs(self._levels, request, self._renderer)
             self._heard = shared
         return 1000 * (self._time_s() - started_s)

@@ -10,7 +10,6 @@ Blocks are rendered in three steps, so that many sessions' can be rendered in on
 A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -49,11 +48,11 @@ from server.scene.effects import read_overrides, require_effect
 from server.scene.plan import Plan
 from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter, LiveInput
+from server.streaming.emitters import LiveInput, Stage, StreamedEmitter
 from server.streaming.load import QualityStep
 from server.streaming.pacing import SendWindow
 from server.streaming.plan_audit import PlanAudit, Regret
-from server.streaming.response_scheduler import ResponseScheduler
+from server.streaming.response_scheduler import ResponseScheduler, Scope
 
 
 def _start_pose(bundle: Bundle) -> Pose:
@@ -128,10 +127,10 @@ class Session:
             has_early=self._direct_sound.early_reflections is not None,
             has_late=bool(self._bundle.manifest.fields),
         )
-        self._emitters: dict[str, Emitter] = {}
+        self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(self._direct_sound, self.renderer, self._emitters)
         self._responses = ResponseScheduler(
-            self.renderer, self._effects, self._emitters, levels=levels, direct_sound=self._direct_sound, rung=rung
+            self.renderer, self._effects, self._emitters, levels=levels, direct_sound=self._direct_sound, quality=rung
         )
         self._next_serial = 0
         self._followed_pose_id = 0  # by the direct paths
@@ -177,7 +176,7 @@ class Session:
                 case AddEmitter():
                     self._add_emitter(message)
                 case SetGain():
-                    self._require_emitter(message.id).gain_db = message.gain_db
+                    self._require_emitter(message.id).set_gain(message.gain_db)
                     self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)))
                 case DryBlock():
                     self._push(message)
@@ -198,10 +197,10 @@ class Session:
         """Whether there was something to ask for when `take_request` looked last, and it is time to."""
         return self._responses.are_wanted
 
-    def take_request(self, *, only_first: bool = False) -> IrRequest | None:
+    def take_request(self, scope: Scope = Scope.ALL) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
-        `only_first` ones may be asked for and none is the first of an emitter."""
-        return self._responses.take_request(self._listener, only_first=only_first)
+        none is in `scope`."""
+        return self._responses.take_request(self._listener, scope)
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""
@@ -216,7 +215,8 @@ class Session:
         planned = self._effects.planned
         if planned is None:
             return None
-        return planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+        states = {name: emitter.state for name, emitter in self._emitters.items()}
+        return planned.take_request(self._listener, states, self._effects.clock_s)
 
     def adopt(self, plan: Plan) -> list[ServerMessage]:
         """Put the plan asked for last into effect, with the block that follows."""
@@ -240,7 +240,7 @@ class Session:
         check = PlanAudit(
             self.rung.level,
             self._listener,
-            dataclasses.replace(emitter),
+            emitter.state,
             whole,
             self.renderer.channels,
             2 if head else self.renderer.channels,
@@ -259,7 +259,7 @@ class Session:
         assert planned is not None
         planned.give_up()
         for emitter in self._emitters.values():
-            emitter.is_decided = True
+            emitter.decide()
         self._responses.retry()
         return [Error(code="plan_failure", message="no plan of effects could be made")]
 
@@ -304,9 +304,9 @@ class Session:
         refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
 
-    def _follow(self, identifier: str, emitter: Emitter) -> None:
+    def _follow(self, identifier: str, emitter: StreamedEmitter) -> None:
         if self._effects.planned is not None:
-            self._effects.planned.follow_emitter(identifier, emitter.pose, self._effects.clock_s)
+            self._effects.planned.follow_emitter(identifier, emitter.state.pose, self._effects.clock_s)
 
     def _wish(self, message: SetEffects) -> None:
         if self._effects.planned is not None:
@@ -331,11 +331,11 @@ class Session:
         emitter = self._require_emitter(message.id)
         self._bundle.require_inside(message.position, "position")
         self._responses.advance(message.pose_id)
-        before = emitter.pose.orientation
+        before = emitter.state.pose.orientation
         emitter.move(message)
         # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
-        is_mirrored = self._direct_sound.early_reflections is not None and emitter.directivity != OMNIDIRECTIONAL
-        emitter.is_outdated |= is_mirrored and emitter.pose.orientation != before
+        is_mirrored = self._direct_sound.early_reflections is not None and emitter.state.directivity != OMNIDIRECTIONAL
+        emitter.is_outdated |= is_mirrored and emitter.state.pose.orientation != before
         self._effects.unbake(message.id, emitter)
         self._follow(message.id, emitter)
 
@@ -351,10 +351,10 @@ class Session:
             raise RequestError("duplicate_emitter", f"emitter {message.id!r} is already there", field="id") from exc
         except RendererFullError as exc:
             raise RequestError("too_many_emitters", str(exc)) from exc
-        emitter = Emitter.added_by(message, self._next_serial, live)
-        emitter.is_decided = self._effects.planned is None
-        if emitter.directivity != OMNIDIRECTIONAL:
-            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.directivity))
+        stage = Stage.DECIDED if self._effects.planned is None else Stage.UNDECIDED
+        emitter = StreamedEmitter.added_by(message, self._next_serial, live, stage)
+        if emitter.state.directivity != OMNIDIRECTIONAL:
+            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.state.directivity))
         self._emitters[message.id] = emitter
         self._follow(message.id, emitter)
         self._next_serial += 1
@@ -379,9 +379,9 @@ class Session:
             self._effects.planned.forget_emitter(message.id)
         self.renderer.remove_emitter(message.id)
         self._responses.retry()
-        return [EmitterRemoved(id=message.id), *self._responses.change_rung_unheard()]
+        return [EmitterRemoved(id=message.id), *self._responses.change_quality_unheard()]
 
-    def _require_emitter(self, identifier: str) -> Emitter:
+    def _require_emitter(self, identifier: str) -> StreamedEmitter:
         if identifier not in self._emitters:
             raise RequestError("unknown_emitter", f"there is no emitter {identifier!r}", field="id", status=404)
         return self._emitters[identifier]

@@ -32,6 +32,7 @@ from server.streaming.load import Ladder, LoadSample, Offer, ir_interval_s
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
 from server.streaming.request_queue import RequestQueue
+from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
 
 MAX_WAITING_MESSAGES = 256
@@ -260,7 +261,7 @@ class Stream:
 
     def _ask(self, workers: Workers) -> None:
         """For the impulse responses of the newest poses, if it is its turn, or for the first of an emitter."""
-        request = self.session.take_request(only_first=not self._turns.may_ask(self))
+        request = self.session.take_request(Scope.ALL if self._turns.may_ask(self) else Scope.FIRST)
         self.wants_turn = self.session.wants_irs
         if request is not None:
             self._has_asked, self.asked_last_s = True, self._time_s()
