@@ -60,6 +60,16 @@ def _start_pose(bundle: Bundle) -> Pose:
     return Pose.from_yaw(start.listener, math.radians(start.listener_yaw_deg))
 
 
+def _require_served(hello: Hello, sample_rate: int) -> None:
+    """Raises RequestError for another protocol or sample rate than a session has."""
+    if hello.protocol != PROTOCOL:
+        problem = f"this server speaks protocol {PROTOCOL}, not {hello.protocol}"
+        raise RequestError("unsupported_protocol", problem, field="protocol")
+    if hello.sample_rate not in {None, sample_rate}:
+        problem = f"scene {hello.scene!r} is rendered at {sample_rate} Hz: ask for that, or leave sample_rate out"
+        raise RequestError("unsupported_sample_rate", problem, field="sample_rate")
+
+
 class Session:
     """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
 
@@ -84,18 +94,7 @@ class Session:
         costs: Callable[[], Costs] = dict,
     ) -> None:
         field = levels.default
-        if hello.protocol != PROTOCOL:
-            raise RequestError(
-                "unsupported_protocol",
-                f"this server speaks protocol {PROTOCOL}, not {hello.protocol}",
-                field="protocol",
-            )
-        if hello.sample_rate not in {None, field.sample_rate}:
-            raise RequestError(
-                "unsupported_sample_rate",
-                f"scene {hello.scene!r} is rendered at {field.sample_rate} Hz: ask for that, or leave sample_rate out",
-                field="sample_rate",
-            )
+        _require_served(hello, field.sample_rate)
         self.window = SendWindow(window)
         self.ir_exchanges = 0
         self.blocks_dropped = 0
