@@ -2,8 +2,8 @@
 quality that was asked for last.
 
 IRs are computed off the audio thread: `take_request` says which, one request at a time and always for the newest poses,
-and whoever computes them brings them back through `accept`, or through `give_up` where none could be. A rung that takes
-another level's IRs is heard from when they are there. Clocks are samples.
+and they come back through `accept`, or through `give_up` where none could be. A step that takes another level's
+IRs is heard from when they are there. Clocks are samples.
 """
 
 from collections.abc import Hashable, Iterable, Mapping
@@ -18,11 +18,11 @@ from server.responses.ir_cache import Shared, shared_response
 from server.responses.ir_request import EmitterSnapshot, IrRequest, IrResponse
 from server.streaming.active_effects import ActiveEffects, as_asked
 from server.streaming.emitters import Emitter
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 
 
 class ResponseScheduler:
-    """Of one session, whose `emitters` are who sounds at each moment. `rung` is what is heard of `levels` first."""
+    """Of one session, whose `emitters` are who sounds at each moment. `quality` is what is heard of `levels` first."""
 
     def __init__(
         self,
@@ -32,9 +32,9 @@ class ResponseScheduler:
         *,
         levels: FieldsByLevel,
         direct_sound: DirectSound,
-        rung: QualityStep,
+        quality: QualityStep,
     ) -> None:
-        self.heard = rung
+        self.heard = quality
         """The quality that is heard."""
         self.newest_pose_id = 0
         self.applied_pose_id = 0
@@ -45,7 +45,7 @@ class ResponseScheduler:
         self._levels = levels
         self._sample_rate = levels.default.sample_rate
         self._direct_sound = direct_sound
-        self._wanted = rung
+        self._wanted = quality
         self._reason: LevelReason = "chosen"
         self._accepted_pose_id = 0
         self._in_flight: IrRequest | None = None
@@ -56,7 +56,7 @@ class ResponseScheduler:
         self._waits_for_change = self._has_looked = False
         self._interval_s = 0.0
         self._next_request_clock = 0
-        renderer.share_tail(rung.shared_tail)
+        renderer.share_tail(quality.shared_tail)
 
     @property
     def are_awaited(self) -> bool:
@@ -68,25 +68,25 @@ class ResponseScheduler:
         """Whether there was something to ask for when it was looked last, and it is time to."""
         return self._has_looked and not self.are_awaited and not self._waits_for_change
 
-    def set_quality(self, rung: QualityStep, reason: LevelReason) -> list[ServerMessage]:
-        """Have IRs come from another rung: from now on, or, where it takes another level's, from when they are
+    def set_quality(self, quality: QualityStep, reason: LevelReason) -> list[ServerMessage]:
+        """Have IRs come from another step: from now on, or, where it takes another level's, from when they are
         there."""
-        if rung.level != self._wanted.level:
+        if quality.level != self._wanted.level:
             for emitter in self._emitters.values():
                 emitter.is_outdated = True
             self._look_again()
             self._next_request_clock = 0
-        self._wanted, self._reason = rung, reason
-        return self.change_rung() if rung.level == self.heard.level else self.change_rung_unheard()
+        self._wanted, self._reason = quality, reason
+        return self.change_quality() if quality.level == self.heard.level else self.change_quality_unheard()
 
-    def change_rung_unheard(self) -> list[ServerMessage]:
-        """Stand on the rung that was asked for last where no emitter has, or is to have, an IR that tells levels
+    def change_quality_unheard(self) -> list[ServerMessage]:
+        """Stand on the step that was asked for last where no emitter has, or is to have, an IR that tells levels
         apart."""
         has_irs = any(not emitter.is_decided or emitter.effects.has_response for emitter in self._emitters.values())
-        return [] if has_irs else self.change_rung()
+        return [] if has_irs else self.change_quality()
 
-    def change_rung(self) -> list[ServerMessage]:
-        """Stand on the rung that was asked for last, with the block that follows."""
+    def change_quality(self) -> list[ServerMessage]:
+        """Stand on the step that was asked for last, with the block that follows."""
         if self._wanted == self.heard:
             return []
         self.heard = self._wanted
@@ -128,7 +128,7 @@ class ResponseScheduler:
         events = self._announce(self._effects.enforce(self._emitters))
         self._effects.share_tail(self.heard.shared_tail, self._emitters)
         self._look_again()
-        return events + self.change_rung_unheard()
+        return events + self.change_quality_unheard()
 
     def take_request(self, listener: Pose, *, only_first: bool = False) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
@@ -203,7 +203,7 @@ class ResponseScheduler:
         if not self._is_partial:
             self._accepted_pose_id = pose_id
         if response.request.level == self._wanted.level:
-            events += self.change_rung()
+            events += self.change_quality()
         return events
 
     def give_up(self, request: IrRequest) -> list[ServerMessage]:

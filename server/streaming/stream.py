@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 from server.core.durations import DurationHistogram
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
-from server.planning.planned_effects import SHARE_OF_ALL as PLAN_SHARE
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
@@ -28,9 +27,10 @@ from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, IrResponse, compute_irs
 from server.runtime.workers import Workers
 from server.scene.plan import Plan
-from server.streaming.load import Ladder, LoadSample, Offer, ir_interval_s
+from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
+from server.streaming.quality_steps import Offer
 from server.streaming.request_queue import RequestQueue
 from server.streaming.session import Session
 
@@ -97,7 +97,7 @@ class Stream:
         self.block_s = block_s
         self.deliver = deliver
         self.blocks_late = 0
-        """Counted by whoever sends the blocks, since only it knows when they left."""
+        """Counted by the sender of the blocks, since only it knows when they left."""
         self.render_times = DurationHistogram()
         self.latenesses = DurationHistogram()
         self.ir_times = DurationHistogram()
@@ -134,14 +134,14 @@ class Stream:
         self._answers: deque[tuple[IrRequest, _Computed | BaseException]] = deque()
         self._plans: deque[tuple[Plan, float] | BaseException] = deque()
         self._under_way: set[Future[Any]] = set()
-        """What workers were given and have not answered. Whatever is answered is taken out, as it holds this stream."""
+        """What workers were given and have not answered. What is answered is taken out, as it holds this stream."""
         self.regrets = RegretRecord()
         self._checks: deque[Regret | BaseException] = deque()
         self._full_since_s: float | None = None
         """Since when there has been no room in the window for a block."""
         self._is_paused = False
-        self._streams = 1
-        """Of the audio thread."""
+        self.company = 1
+        """Streams of the audio thread, with this one."""
         self._next_check_s: float | None = FIRST_S
         """None while one is under way."""
         self._next_status_s = 1.0
@@ -290,29 +290,24 @@ class Stream:
         for future in tuple(self._under_way):
             future.cancel()
 
-    def strain(self, now_s: float) -> LoadSample:
+    def sample_load(self, now_s: float) -> LoadSample:
         """What it went through since this was asked last."""
         waiting_s = () if self._asked_s is None else (now_s - self._asked_s,)
         answered_s = () if self._longest_wait_s is None else (self._longest_wait_s,)
-        strain = LoadSample(
-            self._worst_lateness_s / (self._lead * self.block_s), max((*waiting_s, *answered_s), default=None)
-        )
+        lateness = self._worst_lateness_s / (self._lead * self.block_s)
+        wait_s = max((*waiting_s, *answered_s), default=None)
         self._worst_lateness_s, self._longest_wait_s = 0.0, None
-        return strain
+        return LoadSample(lateness, wait_s, self._request_s, self._plan_s)
 
-    def step(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
-        """Hear what the ladder, which has been moved, now stands on."""
+    def follow_ladder(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
+        """Have the session hear the step on which the ladder, which has been moved, now stands."""
         self._forget_waits(now_s)
-        return [*self.session.set_quality(self.ladder.rung, reason)]
+        return [*self.session.set_quality(self.ladder.step, reason)]
 
-    def set_cpu_budget(self, *, streams: int, share: float) -> None:
-        """Take one of `streams` equal parts of what IRs may take of a core, `share`, and of what plans of effects and
-        checks of them may."""
-        self._streams = streams
-        self.session.space_plans(self._plan_s * streams / PLAN_SHARE)
-        self.session.set_ir_interval(
-            ir_interval_s(self.ladder, request_s=self._request_s, streams=streams, share=share)
-        )
+    def set_intervals(self, ir_s: float, plan_s: float) -> None:
+        """Have so much time pass from one request for IRs to the next, and from one plan of effects to the next."""
+        self.session.space_plans(plan_s)
+        self.session.set_ir_interval(ir_s)
 
     def finish_blocks(
         self, sample_clock: int, rendered: Sequence[Rendered], *, cost_s: float, now_s: float
@@ -365,14 +360,14 @@ class Stream:
 
     def _choose(self, message: SetLevel) -> list[ServerMessage]:
         try:
-            self.ladder = self._offer.ladder(message.level, block_s=self.block_s)
+            self.ladder = Ladder(self._offer.steps(message.level, block_s=self.block_s))
         except RequestError as refusal:
             return [Error.from_refusal(refusal)]
         self._forget_waits(self._time_s())
-        return self.session.set_quality(self.ladder.rung, "chosen")
+        return self.session.set_quality(self.ladder.step, "chosen")
 
     def _forget_waits(self, now_s: float) -> None:
-        """What was asked for before does not tell how a new rung does."""
+        """What was asked for before does not tell how a new step does."""
         self._longest_wait_s = None
         if self._asked_s is not None:
             self._asked_s = now_s
@@ -400,7 +395,7 @@ class Stream:
         if isinstance(regret, BaseException):
             _logger.error("a plan of effects could not be checked", exc_info=regret)
             return
-        self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self._streams)
+        self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self.company)
         self.regrets.add(regret)
         self.session.learn(regret)
 
@@ -444,8 +439,8 @@ class Stream:
             reverberation_ms=Durations.of(self.reverberation_times.durations),
             ir_exchanges=session.ir_exchanges,
             blocks_limited=session.blocks_limited,
-            level=session.rung.level,
-            ir_rate_hz=session.rung.ir_rate_hz,
+            level=session.quality.level,
+            ir_rate_hz=session.quality.ir_rate_hz,
             live=session.live_statuses(),
         )
 
