@@ -52,7 +52,7 @@ from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import CATALOGUE, EffectName, Overrides
 from server.scene.plan import Plan
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 BLOCK_SIZE: BlockSize = 256
@@ -291,7 +291,7 @@ class _Player:
             self._levels,
             kemar(field.sample_rate),
             lambda _: clip,
-            rung=QualityStep(field.level.name, None, False, 1.0),
+            quality=QualityStep(field.level.name, None, False, 1.0),
             window=10_000_000,
             place=place_of_field(field, BLOCK_SIZE),
         )

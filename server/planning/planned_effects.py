@@ -1,6 +1,6 @@
 """When a session asks which effects its situation calls for, and what it was told last.
 
-A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
+A plan is made off the audio thread: `take_request` says what for, and the plan comes back through `accept`.
 One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, or to move faster than it
 did; while poses change, twice a second at most, once a second for many emitters, and less often where plans take more
 than their share of time. Clocks are seconds of sound.
@@ -24,8 +24,6 @@ _EMITTERS_PER_PERIOD, _MOST_PERIODS = 8, 2
 """Plans of more take longer, and are made less often."""
 _LONGEST_S = 2.0
 """All are made well within the `HORIZON_S` that they look ahead."""
-SHARE_OF_ALL = 0.03
-"""Of a core that plans of all streams of an audio thread may take, as long as each is made every `_LONGEST_S`."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
 

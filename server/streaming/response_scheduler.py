@@ -2,8 +2,8 @@
 quality that was asked for last.
 
 IRs are computed off the audio thread: `take_request` says which, one request at a time and always for the newest poses,
-and whoever computes them brings them back through `accept`, or through `give_up` where none could be. A step that takes
-another level's IRs is heard from when they are there. Clocks are samples.
+and they come back through `accept`, or through `give_up` where none could be. A step that takes another level's
+IRs is heard from when they are there. Clocks are samples.
 """
 
 from collections.abc import Hashable, Iterable, Mapping
@@ -20,7 +20,7 @@ from server.responses.ir_cache import Shared, shared_response
 from server.responses.ir_request import AskedIr, IrRequest, IrResponse
 from server.streaming.active_effects import ActiveEffects, as_asked
 from server.streaming.emitters import StreamedEmitter, Validity
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 
 
 class Scope(Enum):

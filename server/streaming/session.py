@@ -1,8 +1,8 @@
 """One listener's stream as a state machine without input, output or waiting.
 
 Messages go in, messages and audio blocks come out. The direct paths of each block follow the newest poses. What follows
-the direct sound comes later: `take_request` hands out what impulse responses (IRs) to compute, and whoever computes
-them brings the answer back through `accept` between two blocks. Sound never waits for it.
+the direct sound comes later: `take_request` hands out what impulse responses (IRs) to compute, and the answer comes
+back through `accept` between two blocks. Sound never waits for it.
 
 Blocks are rendered in three steps, so that many sessions' can be rendered in one call: `begin_block`, rendering
 `renderer`, `finish_blocks`.
@@ -49,9 +49,9 @@ from server.scene.plan import Plan
 from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
 from server.streaming.emitters import LiveInput, Stage, StreamedEmitter
-from server.streaming.load import QualityStep
 from server.streaming.pacing import SendWindow
 from server.streaming.plan_audit import PlanAudit, Regret
+from server.streaming.quality_steps import QualityStep
 from server.streaming.response_scheduler import ResponseScheduler, Scope
 
 
@@ -73,7 +73,7 @@ def _require_served(hello: Hello, sample_rate: int) -> None:
 class Session:
     """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
 
-    `levels` are the scene's, and `rung` is what to hear of them first.
+    `levels` are the scene's, and `quality` is what to hear of them first.
     `filters` are the head it hears through. `load_clip` gives audio at the scene's rate, and is quick: it is
     called on the rendering thread.
     Raises RequestError for a hello that cannot be served.
@@ -86,7 +86,7 @@ class Session:
         filters: HeadFilters,
         load_clip: Callable[[str], DryAudio],
         *,
-        rung: QualityStep,
+        quality: QualityStep,
         max_emitters: int = 16,
         shared_tail: bool = False,
         window: int = 40,
@@ -129,7 +129,12 @@ class Session:
         self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(self._direct_sound, self.renderer, self._emitters)
         self._responses = ResponseScheduler(
-            self.renderer, self._effects, self._emitters, levels=levels, direct_sound=self._direct_sound, quality=rung
+            self.renderer,
+            self._effects,
+            self._emitters,
+            levels=levels,
+            direct_sound=self._direct_sound,
+            quality=quality,
         )
         self._next_serial = 0
         self._followed_pose_id = 0  # by the direct paths
@@ -141,7 +146,7 @@ class Session:
         return self.renderer.sample_clock
 
     @property
-    def rung(self) -> QualityStep:
+    def quality(self) -> QualityStep:
         """The quality that is heard."""
         return self._responses.heard
 
@@ -150,10 +155,10 @@ class Session:
         """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
         return self._responses.are_awaited
 
-    def set_quality(self, rung: QualityStep, reason: LevelReason) -> list[ServerMessage]:
-        """Have what follows the direct sound come from another rung: from now on, or, where it takes another level's
+    def set_quality(self, quality: QualityStep, reason: LevelReason) -> list[ServerMessage]:
+        """Have what follows the direct sound come from another step: from now on, or, where it takes another level's
         IRs, from when they are there."""
-        return self._responses.set_quality(rung, reason)
+        return self._responses.set_quality(quality, reason)
 
     def set_ir_interval(self, interval_s: float) -> None:
         """Have so much time pass from one request for IRs to the next, unless an emitter waits for its first."""
@@ -237,7 +242,7 @@ class Session:
         emitter = self._emitters[named[self._checked % len(named)]]
         whole, head = self._effects.whole()
         check = PlanAudit(
-            self.rung.level,
+            self.quality.level,
             self._listener,
             emitter.state,
             whole,

@@ -15,7 +15,6 @@ from functools import partial
 
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
-from server.planning.planned_effects import SHARE_OF_ALL as PLAN_SHARE
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
@@ -25,9 +24,10 @@ from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
 from server.scene.plan import Plan
 from server.streaming.inbox import ComputedResponse, Inbox, PendingWork
-from server.streaming.load import Ladder, LoadSample, Offer, ir_interval_s
+from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
+from server.streaming.quality_steps import Offer
 from server.streaming.request_queue import RequestQueue
 from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
@@ -96,7 +96,7 @@ class Stream:
         self.block_s = block_s
         self.deliver = deliver
         self.blocks_late = 0
-        """Counted by whoever sends the blocks, since only it knows when they left."""
+        """Counted by the sender of the blocks, since only it knows when they left."""
         self.times = StreamTimes()
         self.regrets = RegretRecord()
         self.load = 0.0
@@ -120,8 +120,8 @@ class Stream:
         self._wake: Callable[[], None] = lambda: None
         self._time_s: Callable[[], float] = time.monotonic
         self._turns = RequestQueue(1)
-        self._streams = 1
-        """Of the audio thread."""
+        self.company = 1
+        """Streams of the audio thread, with this one."""
         self._worst_lateness_s = 0.0
         self._next_check_s: float | None = FIRST_S
         """None while one is under way."""
@@ -238,24 +238,20 @@ class Stream:
         """Have nothing computed any more that this stream has asked for."""
         self._pending.cancel()
 
-    def strain(self, now_s: float) -> LoadSample:
+    def sample_load(self, now_s: float) -> LoadSample:
         """What it went through since this was asked last."""
         lateness, self._worst_lateness_s = self._worst_lateness_s / (self._lead * self.block_s), 0.0
-        return LoadSample(lateness, self._wait.take_longest_s(now_s))
+        return LoadSample(lateness, self._wait.take_longest_s(now_s), self._costs.request_s, self._costs.plan_s)
 
-    def step(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
-        """Hear what the ladder, which has been moved, now stands on."""
+    def follow_ladder(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
+        """Have the session hear the step on which the ladder, which has been moved, now stands."""
         self._wait.restart(now_s)  # what was asked for before does not tell how a new step does
-        return [*self.session.set_quality(self.ladder.rung, reason)]
+        return [*self.session.set_quality(self.ladder.step, reason)]
 
-    def set_cpu_budget(self, *, streams: int, share: float) -> None:
-        """Take one of `streams` equal parts of what IRs may take of a core, `share`, and of what plans of effects and
-        checks of them may."""
-        self._streams = streams
-        self.session.space_plans(self._costs.plan_s * streams / PLAN_SHARE)
-        self.session.set_ir_interval(
-            ir_interval_s(self.ladder, request_s=self._costs.request_s, streams=streams, share=share)
-        )
+    def set_intervals(self, ir_s: float, plan_s: float) -> None:
+        """Have so much time pass from one request for IRs to the next, and from one plan of effects to the next."""
+        self.session.space_plans(plan_s)
+        self.session.set_ir_interval(ir_s)
 
     def finish_blocks(
         self, sample_clock: int, rendered: Sequence[Rendered], *, cost_s: float, now_s: float
@@ -308,11 +304,11 @@ class Stream:
 
     def _choose(self, message: SetLevel) -> list[ServerMessage]:
         try:
-            self.ladder = self._offer.ladder(message.level, block_s=self.block_s)
+            self.ladder = Ladder(self._offer.steps(message.level, block_s=self.block_s))
         except RequestError as refusal:
             return [Error.from_refusal(refusal)]
         self._wait.restart(self._time_s())
-        return self.session.set_quality(self.ladder.rung, "chosen")
+        return self.session.set_quality(self.ladder.step, "chosen")
 
     def _keep_answer(self, request: IrRequest, computed: ComputedResponse | BaseException) -> None:
         self._inbox.responses.append((request, computed))
@@ -337,7 +333,7 @@ class Stream:
         if isinstance(regret, BaseException):
             _logger.error("a plan of effects could not be checked", exc_info=regret)
             return
-        self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self._streams)
+        self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self.company)
         self.regrets.add(regret)
         self.session.learn(regret)
 
@@ -379,8 +375,8 @@ class Stream:
             reverberation_ms=Durations.of(self.times.reverberation.durations),
             ir_exchanges=session.ir_exchanges,
             blocks_limited=session.blocks_limited,
-            level=session.rung.level,
-            ir_rate_hz=session.rung.ir_rate_hz,
+            level=session.quality.level,
+            ir_rate_hz=session.quality.ir_rate_hz,
             live=session.live_statuses(),
         )
 

@@ -16,7 +16,7 @@ from server.rendering.fade import raised_cosine
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import compute_irs
 from server.scene.manifest import QualityLevel
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from tests.signals import error_db
 
@@ -224,7 +224,7 @@ def test_a_live_session_replayed_is_equal_to_the_bit(name, filters, request):
         FieldsByLevel([field]),
         filters,
         clips.get,
-        rung=QualityStep.full(field.level, 1.0),
+        quality=QualityStep.full(field.level, 1.0),
         window=1_000,
     )
     places = {"a": Pose.from_yaw((1.0, 2.0, 1.5), 1.0), "b": THERE}

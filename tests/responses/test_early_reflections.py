@@ -18,7 +18,7 @@ from server.responses.full_response import FullResponse
 from server.responses.ir_request import compute_irs
 from server.responses.radiation import reverberation_gain
 from server.scene.manifest import Manifest
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 SIZE = np.array((8.0, 5.0, 2.8))
@@ -119,8 +119,8 @@ def test_a_directive_emitter_that_turns_is_mirrored_anew(name, turned, filters, 
     field = request.getfixturevalue(name)
     levels = FieldsByLevel([field])
     hello = Hello(protocol=PROTOCOL, scene="flat")
-    rung = QualityStep.full(field.level, 1.0)
-    session = Session(hello, levels, filters, lambda _: np.ones(9, np.float32), rung=rung)
+    quality = QualityStep.full(field.level, 1.0)
+    session = Session(hello, levels, filters, lambda _: np.ones(9, np.float32), quality=quality)
     place = tuple(EMITTER)
     for identifier, pattern in (("all-round", None), ("ahead", {"pattern": "cardioid"})):
         session.receive(AddEmitter(id=identifier, clip="click", position=place, directivity=pattern))

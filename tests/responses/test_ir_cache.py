@@ -16,7 +16,7 @@ from server.responses.emitter_state import EmitterState
 from server.responses.full_response import FullResponse
 from server.responses.ir_request import compute_irs
 from server.scene.manifest import Reuse
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 RATE = 24_000
@@ -26,7 +26,7 @@ CLIP = np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
 
 def open_session(field, filters, clip=CLIP, levels=None):
     hello, levels = Hello(protocol=PROTOCOL, scene="flat"), levels or FieldsByLevel([field])
-    session = Session(hello, levels, filters, lambda _: clip, rung=QualityStep.full(field.level, 1.0), window=10_000)
+    session = Session(hello, levels, filters, lambda _: clip, quality=QualityStep.full(field.level, 1.0), window=10_000)
     session.receive(ListenerPose(pose_id=1, position=START))
     session.receive(AddEmitter(id="talker", clip="noise", position=EMITTER))
     return session

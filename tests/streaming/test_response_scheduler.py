@@ -7,7 +7,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, MoveEmitter, RemoveEmitter
 from server.protocol.server_messages import EmitterAdded, EmitterRemoved, Error
 from server.responses.ir_request import compute_irs
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
 
@@ -17,8 +17,8 @@ HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 
 @pytest.fixture
 def session(field, filters):
-    hello, rung = Hello(protocol=PROTOCOL, scene="flat"), QualityStep("standard", None, False, 1.0)
-    return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, rung=rung, window=1_000)
+    hello, quality = Hello(protocol=PROTOCOL, scene="flat"), QualityStep("standard", None, False, 1.0)
+    return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, quality=quality, window=1_000)
 
 
 def add(session, identifier="talker", position=THERE):
