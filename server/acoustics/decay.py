@@ -1,11 +1,11 @@
-"""Energy decay of an impulse response: backward integration that knows where the measurement ends.
+"""Energy decay of an impulse response, by backward integration up to the end of the measurable decay.
 
 Axes: impulse responses are `(..., sample)`; every leading axis is a batch. Energies are linear, float64.
 
-The energy decay curve E(t) is the energy still to arrive at t (Schroeder, J. Acoust. Soc. Am. 37, 409, 1965;
-ISO 3382-1:2009, 5.3.3). Two things spoil its end: background noise lifts it, truncation bends it down. Both are found
-from powers in 10 ms windows by iterating between a noise estimate and a line through the late decay (Lundeby et al.,
-Acustica 81, 344, 1995). The integral stops where that line meets the noise; the noise power is subtracted (Chu, J.
+The energy decay curve E(t) is the energy that arrives after t (Schroeder, J. Acoust. Soc. Am. 37, 409, 1965;
+ISO 3382-1:2009, 5.3.3). Background noise lifts its end, and truncation bends it down. Both are estimated from powers in
+10 ms windows, by iterating between a noise estimate and a line through the late decay (Lundeby et al., Acustica 81,
+344, 1995). The integral stops where that line meets the noise; the noise power is subtracted (Chu, J.
 Acoust. Soc. Am. 63, 1444, 1978) and the energy of the exponential beyond the end is added, the combination that Guski
 and Vorlander (Acta Acust. 100, 320, 2014) found least biased.
 """
@@ -32,11 +32,13 @@ _ITERATIONS = 5
 
 @dataclass(frozen=True)
 class EnergyDecay:
-    """energy: (..., sample), never rising. onset: (...), samples; -1 where the response is silent.
+    """The energy decay curves of a batch of responses.
 
-    lowest_db: (...), level relative to the onset down to which the curve may be evaluated: 10 dB above the noise, or
-    the end of the response where no noise is seen. Where no decay can be told from noise, all of it may be noise at the
-    level that the response ends with; 0 for noise throughout.
+    energy: (..., sample), never rising. onset: (...), in samples; -1 where the response is silent.
+
+    lowest_db: (...), the level relative to the onset down to which the curve may be evaluated. That is 10 dB above the
+    noise, or the end of the response if there is no noise. If no decay can be told from noise, the whole response is
+    taken as noise of the level at its end; noise throughout has 0.
     """
 
     energy: _Floats
@@ -106,11 +108,12 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
     levels = power_to_db(block_power)
     for row in range(rows):
         first, stop = -(-max(int(onset[row]), 0) // window), int(last[row]) // window
-        if onset[row] < 0 or stop - first < 4:  # silent, or an impulse without a tail to analyse
+        if onset[row] < 0 or stop - first < 4:  # silent, or an impulse without a late decay
             continue
         tail = _tail(block_power[row, first:stop], levels[row, first:stop])
         if tail is None:
-            # What ends the response may be noise or a decay cut off early: as noise from the onset on, it bounds both.
+            # The end of the response may be noise or a truncated decay. Noise of that level from the onset on is an
+            # upper bound of both.
             late = block_power[row, stop - max(1, round(_TAIL_SHARE * (stop - first))) : stop].mean()
             lowest[row] = late * (last[row] - onset[row]) * db_to_power(_NOISE_MARGIN_DB)
             continue
@@ -138,7 +141,7 @@ class _Tail:
 def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
     """Lundeby's iteration over windows `(window,)`; None where the late response does not decay."""
     count = _after_last(block_power > 0.0)
-    if count == 0:  # all there is comes before the first whole window, or after the last
+    if count == 0:  # all energy lies before the first whole window or after the last
         return None
     block_power, levels_db = block_power[:count], levels_db[:count]
     tail_start = count - max(1, round(_TAIL_SHARE * count))
@@ -155,7 +158,7 @@ def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
         decay_db = -line[0]
         level_db = line[1] + decay_db * start
         decayed = float(db_to_power(level_db - decay_db * np.arange(noise_start, count)).mean())
-        # What the line leaves unexplained is noise, once it is more than the scatter of the windows.
+        # Power above the line is noise if it exceeds the scatter of the windows.
         tail = _Tail(level_db, decay_db, observed - decayed if observed > _NOISE_EXCESS * decayed else 0.0)
         noise_from = int(np.ceil((level_db - reference_db + 2.0 * _NOISE_MARGIN_DB) / decay_db))
         moved_to = max(min(noise_from, tail_start), 0)
@@ -171,7 +174,7 @@ def _after_last(condition: npt.NDArray[np.bool_]) -> int:
 
 
 def _line(levels_db: _Floats) -> tuple[float, float] | None:
-    """Least squares (slope, intercept) over the window index; None without a falling line."""
+    """(slope, intercept) of a least-squares line over the window index; None if it does not fall."""
     finite = np.flatnonzero(np.isfinite(levels_db))  # a window of exact zeros has no level
     if len(finite) < 3:
         return None

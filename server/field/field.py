@@ -19,7 +19,8 @@ from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError, FieldError
-from server.field.decoder import Decoder, add_from, resized
+from server.field.any_size_decoder import add_from, resized
+from server.field.decoder import Decoder
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.kinds.catalogue import kind_of

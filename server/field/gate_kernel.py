@@ -1,4 +1,4 @@
-"""The compiled counterpart of `server.field.gate`'s NumPy path."""
+"""The compiled part of `server.field.gate`."""
 
 import numpy as np
 import numpy.typing as npt

@@ -20,7 +20,7 @@ from server.acoustics.geometry import axes_of
 from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
 from server.field.decoder import Decoder
 from server.field.field import AcousticField, Silence
-from server.field.gate import Gate
+from server.field.gate import MOST_GIVEN, Gate, Indices
 from server.field.graph import Spectrograms
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.hrtf import HeadFilters
@@ -113,12 +113,24 @@ class DoubleDecoder(Decoder):
         return _fitted(signal, self.ir_samples)
 
 
-class _DoubleGate(Gate):
-    """The same without a compiler: gains and energies in float64, of float32 samples."""
+class DoubleGate(Gate):
+    """The same in NumPy: gains and energies in float64, of float32 samples."""
 
     def __init__(self, gate: Gate) -> None:
         self._rise, self._answer, self._given = gate._rise, gate._answer, gate._given
-        self._is_compiled = False
+
+    def _open(self, responses: _Float32, onsets: Indices, begins: Indices) -> None:
+        samples = np.arange(responses.shape[-1])
+        for response, onset, begin in zip(responses, onsets.tolist(), begins.tolist(), strict=True):
+            opens = max(0, onset, begin)
+            gain = np.where(
+                samples < opens, 0.0, _at(self._rise, samples - onset, 1) * _at(self._answer, samples - begin, 1)
+            )
+            given = _at(self._given, samples - opens, 0)
+            squares = response.astype(np.float64) ** 2
+            taken, held = (squares * (1 - gain**2)).sum(axis=-1), (squares * gain**2 * given).sum(axis=-1)
+            share = np.divide(taken, held, out=np.full_like(held, MOST_GIVEN), where=taken < MOST_GIVEN * held)
+            response *= gain * np.sqrt(1 + share[:, None] * given)
 
 
 class _DoubleField(AcousticField):
@@ -126,7 +138,7 @@ class _DoubleField(AcousticField):
         super().__init__(field.bundle, field.level, field.graph)
         if self._decoder is not None:
             self._decoder = DoubleDecoder(field)
-        self._gate = _DoubleGate(self._gate)
+        self._gate = DoubleGate(self._gate)
 
     def _placed(self, coded: _Float32, aligned: _Floats) -> _Float32:
         start = np.floor(aligned).astype(int)
@@ -198,6 +210,12 @@ class DoubleFullResponse(FullResponse):
         self._direct = paths
         if self._early is not None:
             self._early = _DoubleEarlyReflections(self._early, paths)
+
+
+def _at(curve: _Float32, index: Indices, after: float) -> _Floats:
+    """The curve's values, its first before it and `after` behind it."""
+    values = np.append(_double(curve), after)
+    return np.asarray(values[np.clip(index, 0, len(curve))])
 
 
 def _double(values: npt.NDArray[np.floating]) -> _Floats:

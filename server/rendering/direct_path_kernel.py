@@ -1,4 +1,4 @@
-"""One block of the direct path of many emitters, in compiled code or, without a compiler, in Python and NumPy.
+"""One block of the direct path of many emitters, in compiled code.
 
 An emitter's block goes into its delay line. Each ear reads the line at a delay of its own, the way's plus the head's,
 and hears it through one minimum-phase filter: what the head, the air and the way do to magnitude, summed as cepstra.
@@ -26,15 +26,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels.compiled import HAS_NUMBA, compiled_in_place
+import server.rendering.path_loops as loops
+from server.kernels.compiled import compiled_in_place
 from server.rendering.direct_path_records import BANDS, DirectPathState, DoubleArray, FloatArray
 from server.rendering.fractional_delay import BEFORE
 from server.rendering.sphere import find_triangle
-
-if HAS_NUMBA:
-    import server.rendering.path_loops as loops
-else:
-    import server.rendering.path_loops_numpy as loops  # type: ignore[no-redef]
 
 _LENGTH_TIME_S = 0.015
 _HEAD_TIME_S = 0.008

@@ -9,13 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from server.kernels.compiled import HAS_NUMBA
 from server.rendering.convolver import FloatArray
 from server.rendering.limiter import Limiter
 from server.rendering.mixing import Mixer, mix
-
-if HAS_NUMBA:
-    from server.rendering.output_kernel import mixing_with, record_of
+from server.rendering.output_kernel import mixing_with, record_of
 
 
 class Output:
@@ -27,9 +24,8 @@ class Output:
         if ceiling is not None:
             self.limiter = Limiter(channels=channels, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
         self.sum = np.zeros((channels, block_size), np.float32)
-        if HAS_NUMBA:
-            self._record = record_of(self)
-            self.address = int(self._record.ctypes.data)
+        self._record = record_of(self)
+        self.address = int(self._record.ctypes.data)
 
 
 class Rendered(NamedTuple):

@@ -1,4 +1,4 @@
-"""The loops over samples of the direct path, compiled; `path_loops_numpy` has the same functions without a compiler.
+"""The loops over samples of the direct path, compiled.
 
 Outputs of `filter_block` are a multiple of `TILE` long: accumulators stay in registers that long.
 """

@@ -55,11 +55,12 @@ def test_commands_and_options_that_are_named_exist(document: Path) -> None:
     of = {"nafir": nafir, "nafir-train": nafir_train}
     for program, rest in re.findall(r"^(nafir|nafir-train) ((?:[^\n#]|\\\n)+)", code_in(document), re.MULTILINE):
         command, given = typer.main.get_command(of[program]), rest.split()
-        while hasattr(command, "commands") and re.fullmatch(r"[a-z-]+", given[0]) and not given[0].startswith("-"):
-            command, given = command.commands[given[0]], given[1:]
-            if not given:
-                break
         known = {"--help"} | {name for each in command.params for name in each.opts}
+        for word in given:
+            # Options of a group of commands stand before the command.
+            if hasattr(command, "commands") and re.fullmatch(r"[a-z][a-z-]*", word):
+                command = command.commands[word]
+                known |= {name for each in command.params for name in each.opts}
         assert {option for option in given if re.match(r"--?[a-z]", option)} <= known, rest
 
 

@@ -1,5 +1,5 @@
-"""Nodes away from where they are kept: held-out poses are where a simulation has them and look where it did, and might
-be nodes, where a level that reuses responses errs no more than one that makes each anew."""
+"""Fields with moved nodes. Held-out poses are at the probes of the simulation, and might coincide with nodes, where a
+level that reuses responses has no extra error. Moving the nodes avoids this bias."""
 
 import copy
 
@@ -9,8 +9,8 @@ from server.field.field import AcousticField
 
 
 def with_moved_nodes(field: AcousticField, rng: np.random.Generator) -> AcousticField:
-    """The field with its nodes elsewhere; both keep their responses in the same cache. The field itself where every
-    pose has a response of its own."""
+    """The field with its nodes elsewhere; both keep their responses in the same cache. A field that reuses no responses
+    is returned unchanged."""
     if not field.kind.reuses_responses:
         return field
     moved = copy.copy(field)

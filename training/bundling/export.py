@@ -1,5 +1,5 @@
-"""Fields to a scene bundle: trained ones, and measured responses themselves. Every graph is checked against torch
-before anything is written."""
+"""Writes fields to a scene bundle: trained fields, and measured responses themselves. Every graph is checked against
+torch before anything is written."""
 
 import io
 import tempfile
@@ -48,24 +48,24 @@ MODEL_FILE = "factorised.onnx"
 DEFAULT_LEVEL = "standard"
 SHAPED_NEAREST = "shaped-nearest"
 EFFORT = Effort()
-"""Of the health check that a bundle has to pass."""
+"""The effort of the health check that a bundle must pass."""
 
 _CHECK_POSES = {"factorised": 64, "naf": 2, SHAPED_NEAREST: 8}
 _INT8_LEAST_WEIGHTS = 100_000
 _TRUNCATION_POSES = 3000
-# Rounded weights are the only difference; phases of uncertain bins may turn, so frequency is compared where it matters.
-# Largest differences for float32 (float16 weights), root mean squares for int8.
+# Rounding of weights is the only difference. Phases of uncertain bins may change, so frequency is compared where phase
+# is certain. Tolerances are for the largest difference in float32 (float16 weights), and the root mean square in int8.
 _TOLERANCES: dict[Precision, dict[str, float]] = {
     "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, RESPONSE: 1e-3},
     "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, RESPONSE: 0.05},
 }
 _PHASE_TOLERANCE: dict[Precision, float] = {"float32": 0.05, "int8": 0.2}
 TABLED_TOLERANCE = 1e-4
-"""Largest difference in log-magnitude between the plain graph of a `naf` and the tabled one."""
+"""Largest difference in log-magnitude between the plain and the tabled graph of a `naf`."""
 
 
 class ExportError(NafirError):
-    """A field that fits into no bundle, or an exported graph that does not compute what the trained field computes."""
+    """A field that does not fit into the bundle, or an exported graph whose results differ from the trained field's."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
     for name, reason in reasons.items():
         if name not in known:
             raise ExportError(
-                f"accept: {name}: is no law that may be broken for a reason; those are {', '.join(known)}"
+                f"accept: {name}: is not a law that may be broken for a reason; those are {', '.join(known)}"
             )
         if not reason.strip():
             raise ExportError(f"accept: {name}: needs a reason, which the bundle keeps")
@@ -177,13 +177,13 @@ def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
 
 
 def _needed(accepting: tuple[AcceptedLaw, ...], health: Health) -> tuple[AcceptedLaw, ...]:
-    """Of the laws that are accepted those that are broken."""
+    """Those of the accepted laws that are broken."""
     broken = {finding.law.name for finding in health.accepted}
     return tuple(entry for entry in accepting if entry.law in broken)
 
 
 def _arrays(noise: npt.NDArray[np.float32]) -> bytes:
-    """The bundle's file of arrays."""
+    """The content of the bundle's file of arrays."""
     arrays = io.BytesIO()
     np.savez(arrays, frozen_noise=noise)
     return arrays.getvalue()
@@ -208,12 +208,13 @@ def _name_of(field: Learner | ImportedDataset, place: Path, usual_width: int) ->
 
 
 def _factorised_name(rank: int, width: int, usual_width: int) -> str:
-    """With the width, where it is another than that of the bundle's first factorised field."""
+    """The name of a factorised field. It includes the width if that differs from the width of the bundle's first
+    factorised field."""
     return f"factorised-r{rank}" if width == usual_width else f"factorised-w{width}-r{rank}"
 
 
 def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
-    """Whether these fields of a simulated scene do. Raises ExportError where only some of them do."""
+    """Whether these fields of a simulated scene include the direct sound. Raises ExportError if only some do."""
     holding = [isinstance(field, NafLearner) and field.recipe.whole for field in fields]
     if any(holding) and not all(holding):
         raise ExportError("naf-whole holds the direct sound, other fields leave it out: export it to its own bundle")
@@ -227,18 +228,18 @@ def _require_used(
     *,
     exact_tables: bool,
 ) -> None:
-    """Raises ExportError for what is asked for and none of the fields has."""
+    """Raises ExportError for options that apply to none of the fields."""
     if ranks and not any(isinstance(field, FactorisedLearner) for field in fields):
-        raise ExportError("ranks: none of the runs is a factorised field, which alone has them; leave it out")
+        raise ExportError("ranks: none of the runs is a factorised field, and other fields have none; leave it out")
     if exact_tables and not any(isinstance(field, NafLearner) for field in fields):
-        raise ExportError("exact-tables: none of the runs is a naf, which alone has them; leave it out")
+        raise ExportError("exact-tables: none of the runs is a naf, and other fields have none; leave it out")
     if list(precisions) != ["float32"] and all(isinstance(field, ImportedDataset) for field in fields):
-        raise ExportError("precision: measured responses themselves are kept in float32 alone; leave it out")
+        raise ExportError("precision: measured responses themselves are stored in float32 only; leave it out")
 
 
 def _require_different(names: list[str]) -> None:
-    if doubled := {name for name in names if names.count(name) > 1}:
-        raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
+    if duplicates := {name for name in names if names.count(name) > 1}:
+        raise ExportError(f"{', '.join(sorted(duplicates))}: more than one run makes a field of that name")
 
 
 def _factorised(
@@ -249,7 +250,7 @@ def _factorised(
     *,
     usual_width: int,
 ) -> list[_Exported]:
-    """All graphs of a run, each checked."""
+    """All graphs of a factorised field's run, each checked."""
     cells, whole = learner.cells, learner.field
     trained_at = _tensors(_poses(learner.responses, _TRUNCATION_POSES, configuration.seed), _TRUNCATION_POSES)
     lower = sorted({rank for rank in ranks if rank < len(whole.basis)}, reverse=True)
@@ -275,7 +276,7 @@ def _factorised(
 def _naf(
     learner: NafLearner, configuration: Configuration, precisions: Sequence[Precision], *, exact_tables: bool
 ) -> list[_Exported]:
-    """All graphs of a run, each checked."""
+    """All graphs of a naf's run, each checked."""
     field = learner.field
     time_domain = field.shape.domain == "time"
     outputs = (RESPONSE,) if time_domain else _outputs(learner)
@@ -311,7 +312,7 @@ def _suffix(precision: Precision) -> str:
 
 
 def _outputs(learner: FactorisedLearner | NafLearner) -> tuple[str, ...]:
-    """Of one channel there is no coherence between ears."""
+    """The outputs of a field. For one channel there is no coherence between ears."""
     return OUTPUTS[: 2 + learner.responses.channels]
 
 
@@ -329,7 +330,7 @@ def _codec_parameters(codec: Codec, known_frames: int, frames: Axis | None = Non
 
 
 def _poses(responses: ResponseSet, count: int, seed: int) -> tuple[npt.NDArray[np.float32], ...]:
-    """Random listener, emitter and yaw in the neighbourhoods of those measured."""
+    """Random listeners, emitters and yaws near the measured ones."""
     rng = np.random.default_rng(seed)
     listener, emitter = (
         end[rng.integers(0, len(end), count)] + rng.uniform(-0.05, 0.05, (count, 3))
@@ -353,7 +354,7 @@ def _check(
     session = open_session(model.SerializeToString())
     found = dict(zip(outputs, session.run(list(outputs), dict(zip(INPUTS, poses, strict=True))), strict=True))
     with torch.no_grad():
-        # One at a time: a batch of `naf` would not fit into memory.
+        # One pose at a time, because a batch of `naf` would not fit into memory.
         rows = [module(*(torch.from_numpy(part[row : row + 1]) for part in poses)) for row in range(len(poses[0]))]
     expected = {name: np.concatenate([row[number] for row in rows]) for number, name in enumerate(outputs)}
     for name, tolerance in _TOLERANCES[precision].items():

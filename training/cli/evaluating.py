@@ -1,4 +1,4 @@
-"""`nafir-train evaluate`, `tabulate`, `maps` and `probe`: how well a field does, as tables and pictures."""
+"""`nafir-train evaluate`, `tabulate`, `maps` and `probe`: the accuracy of fields, as tables and pictures."""
 
 import json
 import os

@@ -26,7 +26,7 @@ _LATTICES: Final = (
     (5.0, 120),
     (5.0, 360),
 )
-"""Spacing in metres, turn in degrees: from a step's length to one node per room."""
+"""Spacing in metres, step of the heading in degrees: from a spacing of centimetres to one node per room."""
 
 
 class LatticeReverberation(LevelKind):

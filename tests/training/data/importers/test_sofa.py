@@ -6,7 +6,7 @@ import pytest
 
 from server.acoustics.room_parameters import interaural_time_difference_s
 from tests.training.data.importers.conftest import RATE, wave
-from training.data.importers.conditioning import Conditioning, SourceError, conditioned
+from training.data.importers.conditioning import Conditioning, SourceError, condition
 from training.data.importers.receivers import Receivers
 from training.data.importers.report import ImportReport
 from training.data.importers.sofa import read
@@ -72,7 +72,7 @@ def brirs(path, responses, **changed):
 
 def imported(path, **options):
     report = ImportReport()
-    return list(conditioned(read(path, report, **options), Conditioning(), report)), report
+    return list(condition(read(path, report, **options), Conditioning(), report)), report
 
 
 def test_a_rate_in_kilohertz_and_a_type_of_any_spelling_are_read(tmp_path):
