@@ -9,7 +9,7 @@ from server.responses.effect_flags import ALL_ON, EmitterEffects
 
 @dataclass(frozen=True)
 class EmitterState:
-    """Whatever renders an emitter, asks for its response or plans its effects gets this."""
+    """What code gets that renders an emitter, asks for its response or plans its effects."""
 
     pose: Pose
     pattern: Directivity = OMNIDIRECTIONAL

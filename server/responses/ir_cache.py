@@ -1,6 +1,6 @@
 """Impulse responses (IRs) ready to be convolved, kept where a quality level reuses them.
 
-What a response is made of says which poses share it, so that nobody asks for one that is already heard. Where first
+What a response is made of says which poses share it, so that none is asked for that is already heard. Where first
 reflections are the pose's own, the rest is kept, and the stages of partitions that they do not reach are used again.
 """
 

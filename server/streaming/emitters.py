@@ -59,8 +59,8 @@ class Validity:
 
 @dataclass
 class StreamedEmitter:
-    """`state` is what the client and the plan say; `heard` is what the renderer was given last. What of that is out of
-    date is noted here by those who change the state. `serial` tells it from others that had the same id before."""
+    """`state` is what the client and the plan say; `heard` is what the renderer was given last. Code that changes the
+    state notes here what of that is out of date. `serial` tells it from others that had the same id before."""
 
     serial: int
     state: EmitterState

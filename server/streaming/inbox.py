@@ -1,6 +1,6 @@
 """What waits for an audio thread to take it into a stream: a client's messages, and what workers have computed.
 
-Only the event loop and the workers put something in, only the audio thread takes it out, and nobody waits for a lock.
+The event loop and the workers put something in, and the audio thread takes it out. There is no lock to wait for.
 """
 
 from collections import deque

@@ -14,4 +14,4 @@ KINDS: Final[tuple[type[LevelKind], ...]] = (LatticeReverberation, WholeNode, Ev
 
 def kind_of(level: QualityLevel) -> LevelKind:
     """The level as its kind serves it."""
-    return next(kind(level) for kind in KINDS if kind.has(level))
+    return next(kind(level) for kind in KINDS if kind.matches(level))

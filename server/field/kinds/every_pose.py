@@ -16,7 +16,7 @@ class EveryPose(LevelKind):
     reuses_responses = False
 
     @classmethod
-    def has(cls, level: QualityLevel) -> bool:  # noqa: ARG003  any, if no other kind has it
+    def matches(cls, level: QualityLevel) -> bool:  # noqa: ARG003  any, if no other kind has it
         return True
 
     def open(
@@ -45,8 +45,8 @@ class ComputedResponses(ResponseSource):
         return Snapped(Node(listener, emitter, yaw), 0)
 
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
-        nobody_else = Neighbourhood(listener, 0.0, emitter, 0.0, 0.0, yaw, 0.0)
-        return self.snap(listener, emitter, yaw), nobody_else
+        no_other = Neighbourhood(listener, 0.0, emitter, 0.0, 0.0, yaw, 0.0)
+        return self.snap(listener, emitter, yaw), no_other
 
     def response(self, snapped: Snapped) -> Float32:
         node = snapped.node

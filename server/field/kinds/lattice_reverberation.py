@@ -37,7 +37,7 @@ class LatticeReverberation(LevelKind):
     _renewed: ClassVar[str] = "reverberation"
 
     @classmethod
-    def has(cls, level: QualityLevel) -> bool:
+    def matches(cls, level: QualityLevel) -> bool:
         return level.reuse is not None and level.reuse.first_reflections == cls._first_reflections
 
     @property

@@ -1,4 +1,4 @@
-"""What everybody who serves a quality level asks of its kind."""
+"""The questions that a kind of quality level answers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -12,8 +12,8 @@ from server.scene.manifest import QualityLevel
 
 
 class LevelKind(ABC):
-    """One quality level, as levels of its kind are served. A subclass says which poses share a response; what a level
-    limits besides, whatever its kind, stands here."""
+    """One quality level. A subclass says which poses share a response, and what follows from that for the rest of the
+    server; limits that a level of any kind may have are here."""
 
     reuses_responses: ClassVar[bool]
     """Whether poses share what the field holds. It is kept for them then, and most poses of a walk cost next to
@@ -26,7 +26,7 @@ class LevelKind(ABC):
 
     @classmethod
     @abstractmethod
-    def has(cls, level: QualityLevel) -> bool:
+    def matches(cls, level: QualityLevel) -> bool:
         """Whether a level of the manifest is of this kind."""
 
     @abstractmethod
