@@ -61,6 +61,7 @@ class Predictions:
     def _energies(self, poses: Poses) -> Energies:
         self.poses += len(poses)
         outputs = self.graph.run(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
+        # guard: faults of a graph are counted
         self.faults += sum(int(np.count_nonzero(~np.isfinite(output))) for output in outputs)
         codec = self.graph.parameters.codec
         if self.graph.gives_responses:

@@ -58,6 +58,7 @@ def energy_excess_db(manifest: Manifest, geometry: Geometry, poses: Poses, energ
     direct sound and its image sources in the three walls of a corner, none of which is nearer than the emitter.
     """
     most = np.full(len(poses), diffuse_energy(geometry) * _CORNER)
+    # guard: as near as the head is as near as its limit
     spread = np.maximum(np.linalg.norm(poses[:, LISTENER] - poses[:, EMITTER], axis=-1), NEAR_LIMIT_M) ** 2
     paths = (manifest.direct_sound == "field") + 3 * (manifest.image_order == 0)
     bound = np.maximum(_NEARER_EAR * (most + paths / spread), _SILENT_ENERGY)
@@ -93,6 +94,7 @@ def rises_db(energies: Energies) -> Floats:
     floor_db = np.take_along_axis(levels_db, peak, axis=-1) - _DECAY_DB
     after = np.arange(levels_db.shape[-1]) >= peak
     lowest_db = np.minimum.accumulate(np.where(after, levels_db, np.inf), axis=-1)
+    # guard: below the floor of storage nothing rises
     return np.maximum(np.where(after, levels_db - np.maximum(lowest_db, floor_db), 0.0), 0.0)
 
 

@@ -28,7 +28,7 @@ from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import EffectName
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 SIZE = 256
@@ -61,7 +61,7 @@ class Stage:
             self.levels,
             filters,
             lambda _: self.clip,
-            rung=QualityStep(field.level.name, None, False, 1.0),
+            quality=QualityStep(field.level.name, None, False, 1.0),
             window=1_000_000,
             place=place,
         )
@@ -100,7 +100,7 @@ class Stage:
 
     @property
     def is_folded(self):
-        return [emitter.is_folded for emitter in self.session._emitters.values()]
+        return [emitter.heard.bakes_direct for emitter in self.session._emitters.values()]
 
 
 @pytest.fixture
