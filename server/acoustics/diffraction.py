@@ -26,7 +26,10 @@ SMALL_ARGUMENT = 1e-4
 def diffraction_gain_db(fresnel_number: npt.ArrayLike) -> Numbers:
     """(...) gain in dB, 0 or less, for Fresnel numbers (...)."""
     number = np.asarray(fresnel_number, dtype=np.float64)
+    # guard: an edge far in sight is as one just clear
     x = np.sqrt(2 * np.pi * np.abs(np.maximum(number, CLEAR_FRESNEL_NUMBER)))
     safe = np.maximum(x, SMALL_ARGUMENT)
+    # guard: a screen's formula has no nought by nought
     bent = np.where(x < SMALL_ARGUMENT, 1.0, np.where(number > 0, safe / np.tanh(safe), safe / np.tan(safe)))
+    # guard: beyond its clearance an edge screens nothing
     return np.where(number > CLEAR_FRESNEL_NUMBER, np.minimum(0.0, -(GRAZING_LOSS_DB + amplitude_to_db(bent))), 0.0)
