@@ -22,7 +22,7 @@ Kept = BoundedCache[tuple[object, ...], object]
 """What all levels of a scene keep, by whatever it depends on."""
 
 KEPT_BYTES = 64 * 1024 * 1024
-_SPARES = ArrayPool(16 * 1024 * 1024)
+_POOL = ArrayPool(16 * 1024 * 1024)
 
 
 class NodeResponses:
@@ -58,7 +58,7 @@ class NodeResponses:
     def responses(self, listeners: Floats, emitters: Floats, yaws: Floats) -> Float32:
         """(B, channel, sample), arrays of their own."""
         found = [(self.at(node), later) for node, later in self._snapped(listeners, emitters, yaws)]
-        responses = _SPARES.floats(len(found), *found[0][0].shape)
+        responses = _POOL.floats(len(found), *found[0][0].shape)
         for (response, later), result in zip(found, responses, strict=True):
             delay_response(response, later, result)
         return responses
