@@ -96,9 +96,11 @@ class Codec:
         return spectrogram
 
     def log_magnitude(self, spectrogram: npt.NDArray[np.inexact]) -> npt.NDArray[np.float64]:
+        # guard: silence has a logarithm
         return np.asarray(np.log(np.abs(spectrogram).astype(np.float64) + self.log_floor))
 
     def magnitude(self, log_magnitude: Array) -> Array:
+        # guard: beneath the floor is silence
         return np.maximum(np.exp(log_magnitude) - self.log_floor, 0)
 
     def encode(self, signal: Array) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -113,15 +115,19 @@ class Codec:
 
     def instantaneous_frequency(self, phase: Array) -> npt.NDArray[np.float64]:
         """Phase advance per frame of phases (..., frequency, frame), demodulated and wrapped."""
+        # guard: advances are demodulated
         advance = np.diff(phase, axis=-1) - self.nominal_advance
+        # guard: advances are wrapped to one turn
         wrapped = (advance + np.pi) % (2 * np.pi) - np.pi
         return np.concatenate([phase[..., :1], wrapped], axis=-1)
 
     def integrate(self, instantaneous_frequency: Array) -> Array:
         """Phase from its advances: the inverse of `instantaneous_frequency`, up to whole turns."""
         frames = np.arange(instantaneous_frequency.shape[-1])
+        # guard: phase is summed in double precision
         phase = np.cumsum(instantaneous_frequency, axis=-1, dtype=np.float64) + self.nominal_advance * frames
         # Whole turns are dropped before they can eat the mantissa of a float32.
+        # guard: whole turns come off before single precision
         return (phase % (2 * np.pi)).astype(instantaneous_frequency.dtype)
 
     def synthesise(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.floating]:

@@ -52,13 +52,16 @@ def onset_sample(ir: npt.ArrayLike, *, threshold_db: float = ONSET_THRESHOLD_DB)
     Raises ValueError for a response that is empty or not finite.
     """
     magnitude = np.abs(np.asarray(ir))
+    # guard: responses without samples are not measured
     if magnitude.shape[-1] == 0:
         raise ValueError("an impulse response needs at least one sample")
     peak = magnitude.max(axis=-1)
+    # guard: responses that are not finite are not measured
     if not np.all(np.isfinite(peak)):  # max propagates NaN
         raise ValueError("the impulse response has samples that are not finite")
     threshold = peak * np.float64(10.0 ** (threshold_db / 20.0))
     first = np.argmax(magnitude >= threshold[..., np.newaxis], axis=-1)
+    # guard: what is silent has no onset
     return np.where(peak > 0.0, first, -1).astype(np.int64)
 
 
@@ -70,6 +73,7 @@ def energy_decay(ir: npt.ArrayLike, sample_rate: float) -> EnergyDecay:
     responses = np.asarray(ir)
     shape = responses.shape
     onset = onset_sample(responses).reshape(-1)
+    # guard: energies are squared in double precision
     power = np.square(responses.reshape(-1, shape[-1]), dtype=np.float64)
     end, noise, beyond, lowest_power = _ends(power, onset, max(1, round(_WINDOW_S * sample_rate)))
 
@@ -81,6 +85,7 @@ def energy_decay(ir: npt.ArrayLike, sample_rate: float) -> EnergyDecay:
     for row in range(len(energy)):
         energy[row, : end[row]] += beyond[row]
         if noise[row] > 0.0:  # subtracting noise can make the curve rise locally
+            # guard: a decay curve that noise was taken off never rises
             energy[row] = np.maximum.accumulate(energy[row, ::-1])[::-1]
         start = max(onset[row], 0)
         energy[row, :start] = energy[row, start]
@@ -108,6 +113,7 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
     levels = power_to_db(block_power)
     for row in range(rows):
         first, stop = -(-max(int(onset[row]), 0) // window), int(last[row]) // window
+        # guard: a short response has no tail
         if onset[row] < 0 or stop - first < 4:  # silent, or an impulse without a late decay
             continue
         tail = _tail(block_power[row, first:stop], levels[row, first:stop])
@@ -115,6 +121,7 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
             # The end of the response may be noise or a truncated decay. Noise of that level from the onset on is an
             # upper bound of both.
             late = block_power[row, stop - max(1, round(_TAIL_SHARE * (stop - first))) : stop].mean()
+            # guard: what does not decay may be noise
             lowest[row] = late * (last[row] - onset[row]) * db_to_power(_NOISE_MARGIN_DB)
             continue
         decay_per_sample = tail.decay_db / window * np.log(10.0) / 10.0
@@ -125,6 +132,7 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
             end[row] = max(round((first + at + 0.5) * window), int(onset[row]) + 1)
         noise[row] = tail.noise_power
         beyond[row] = db_to_power(tail.level_db - tail.decay_db * at) / decay_per_sample
+        # guard: a decay is told from noise with a margin
         lowest[row] = max(beyond[row], noise[row] / decay_per_sample * db_to_power(_NOISE_MARGIN_DB))
     return end, noise, beyond, lowest
 
@@ -139,7 +147,7 @@ class _Tail:
 
 
 def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
-    """Lundeby's iteration over windows `(window,)`; None where the late response does not decay."""
+    """The late decay, by Lundeby's iteration over windows `(window,)`; None if the late response does not decay."""
     count = _after_last(block_power > 0.0)
     if count == 0:  # all energy lies before the first whole window or after the last
         return None
@@ -175,7 +183,9 @@ def _after_last(condition: npt.NDArray[np.bool_]) -> int:
 
 def _line(levels_db: _Floats) -> tuple[float, float] | None:
     """(slope, intercept) of a least-squares line over the window index; None if it does not fall."""
+    # guard: a window of zeros has no level
     finite = np.flatnonzero(np.isfinite(levels_db))  # a window of exact zeros has no level
+    # guard: a line through fewer than three windows is none
     if len(finite) < 3:
         return None
     centred = finite - finite.mean()

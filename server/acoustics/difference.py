@@ -20,14 +20,14 @@ _LEAD_S = 0.001
 _EARLY_S = 0.050
 _SILENCE = 1e-12  # of a direct sound at a metre
 _THIRDS_HZ = 1000 * 2 ** (np.arange(-9, 14) / 3)
-_HEARD_BAND_DB = 30.0  # under the loudest third of an octave, in proportion to its width
+_AUDIBLE_BAND_DB = 30.0  # under the loudest third of an octave, in proportion to its width
 # A decay time is compared only below these DRRs. Above them the direct sound dominates the first 10 dB of the decay
 # (EDT), or the reverberation is too weak to measure (T60).
 _DECAY_DRR_DB = {"edt": 8.0, "t60": 21.0}
 
 
 def audible_difference(
-    reference: npt.ArrayLike, heard: npt.ArrayLike, sample_rate: int, *, onset_s: float
+    reference: npt.ArrayLike, other: npt.ArrayLike, sample_rate: int, *, onset_s: float
 ) -> dict[str, float]:
     """Difference by parameter, in JND: `level`, `spectrum`, `drr`, `c50`; `edt` and `t60` if both responses have them;
     and with two ears `iacc`, `itd`, `ild`. Each is that of the ear that differs more.
@@ -35,7 +35,7 @@ def audible_difference(
     `onset_s` is when the direct sound arrives by geometry. Raises ValueError for responses that are not finite or
     differ in shape.
     """
-    pair = [np.asarray(response, dtype=np.float64) for response in (reference, heard)]
+    pair = [np.asarray(response, dtype=np.float64) for response in (reference, other)]
     if pair[0].shape != pair[1].shape or pair[0].ndim != 2:
         raise ValueError(f"responses of {pair[0].shape} and {pair[1].shape} cannot be compared")
     energies = [np.sum(response**2, axis=-1) + _SILENCE for response in pair]
@@ -82,7 +82,7 @@ def _ratio_db(response: _Floats, sample_rate: int, onset_s: float, until_s: floa
     return power_to_db(first / rest)
 
 
-def _spectral_difference(reference: _Floats, heard: _Floats, sample_rate: int) -> float:
+def _spectral_difference(reference: _Floats, other: _Floats, sample_rate: int) -> float:
     """Greatest level difference in dB over all audible third-octave bands."""
     frequency = np.fft.rfftfreq(reference.shape[-1], 1 / sample_rate)
     thirds_hz = _THIRDS_HZ[sample_rate / 2 > _THIRDS_HZ * 2 ** (1 / 6)]
@@ -90,11 +90,11 @@ def _spectral_difference(reference: _Floats, heard: _Floats, sample_rate: int) -
     bounds = np.searchsorted(frequency, edges_hz)
     wide = bounds[:, 1] > bounds[:, 0]
     spectra = []
-    for response in (reference, heard):
+    for response in (reference, other):
         power = np.abs(np.fft.rfft(response)) ** 2
         below = np.concatenate([np.zeros((len(power), 1)), np.cumsum(power, axis=-1)], axis=-1)
         width = np.maximum(bounds[:, 1] - bounds[:, 0], 1)
         spectra.append(power_to_db((below[:, bounds[:, 1]] - below[:, bounds[:, 0]]) / width + _SILENCE))
     loudest_db = np.max(np.maximum(*spectra), axis=-1, keepdims=True)
-    is_heard = (np.maximum(*spectra) > loudest_db - _HEARD_BAND_DB) & wide
-    return float(np.max(np.where(is_heard, np.abs(spectra[1] - spectra[0]), 0.0)))
+    is_audible = (np.maximum(*spectra) > loudest_db - _AUDIBLE_BAND_DB) & wide
+    return float(np.max(np.where(is_audible, np.abs(spectra[1] - spectra[0]), 0.0)))

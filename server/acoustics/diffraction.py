@@ -22,10 +22,12 @@ SMALL_ARGUMENT = 1e-4
 
 @compiled
 def diffraction_gain_db(fresnel_number: float) -> float:
-    """<= 0."""
+    """Gain in dB, 0 or less."""
+    # guard: beyond its clearance an edge screens nothing
     if fresnel_number <= CLEAR_FRESNEL_NUMBER:
         return 0.0
     x = math.sqrt(2 * math.pi * abs(fresnel_number))
+    # guard: a screen's formula has no nought by nought
     if x < SMALL_ARGUMENT:
         return -GRAZING_LOSS_DB
     bent = x / math.tanh(x) if fresnel_number > 0 else x / math.tan(x)

@@ -37,6 +37,7 @@ class Cardioid:
     def __post_init__(self) -> None:
         if not 0 <= self.omni_share <= 1:
             raise ValueError("omni_share must be from 0 to 1")
+        # guard: a pattern's order is one
         if not 0 < self.order <= _SHARPEST_ORDER:
             raise ValueError(f"order must be above 0 and at most {_SHARPEST_ORDER:g}")
 
@@ -46,6 +47,7 @@ class Cardioid:
         if self.omni_share == 1:
             return np.zeros((*ahead.shape[:-1], _BANDS))
         amplitude = np.abs(self.omni_share + (1 - self.omni_share) * ahead) ** self.order
+        # guard: a pattern's null is finite
         gain = amplitude_to_db(np.maximum(amplitude, _FLOOR))
         return np.repeat(gain, _BANDS, axis=-1)
 
@@ -74,6 +76,7 @@ class PolarPattern:
 
     def __post_init__(self) -> None:
         angles = np.asarray(self.angles_deg, dtype=np.float64)
+        # guard: a measured pattern goes all the way round
         if (
             angles.ndim != 1
             or len(angles) < 2
@@ -84,6 +87,7 @@ class PolarPattern:
             raise ValueError("angles must rise from 0 to 180 degrees")
         if len(self.gains_db) != _BANDS or any(len(row) != len(angles) for row in self.gains_db):
             raise ValueError(f"gains must be {_BANDS} bands of one gain per angle")
+        # guard: a measured pattern does not amplify without end
         if not np.all(np.isfinite(self.gains_db)) or np.max(self.gains_db) > _LARGEST_GAIN_DB:
             raise ValueError(f"gains must be finite and at most {_LARGEST_GAIN_DB:g} dB")
 

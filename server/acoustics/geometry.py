@@ -47,14 +47,17 @@ class Quaternion(_Components):
         length = math.hypot(x, y, z, w)
         if not math.isfinite(length):
             raise ValueError("orientation must be four finite numbers")
+        # guard: a quaternion has a length
         if not _SHORTEST < length < _LONGEST:
             raise ValueError(f"orientation must be a quaternion of non-zero length, not of {length:g}")
+        # guard: an orientation is normalised once
         return super().__new__(cls, x / length, y / length, z / length, w / length)
 
     @classmethod
     def from_yaw(cls, yaw_rad: float) -> "Quaternion":
         """Rotation by `yaw_rad` counter-clockwise about the vertical; 0 looks along +x. Raises ValueError if it is not
         finite."""
+        # guard: a yaw is finite
         if not math.isfinite(yaw_rad):
             raise ValueError("yaw must be a finite number")
         return cls(0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
@@ -90,11 +93,14 @@ class Pose:
         if len(self.position) != 3:
             raise ValueError("position must be three finite numbers")
         x, y, z = map(float, self.position)  # no loops: poses come hundreds of times a second
+        # guard: a position is finite
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             raise ValueError("position must be three finite numbers")
+        # guard: a position is somewhere
         if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
             raise ValueError(f"position must lie within {FARTHEST_M:g} m")
         object.__setattr__(self, "position", (x, y, z))
+        # guard: an orientation is normalised no second time
         if type(self.orientation) is not Quaternion:  # normalising again would change the last bit
             if len(self.orientation) != 4:
                 raise ValueError("orientation must be four finite numbers")
@@ -163,6 +169,7 @@ class FloorPlan:
         crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
         inside = np.sum(straddles & (x < crossing), axis=-1) % 2 == 1
         touches = self.wall_distance_m(points) < TOUCH_M
+        # guard: what touches a wall is inside
         return np.asarray((inside | touches) & (points[..., 2] >= self.floor_m) & (points[..., 2] <= self.height_m))
 
     def holds(self, position: Vector3) -> bool:
@@ -178,6 +185,7 @@ class FloorPlan:
             along_x, along_y = bx - ax, by - ay
             share = ((x - ax) * along_x + (y - ay) * along_y) / (along_x * along_x + along_y * along_y)
             share = min(1.0, max(0.0, share))
+            # guard: one place that touches a wall is inside
             if math.hypot(x - ax - share * along_x, y - ay - share * along_y) < TOUCH_M:
                 return True
             ax, ay = bx, by
@@ -204,6 +212,7 @@ class FloorPlan:
             edge, offset = tip - origin, point - origin
             return np.asarray(edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0])
 
+        # guard: a line that grazes a corner is free
         crosses = (side(start, end, p) * side(start, end, q) < -TOUCH_M) & (
             side(p, q, start) * side(p, q, end) < -TOUCH_M
         )
@@ -211,6 +220,7 @@ class FloorPlan:
         middle = (a + b) / 2
         level = np.full((*middle.shape[:-1], 1), self.floor_m)
         inside = self.contains(np.concatenate([middle[..., :2], level], axis=-1))
+        # guard: a sight line through a block of wall is none
         return np.asarray(~np.any(crosses, axis=-1) & inside)
 
     def path_length_m(self, a: Points, b: Points) -> npt.NDArray[np.float64]:
@@ -229,4 +239,5 @@ class FloorPlan:
         # Computed once for each point a, which is paired with many points b.
         to_last = np.min(reach(a)[..., :, None] + self.bend_lengths_m, axis=-2)
         bent = np.hypot(np.min(to_last + reach(b), axis=-1), a[..., 2] - b[..., 2])
+        # guard: a path into a wall is as long as the straight line
         return np.asarray(np.where(self.is_visible(a, b) | ~np.isfinite(bent), straight, bent))

@@ -75,6 +75,7 @@ def band_cepstra(sample_rate: float, taps: int) -> _Floats:
     decibels = np.maximum(0.0, 1 - np.abs(octave - np.arange(len(centres))[:, None]))
     nepers = np.log(10) / 20
     shapes = folded_cepstrum(nepers * decibels)[:, :taps]
+    # guard: bands above Nyquist's frequency are left out
     audible = centres < sample_rate / 2
     at_centres = shapes @ np.cos(2 * np.pi / sample_rate * np.outer(np.arange(taps), centres)) / nepers
     shapes[audible] = np.linalg.solve(at_centres[np.ix_(audible, audible)], shapes[audible])

@@ -72,8 +72,10 @@ def separate(magnitude: Real, known_phase: Real, certainty: Real, coherence: Com
     unknown = np.sqrt(np.maximum(1 - certainty**2, 0))
     # The known parts have a coherence of their own. The noise supplies the difference.
     rest = coherence[..., :known_frames] - phasors[..., 0, :, :] * np.conj(phasors[..., 1, :, :])
+    # guard: noise that is not there has no coherence
     share = np.maximum(unknown[..., 0, :, :] * unknown[..., 1, :, :], UNDECIDED)
     noise_coherence = np.concatenate([rest / share, coherence[..., known_frames:]], axis=-1)
+    # guard: coherence is at most one
     noise_coherence *= MOST_COHERENT / np.maximum(np.abs(noise_coherence), 1)
     noise_magnitude = magnitude.copy()
     noise_magnitude[..., :known_frames] *= unknown
@@ -87,8 +89,10 @@ def delayed(values: npt.NDArray[Number], frames: npt.NDArray[np.float64]) -> npt
     count = values.shape[-1]
     for row, delay in enumerate(frames):
         whole = int(np.floor(delay))
+        # guard: levels are delayed by parts of a frame
         share = float(delay - whole)
         for start, weight in ((whole, 1 - share), (whole + 1, share)):
+            # guard: a delayed level stays within its response
             first, last = max(0, start), min(count, count + start)
             if last > first:
                 later[row, ..., first:last] += (
@@ -119,6 +123,7 @@ def griffin_lim(codec: Codec, magnitude: Real, signal: Real, iterations: int) ->
     for _ in range(iterations):
         spectrogram = codec.transform(signal)
         square = spectrogram.real**2 + spectrogram.imag**2
+        # guard: what is silent has no phase
         has_phase = square >= NO_PHASE
         phasors = np.where(has_phase, spectrogram / np.sqrt(np.where(has_phase, square, 1)), 1)
         signal = codec.synthesise((magnitude * phasors).astype(np.complex64)).astype(np.float32)

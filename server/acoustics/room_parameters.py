@@ -196,6 +196,7 @@ def _require(condition: npt.ArrayLike, reason: str) -> None:
 
 
 def _present(values: _Floats, reason: str) -> _Floats:
+    # guard: a parameter that is missing is told
     _require(~np.isnan(values), reason)
     return values
 
@@ -215,6 +216,7 @@ def _direct_sample(responses: npt.NDArray[np.generic], onset: npt.ArrayLike, sam
     for row, (at, response) in enumerate(zip(expected, responses.reshape(len(expected), -1), strict=True)):
         start = max(int(at) - reach, 0)
         nearby = np.abs(response[start : int(at) + reach + 1])
+        # guard: direct sound is sought where there are samples
         if at >= 0 and len(nearby) and nearby.max() > 0.0:
             first = int(onset_sample(nearby))
             peaks[row] = start + first + int(np.argmax(nearby[first : first + length + 1]))
@@ -222,7 +224,9 @@ def _direct_sample(responses: npt.NDArray[np.generic], onset: npt.ArrayLike, sam
 
 
 def _level_db(responses: npt.NDArray[np.generic]) -> _Floats:
+    # guard: levels are squared in double precision
     levels = power_to_db(np.square(responses, dtype=np.float64).sum(axis=-1))
+    # guard: silence has no level
     return np.where(np.isfinite(levels), levels, np.nan)
 
 
@@ -233,16 +237,19 @@ def _rows(decay: EnergyDecay) -> tuple[_Floats, _Integers]:
 def _decay_time_s(decay: EnergyDecay, sample_rate: float, upper_db: float, lower_db: float) -> _Floats:
     energy, onset = _rows(decay)
     times = np.full(len(energy), np.nan)
+    # guard: a decay is measured as far as it is known
     for row in np.flatnonzero((onset >= 0) & (decay.lowest_db.reshape(-1) <= lower_db)):
         curve = energy[row, onset[row] :]
         rising = curve[::-1]  # searchsorted needs a rising curve
         start = len(curve) - int(np.searchsorted(rising, curve[0] * 10.0 ** (upper_db / 10.0), side="right"))
         stop = len(curve) - int(np.searchsorted(rising, curve[0] * 10.0 ** (lower_db / 10.0), side="left"))
         count = stop - start
+        # guard: two points make a line
         if count < 2:
             continue
         centred = np.arange(count) - (count - 1) / 2.0
         slope = float(centred @ power_to_db(curve[start:stop])) / (count * (count * count - 1) / 12.0)
+        # guard: what does not fall has no reverberation time
         if slope < 0.0:
             times[row] = -60.0 / (slope * sample_rate)
     return times.reshape(decay.onset.shape)
@@ -255,6 +262,7 @@ def _clarity_db(decay: EnergyDecay, sample_rate: float, early_s: float) -> _Floa
     for row in np.flatnonzero((onset >= 0) & (split < energy.shape[-1])):
         late = energy[row, split[row]]
         early = energy[row, onset[row]] - late
+        # guard: clarity needs early and late energy
         if early > 0.0 and late > 0.0:
             values[row] = power_to_db(early / late)
     return values.reshape(decay.onset.shape)
@@ -269,10 +277,12 @@ def _direct_to_reverberant_db(
     lead, length = round(_DIRECT_LEAD_S * sample_rate), round(direct_s * sample_rate)
     for row, at in enumerate(direct_at.reshape(-1)):
         stop = int(at) + length
+        # guard: what follows the direct sound is within the response
         if at < 0 or stop >= energy.shape[-1]:
             continue
         direct = np.square(rows[row, max(int(at) - lead, 0) : stop], dtype=np.float64).sum()
         reverberant = energy[row, stop]
+        # guard: a ratio needs what is direct and what is not
         if direct > 0.0 and reverberant > 0.0:
             values[row] = power_to_db(direct / reverberant)
     return values.reshape(decay.onset.shape)

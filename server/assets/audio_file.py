@@ -119,11 +119,11 @@ def _compared(read: Recording, sizes: "_Sizes | None", promised: int, content: b
     finding, is_cut = "", False
     if sizes is not None and sizes.is_short:
         claimed = "does not say how much sound follows" if sizes.is_unknown else f"tells of {sizes.declared} bytes"
-        finding = f"its header {claimed}, and the file holds {sizes.held}: {amount}"
+        finding = f"its header {claimed}, and the file holds {sizes.present}: {amount}"
     elif sizes is not None and sizes.is_unknown:
         finding = f"its header does not say how much sound follows: {amount}"
-    elif sizes is not None and sizes.held < sizes.declared:
-        finding, is_cut = f"it is cut off: of {sizes.declared} bytes of sound it holds {sizes.held}; {amount}", True
+    elif sizes is not None and sizes.present < sizes.declared:
+        finding, is_cut = f"it is cut off: of {sizes.declared} bytes of sound it holds {sizes.present}; {amount}", True
     elif promised > len(read.samples) or _lacks_its_last_page(content):
         finding, is_cut = f"it is cut off: it promises more than it holds; {amount}", True
     return Recording(read.samples, read.sample_rate, finding, is_cut)
@@ -131,11 +131,11 @@ def _compared(read: Recording, sizes: "_Sizes | None", promised: int, content: b
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Size of the sound in bytes: `declared` by the header, and `held` by the file from byte `start` on. `fields` has
-    the offset and the `struct` format of each size field."""
+    """Size of the sound in bytes: `declared` by the header, and `present` in the file from byte `start` on. `fields`
+    has the offset and the `struct` format of each size field."""
 
     declared: int
-    held: int
+    present: int
     start: int
     is_unknown: bool
     fields: tuple[tuple[int, str], ...]
@@ -145,7 +145,7 @@ class _Sizes:
     def corrected(self, content: bytes) -> bytes:
         changed = bytearray(content)
         for at, form in self.fields:
-            struct.pack_into(form, changed, at, min(self.held, 2 ** (8 * struct.calcsize(form)) - 1))
+            struct.pack_into(form, changed, at, min(self.present, 2 ** (8 * struct.calcsize(form)) - 1))
         return bytes(changed)
 
 
@@ -158,9 +158,9 @@ def _sizes(content: bytes) -> _Sizes | None:
         return _sizes_in_chunks(content, b"SSND", ">I")
     if kind == b".snd" and len(content) >= 24:
         start, declared = struct.unpack(">II", content[4:12])
-        held = max(0, len(content) - start)
+        present = max(0, len(content) - start)
         is_unknown = declared == 0xFFFFFFFF
-        return _Sizes(declared, held, start, is_unknown, (), is_short=False)
+        return _Sizes(declared, present, start, is_unknown, (), is_short=False)
     return None
 
 
@@ -176,12 +176,12 @@ def _sizes_in_chunks(content: bytes, sound: bytes, form: str) -> _Sizes | None:
             if size == 0xFFFFFFFF and long_size is not None:
                 (size,) = struct.unpack_from("<Q", content, long_size)
                 fields = [(long_size, "<Q")]
-            held = len(content) - start
-            is_unknown = (size in _UNKNOWN_SIZES and size > held) or (size == 0 and held > 0)
-            follows = content[start + size :] if size < held else b""
-            is_short = size < held and sound == b"data" and not _is_chunks(follows, size % 2, form)
+            present = len(content) - start
+            is_unknown = (size in _UNKNOWN_SIZES and size > present) or (size == 0 and present > 0)
+            follows = content[start + size :] if size < present else b""
+            is_short = size < present and sound == b"data" and not _is_chunks(follows, size % 2, form)
             # Chunks after the declared sound are not sound.
-            return _Sizes(size, held, start, is_unknown and (size > 0 or is_short), tuple(fields), is_short)
+            return _Sizes(size, present, start, is_unknown and (size > 0 or is_short), tuple(fields), is_short)
         at = start + size + size % 2
     return None
 

@@ -66,8 +66,10 @@ def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAu
             raise AudioFileError("it holds no samples")
         # Before averaging and resampling, which would spread one bad sample over many.
         is_bad = ~np.isfinite(samples).all(axis=1)
+        # guard: a file of no audio is refused
         if is_bad.any():
             raise AudioFileError(f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
+        # guard: a file beyond the loudest is refused
         if (peak := np.abs(samples).max()) > LOUDEST:
             raise AudioFileError(f"its peak of {peak:.3g} is not audio, where full scale is 1")
         mono, downmix = to_mono(samples, channel)

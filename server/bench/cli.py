@@ -1,8 +1,8 @@
-"""`nafir bench`: what things cost on this host. Medians of several rounds; run it on an idle machine.
+"""`nafir bench`: performance on this host. Results are medians of several rounds; run it on an idle machine.
 
-Every command gives back an `Outcome`, and `_finish` does with it what is alike for all: it adds the run to the history
-where `--record` asks for that, and ends with exit code 1 where a goal is not reached that the run was to reach, with a
-line on standard error that says why. A command that raises leaves nothing in the history.
+Every command returns an `Outcome`. `_finish` adds it to the history if `--record` is given. It ends with exit code 1 if
+a goal of the run is not reached, with a line on standard error that says why. A command that raises adds nothing to the
+history.
 """
 
 import asyncio
@@ -34,7 +34,7 @@ from server.core.errors import NafirError
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run of `bench` measured, in numbers by name, and what went wrong with it."""
+    """Result of a run of `bench`: figures by name, and failures."""
 
     bench: str
     figures: Mapping[str, float | None]
@@ -104,7 +104,7 @@ def convolver(
     ] = False,
     as_json: AsJson = False,
 ) -> Outcome:
-    """The convolver beside pedalboard and SciPy: speed, exactness, evenness, exchanges, drift, start.
+    """The convolver compared with pedalboard and SciPy: speed, error, evenness, exchanges, drift, start-up.
 
     Two to six minutes, or one at most with --quick. Without pedalboard (extra `dev`) its columns stay empty.
     """
@@ -137,8 +137,8 @@ def stream(
 ) -> Outcome:
     """How many sessions one core serves, with fewer than one block in a thousand late.
 
-    A search takes about five minutes for each number of emitters, a number of sessions one and a half. Every step is
-    told as it ends; what Ctrl-C interrupts, prints what it has.
+    A search takes about five minutes for each number of emitters; a given number of sessions takes one and a half. Each
+    step is reported when it ends. After Ctrl-C the results so far are printed.
     """
     from server.bench.sessions import Plan, failures, measure_sessions
 
@@ -159,7 +159,7 @@ def effects(
     as_json: AsJson = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a table for a README.")] = False,
 ) -> Outcome:
-    """What a plan of effects saves, and what it gets wrong, in six situations."""
+    """How much time a plan of effects saves, and how large its error is, in six situations."""
     require_at_most_one({"--json": as_json, "--markdown": markdown})
     from server.bench.effects import SCENARIOS, measure_effects
     from server.bench.effects_table import markdown_table, terminal_rows
@@ -187,7 +187,7 @@ def listen(
     poses_per_second: Annotated[float, typer.Option(min=0.1, help="How often the listener moves.")] = 30.0,
     as_json: AsJson = False,
 ) -> Outcome:
-    """Listen to a running server while walking in circles: late blocks, and the time from a pose to its sound."""
+    """Listen to a running server while walking in circles: late blocks and pose-to-sound latency."""
     from websockets.exceptions import WebSocketException
 
     from server.bench import listen as one_stream
@@ -202,14 +202,14 @@ def listen(
 
 
 def _steps_told() -> Callable[[str], None]:
-    """A line for each step, where nobody knows how many there will be."""
+    """A callback that prints a line for each step, for runs whose number of steps is unknown."""
     console, began_s = Console(stderr=True), time.monotonic()
     return lambda step: console.print(f"{time.monotonic() - began_s:6.0f} s  {step}", highlight=False)
 
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Redrawn between measurements only: a thread that redraws would be measured too."""
+    """A progress bar that is redrawn only between measurements, since a thread that redraws would affect them."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
         task = progress.add_task("", total=total)
@@ -258,7 +258,7 @@ def _print_sessions(measured: dict[str, Any], judgements: list[Judgement]) -> No
 
 _TIMES = ("ms_p50", "ms_p99")
 _BY_PLAN = ("plan_us", "ratio", "error_jnd")
-"""What goes into a history of each level, and of each situation."""
+"""Figures of each level, and of each situation, that go into a history."""
 
 _CASE = {"block": "block_size", "ir s": "ir_s", "sources": "sources"}
 _ALONE = {
@@ -274,4 +274,4 @@ _SHARED = {
     "ratio": "shared_tail_ratio",
     "worst / mean": "shared_tail_worst_to_mean_block",
 }
-"""Headings short enough for a terminal."""
+"""Columns of tables: short headings and the keys of their values."""

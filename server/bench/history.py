@@ -1,4 +1,4 @@
-"""Runs of benchmarks that were kept: what each measured, on which host, when, and of which commit."""
+"""The history of a benchmark: results of runs with host, date and commit."""
 
 import json
 import subprocess
@@ -17,7 +17,8 @@ UNKNOWN = "unknown"
 
 
 class RunHost(BaseModel):
-    """`load` is the system's, of the last minute when the run had ended: beyond one, times are too long."""
+    """The host of a run. `load` is the system load over the last minute at the end of the run; above one, times are too
+    long."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -32,8 +33,8 @@ class RunHost(BaseModel):
 
 
 class Run(BaseModel):
-    """One run. `commit` ends in "+changes" where the checkout had others than it; `failures` say which goals were not
-    reached and what went wrong."""
+    """One run of a benchmark. `commit` ends in "+changes" if the checkout had uncommitted changes. `failures` say which
+    goals were not reached and what went wrong."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,7 +62,7 @@ _RUNS = TypeAdapter(tuple[Run, ...])
 
 
 def current_commit() -> str:
-    """Of the checkout that this code lies in; "unknown" where it lies in none, as when it is installed."""
+    """Commit of the checkout that contains this code; "unknown" if there is none, as in an installed package."""
     folder = Path(__file__).parent
     try:
         commit = _git(folder, "rev-parse", "HEAD")
@@ -77,7 +78,8 @@ def _git(folder: Path, *arguments: str) -> str:
 
 
 def read_history(path: Path) -> list[Run]:
-    """Oldest first; none where there is no such file. Raises NafirError for a file that is no history."""
+    """The runs in a history, oldest first; none if the file does not exist. Raises NafirError if it is not a
+    history."""
     try:
         return list(_RUNS.validate_json(path.read_bytes()))
     except FileNotFoundError:
@@ -87,7 +89,7 @@ def read_history(path: Path) -> list[Run]:
 
 
 def append_run(path: Path, run: Run) -> None:
-    """The file is written anew beside the old one and put in its place. Raises NafirError where it cannot be."""
+    """Add a run to a history. A new file replaces the old one at once. Raises NafirError if it cannot be written."""
     runs = [*read_history(path), run]
     text = ",\n".join(json.dumps(each.model_dump(mode="json"), ensure_ascii=False, indent=2) for each in runs)
     beside = path.with_suffix(".json.new")

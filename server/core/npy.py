@@ -86,7 +86,7 @@ def read_npy(path: Path) -> npt.NDArray[np.generic]:
     """Read an array from a file. Raises OSError, or NpyError before any memory that the header claims is allocated."""
     with path.open("rb") as stream:
         header = NpyHeader.read(stream)
-        held = path.stat().st_size - header.header_bytes
-        if held != header.data_bytes:
-            raise NpyError(f"claims {header.data_bytes} bytes of {header.dtype} {header.shape} and has {held}")
+        present = path.stat().st_size - header.header_bytes
+        if present != header.data_bytes:
+            raise NpyError(f"claims {header.data_bytes} bytes of {header.dtype} {header.shape} and has {present}")
         return header.array(stream.read())

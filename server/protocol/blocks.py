@@ -57,6 +57,7 @@ class AudioBlock:
     type: ClassVar[str] = "audio_block"
     KIND: ClassVar[int] = 1
     FLAGS: ClassVar[Mapping[str, int]] = {"is_exchange": 1, "is_late": 2, "is_limited": 4}
+    # guard: the sample clock has 64 bits
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
         ("flags", "B", "sum of " + ", ".join(f"{bit} {name}" for name, bit in FLAGS.items())),
@@ -78,6 +79,7 @@ class AudioBlock:
             if getattr(self, name):
                 flags |= bit
         poses = self.pose_id, self.reverberation_pose_id
+        # guard: sequences wrap round
         header = self.LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
         return header + _encode(self.samples.T, encoding)
 
@@ -130,9 +132,11 @@ class DryBlock:
     @classmethod
     def parse(cls, data: bytes) -> Self:
         """Read a block from bytes. Raises RequestError malformed_block."""
+        # guard: a dry block has a header
         if len(data) < cls.LAYOUT.size:
             raise _malformed(f"a dry block begins with {cls.LAYOUT.size} bytes, not {len(data)}", "header")
         _, encoding, id_bytes, sequence, frames = cls.LAYOUT.unpack_from(data)
+        # guard: a dry block is of a known encoding
         if encoding >= len(cls._ENCODINGS):
             raise _malformed(f"encoding {encoding} is neither 0 (f32) nor 1 (s16)", "encoding")
         if id_bytes > cls._LONGEST_ID:
@@ -141,9 +145,11 @@ class DryBlock:
         try:
             identifier = data[cls.LAYOUT.size : start].decode()
         except UnicodeDecodeError as exc:
+            # guard: an id is text
             raise _malformed("the id is not UTF-8", "id") from exc
         start += -id_bytes % 4
         size = frames * (2 if cls._ENCODINGS[encoding] == "s16" else 4)
+        # guard: a block is as long as it says
         if frames == 0 or len(data) != start + size:
             raise _malformed(f"{frames} frames are {size} bytes, not {max(0, len(data) - start)}", "frames")
         return cls(identifier, sequence, _decode(data, cls._ENCODINGS[encoding], start))

@@ -32,11 +32,14 @@ PROTOCOL: Final = 2
 AUTO = "auto"
 """Name of a level in messages; it lets the server choose the quality level."""
 
+# guard: a block is as long as blocks may be
 BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
+# guard: a pose id ends where its number does
 PoseId = Annotated[int, Field(ge=0, lt=2**32), WHOLE]
 Orientation = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 LevelName = Annotated[str, Field(max_length=256)]
+# guard: a gain in a message is one that can be heard
 GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
 
 _POSE_FIELDS = frozenset({"position", "orientation", "yaw", "listener"})
@@ -95,6 +98,7 @@ class Hello(Message):
     level: LevelName = AUTO
     output: Output = "headphones"
     effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
+    # guard: a buffer has blocks, and not too many
     buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
 
 
@@ -212,14 +216,17 @@ class ListenerPose(_Directed):
 
         Raises RequestError: unknown_message for another kind, malformed_pose for a wrong length or impossible numbers.
         """
+        # guard: an empty message has no kind
         if not data or data[0] != cls.KIND:
             raise RequestError("unknown_message", f"binary message of unknown kind {data[0] if data else 'none'}")
+        # guard: a binary pose is as long as it is
         if len(data) != cls.LAYOUT.size:
             raise RequestError("malformed_pose", f"a binary pose has {cls.LAYOUT.size} bytes, not {len(data)}")
         _, pose_id, *numbers = cls.LAYOUT.unpack(data)
         try:
             return cls(pose_id=pose_id, position=tuple(numbers[:3]), orientation=tuple(numbers[3:]))
         except ValidationError as exc:
+            # guard: a binary pose that is none is refused by code
             raise _refusal(exc, is_tagged=False) from exc
 
     def serialize_binary(self) -> bytes:
@@ -273,6 +280,7 @@ def parse_client_message(data: str | bytes) -> ClientMessage:
         message = _CLIENT.validate_json(data)
     except ValidationError as exc:
         _require_version(data)
+        # guard: a message that is none is refused by code
         raise _refusal(exc, is_tagged=True) from exc
     # Every key has a colon, so a message with no more colons than fields has no duplicate key. This settles nearly all
     # messages at a hundredth of the cost of parsing them again.
@@ -313,6 +321,7 @@ def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
     field = ".".join(place) or None
     if kind in {"union_tag_invalid", "union_tag_not_found"}:
         code, field = "unknown_message", "type"
+    # guard: a pose that is impossible is refused by code
     elif kind == "malformed_pose" or (place and place[0] in _POSE_FIELDS):
         code = "malformed_pose"
     elif place and place[0] == "directivity":

@@ -18,6 +18,8 @@ Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 class Message(BaseModel):
     # Unknown fields are refused. With a misspelt "orientaton" the head would otherwise never turn.
+    # guard: numbers are not read from anything else
+    # guard: fields that are unknown are refused
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     def serialize(self) -> str:

@@ -131,12 +131,14 @@ class Convolver:
         Raises ValueError for another shape, and for a sample that is not finite, or so large that a product might not
         be: either would spoil every output to come.
         """
+        # guard: a response has samples
         if ir.ndim != 2 or ir.shape[0] != self.channels or not 1 <= ir.shape[1] <= self.ir_samples:
             raise ValueError(f"expected an IR ({self.channels}, 1..{self.ir_samples}), got shape {ir.shape}")
         with np.errstate(over="ignore"):  # seen below
             samples = ir.astype(np.float32, copy=False)
         head_energy, tail_energy = _energy(samples[:, : self._tail_start]), _energy(samples[:, self._tail_start :])
         # Energy says it at once of nearly all; neither is true of what is no number.
+        # guard: a response is sound
         if not (head_energy + tail_energy <= LOUDEST or -LOUDEST <= ir.min() <= ir.max() <= LOUDEST):
             raise ValueError(f"impulse response has samples that are not finite, or beyond {LOUDEST:g}")
         if like is not None and like.layout != self._layout:

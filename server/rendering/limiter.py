@@ -129,6 +129,7 @@ def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np
     is_loud = not _is_within(signal[:, :before], safe)
     if not _is_within(block, safe):
         is_loud = True
+        # guard: what is not finite never leaves
         silenced = _silence_what_is_not_finite(block)
     gain[0] = gain[-1]
     if is_loud:
@@ -147,6 +148,7 @@ def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np
         at = step * _STEP
         line = (gain[step] + (gain[step + 1] - gain[step]) * rise).astype(np.float32)
         if step == 0:
+            # guard: a peak at the beginning of a block is held
             line = np.minimum(line, ceiling / np.maximum(peak[:_STEP], ceiling))
         for channel in range(channels):
             block[channel, at : at + _STEP] *= line
@@ -227,5 +229,6 @@ def _follow(peak: FloatArray, ceiling: np.float32, keep: float, hold: int, gain:
         else:
             held[0] += 1
         gain[step + 1] = min(gain[step + 1], gain[step] if held[0] < hold else 1 - (1 - gain[step]) * keep)
+    # guard: a gain that recovers gets there
     if gain[steps] > 1 - _AT_REST:
         gain[steps] = 1

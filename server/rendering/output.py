@@ -59,6 +59,7 @@ def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer], int]]) -> list[li
     like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
     limiter = next((output.limiter.state for output, _, _ in listeners if output.limiter is not None), None)
     kinds = (None if each is None else each.kind for each in (like, limiter))
+    # guard: a block is handed out as a copy
     frames, flags = np.empty(samples, np.float32), np.zeros((blocks, 2), np.int64)
     mixing_with(*kinds)(np.array(rows, np.int64), frames, flags, like, limiter)
     for mixer in mixers:

@@ -87,4 +87,5 @@ class Partitioning:
     def quiet_blocks(self) -> int:
         """Blocks of silence after which no window of any stage holds anything else, turns included, and nothing is left
         to come out."""
+        # guard: a convolver hears on until its longest window is empty
         return max(self.history_blocks, *((stage.partitions + 2 * TURNS) * stage.ticks for stage in self.stages))

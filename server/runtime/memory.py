@@ -16,7 +16,8 @@ import platform
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h
 _LARGE_BYTES = 96 * 1024
-"""Smaller than an impulse response or one stage of it; larger than the output of a field's graph."""
+"""Arrays of this size get their own pages. It is less than an impulse response or one stage of it, and more than the
+output of a field's graph."""
 _HEAPS = 2
 _USUAL_COLLECTIONS = gc.get_threshold()
 _RARE_COLLECTIONS = (20_000, 20, 20)

@@ -39,6 +39,7 @@ _NOISE_MEMBER = "frozen_noise.npy"
 _WIDEST_SAMPLE_BYTES = 8
 _ARCHIVE_OVERHEAD_BYTES = 2**16
 # Exceptions of `zipfile` for invalid or damaged archives. NotImplementedError is a RuntimeError.
+# guard: an archive that is none is refused by file and field
 _ARCHIVE_ERRORS = (OSError, EOFError, KeyError, ValueError, RuntimeError, zlib.error, zipfile.BadZipFile)
 
 
@@ -62,6 +63,7 @@ class Bundle:
         try:
             manifest = Manifest.model_validate_json(text)
         except ValidationError as exc:
+            # guard: a manifest that is none is refused by file and field
             first = exc.errors()[0]
             field = ".".join(str(part) for part in first["loc"]) or "document"
             raise BundleError(path, field, first["msg"]) from exc
@@ -89,6 +91,7 @@ class Bundle:
         inside a wall."""
         bounds = self.manifest.bounds
         sides = zip(bounds.minimum, position, bounds.maximum, strict=True)
+        # guard: a place is within the bounds
         in_box = all(least <= at <= most for least, at, most in sides)
         if in_box and self.floor_plan.holds(position):
             return
@@ -150,6 +153,7 @@ def _read(folder: Path, name: str, most_bytes: int, *, sha256: str | None = None
     folder, longer than `most_bytes`, or has another hash. These checks come before the content is held in memory."""
     path = folder / name
     try:
+        # guard: a bundle is what lies in its folder
         if not path.resolve().is_relative_to(folder.resolve()):
             raise BundleError(path, "file", f"is a link to {path.resolve()}, outside of the bundle; copy the file here")
         # Before opening, which would block on a pipe.
@@ -195,6 +199,7 @@ def _frozen_noise(path: Path, data: bytes, samples: int) -> npt.NDArray[np.float
         raise BundleError(path, "frozen_noise", f"cannot be read: {exc}") from exc
     with np.errstate(over="ignore"):  # checked below
         noise = stored.astype(np.float32)
+    # guard: the frozen noise is finite
     if not np.isfinite(noise).all():
         raise BundleError(path, "frozen_noise", "holds non-finite samples")
     return noise
@@ -207,10 +212,12 @@ def _noise_member(path: Path, archive: zipfile.ZipFile, samples: int) -> zipfile
     names = [member.filename for member in members]
     if _NOISE_MEMBER not in names:
         raise BundleError(path, "frozen_noise", "cannot be read: there is no such array in the archive")
+    # guard: an archive of arrays has one member
     if len(names) > 1:
         others = [name for name in names if name != _NOISE_MEMBER]
         problem = f"there are others beside it, {others[0]!r} for one" if others else "it is there twice"
         raise BundleError(path, "frozen_noise", problem)
+    # guard: an archive unpacks to no more than the manifest allows
     if members[0].file_size > _noise_bytes(samples):
         raise BundleError(
             path,

@@ -11,6 +11,7 @@ from server.scene.outline import faults_of
 Share = Annotated[float, Field(ge=0, le=1)]
 PerBand = Annotated[tuple[Share, ...], Field(min_length=len(OCTAVE_BANDS_HZ), max_length=len(OCTAVE_BANDS_HZ))]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+# guard: a coordinate of a scene is a place
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 PlanPoint = tuple[Coordinate, Coordinate]
 Point = tuple[Coordinate, Coordinate, Coordinate]

@@ -21,12 +21,14 @@ def faults_of(corners: Sequence[_Corner]) -> list[str]:
     """The first few reasons why three or more corners are not a simple, counter-clockwise polygon; empty if they
     are."""
     for index, corner in enumerate(corners):
+        # guard: a wall has a length
         if math.dist(corner, corners[index - 1]) < SHORTEST_WALL_M:
             closes = ": leave the last one out, a floor plan closes by itself" if index == 0 else ""
             return [f"corner {index} is where corner {(index - 1) % len(corners)} is, at {_place(corner)}{closes}"]
     meetings = _meetings(corners)
     if meetings:
         return [*meetings[:_MOST_FAULTS_TOLD], "edge 0 runs from corner 0 to corner 1"]
+    # guard: a room has an inside
     if not shapely.LinearRing(corners).is_ccw:
         return ["corners must run counter-clockwise: these run clockwise, so write them in the opposite order"]
     return []

@@ -31,7 +31,7 @@ EDGES_S = (0.0025, 0.006, 0.012, 0.025, 0.050, 0.1, 0.2, 0.4, 0.8)
 FADE = 0.12  # of an edge's time, on either side
 LARGEST_GAIN = 4.5  # more is a fault of the measurement or of the regression
 _SILENCE = 1e-12  # of the energy of a response
-_SEARCH_S = (0.0015, 0.005)  # for the arrival, before and after what geometry says
+_SEARCH_S = (0.0015, 0.005)  # for the arrival, before and after the one that geometry predicts
 _UPSAMPLING = 8
 KERNEL_REACH = 32  # samples on either side
 KERNEL_BETA = 8.0
@@ -43,7 +43,7 @@ def bands(responses: npt.NDArray[np.floating], sample_rate: float) -> _Floats:
     """(..., band, sample) octave bands that add up to the responses `(..., sample)`. The lowest and the highest band
     are open."""
     samples = responses.shape[-1]
-    size = next_fast_len(2 * samples, real=True)  # what a band's filter smears wraps into nothing
+    size = next_fast_len(2 * samples, real=True)  # zeros, into which the filters of bands may ring
     octave = np.log2(np.maximum(rfftfreq(size, 1 / sample_rate), 1e-3))
     crossovers = [hertz for hertz in _CROSSOVERS_HZ if hertz < _HIGHEST * sample_rate]
     above = [np.ones_like(octave), *(_rise(octave - np.log2(hertz) + 0.5) for hertz in crossovers)]

@@ -138,6 +138,8 @@ def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = N
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
         onnx.save(copy, source)
+        # guard: small products are computed exactly
+        # guard: each column of weights has a scale of its own
         quantize_dynamic(
             source,
             target,

@@ -172,7 +172,7 @@ def export(
     ],
     output: Folder,
     data: Annotated[Path | None, typer.Option(help="Dataset folder, if it has moved since training.")] = None,
-    precision: Annotated[str, typer.Option(help="float32 or int8, or both, comma by comma.")] = "float32",
+    precision: Annotated[str, typer.Option(help="float32 or int8, or both, separated by a comma.")] = "float32",
     ranks: Annotated[str, typer.Option(help="Lower ranks, 64,32 say, to write factorised fields at too.")] = "",
     exact_tables: Annotated[
         bool, typer.Option("--exact-tables", help="Add every naf once more, with less arithmetic for the same numbers.")

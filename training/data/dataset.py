@@ -237,7 +237,7 @@ class Dataset:
             file["done"][emitter] = True
 
     def pairs(self, *, held_out: bool) -> npt.NDArray[np.int64]:
-        """(pair, 2) emitter and listener of each held-out pair, or of each other pair."""
+        """(pair, 2) emitter and listener of each held-out pair or, without `held_out`, of each training pair."""
         chosen = self.held_out if held_out else ~self.held_out & ~np.eye(len(self.probes), dtype=bool)
         return np.argwhere(chosen)
 

@@ -340,6 +340,7 @@ def choose_held_out(emitter: _Floats, listener: _Floats, share: float, seed: int
     ends = np.round(np.stack([emitter, listener], axis=1) / SAME_POINT_M).astype(np.int64)
     _, point = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
     couples, couple = np.unique(np.sort(point.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+    # guard: one couple at least is not held out
     wanted = 0 if share == 0 else min(max(1, round(share * len(couples))), len(couples) - 1)
     chosen = np.random.default_rng([seed, 1]).choice(len(couples), wanted, replace=False)
     return np.isin(couple.reshape(-1), chosen)
@@ -347,14 +348,17 @@ def choose_held_out(emitter: _Floats, listener: _Floats, share: float, seed: int
 
 def _require_usable(measurement: Measurement, row: int, source: str) -> None:
     pose = (*measurement.listener, *measurement.emitter, measurement.yaw)
+    # guard: a response without samples is not stored
     if measurement.response.shape[-1] == 0:
         raise ResponsesError(Path(source), "responses", f"row {row} has no samples; leave it out")
+    # guard: a response that is not finite is not stored
     if not np.isfinite(measurement.response).all() or not np.isfinite(pose).all():
         raise ResponsesError(Path(source), "responses", f"row {row} is not finite, response or pose; leave it out")
 
 
 def _require_finite_samples(responses: _Responses, path: Path) -> _Responses:
     """Returns the responses; raises ResponsesError if a sample is not finite."""
+    # guard: a damaged file is not learned from
     if not np.isfinite(responses).all():
         raise ResponsesError(path, "responses", "hold samples that are not finite; simulate or import them anew")
     return responses

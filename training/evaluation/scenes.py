@@ -198,14 +198,14 @@ def _mean_rows(results: Sequence[SceneResult]) -> list[str]:
 def _remarks(results: Sequence[SceneResult]) -> list[str]:
     remarks = []
     for result in results:
-        said = "; ".join(_beside(result, naf) for naf in (NAF, NAF_WHOLE) if naf in result.methods)
-        if not said:
+        comparisons = "; ".join(_beside(result, naf) for naf in (NAF, NAF_WHOLE) if naf in result.methods)
+        if not comparisons:
             continue
         orientations = "1 orientation" if result.yaws == 1 else f"{result.yaws} orientations"
         drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {orientations}"
         if result.draws > 1:
             drawn += f", medians of {result.draws} draws"
-        remarks.append(f"- {result.scene} ({drawn}): {said}.")
+        remarks.append(f"- {result.scene} ({drawn}): {comparisons}.")
     return remarks
 
 

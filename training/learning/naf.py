@@ -67,6 +67,7 @@ class NafLearner:
                 cross += spectrogram[0] * np.conj(spectrogram[1])
                 power += np.abs(spectrogram) ** 2
         mean = total / count
+        # guard: rounding leaves no variance below zero
         sigma = np.sqrt(np.maximum(squares / count - mean**2, 0))
         if field.shape.domain == "time":
             # A waveform has zero mean, and its level is a smooth function of time.
@@ -74,10 +75,12 @@ class NafLearner:
             sigma = np.maximum(envelope, 1e-4 * envelope.max())
         else:
             # Otherwise bins that hardly vary (silence before the onset) would make rounding errors large targets.
+            # guard: a spread of zero is not divided by
             sigma = np.maximum(sigma, _LEAST_SIGMA)
         field.mean.copy_(torch.from_numpy(mean))
         field.spread.copy_(torch.from_numpy(_SIGMAS * sigma))
         if hasattr(field, "coherence"):
+            # guard: ears in silence have no mean coherence
             coherence = cross / np.maximum(np.sqrt(power[0] * power[1]), 1e-20)
             field.coherence.copy_(torch.from_numpy(np.stack([coherence.real, coherence.imag])))
 
@@ -148,6 +151,7 @@ class NafLearner:
         left = self.responses.samples - delay_samples(self.responses, row)
         if self.field.shape.domain == "time":
             return max(1, int(left))
+        # guard: a response that ends before sound arrives has a frame
         return max(1, int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left)))
 
 

@@ -21,11 +21,14 @@ def split(responses: ResponseSet, *, share: float, seed: int) -> tuple[npt.NDArr
     _, point = np.unique(np.round(ends.reshape(-1, 3) / SAME_POINT_M).astype(np.int64), axis=0, return_inverse=True)
     couples, couple = np.unique(np.sort(point.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
     rng = np.random.default_rng([seed, 3])
+    # guard: a twentieth of few couples is one
     wanted = max(1, round(_VALIDATION_SHARE * len(couples)))
+    # guard: the same place measured twice is one place
     validation = np.isin(couple.reshape(-1), rng.choice(len(couples), wanted, replace=False))
     pairs = responses.pair[trainable]
     candidates = rng.permutation(np.unique(pairs[~validation]))
     used = np.isin(pairs, candidates[: max(1, round(share * len(candidates)))])
+    # guard: too few places are told
     if not (used & ~validation).any():
         raise DatasetError(
             f"{responses.file}: nothing is left to train on: {len(trainable)} responses are not held out, between "

@@ -208,6 +208,7 @@ def read_json(run: Path, name: str) -> dict[str, Any]:
 
 def save_checkpoint(run: Path, state: dict[str, Any]) -> None:
     """Writes the checkpoint so that an interruption leaves the previous one whole."""
+    # guard: checkpoints are written whole
     partial = run / "checkpoint.partial"
     torch.save(state, partial)
     partial.replace(run / CHECKPOINT)
@@ -225,6 +226,7 @@ def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> 
     """Loads the parameters of a finished run into the field. Raises RunError if the run is unfinished, or of another
     network."""
     state = load_checkpoint(run, torch.device("cpu"))
+    # guard: an unfinished run is no field
     if not state["finished"]:
         length = (
             f"{state['epochs']:.3g} of {configuration.epochs} epochs"
@@ -270,6 +272,7 @@ def append_log(run: Path, row: dict[str, float]) -> None:
 
 def _write_whole(path: Path, document: dict[str, Any]) -> None:
     """Writes the file so that an interruption leaves the previous one whole."""
+    # guard: what a run is, is written whole
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(document, indent=2) + "\n")
     partial.replace(path)

@@ -128,15 +128,19 @@ class _Loop:
         size = min(configuration.batch, visited)
         self._batch = max(size - size % processes.count, processes.count)
         self._steps_per_epoch = max(1, visited // self._batch)
+        # guard: a run goes on from its checkpoint and not from its beginning
         if (run / CHECKPOINT).exists():
             state = load_checkpoint(run, processes.device)
             learner.field.load_state_dict(state.pop("field"))
+            # guard: an optimiser goes on as it was
             self._optimiser.load_state_dict(state.pop("optimiser"))
             self._state = _State(**state)
             if processes.first and not self._state.finished:
+                # guard: the log goes no further than the checkpoint
                 keep_log(run, self._state.rounds)
         else:
             if processes.first:
+                # guard: a log begins anew with its run
                 keep_log(run, 0)
             learner.initialise(self._rows, configuration.seed)
             self._state = _State(bfloat16=self._choose_precision())
@@ -213,6 +217,8 @@ class _Loop:
         norm = torch.nn.utils.clip_grad_norm_(self._learner.field.parameters(), _LARGEST_GRADIENT)
         mean_loss, mean_norm = (float(value) for value in self._processes.mean(torch.stack([loss.detach(), norm])))
         state.first_loss = mean_loss if state.first_loss is None else state.first_loss
+        # guard: a loss out of proportion stops training
+        # guard: a loss that is no number stops training
         if not np.isfinite(mean_norm) or not self._is_plausible(mean_loss):
             raise self._diverged(f"the loss is {mean_loss:g} and its gradient {mean_norm:g} in step {state.step + 1}")
         if save:
@@ -249,6 +255,7 @@ class _Loop:
         parts = self._validate() if self._processes.first else {}
         seconds = state.seconds + time.perf_counter() - start
         validation_error, state.seconds = self._processes.broadcast(sum(parts.values()), seconds)
+        # guard: an error out of proportion is not kept
         if not self._is_plausible(validation_error):  # before parameters are kept and saved
             raise self._diverged(f"the validation error is {validation_error:g} after step {state.step}")
         if validation_error < state.best_loss:

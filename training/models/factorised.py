@@ -71,7 +71,9 @@ class FeatureGrid(nn.Module):
         offset = position[..., :2, None] - self._nodes.T
         squared = torch.sum(offset * offset, dim=-2)
         # On a node, an infinite precision would give 0 times infinity.
+        # guard: a bandwidth of zero is none
         precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
+        # guard: kernel weights are a softmax
         return torch.softmax(squared * -precision, dim=-1) @ self._features
 
 

@@ -47,12 +47,14 @@ class GaussianGrid(nn.Module):
     @property
     def bandwidths_m(self) -> Tensor:
         """(cell,)"""
+        # guard: a bandwidth has a least
         return _LEAST_BANDWIDTH_M + (_MOST_BANDWIDTH_M - _LEAST_BANDWIDTH_M) * torch.sigmoid(self.bandwidth_logit)
 
     def forward(self, position: Tensor) -> Tensor:
         """(B, 2 or 3) metres to (B, features)."""
         cells = self._cells + _FLOAT_M * torch.tanh(self.offset)
         squared = torch.sum((position[:, None, :2] - cells) ** 2, dim=-1)
+        # guard: kernel weights of the paper's grid are a softmax
         return torch.softmax(-squared / (2 * self.bandwidths_m**2), dim=-1) @ self.features
 
 
@@ -75,6 +77,7 @@ class OrientationEmbedding(nn.Module):
     def forward(self, yaw: Tensor) -> Tensor:
         """(B,) radians to (B, layers, width)."""
         turn = yaw[:, None] - self._yaws
+        # guard: a heading is one within a turn
         turn = turn - 2 * np.pi * torch.floor((turn + np.pi) / (2 * np.pi))
         gap = torch.where(turn >= 0, self._after, self._before)
         weights = torch.clamp(1 - turn.abs() / gap, min=0)

@@ -58,7 +58,9 @@ class Site:
             corners = np.asarray(plan.corners)
             low[:2], high[:2] = corners.min(axis=0), corners.max(axis=0)
         else:
+            # guard: places on a line have room around them
             (x, y), (right, top) = low[:2] - _MARGIN_M, high[:2] + _MARGIN_M
+            # guard: places on the floor have room above them
             plan = FloorPlan(((x, y), (right, y), (right, top), (x, top)), max(float(high[2]), 0.0) + _MARGIN_M)
             low[:2], high[:2] = (x, y), (right, top)
         axes = [(0, 1, 2) if np.ptp(end[:, 2]) > _MOVES_M else (0, 1) for end in ends]

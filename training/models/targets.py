@@ -21,6 +21,7 @@ LOG_FLOOR = 1e-5
 
 def codec_of(responses: ResponseSet, n_fft: int = N_FFT) -> Codec:
     """The codec for these responses. Raises DatasetError for responses shorter than one frame of the transform."""
+    # guard: responses shorter than a window are refused
     if responses.samples < n_fft:
         raise DatasetError(f"{responses.file}: responses of {responses.samples} samples are too short, {n_fft} needed")
     return Codec(responses.sample_rate, n_fft, n_fft // 4, responses.samples, LOG_FLOOR)
@@ -46,11 +47,13 @@ def flat_targets(aligned: npt.NDArray[np.floating], cells: Cells) -> npt.NDArray
     # The level of a cell is that of noise with the mean power of its bins.
     late = codec.log_magnitude(np.sqrt(bands.T @ np.abs(spectrogram[..., cells.fine_frames :]) ** 2 @ late_frames))
     known = spectrogram[..., : cells.known_frames]
+    # guard: the phasor of silence is zero
     phasor = known / np.maximum(np.abs(known), 1e-12)
     parts = [fine, late, _complex_parts(phasor, -4)]
     if aligned.shape[-2] == 2:
         power = bands.T @ np.abs(spectrogram) ** 2 @ all_frames
         cross = bands.T @ (spectrogram[..., 0, :, :] * np.conj(spectrogram[..., 1, :, :])) @ all_frames
+        # guard: ears in silence have no coherence
         interaural = cross / np.maximum(np.sqrt(power[..., 0, :, :] * power[..., 1, :, :]), 1e-20)
         parts.append(_complex_parts(interaural, -3))
     lead = aligned.shape[:-2]
@@ -64,6 +67,7 @@ def _complex_parts(values: npt.NDArray[np.complexfloating], axis: int) -> npt.ND
 def delay_samples(responses: ResponseSet, row: int) -> float:
     """The number of samples by which alignment advances a response. Raises DatasetError if no sound can arrive."""
     onset_s = float(responses.onset_s[row])
+    # guard: a pair that no way connects is told
     if not np.isfinite(onset_s):
         raise DatasetError(f"{responses.file}: row {row}: no way leads from emitter to listener; is one inside a wall?")
     return onset_s * responses.sample_rate - LEAD_SAMPLES

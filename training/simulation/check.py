@@ -91,8 +91,8 @@ def check_plan(
             for _ in simulation.own(emitter, repeated, 1):
                 pass
             seconds[name] += process_time() - began
-            heard = np.stack([simulation.whole(0, each)[:: max(1, len(yaws) // _YAWS_HEARD)] for each in own]) + known
-            measured[name].append(measure(heard, scene.simulation.sample_rate))
+            whole = np.stack([simulation.whole(0, each)[:: max(1, len(yaws) // _YAWS_HEARD)] for each in own]) + known
+            measured[name].append(measure(whole, scene.simulation.sample_rate))
     return PlanCheck(
         scene=scene.id,
         emitters=len(measured["plan"]),
@@ -112,10 +112,10 @@ class GeometricResponses:
 
     def __init__(self, scene: SceneFile, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
         settings = scene.simulation
-        heard = yaws[:: max(1, len(yaws) // _YAWS_HEARD)]
+        compared = yaws[:: max(1, len(yaws) // _YAWS_HEARD)]
         samples = round(settings.duration_s * settings.sample_rate)
         directions = sphere_directions(settings.arrival_directions)
-        self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, heard, samples)
+        self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, compared, samples)
         self._probes = probes
         self._direct = DirectPaths.of(scene, plan)
         self._tracer = RoomTracer.of(scene, plan, probes, image_order=GEOMETRIC_ORDER)
@@ -124,14 +124,14 @@ class GeometricResponses:
         """(listener, yaw, ear, sample)"""
         place, reflections = self._probes[emitter], self._tracer.images(self._probes[emitter])
 
-        def heard(images: tuple[_Floats, _Floats], receiver: _Floats) -> npt.NDArray[np.float32]:
+        def response(images: tuple[_Floats, _Floats], receiver: _Floats) -> npt.NDArray[np.float32]:
             positions, amplitudes = images
             return self._synthesis.specular(positions, amplitudes, receiver)
 
         return np.stack(
             [
-                heard(self._direct.images(place, self._probes[listener]), self._probes[listener])
-                + heard(reflections[listener], self._probes[listener])
+                response(self._direct.images(place, self._probes[listener]), self._probes[listener])
+                + response(reflections[listener], self._probes[listener])
                 for listener in listeners
             ]
         )

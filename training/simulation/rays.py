@@ -190,7 +190,7 @@ def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
             length, hit = _next_surface(room, position, direction, wall)
             surface, wall = hit
             if surface < 0:
-                break  # out through a corner, by rounding
+                break  # rounding let it out through a corner
             # Scattered energy reaches receivers as diffuse rain, and image sources account for the first reflections.
             if is_mirrored and (was_scattered or reflections > image_order):
                 _add_crossings(receivers, position, direction, length, travelled_m, weight, histogram)

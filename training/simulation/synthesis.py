@@ -90,17 +90,17 @@ class BinauralSynthesis:
         return self.specular(emitter[None], amplitude, receiver)
 
     def late_covariance(
-        self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles, heard: _Singles
+        self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles, products: _Singles
     ) -> _Singles:
         """(bin, product, yaw, cell) expected products per sample of the ears' spectra, for the diffuse part of
         `render`. They are summed over `times_s` (time,) with `weights` (time, cell); times outside the response add
-        nothing. `heard` is the result of `arrival_products`."""
+        nothing. `products` is the result of `arrival_products`."""
         step_s = self._n_fft // 2 / self._sample_rate
         frames = -(-self.samples // (self._n_fft // 2)) + 1
         per_sample = power_at(np.asarray(np.arange(frames) * step_s, np.float64), energy) / np.float32(
             self._sample_rate
         )
-        frequencies_hz = np.linspace(0, self._sample_rate / 2, heard.shape[0])
+        frequencies_hz = np.linspace(0, self._sample_rate / 2, products.shape[0])
         power = np.einsum("dbt,bn->ndt", per_sample, band_weights(frequencies_hz).astype(np.float32), optimize=True)
         # Overlapping windows shape the same noise: their amplitudes add up, so neighbours have a product, too.
         position = np.clip(times_s / step_s, 0, frames - 1)
@@ -118,7 +118,7 @@ class BinauralSynthesis:
         neighbours = np.sqrt(power[..., :-1] * power[..., 1:])
         over_cells = np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
         # Einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
-        return np.einsum("bpyd,bdc->bpyc", heard, over_cells)
+        return np.einsum("bpyd,bdc->bpyc", products, over_cells)
 
     def arrival_products(self, bins: int) -> _Singles:
         """(bin, product, yaw, direction) products of the ears' spectra for a wave from each direction, at frequencies
@@ -140,7 +140,7 @@ class BinauralSynthesis:
         band). Overlapping bands are independent, so that their powers add up for any gains of the bands."""
         step = self._n_fft // 2
         frames = samples // step
-        heard = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
+        at_ears = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
         for neighbours in (0, 1):  # only neighbouring bands overlap
             noise = _unit_noise((len(directional), frames, step), rng)
             sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
@@ -159,8 +159,8 @@ class BinauralSynthesis:
                 sections = irfft(shaped, self._n_fft)
                 sections *= self._window
                 later = np.roll(sections[..., step:], 1, axis=1)
-                heard[band] = (sections[..., :step] + later).reshape(len(sections), -1)
-        return heard.reshape(len(heard), len(self.yaws), 2, -1)
+                at_ears[band] = (sections[..., :step] + later).reshape(len(sections), -1)
+        return at_ears.reshape(len(at_ears), len(self.yaws), 2, -1)
 
     @property
     def _sample_rate(self) -> int:
@@ -205,8 +205,8 @@ class BinauralSynthesis:
         times_s = np.arange(frames) * step / self._sample_rate
         per_sample = np.moveaxis(power_at(times_s, energy), -1, 0) / np.float32(self._sample_rate)
         spectra *= np.sqrt(np.ascontiguousarray(per_sample) @ self._band_weights)
-        heard = np.matmul(np.ascontiguousarray(np.moveaxis(spectra, -1, 0)), self._arrival_spectra)
-        sections = irfft(np.ascontiguousarray(heard.transpose(2, 1, 0)), self._n_fft)
+        at_ears = np.matmul(np.ascontiguousarray(np.moveaxis(spectra, -1, 0)), self._arrival_spectra)
+        sections = irfft(np.ascontiguousarray(at_ears.transpose(2, 1, 0)), self._n_fft)
         sections *= self._window
         late = sections[:, :-1, step:] + sections[:, 1:, :step]
         response = late.reshape(len(self.yaws), 2, -1)[..., : self.samples]
@@ -221,11 +221,11 @@ class BinauralSynthesis:
     def _add_specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats, response: _Singles) -> None:
         offset = positions - receiver
         distance = np.linalg.norm(offset, axis=-1)
-        heard = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
+        directions = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
         delay = distance / SPEED_OF_SOUND * self._sample_rate
         start = np.floor(delay).astype(int)
         lead = round(_LEAD_S * self._sample_rate)
-        spectra = self._ears.specular(heard, amplitudes, lead + delay - start)
+        spectra = self._ears.specular(directions, amplitudes, lead + delay - start)
         taps = irfft(spectra, self._n_fft).reshape(len(spectra), 2 * len(self.yaws), self._n_fft)
         _add_at(start - lead, taps, response.reshape(-1, self.samples))
 

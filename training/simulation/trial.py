@@ -45,7 +45,7 @@ _FIRST_HITS, _MORE, _MOST_HITS = 400_000, 4, 6_400_000
 _SAME_SHARE = 0.05
 # With more walls than this, each reflection takes longer.
 _FEW_WALLS = 20
-# Rays for the first number of reflections.
+# Fewest and most rays at the first number of reflections.
 _FEWEST_RAYS, _MOST_RAYS = 50, 2_000
 _EARLY_S = 0.050
 # First duration in reverberation times by Eyring's formula, and growth factor: smooth rooms decay more slowly.

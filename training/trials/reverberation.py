@@ -165,8 +165,8 @@ def median_of_runs(times_s: Callable[[int, int], _Floats]) -> _Floats:
     rays = _RAYS
     while True:
         times = np.array([times_s(run, rays) for run in range(_RUNS)])
-        told = np.isfinite(times).all(axis=0)
-        errors = times[:, told].std(axis=0, ddof=1) / times[:, told].mean(axis=0) / np.sqrt(_RUNS)
+        is_known = np.isfinite(times).all(axis=0)
+        errors = times[:, is_known].std(axis=0, ddof=1) / times[:, is_known].mean(axis=0) / np.sqrt(_RUNS)
         if (errors <= _SURE).all() or rays >= _MOST_RAYS:
             return np.asarray(np.median(times, axis=0))
         rays *= _MORE

@@ -127,8 +127,8 @@ class Evidence:
             report.note("ears cannot be checked: no emitter is in sight to the side of the head")
             return
         agreeing = _share(offsets, yaws, louder)
-        told = f"the ear turned to the emitter is the louder one in {agreeing:.0%} of {compared} responses"
-        report.note(told)
+        finding = f"the ear turned to the emitter is the louder one in {agreeing:.0%} of {compared} responses"
+        report.note(finding)
         if agreeing >= _LEAST_AGREEING or compared < _FEWEST_RESPONSES:
             return
         hint = _best_remedy(offsets, yaws, louder)
@@ -137,7 +137,7 @@ class Evidence:
             return
         raise ContradictionError(
             "ears",
-            f"{told}, so coordinates are mirrored, or ears exchanged: {hint} (--accept-ears imports all the same)",
+            f"{finding}, so coordinates are mirrored, or ears swapped: {hint} (--accept-ears imports all the same)",
         )
 
 
