@@ -3,7 +3,6 @@
 Exit code 1 where a goal is not reached that the run was to reach, with a line on standard error that says why.
 """
 
-import asyncio
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +10,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from server.bench.report import (
     Judgement,
@@ -150,6 +148,8 @@ def listen(
     from server.bench.machine import describe_machine
 
     try:
+        import asyncio
+
         measured = asyncio.run(one_stream.listen(url, scene, emitters, duration_s, poses_per_second))
     except (OSError, WebSocketException) as exc:
         raise NafirError(f"{url}: {exc}") from exc
@@ -165,6 +165,8 @@ def _steps_told() -> Callable[[str], None]:
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[str], None]]:
     """Redrawn between measurements only: a thread that redraws would be measured too."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
         task = progress.add_task("", total=total)

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import track
 
 from server.core.command_line import figure_file
 
@@ -24,6 +23,8 @@ def check(
     Exit code 1 where a law is broken, unless the scene was exported with a reason to accept that. Fields that take long
     are asked for fewer poses, in about a quarter of a minute.
     """
+    from rich.progress import track
+
     from server.health.check import check as check_bundle
     from server.health.report import reasons, table, to_json
     from server.scene.bundle import Bundle, find_bundle

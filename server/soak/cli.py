@@ -3,8 +3,6 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 
 def soak(
@@ -19,6 +17,9 @@ def soak(
     Beside them a listener at rest compares every sample with an offline render in double precision. Exit code 1 where
     something that has to hold does not, with the reason on standard error.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     from server.bench.report import Judgement, end_with, missed, print_json, print_judgements, print_measures
     from server.soak.run import Plan
     from server.soak.run import soak as run
