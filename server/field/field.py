@@ -17,7 +17,8 @@ from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError, FieldError
-from server.field.decoder import Decoder, add_from, resized
+from server.field.any_size_decoder import add_from, resized
+from server.field.decoder import Decoder
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.lattice import Neighbourhood, Node, Snapped
@@ -126,6 +127,7 @@ class AcousticField:
         Raises ValueError for poses that are not finite, and FieldError where a response would not be.
         """
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        # guard: poses that are not finite reach no field
         if not all(np.isfinite(part).all() for part in (listeners, emitters, yaws)):
             raise ValueError("listeners, emitters and yaws must be finite")
         if self.nodes is not None:
@@ -183,6 +185,7 @@ class AcousticField:
     def _compute(self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None) -> Float32:
         parameters = self.graph.parameters
         aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
+        # guard: a way without end is no index of a sample
         if not (aligned < _NEVER).all():
             raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
         if self._decoder is None:
@@ -227,6 +230,7 @@ class AcousticField:
         """The responses. Raises FieldError naming the first that is not finite."""
         # A sum is quicker to look at than its parts; what overflows it is no response either.
         flat = responses.reshape(len(responses), -1)
+        # guard: responses that are not finite are handed to nobody
         wrong = ~np.isfinite(np.vecdot(flat, flat))
         if wrong.any():
             at = int(np.argmax(wrong))

@@ -1,8 +1,8 @@
-"""Rendering to a file: the live renderer, fed from a path instead of a connection.
+"""Rendering to a file: the live renderer, driven by a path instead of a connection.
 
-A path says from which sample on the listener has which pose, for the direct sound and for what follows it. Poses take
-effect at block boundaries, as they do live; so a live session whose poses are written down with the sample clocks of
-the blocks that first applied them renders the same.
+A path gives the listener's poses with the samples from which they apply, separately for the direct sound and for the
+reflected field. Poses take effect at block boundaries, as they do live. So a path with the poses of a live session, and
+the sample clocks of the blocks that first applied them, renders the same samples.
 """
 
 import csv
@@ -36,10 +36,10 @@ from server.streaming.emitters import Emitter
 FloatArray = npt.NDArray[np.float32]
 
 MAX_RENDER_S = 2 * 3600
-"""A render is held in memory as a whole: two hours of stereo at 48 kHz are 2.8 GB."""
+"""Longest render. It is held in memory as a whole: two hours of stereo at 48 kHz are 2.8 GB."""
 
 _LEAST_GAIN = 1e-6
-"""A plan takes what is softer for this."""
+"""Least amplitude that a plan assumes, since silence has no level in dB."""
 _CLOCKS = ("sample", "time_s")
 _REVERBERATION = "reverberation_sample"
 _LEVEL = "level"
@@ -49,12 +49,12 @@ _YAW = ("yaw_deg",)
 
 
 class PathError(NafirError):
-    """A path file that cannot be followed; the message names the line and the column."""
+    """A path file is invalid. The message names the line and the column."""
 
 
 @dataclass(frozen=True)
 class RenderedEmitter:
-    """A clip (n,) at the scene's rate, played at a place; `gain` is linear amplitude.
+    """An emitter that plays a clip (n,) at the scene's rate. `gain` is a linear amplitude.
 
     Raises ValueError for a gain that is not finite or beyond `LOUDEST_GAIN`.
     """
@@ -71,9 +71,9 @@ class RenderedEmitter:
 
 @dataclass(frozen=True)
 class PathPoint:
-    """The listener's pose: that of the direct sound from `sample` on, and that of what follows it, the field's impulse
-    responses, from `reverberation_sample` on; with None, never, since another pose was faster. From then on responses
-    are of quality level `level`; with None, of the same as before."""
+    """A pose of the listener. It applies to the direct sound from `sample` on, and to the reflected field from
+    `reverberation_sample` on; None means never, because a later pose overtook it. Responses are of quality level
+    `level` from then on; None keeps the level."""
 
     sample: int
     pose: Pose
@@ -82,17 +82,17 @@ class PathPoint:
 
     @classmethod
     def at(cls, sample: int, pose: Pose) -> "PathPoint":
-        """For both from the same sample on."""
+        """A pose that applies to direct sound and reflected field from the same sample on."""
         return cls(sample, pose, sample)
 
 
 def read_path(path: Path, sample_rate: int, levels: Collection[str] | None = None) -> list[PathPoint]:
-    """Read a CSV file with a header line, columns in any order.
+    """Read a CSV file with a header line and columns in any order.
 
-    They are `sample` or `time_s`; `x`, `y`, `z` in metres; `qx`, `qy`, `qz`, `qw` or `yaw_deg` (counter-clockwise, 0
-    looks along +x); and, or else it is the same, `reverberation_sample`, empty for never; and `level`, one of `levels`
-    where those are given, empty for the same as before. Neither clock goes back from line to line, nor beyond
-    `MAX_RENDER_S`. Raises PathError.
+    The columns are `sample` or `time_s`; `x`, `y`, `z` in metres; and `qx`, `qy`, `qz`, `qw` or `yaw_deg`
+    (counter-clockwise, 0 looks along +x). Optional columns are `reverberation_sample`, by default the same sample and
+    empty for never, and `level`, empty to keep the level. If `levels` are given, `level` has to be one of them. Times
+    never go back from line to line nor exceed `MAX_RENDER_S`. Raises PathError.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -189,6 +189,7 @@ def _pose(values: dict[str, float], where: str) -> Pose:
     try:
         return Pose(position, Quaternion(values["qx"], values["qy"], values["qz"], values["qw"]))
     except ValueError as exc:
+        # guard: a path file's orientation is refused by its line
         raise PathError(f"{where}, columns 'qx' to 'qw': {exc}") from exc
 
 
@@ -204,14 +205,15 @@ def render(
     planned: PlannedEffects | None = None,
     levels: Mapping[str, Field] | None = None,
 ) -> FloatArray:
-    """What a listener on `path` (one point or more, by rising sample) hears of `emitters` (one or more): (channel,
-    length), two ears or, from a mono loudspeaker, one channel.
+    """Render at least one emitter for a listener on `path`, which has at least one point. Returns (channel, length):
+    two ears, or one channel for a mono loudspeaker.
 
     A point takes effect with the first block that begins at its sample or later, unless a later point does too. The
-    emitters start where the path begins. `length` in samples defaults to the end of the path or of the longest clip,
-    whichever is later, and the reverberation after it. `progress` is told the fraction done. Only the effects are
-    rendered that are `planned`, or all. Responses are those of `field` until a point names another of `levels`; for the
-    same samples as a stream's these are all that its scene has. Raises KeyError for a level that is none of them.
+    emitters start at the beginning of the path. `length`, in samples, defaults to the end of the path or of the longest
+    clip, whichever is later, and the reverberation after it. `progress` gets the fraction done. With `planned` only the
+    planned effects are rendered, otherwise all. Responses are those of `field` until a point names another of
+    `levels`. To get the same samples as a stream, `levels` has to have all levels of the scene. Raises KeyError for a
+    level that is not among them.
     """
     if not path or not emitters:
         raise ValueError("a render needs a path and an emitter")
@@ -239,7 +241,7 @@ def render(
 
 
 def _fields(field: Field, path: Sequence[PathPoint], levels: Mapping[str, Field]) -> list[Field]:
-    """What gives the responses of each point; `field` before any names a level."""
+    """The field that computes the responses of each point; it is `field` until a point names a level."""
     fields = []
     for point in path:
         field = field if point.level is None else levels[point.level]
@@ -248,7 +250,8 @@ def _fields(field: Field, path: Sequence[PathPoint], levels: Mapping[str, Field]
 
 
 def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output: Output) -> PlannedEffects | None:
-    """What to render: `all` effects (None), those that a `plan` calls for, or those named between commas and no other.
+    """The effects to render by the option `choice`: `all` (returns None), those that a `plan` calls for, or exactly
+    those named, separated by commas.
 
     Raises RequestError unknown_effect.
     """
@@ -264,7 +267,7 @@ def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output
 
 
 class _Walk:
-    """A renderer and what it is told, block by block, as a session would: plans and responses at once."""
+    """Drives a renderer block by block as a session does, but with plans and responses computed at once."""
 
     def __init__(
         self,
@@ -277,7 +280,8 @@ class _Walk:
         ir_samples: int,
         shares_tail: bool,
     ) -> None:
-        """`ir_samples` at most has any response; `shares_tail` says whether emitters share a tail at any level."""
+        """`ir_samples` is the length of the longest response. `shares_tail` says whether any level has a shared
+        tail."""
         self.renderer = direct_sound.renderer(
             block_size=block_size,
             ir_samples=ir_samples,
@@ -313,7 +317,8 @@ class _Walk:
                 planned.follow_emitter(name, emitter.pose, 0.0)
 
     def go_on(self, direct: Pose | None, reverberation: tuple[Pose, Field] | None) -> None:
-        """What is heard from the next block on: direct sound of this pose and responses of that, or as before."""
+        """Set the state for the next block: the pose of the direct sound, and the pose and field of the responses. None
+        keeps the present one."""
         if direct is not None:
             self._move(direct)
         self._plan()
@@ -351,7 +356,7 @@ class _Walk:
             self._effects.share_tail(self._field.level.shared_tail, self._emitters)
 
     def _respond(self, listener: Pose) -> None:
-        """Hand in the responses that are out of date."""
+        """Compute the outdated responses and give them to the renderer."""
         named = {
             name: emitter
             for name, emitter in self._emitters.items()
@@ -361,12 +366,12 @@ class _Walk:
             self.renderer.set_channels(self._effects.channels)
         if not named:
             return
-        asked = [
+        snapshots = [
             EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity, effects=as_asked(emitter))
             for emitter in named.values()
         ]
-        irs = composed_irs(self._field, self._direct_sound, listener, asked, self._effects.channels)
-        for (name, emitter), snapshot, ir in zip(named.items(), asked, irs, strict=True):
+        irs = composed_irs(self._field, self._direct_sound, listener, snapshots, self._effects.channels)
+        for (name, emitter), snapshot, ir in zip(named.items(), snapshots, irs, strict=True):
             emitter.is_outdated = False
             self._effects.accept_ir(name, emitter, self.renderer.prepare(ir), snapshot.effects, 0)
 

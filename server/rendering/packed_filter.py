@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels import right_angle
+from server.kernels import odd_fft
 from server.kernels.array_pool import ArrayPool
 from server.kernels.compiled import compiled
+from server.rendering.multiply_accumulate import filter_offset
 from server.rendering.partitions import Partitioning
-from server.rendering.products import filter_offset
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -77,10 +77,10 @@ def pack(
 
 
 @cache
-def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[right_angle.Tables, ...]]:
+def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[odd_fft.Tables, ...]]:
     """(stage, 5) where each begins, the size of its partitions, and the addresses of its transform's tables; and those
     tables, so that they last as long."""
-    all_tables = tuple(right_angle.tables(stage.size) for stage in partitioning.stages)
+    all_tables = tuple(odd_fft.tables(stage.size) for stage in partitioning.stages)
     rows = [
         (stage.start, stage.size, address(tables.twist), address(tables.passes), address(tables.lanes))
         for stage, tables in zip(partitioning.stages, all_tables, strict=True)
@@ -115,7 +115,7 @@ def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digest
                 at = filter_offset(channels, size // 8, count, 0, partition)
                 step = filter_offset(channels, size // 8, count, 1, partition) - at
                 to = spectra + 4 * (at + 16 * channel)
-                right_angle.forward(first, silence, bins, to, step, 8, size, twist, passes, lanes)
+                odd_fft.forward(first, silence, bins, to, step, 8, size, twist, passes, lanes)
             digests[done] = np.int64(digest)
             done += 1
 

@@ -137,6 +137,7 @@ class DirectSound:
         outputs: int = 2,
         has_head: bool = True,
     ) -> Renderer:
+        # guard: a session's sound is limited
         return Renderer(
             block_size=block_size,
             ir_samples=ir_samples,

@@ -1,4 +1,4 @@
-"""Plain words for quality levels: what a visitor reads in place of a level's name."""
+"""Titles of quality levels, shown to people instead of the levels' names."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ _PHASES: Final = {"frozen": "", "integrated": "integrated phase", "griffin_lim":
 
 @dataclass(frozen=True)
 class LevelOfField:
-    """A quality level and what its field is; `architecture` is None where the scene has no field."""
+    """A quality level with the architecture and rank of its field. `architecture` is None if the scene has no field."""
 
     level: QualityLevel
     architecture: str | None
@@ -24,27 +24,27 @@ class LevelOfField:
 
 
 def level_titles(levels: Sequence[LevelOfField]) -> dict[str, str]:
-    """Titles by level name, each different from the others, and no longer than that asks for."""
+    """Titles by level name. They differ from each other and are no longer than necessary for that."""
     titles = {level.name: _kind(level) for level in levels}
     for detail in _DETAILS:
         for alike in _groups(levels, titles):
-            told = {level.name: detail(level) for level in alike}
-            if len(set(told.values())) > 1:
-                titles |= {name: ", ".join(filter(None, (titles[name], told[name]))) for name in told}
+            details = {level.name: detail(level) for level in alike}
+            if len(set(details.values())) > 1:
+                titles |= {name: ", ".join(filter(None, (titles[name], details[name]))) for name in details}
     return titles
 
 
 def _groups(levels: Sequence[LevelOfField], titles: dict[str, str]) -> list[list[LevelOfField]]:
-    """Levels of one title."""
+    """Groups of levels that have the same title so far."""
     groups = defaultdict(list)
     for level in levels:
         groups[titles[level.name]].append(level)
     return list(groups.values())
 
 
-def _kind(of: LevelOfField) -> str:
-    level = of.level
-    if of.architecture is None:
+def _kind(entry: LevelOfField) -> str:
+    level = entry.level
+    if entry.architecture is None:
         return "Geometry only"
     limits = []
     if level.reuse is not None:
@@ -60,18 +60,18 @@ def _kind(of: LevelOfField) -> str:
     return kind[0].upper() + kind[1:]
 
 
-def _turn(of: LevelOfField) -> str:
-    return "" if of.level.reuse is None else f"{of.level.reuse.turn_deg:g}°"
+def _turn(entry: LevelOfField) -> str:
+    return "" if entry.level.reuse is None else f"{entry.level.reuse.turn_deg:g}°"
 
 
-def _network(of: LevelOfField) -> str:
-    return of.architecture or "" if of.rank is None else f"rank {of.rank}"
+def _network(entry: LevelOfField) -> str:
+    return entry.architecture or "" if entry.rank is None else f"rank {entry.rank}"
 
 
 _DETAILS: Final[tuple[Callable[[LevelOfField], str], ...]] = (
     _turn,
-    lambda of: _PHASES[of.level.phase.kind],
+    lambda entry: _PHASES[entry.level.phase.kind],
     _network,
-    lambda of: of.name,
+    lambda entry: entry.name,
 )
-"""What tells levels of one kind apart, plainest first; names do for certain."""
+"""Details that distinguish levels of one kind, simplest first. The last, the name, always differs."""

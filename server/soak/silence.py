@@ -1,6 +1,6 @@
-"""What a block costs while there is sound, and in the silence after it.
+"""Time to render a block during sound and in the silence after it.
 
-Filters that ring out end in numbers so small that some processors take a hundred times as long over them.
+Decaying filters end in denormal numbers, for which some processors take a hundred times as long.
 """
 
 import statistics
@@ -24,7 +24,7 @@ _ROUNDS = 5
 
 
 def silence_to_sound(field: AcousticField) -> float:
-    """The median time of a block in silence over that in sound; the median of several rounds of both."""
+    """Median time of a block in silence divided by that in sound; the median of several rounds."""
     manifest = field.bundle.manifest
     rate = field.sample_rate
     direct = DirectSound.of(field.bundle, kemar(rate))

@@ -107,6 +107,7 @@ class ResponseScheduler:
 
     def advance(self, pose_id: int) -> None:
         """Something takes a pose. Raises RequestError where a newer one was taken before."""
+        # guard: an old pose is refused
         if pose_id <= self.newest_pose_id:
             raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")
         self.newest_pose_id = pose_id

@@ -287,6 +287,7 @@ class Session:
             self.blocks_limited += is_limited
             if number < len(sequences):
                 place = sequences[number], clocks[number]
+                # guard: a block says that it was turned down
                 blocks.append(AudioBlock(*place, *pose_ids, samples, is_exchange=is_exchange, is_limited=is_limited))
         return blocks
 
@@ -315,6 +316,7 @@ class Session:
 
     def _move_listener(self, message: ListenerPose) -> None:
         pose = message.pose
+        # guard: a listener stays inside
         self._bundle.require_inside(pose.position, "position")
         self._responses.advance(message.pose_id)
         moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation

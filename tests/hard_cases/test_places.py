@@ -21,6 +21,8 @@ from server.rendering.still_paths import StillPaths
 from server.responses.radiation import reverberation_gain
 from server.scene.bundle import BUNDLED, Bundle
 from tests.hard_cases.listening import AHEAD, FLAT, Listening, hear, not_finite, play, renderer
+from tests.oracles.reflections import NumpyReflectionFinder
+from tests.oracles.sound_path import NumpySoundPathFinder
 from tests.signals import noise
 
 # A room with one reflex corner, and a flat of two rooms with a doorway.
@@ -45,9 +47,8 @@ LISTENER = (1.0, 5.0, 1.5)
 
 def paths(plan, listener, emitter):
     """By compiled code and by NumPy."""
-    finder = SoundPathFinder(plan, 343.0)
     listener, emitters = np.asarray(listener, float), np.asarray([emitter], float)
-    return finder.find(listener, emitters), finder.find_with_numpy(listener, emitters)
+    return tuple(kind(plan, 343.0).find(listener, emitters) for kind in (SoundPathFinder, NumpySoundPathFinder))
 
 
 @pytest.mark.parametrize("place", SPECIAL.values(), ids=SPECIAL)
@@ -219,8 +220,7 @@ def test_compiled_and_plain_reflections_agree_anywhere(measured, plan, shares):
     a, b = (np.array([*(low + np.array(part[:2]) * (high - low)), 2.5 * part[2]]) for part in (shares[:3], shares[3:]))
     if not (plan.contains(a) and plan.contains(b)):
         return
-    finder = _mirrors_of(plan)
-    one, other = finder.find(a, b[None]), finder.find_with_numpy(a, b[None])
+    one, other = _mirrors_of(plan).find(a, b[None]), NumpyReflectionFinder(plan, _MIRRORS_DB).find(a, b[None])
     lengths = [np.sort(found.length_m) for found in (one, other)]
     # At the very end of a wall one may see a path that the other does not; every other is there twice.
     if len(lengths[0]) == len(lengths[1]):
@@ -229,11 +229,12 @@ def test_compiled_and_plain_reflections_agree_anywhere(measured, plan, shares):
 
 
 _FINDERS = {}
+_MIRRORS_DB = np.full((3, 7), -1.0)
 
 
 def _mirrors_of(plan):
     if plan.corners not in _FINDERS:
-        _FINDERS[plan.corners] = ReflectionFinder(plan, np.full((3, 7), -1.0))
+        _FINDERS[plan.corners] = ReflectionFinder(plan, _MIRRORS_DB)
     return _FINDERS[plan.corners]
 
 

@@ -1,5 +1,5 @@
-"""Lattices away from where they are kept: held-out poses are where a simulation has them and look where it did, and
-might be nodes, where a level that reuses responses errs no more than one that makes each anew."""
+"""Fields with moved lattices. Held-out poses are at the probes of the simulation, and might coincide with nodes, where
+a level that reuses responses has no extra error. Moving the lattice avoids this bias."""
 
 import copy
 import math
@@ -14,8 +14,8 @@ _MOST_OFFSET_M = 0.25
 
 
 def with_moved_lattice(field: AcousticField, rng: np.random.Generator) -> AcousticField:
-    """The field with its nodes elsewhere, by up to 25 cm or half a cell, and headings turned by any angle; both keep
-    their responses in the same room. The field itself where it has no lattice."""
+    """The field with its nodes moved by up to 25 cm or half a cell, and headings rotated by any angle. Responses stay
+    in the same room as their nodes. A field without a lattice is returned unchanged."""
     reuse, nodes = field.level.reuse, field.nodes
     if reuse is None or nodes is None:
         return field

@@ -1,7 +1,8 @@
-"""Which quality levels a bundle could offer: every field with every way of finding its phase, and of reusing responses.
+"""The quality levels that a bundle could offer: every field with every method of finding its phase, and of reusing
+responses.
 
-Shorter responses are not among them: room parameters are taken from the first 35 dB of a decay and would not hear that
-the rest was cut off, so cutting it would always seem to be worth the time it saves.
+Shorter responses are not among them. Room parameters depend only on the first 35 dB of a decay, so they would not show
+that the rest was cut off.
 """
 
 from collections.abc import Iterable, Iterator
@@ -11,7 +12,7 @@ from server.scene.bundle import Bundle
 from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel, Reuse
 
 NONE = "none"
-"""Instead of a field's name: no field."""
+"""Stands for no field, in place of a field's name."""
 GRIFFIN_LIM_ITERATIONS = (1, 4, 16, 64)
 _LATTICES = (
     (0.1, 15),
@@ -28,24 +29,25 @@ _LATTICES = (
     (5.0, 120),
     (5.0, 360),
 )
-"""Spacing in metres, turn in degrees."""
+"""Spacing in metres, step of the heading in degrees."""
 
 
 REUSES = (
     *(Reuse(spacing_m=spacing_m, turn_deg=turn_deg) for spacing_m, turn_deg in _LATTICES),
     *(Reuse(spacing_m=spacing_m, turn_deg=turn_deg, first_reflections="node") for spacing_m, turn_deg in _LATTICES),
 )
-"""Lattices from a step's length to one node per room, each with first reflections of its own and kept with the rest."""
+"""Lattices from a spacing of centimetres to one node per room, each with first reflections for every pose, and with
+first reflections stored at nodes."""
 
 
 def candidates(
     bundle: Bundle, phases_of: Iterable[str] | None = None, reuse_of: Iterable[str] = ()
 ) -> list[QualityLevel]:
-    """One level per combination worth measuring, named after what sets it apart.
+    """One level per combination, named after what distinguishes it.
 
-    Swept over phases are the fields that `phases_of` names, by default all: what Griffin and Lim's iteration adds in
-    time does not depend on the field beneath. Swept over lattices on which responses are reused are those that
-    `reuse_of` names; either may name `NONE`. Raises BundleError for a name that is no field.
+    `phases_of` names the fields for which all methods of finding the phase are measured, by default all fields; the
+    time of Griffin and Lim's iteration does not depend on the field. `reuse_of` names the fields for which lattices are
+    measured. Either may be `NONE`. Raises BundleError for a name that is not a field.
     """
     fields = bundle.manifest.fields
     reused = set(reuse_of)

@@ -1,4 +1,4 @@
-"""What an evaluation has measured so far, so that one that is interrupted goes on where it stopped."""
+"""Stores the errors that an evaluation has measured, so that an interrupted evaluation can be resumed."""
 
 import hashlib
 import json
@@ -14,20 +14,21 @@ import server
 import training
 
 Errors = Sequence[Mapping[str, npt.NDArray[np.float64]]]
-"""Of one pair: column by column, what is (yaw,) by metric."""
+"""The errors of one pair: for each column, errors (yaw,) by metric."""
 
 
-class KeptErrors:
-    """A line of JSON per pair, after one that says what they were made by; thread-safe.
+class StoredErrors:
+    """A file with a line of JSON per pair, after a first line with a digest of everything the errors depend on. Several
+    threads may use it.
 
-    What was made of anything else, or by other code, is not gone on with.
+    A file with another digest, or from other code, is started again.
     """
 
-    def __init__(self, path: Path, made_of: Any) -> None:
-        """`made_of` is whatever errors depend on but the code, plain values for `json.dumps`."""
+    def __init__(self, path: Path, depends_on: Any) -> None:
+        """`depends_on` is everything besides the code that decides the errors, in plain values for `json.dumps`."""
         self._path = path
         self._lock = threading.Lock()
-        key = hashlib.sha256(json.dumps([made_of, _code()]).encode()).hexdigest()
+        key = hashlib.sha256(json.dumps([depends_on, _code()]).encode()).hexdigest()
         text = path.read_text() if path.exists() else ""
         # The last line may have been interrupted.
         lines = text[: text.rfind("\n") + 1].splitlines(keepends=True)
@@ -48,12 +49,12 @@ class KeptErrors:
             file.write(json.dumps([pair, values]) + "\n")
 
     def discard(self) -> None:
-        """Where nothing is left to go on with."""
+        """Removes the file, when the evaluation is finished."""
         self._path.unlink(missing_ok=True)
 
 
 def signature(folder: Path) -> list[tuple[str, int, int]]:
-    """Name, size and time of every file in a folder: others wherever it was written to."""
+    """Name, size and modification time of each file in a folder."""
     files = sorted(path for path in folder.iterdir() if path.is_file())
     return [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
 

@@ -1,4 +1,4 @@
-"""What `path_loops` does, where there is no compiler."""
+"""The functions of `server.rendering.path_loops` in NumPy."""
 
 import numpy as np
 import numpy.typing as npt

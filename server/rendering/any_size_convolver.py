@@ -1,4 +1,4 @@
-"""The convolver in NumPy: the reference for the compiled one, and what runs where numba is not installed.
+"""The convolver for blocks that are no power of two, such as the 480 samples of an offline render, in NumPy.
 
 The same stages, windows and exchanges; a stage does the work of a window all at once when it is full.
 """
@@ -23,7 +23,7 @@ class SpectralFilter:
     spectra: tuple[Spectra, ...]
 
 
-class NumpyConvolver:
+class AnySizeConvolver:
     """See `server.rendering.convolver.Convolver`."""
 
     def __init__(

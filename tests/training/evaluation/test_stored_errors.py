@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from training.evaluation import kept_errors
+from training.evaluation import stored_errors
 from training.evaluation.evaluate import METRICS, Column, evaluate
-from training.evaluation.kept_errors import KeptErrors, signature
 from training.evaluation.run import evaluate_bundles
+from training.evaluation.stored_errors import StoredErrors, signature
 
 PAIRS, SAMPLES = 6, 2_000
 
@@ -39,9 +39,9 @@ class Source:
         return noise(index, seed=1)[turns]
 
 
-def run(held_out, path, source, made_of=("bundle",)):
-    kept = KeptErrors(path, made_of)
-    return evaluate(held_out, [Column("field", source, "baseline")], threads=1, kept=kept)
+def run(held_out, path, source, depends_on=("bundle",)):
+    stored = StoredErrors(path, depends_on)
+    return evaluate(held_out, [Column("field", source, "baseline")], threads=1, stored=stored)
 
 
 def test_what_was_interrupted_goes_on_and_comes_to_the_same(held_out, path) -> None:
@@ -54,31 +54,31 @@ def test_what_was_interrupted_goes_on_and_comes_to_the_same(held_out, path) -> N
     whole = evaluate(held_out, [Column("field", Source(), "baseline")]).of("field").errors
     for metric in METRICS:
         assert_array_equal(errors[metric.name], whole[metric.name])
-    assert len(KeptErrors(path, ("bundle",))) == PAIRS
+    assert len(StoredErrors(path, ("bundle",))) == PAIRS
 
 
 def test_of_anything_else_or_by_other_code_all_is_measured_anew(held_out, path, monkeypatch) -> None:
     run(held_out, path, Source())
-    assert len(KeptErrors(path, ("bundle",))) == PAIRS
-    assert len(KeptErrors(path, ("another bundle",))) == 0
+    assert len(StoredErrors(path, ("bundle",))) == PAIRS
+    assert len(StoredErrors(path, ("another bundle",))) == 0
     run(held_out, path, Source())
-    monkeypatch.setattr(kept_errors, "_code", lambda: "other")
-    assert len(KeptErrors(path, ("bundle",))) == 0
+    monkeypatch.setattr(stored_errors, "_code", lambda: "other")
+    assert len(StoredErrors(path, ("bundle",))) == 0
 
 
 def test_a_line_that_was_not_finished_is_measured_anew(held_out, path) -> None:
     run(held_out, path, Source())
     path.write_text(path.read_text()[:-9])
-    kept = KeptErrors(path, ("bundle",))
+    kept = StoredErrors(path, ("bundle",))
     assert len(kept) == PAIRS - 1
     assert kept.get(PAIRS - 1) is None
     run(held_out, path, Source())
-    assert len(KeptErrors(path, ("bundle",))) == PAIRS
+    assert len(StoredErrors(path, ("bundle",))) == PAIRS
 
 
 def test_missing_errors_stay_missing(path) -> None:
-    KeptErrors(path, ()).put(3, [{"t60": np.array([np.nan, 0.1])}])
-    (column,) = KeptErrors(path, ()).get(3)
+    StoredErrors(path, ()).put(3, [{"t60": np.array([np.nan, 0.1])}])
+    (column,) = StoredErrors(path, ()).get(3)
     assert_array_equal(column["t60"], [np.nan, 0.1])
 
 

@@ -1,8 +1,9 @@
-"""What a trained `naf` teaches a factorised field: levels of responses at poses that nobody measured.
+"""Distillation: a trained `naf` predicts levels of responses at unmeasured poses, as further targets for a factorised
+field.
 
-Its spectrograms have another codec than the factorised field's targets, so they are given noise for a phase,
-synthesised, and read again like any response. Phases and interaural coherence, of which a `naf` knows nothing, are not
-taught.
+Spectrograms of a `naf` have another resolution than the factorised field's targets. So they get the phase of noise, are
+synthesised, and transformed like any response. Phase and interaural coherence are not distilled, because a `naf` does
+not predict them.
 """
 
 from dataclasses import dataclass
@@ -18,12 +19,12 @@ from training.models.naf_graph import NafGraph
 from training.models.targets import flat_targets
 
 _NOISE_ITERATIONS = 60
-_BESIDE_M = 0.5
+_LARGEST_MOVE_M = 0.5
 
 
 @dataclass(frozen=True)
 class DistillationTargets:
-    """Poses (lesson, 3), yaws (lesson,) and flat targets (lesson, heads.size), whose levels alone count."""
+    """Poses (row, 3), yaws (row,) and flat targets (row, heads.size), of which only the levels are valid."""
 
     listener: npt.NDArray[np.float32]
     emitter: npt.NDArray[np.float32]
@@ -32,14 +33,15 @@ class DistillationTargets:
 
 
 @torch.no_grad()
-def lessons_of(teacher: NafLearner, cells: Cells, count: int, seed: int) -> DistillationTargets:
-    """Of poses beside those measured, within half a metre in plan where that is inside the room."""
+def distillation_targets(teacher: NafLearner, cells: Cells, count: int, seed: int) -> DistillationTargets:
+    """Targets at `count` poses near measured ones: both ends are moved by up to half a metre along x and y, where the
+    new position is inside the room."""
     rng = np.random.default_rng([seed, 9])
     responses, plan = teacher.responses, teacher.site.plan
     chosen = rng.choice(np.flatnonzero(~responses.held_out), count)
     ends = []
     for measured in (responses.listener[chosen], responses.emitter[chosen]):
-        beside = measured + rng.uniform(-_BESIDE_M, _BESIDE_M, measured.shape) * (1, 1, 0)
+        beside = measured + rng.uniform(-_LARGEST_MOVE_M, _LARGEST_MOVE_M, measured.shape) * (1, 1, 0)
         inside = np.array([bool(plan.contains(point)) for point in beside])
         ends.append(np.where(inside[:, None], beside, measured).astype(np.float32))
     listener, emitter = ends

@@ -3,6 +3,11 @@
 `stage` is a STAGE record, and layouts are as in `server.rendering.convolver_kernel`. Memory is what limits them: it is
 read in order and asked for ahead, by few streams at a time; a mix is read once for a group of sources, and sums stay in
 registers.
+
+Eight complex numbers are one vector of sixteen lanes, real parts in its first half and imaginary ones in the second, so
+that a product takes two steps: by the real parts of one factor twice, and by its imaginary parts crosswise, with
+opposed signs. Such a vector is one register with AVX-512 and two elsewhere, which is for loops alone that load more
+than they keep: two of each would not fit into the registers.
 """
 
 import numpy as np
@@ -10,19 +15,21 @@ from numba import carray
 
 from server.kernels.cache_lines import LINE_BYTES
 from server.kernels.compiled import compiled
-from server.kernels.simd import load_int, pointer, prefetch
-from server.kernels.wide_simd import (
-    add_16,
-    broadcast_16,
-    load_16,
-    load_opposed,
-    load_twice,
-    multiply_16,
-    multiply_add_16,
-    store_16,
+from server.kernels.simd import (
+    add,
+    lanes,
+    load_int,
+    multiply,
+    multiply_add,
+    pointer,
+    prefetch,
+    store,
     swap_halves,
 )
 from server.rendering.partitions import NEAR, TURNS
+
+_wide = lanes(16)
+load, broadcast, load_twice, load_opposed = _wide.load, _wide.broadcast, _wide.load_twice, _wide.load_opposed
 
 COLUMNS = TURNS + 1
 """Of a mix: windows, by their number modulo TURNS, and what the IRs that are faded from add to the one at work."""
@@ -74,14 +81,14 @@ def member_of(stage, member):
 @compiled
 def _multiply_add(total, real, opposed, filters, h):
     """The sum of eight complex numbers, and of the product of eight others and what is in a filter."""
-    taps = load_16(filters, h)
-    return multiply_add_16(opposed, swap_halves(taps), multiply_add_16(real, taps, total))
+    taps = load(filters, h)
+    return multiply_add(opposed, swap_halves(taps), multiply_add(real, taps, total))
 
 
 @compiled
 def _add_to(mix, at, sums) -> None:
     """Only sums meet the mix: added one by one to what is large already, products of many sources would lose more."""
-    store_16(mix, at, add_16(load_16(mix, at), sums))
+    store(mix, at, add(load(mix, at), sums))
 
 
 @compiled
@@ -105,7 +112,7 @@ def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
     """Add the products of the newest spectra of a group, in slot `newest` of their rings, to the mix of the window at
     work, and of the `ahead` - 1 that follow it: with the first partition of their filters, the second and so on."""
     mix, tiles, start = stage.mix, stage.size // 8, spectrum_stride(stage.size) * newest
-    zero = broadcast_16(np.float32(0))
+    zero = broadcast(np.float32(0))
     for tile in range(first, last):
         x = start + 16 * tile
         for partition in range(ahead):
@@ -129,9 +136,9 @@ def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
 def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, column, first, last, sign) -> None:
     """Add partitions `begin` to `end` of a filter, times `sign` and the spectra in the ring, to a column of the mix,
     which is that of a window `ahead` of the one whose spectrum is in slot `newest`."""
-    mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast_16(sign)
+    mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast(sign)
     spectrum = spectrum_stride(stage.size)
-    zero = broadcast_16(np.float32(0))
+    zero = broadcast(np.float32(0))
     near = min(NEAR, count)
     start = (newest + begin - ahead) % slots
     for tile in range(first, last):
@@ -141,7 +148,7 @@ def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, 
         h = filter_offset(channels, tiles, count, tile, begin)
         for partition in range(begin, end):
             x = spectrum * slot + 16 * tile
-            real, opposed = multiply_16(load_twice(ring, x), factor), multiply_16(load_opposed(ring, x + 8), factor)
+            real, opposed = multiply(load_twice(ring, x), factor), multiply(load_opposed(ring, x + 8), factor)
             left_sum = _multiply_add(left_sum, real, opposed, filters, h)
             right_sum = _multiply_add(right_sum, real, opposed, filters, h + 16 * (channels - 1))
             h += _step(near, tiles, channels, count, tile, partition)
@@ -159,7 +166,7 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
     mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
     spectrum = spectrum_stride(stage.size)
     other = 16 * COLUMNS * (channels - 1)  # from one channel to the other, which is the same if there is only one
-    zero = broadcast_16(np.float32(0))
+    zero = broadcast(np.float32(0))
     for tile in range(first, last):
         a = mix_offset(channels, tile, 0, stage.window % TURNS)
         b = mix_offset(channels, tile, 0, (stage.window + 1) % TURNS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from server.kernels import right_angle
+from server.kernels import odd_fft
 from tests.signals import noise
 
 SIZES = [64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384]
@@ -15,9 +15,9 @@ def address(array):
 
 def transform(window):
     size = window.size // 2
-    tables = right_angle.tables(size)
+    tables = odd_fft.tables(size)
     bins = np.zeros((2, size), np.float32)
-    right_angle.forward(
+    odd_fft.forward(
         address(window),
         address(window) + 4 * size,
         address(bins),
@@ -34,9 +34,9 @@ def transform(window):
 
 def second_half(bins):
     size = bins.shape[1]
-    tables = right_angle.tables(size)
+    tables = odd_fft.tables(size)
     out = np.zeros(size, np.float32)
-    right_angle.inverse(
+    odd_fft.inverse(
         address(bins),
         8,
         size,
@@ -51,7 +51,7 @@ def second_half(bins):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_bins_are_the_polynomial_at_the_roots_of_minus_i(size):
+def test_forward_evaluates_the_polynomial_at_the_roots_of_minus_i(size):
     """In some order: each expected value has a bin near it, and energies agree."""
     window = noise(1, 2 * size)
     roots = np.exp(-1j * np.pi * (0.5 + 2 * np.arange(size)) / size)
@@ -83,11 +83,11 @@ def test_products_of_bins_convolve_what_overlap_save_keeps(size):
     assert np.abs(wet - expected).max() / np.abs(expected).max() < 2e-6
 
 
-def test_silence_stays_exactly_silent():
+def test_forward_keeps_silence_exactly():
     assert not transform(np.zeros(512, np.float32)).any()
 
 
 @pytest.mark.parametrize("size", [0, 32, 96, 100])
 def test_sizes_it_cannot_have_are_refused(size):
     with pytest.raises(ValueError, match="power of two"):
-        right_angle.tables(size)
+        odd_fft.tables(size)

@@ -1,10 +1,12 @@
-"""The transform of the compiled convolver: right-angle, in place, in no particular order of bins.
+"""The transform of the compiled convolver: the odd-frequency Fourier transform of real samples, in place, in no
+particular order of bins.
 
-A window of 2 n real samples x is a polynomial modulo z^2n = -1, that is, negacyclic; at the n roots of z^n = -i it
-takes the values of the n complex numbers x[j] - i x[n + j], j < n, twisted by exp(-i pi j / 2 n) and transformed by an
-ordinary complex FFT of size n (Nussbaumer 1981; the "right-angle" convolution of Krot and Minervina 1992). The other n
-roots give the conjugates. So 2 n real samples need n complex bins, all alike: no bin is real, and nothing has to be
-untangled as after a real FFT. Overlap-save does not mind the sign with which products wrap: it drops what wrapped.
+Its bins lie halfway between those of an ordinary transform. A window of 2 n real samples x is a polynomial modulo
+z^2n = -1; at the n roots of z^n = -i it takes the values of the n complex numbers x[j] - i x[n + j], j < n, twisted by
+exp(-i pi j / 2 n) and transformed by an ordinary complex FFT of size n (Nussbaumer 1981; the "right-angle" convolution
+of Krot and Minervina 1992). The other n roots give the conjugates. So 2 n real samples need n complex bins, all alike:
+no bin is real, and nothing has to be untangled as after an ordinary FFT of real samples. Products of such bins convolve
+negacyclically: what wraps round has the other sign. Overlap-save does not mind, since it drops what wrapped.
 
 The FFT splits n = 8 m: m-point transforms in every lane (`lane_fft`), twiddles, then 8 points
 across the lanes after a transposition of eight vectors. Bins stay where that leaves them, since only products of bins
@@ -140,6 +142,27 @@ def inverse(
     """Write the second half (n,) of the window, the half overlap-save keeps, to `out`. A spectrum lies as `forward`
     leaves it; `bins` (2, n), room for it, may be the same place, and are used up."""
     vectors = size // 8
+    _invert_across_lanes(spectrum, step, imaginary, bins, size, lanes)
+    largest = first_span(vectors)
+    is_odd = 4 * largest != vectors
+    # The twiddles of a span come after those of all larger ones, six floats per butterfly.
+    table = 2 * (4 * largest - 4) + (vectors if is_odd else 0)
+    span = 1
+    while span <= largest:
+        _invert_pass(bins, size, span, passes, table)
+        span *= 4
+        table -= 6 * span
+    scale = broadcast(np.float32(-1.0 / size))
+    if is_odd:
+        _untwist_halves(bins, size, twist, passes, scale, out)
+    else:
+        for n in range(0, size, 8):
+            _untwist(load(bins, n), load(bins, size + n), n, size, twist, scale, out)
+
+
+@compiled
+def _invert_across_lanes(spectrum, step, imaginary, bins, size, lanes) -> None:
+    """Undo the eight points across the lanes, and the twiddles before them."""
     for at in range(0, size, 64):
         im, re = _load_8(spectrum, imaginary + at // 8 * step, step), _load_8(spectrum, at // 8 * step, step)
         im, re = _eight_points(im, re)  # parts swapped: the inverse
@@ -148,54 +171,57 @@ def inverse(
         re, im = _multiply_conjugate_8(re, im, cos, sin)
         _store_8(bins, at, 8, re)
         _store_8(bins, size + at, 8, im)
-    largest = first_span(vectors)
-    is_odd = 4 * largest != vectors
-    span = 1
-    while span <= largest:
-        # Before the twiddles of this span lie those of all larger ones, six floats per butterfly.
-        table = (vectors if is_odd else 0) + 2 * (4 * largest - 4 * span)
-        for j in range(span):
-            t = table + 6 * j
-            c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
-            c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
-            c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
-            group = j  # a range of such a step would divide to find its length
-            while group < vectors:
-                p0, p1 = 8 * group, 8 * (group + span)
-                p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
-                ar, ai = load(bins, p0), load(bins, size + p0)
-                yr, yi = load(bins, p1), load(bins, size + p1)
-                br, bi = multiply_add(yi, s1, multiply(yr, c1)), multiply_subtract(yr, s1, multiply(yi, c1))
-                yr, yi = load(bins, p2), load(bins, size + p2)
-                cr, ci = multiply_add(yi, s2, multiply(yr, c2)), multiply_subtract(yr, s2, multiply(yi, c2))
-                yr, yi = load(bins, p3), load(bins, size + p3)
-                dr, di = multiply_add(yi, s3, multiply(yr, c3)), multiply_subtract(yr, s3, multiply(yi, c3))
-                er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
-                gr, gi = add(br, dr), add(bi, di)
-                hr, hi = subtract(di, bi), subtract(br, dr)  # i (b - d)
-                store(bins, p0, add(er, gr))
-                store(bins, size + p0, add(ei, gi))
-                store(bins, p1, add(fr, hr))
-                store(bins, size + p1, add(fi, hi))
-                store(bins, p2, subtract(er, gr))
-                store(bins, size + p2, subtract(ei, gi))
-                store(bins, p3, subtract(fr, hr))
-                store(bins, size + p3, subtract(fi, hi))
-                group += 4 * span
-        span *= 4
-    scale = broadcast(np.float32(-1.0 / size))
-    if is_odd:
-        half = size // 2
-        for n in range(0, half, 8):
-            m = half + n
-            c, s = load_broadcast(passes, n // 4), load_broadcast(passes, n // 4 + 1)
-            ar, ai, yr, yi = load(bins, n), load(bins, size + n), load(bins, m), load(bins, size + m)
-            br, bi = multiply_add(yi, s, multiply(yr, c)), multiply_subtract(yr, s, multiply(yi, c))
-            _untwist(add(ar, br), add(ai, bi), n, size, twist, scale, out)
-            _untwist(subtract(ar, br), subtract(ai, bi), m, size, twist, scale, out)
-    else:
-        for n in range(0, size, 8):
-            _untwist(load(bins, n), load(bins, size + n), n, size, twist, scale, out)
+
+
+@compiled
+def _invert_pass(bins, size, span, passes, table) -> None:
+    """Undo a pass of radix 4, whose butterflies' points are `span` apart; `table` is where its twiddles are."""
+    vectors = size // 8
+    for j in range(span):
+        t = table + 6 * j
+        c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
+        c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
+        c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
+        group = j  # a range of such a step would divide to find its length
+        while group < vectors:
+            p0, p1 = 8 * group, 8 * (group + span)
+            p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
+            ar, ai = load(bins, p0), load(bins, size + p0)
+            br, bi = _turned_back(bins, size, p1, c1, s1)
+            cr, ci = _turned_back(bins, size, p2, c2, s2)
+            dr, di = _turned_back(bins, size, p3, c3, s3)
+            er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
+            gr, gi = add(br, dr), add(bi, di)
+            hr, hi = subtract(di, bi), subtract(br, dr)  # i (b - d)
+            store(bins, p0, add(er, gr))
+            store(bins, size + p0, add(ei, gi))
+            store(bins, p1, add(fr, hr))
+            store(bins, size + p1, add(fi, hi))
+            store(bins, p2, subtract(er, gr))
+            store(bins, size + p2, subtract(ei, gi))
+            store(bins, p3, subtract(fr, hr))
+            store(bins, size + p3, subtract(fi, hi))
+            group += 4 * span
+
+
+@compiled
+def _turned_back(bins, size, at, cos, sin):
+    """A point, multiplied by the conjugate of a twiddle."""
+    re, im = load(bins, at), load(bins, size + at)
+    return multiply_add(im, sin, multiply(re, cos)), multiply_subtract(re, sin, multiply(im, cos))
+
+
+@compiled
+def _untwist_halves(bins, size, twist, passes, scale, out) -> None:
+    """Undo the pass of radix 2, and the twist."""
+    half = size // 2
+    for n in range(0, half, 8):
+        m = half + n
+        c, s = load_broadcast(passes, n // 4), load_broadcast(passes, n // 4 + 1)
+        ar, ai = load(bins, n), load(bins, size + n)
+        br, bi = _turned_back(bins, size, m, c, s)
+        _untwist(add(ar, br), add(ai, bi), n, size, twist, scale, out)
+        _untwist(subtract(ar, br), subtract(ai, bi), m, size, twist, scale, out)
 
 
 @compiled
