@@ -41,13 +41,13 @@ from server.protocol.client_messages import (
     ListenerStart,
     MoveEmitter,
 )
+from server.rendering.hrtf import kemar
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import EmitterEffects, SharedEffects
 from server.responses.emitter_state import EmitterState
-from server.responses.full_response import kemar
 from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import CATALOGUE, EffectName, Overrides

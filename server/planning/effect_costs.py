@@ -22,12 +22,12 @@ from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.planning.planner import Cost, Costs
 from server.rendering.convolver import FloatArray
+from server.rendering.hrtf import kemar
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import EmitterEffects
 from server.responses.emitter_state import EmitterState
-from server.responses.full_response import kemar
 from server.responses.ir_request import composed_irs
 from server.responses.radiation import departure_gain_db
 from server.scene.effects import EffectName
