@@ -355,7 +355,7 @@ class _Walk:
         named = {
             name: emitter
             for name, emitter in self._emitters.items()
-            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_folding)
+            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_baking)
         }
         if self._effects.awaits_ears:
             self.renderer.set_channels(self._effects.channels)

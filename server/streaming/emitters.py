@@ -7,12 +7,13 @@ from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose, Vector3
 from server.core.errors import RequestError
 from server.field.lattice import Neighbourhood
+from server.planning.catalogue import EVERYTHING
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import AddEmitter, MoveEmitter
 from server.protocol.server_messages import LiveStatus
 from server.rendering.convolver import PartitionedIr
 from server.rendering.sources import LiveSource
-from server.responses.effect_flags import ALL_ON, EmitterEffects
+from server.responses.effect_flags import EmitterEffects
 
 _LIVE_LEAD_BLOCKS = 2
 _LIVE_QUEUE_S = 0.5
@@ -28,7 +29,7 @@ class Emitter:
     """How it radiates, whether or not that is heard."""
     live: "LiveInput | None" = None
     gain_db: float = 0.0
-    effects: EmitterEffects = ALL_ON
+    effects: EmitterEffects = EVERYTHING
     is_decided: bool = True
     """Whether `effects` are those called for, or nobody has told yet."""
     is_announced: bool = False
@@ -42,9 +43,9 @@ class Emitter:
     found_for: Hashable | None = None
     around: Neighbourhood | None = None
     """Listeners who hear that response for certain, as long as everything else is as it was `found_for`."""
-    unfolded: PartitionedIr | None = None
+    ir_without_direct: PartitionedIr | None = None
     """The newest impulse response in effect that leaves the direct sound to the renderer."""
-    is_folded: bool = False
+    is_baked: bool = False
     """Whether the response in effect holds the direct sound."""
     token: int | None = None
     """Pose id of the newest impulse response handed to the renderer; None before the first."""
@@ -65,9 +66,11 @@ class Emitter:
         return self.live is not None
 
     @property
-    def wants_folding(self) -> bool:
+    def wants_baking(self) -> bool:
         """Whether the direct sound is to become part of a response that is otherwise up to date."""
-        return self.effects.bakes_direct and self.unfolded is not None and not (self.is_folded or self.is_outdated)
+        return (
+            self.effects.bakes_direct and self.ir_without_direct is not None and not (self.is_baked or self.is_outdated)
+        )
 
     @property
     def position(self) -> Vector3:

@@ -232,7 +232,7 @@ class ResponseScheduler:
             return False
         if emitter.is_outdated and emitter.identity is not None:
             emitter.is_outdated = not self._still_hears(emitter, listener)
-        return emitter.is_outdated or emitter.wants_folding
+        return emitter.is_outdated or emitter.wants_baking
 
     def _still_hears(self, emitter: Emitter, listener: Pose) -> bool:
         """Whether what is heard of an emitter is its response at the pose, too: at once where that has hardly changed

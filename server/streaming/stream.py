@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from server.core.durations import DurationHistogram
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.plan import Plan
 from server.planning.planned_effects import SHARE_OF_ALL as PLAN_SHARE
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock
@@ -27,7 +28,6 @@ from server.protocol.server_messages import Durations, Error, LevelReason, Serve
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, IrResponse, compute_irs
 from server.runtime.workers import Workers
-from server.scene.plan import Plan
 from server.streaming.load import Ladder, LoadSample, Offer, ir_interval_s
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s

@@ -4,9 +4,9 @@ import time
 
 import pytest
 
+from server.planning.plan import Plan
 from server.planning.planned_effects import SHARE_OF_ALL
 from server.protocol.client_messages import AddEmitter, ListenerPose
-from server.scene.plan import Plan
 from server.streaming.plan_audit import Regret
 from tests.engine_stage import BLOCK_S, Stage
 
