@@ -7,10 +7,10 @@ WORKDIR /source
 # An environment without pip: the outer pip installs into it, and the image carries no installer.
 RUN python -m venv --without-pip /opt/nafir
 # Dependencies come before the code, so that a change of code reuses their layer.
-COPY pyproject.toml ./
-RUN python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" > requirements.txt \
-    && python -m pip --python /opt/nafir/bin/python install --no-cache-dir --requirement requirements.txt
-COPY LICENSE README.md ./
+# `make lock` writes the file of exact versions and of digests that each download has to have.
+COPY requirements.lock ./
+RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --require-hashes --requirement requirements.lock
+COPY LICENSE README.md pyproject.toml ./
 COPY server server
 # Without `training` beside it the package is the server alone, so its other command goes.
 RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-deps . \

@@ -30,7 +30,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
-.PHONY: mutants attacks docs docs-serve
+.PHONY: mutants attacks docs docs-serve results lock
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
 
 help: ## show this list
@@ -99,6 +99,15 @@ container-test: ## build the container image and try it read-only (needs buildah
 
 predictions: $(VENV)/installed-training ## what plans predict of effects beside what simulation finds, in ten rooms of extremes: some minutes
 	$(BIN)/python -m training.trials.rooms_tried
+
+# Of this machine's Python, and without naming where packages come from.
+lock: $(VENV)/installed-dev ## take newer versions into requirements.lock, the base install of the image: minutes
+	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --upgrade --generate-hashes --strip-extras \
+		--no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options \
+		--output-file requirements.lock pyproject.toml
+
+results: $(VENV)/installed-dev ## write the tables and plots of docs/results anew from benchmarks/*/*.json
+	$(BIN)/python -m benchmarks.pages
 
 clean: ## remove .venv and caches; keeps runs/
 	rm -rf $(VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,11 +1,11 @@
-"""Send sound to a scene as it is made, and keep what comes back.
+"""Send live sound to a scene, and store the sound that comes back.
 
     pip install numpy soundfile soxr websockets
     python live.py --input voice.wav --url ws://127.0.0.1:8000/v1/stream -o wet.wav
 
-Connects to a Nafir server, puts a live emitter where the scene suggests, and sends it a recording block by block, as a
-microphone would; without one, claps. What comes back, the recording as heard from the scene's starting place, is
-written to a file.
+Connects to a Nafir server, adds a live emitter where the scene suggests, and sends it a recording block by block, as a
+microphone would (claps, if there is no recording). The sound that comes back is the recording as heard from the scene's
+starting place. It is written to a file.
 """
 
 import argparse
@@ -42,7 +42,7 @@ def effect(text: str) -> tuple[str, bool]:
 
 
 def read(path: Path | None, sample_rate: int) -> np.ndarray:
-    """(n,) at `sample_rate`: a recording, or two seconds of claps."""
+    """(n,) samples at `sample_rate`: a recording, or two seconds of claps."""
     if path is None:
         claps = np.random.default_rng(0).standard_normal((4, sample_rate // 2)) / 8
         return (claps * np.exp(-np.arange(sample_rate // 2) / (0.01 * sample_rate))).ravel().astype(np.float32)
@@ -52,13 +52,13 @@ def read(path: Path | None, sample_rate: int) -> np.ndarray:
         raise SystemExit(f"{path}: {exc.error_string}") from exc
     mono = samples.mean(axis=1)
     energy = np.sum(samples**2, axis=0)
-    if samples.shape[1] * np.sum(mono**2) < 0.4 * energy.mean():  # of opposite phase, channels would cancel each other
+    if samples.shape[1] * np.sum(mono**2) < 0.4 * energy.mean():  # channels of opposite phase would cancel
         mono = samples[:, np.argmax(energy)]
     return soxr.resample(mono, rate, sample_rate)
 
 
 def say(change: dict, sample_rate: int) -> None:
-    """What a `level_changed` tells."""
+    """Prints a `level_changed`."""
     at_s, rate_hz = change["sample_clock"] / sample_rate, change["ir_rate_hz"]
     pace = "with every pose" if rate_hz is None else f"at most {rate_hz:g} times a second"
     why = {"chosen": "as chosen", "load": "the server is under load", "recovered": "the server has recovered"}
@@ -66,7 +66,7 @@ def say(change: dict, sample_rate: int) -> None:
 
 
 async def perform(arguments: argparse.Namespace) -> None:
-    # Compression off: audio does not shrink, and trying takes time.
+    # Without compression, which takes time and does not make audio smaller.
     async with connect(arguments.url, compression=None, max_size=None) as socket:
         hello = {"protocol": PROTOCOL, "scene": arguments.scene, "block_size": BLOCK_SIZE, "encoding": "f32"}
         wishes = {"level": arguments.level, "effects": dict(arguments.effect)}
@@ -81,7 +81,7 @@ async def perform(arguments: argparse.Namespace) -> None:
         emitter = {"id": EMITTER, "live": True, "position": welcome["scene"]["emitter"]["position"]}
         await socket.send(json.dumps({"type": "add_emitter", **emitter}))
 
-        # Until the last of it has been played and rung out.
+        # Runs until the end of the recording has been played and has decayed.
         length = dry.size + arguments.ahead * BLOCK_SIZE + welcome["ir_samples"] + rate // 2
         wet: dict[int, np.ndarray] = {}
         start, sent, state = None, 0, None
@@ -89,14 +89,14 @@ async def perform(arguments: argparse.Namespace) -> None:
             message = await socket.recv()
             if isinstance(message, bytes):
                 if message[:1] != b"\x01":
-                    continue  # no block, but a kind that a newer server knows
+                    continue  # not a block, but a kind of message from a newer server
                 _, _, channels, sequence, clock, _, _, frames = WET.unpack_from(message)
                 if sequence % 4 == 3:
                     await socket.send(json.dumps({"type": "acknowledge", "sequence": sequence}))
                 if start is None:
                     continue
                 wet[clock] = np.frombuffer(message, "<f4", offset=WET.size).reshape(frames, channels)
-                # One block up for each that comes down: the server's clock is the one that counts.
+                # Sends one block for each that it receives, because the server's clock counts.
                 due = (clock - start) // BLOCK_SIZE + 1 + arguments.ahead
                 for block in dry[sent:due]:
                     await socket.send(dry_block(sent, block))
@@ -124,7 +124,7 @@ async def perform(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Send sound to a scene as it is made, and keep what comes back.")
+    parser = argparse.ArgumentParser(description="Send live sound to a scene, and store the sound that comes back.")
     parser.add_argument("--url", default="ws://127.0.0.1:8000/v1/stream")
     parser.add_argument("--scene", default="apartment")
     parser.add_argument("--level", default="auto", help="a quality level of GET /v1/scenes/SCENE/frontier")
@@ -138,7 +138,7 @@ def main() -> None:
     )
     parser.add_argument("--input", type=Path, help="audio file to send (default: claps)")
     parser.add_argument(
-        "--ahead", type=int, default=4, help="blocks sent ahead: more survives a worse network, fewer are heard sooner"
+        "--ahead", type=int, default=4, help="blocks sent ahead: more for a worse network, fewer to hear them sooner"
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("wet.wav"))
     arguments = parser.parse_args()

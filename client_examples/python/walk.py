@@ -1,13 +1,13 @@
-"""Walk through a scene and keep what was heard.
+"""Walk through a scene and store the sound.
 
     pip install numpy soundfile websockets
     python walk.py --url ws://127.0.0.1:8000/v1/stream -o heard.wav
 
-Connects to a Nafir server, puts a clip where the scene suggests, walks from the scene's starting place through its
-openings towards the clip while looking around, and writes two files: the sound as it arrived, and the path as it was
-heard: every pose with the sample from which on the direct sound was of it, and the one from which on the reverberation
-was, which follows a little later and skips poses, and at which quality level. Given to `nafir render`, that path makes
-the same sound again, sample for sample.
+Connects to a Nafir server, plays a clip where the scene suggests, and walks from the scene's starting place through its
+openings towards the clip while looking around. It writes two files: the sound as it arrived, and the path as it was
+heard. For each pose, the path has the sample from which on the direct sound was heard from it, the sample for the
+reverberation, which follows later and skips poses, and the quality level. `nafir render` makes the same sound from that
+path, to the sample.
 """
 
 import argparse
@@ -45,17 +45,17 @@ EFFECTS = [
     "per_source_tail",
     "head_rotation",
 ]
-"""All of them, so that an offline render is the same sample for sample; a game leaves them to the server's plan."""
+"""All effects are on, so that an offline render has the same samples; a game leaves them to the server's plan."""
 
 
 def as_float32(numbers: tuple[float, ...]) -> tuple[float, ...]:
-    """What the wire carries, so that the path file says exactly what the server was told."""
+    """Rounds numbers as the wire format does, so that the path file has exactly what the server got."""
     return tuple(float(np.float32(number)) for number in numbers)
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Metres, and a unit quaternion (x, y, z, w); the identity looks along +x."""
+    """A position in metres, and a unit quaternion (x, y, z, w); the identity looks along +x."""
 
     position: tuple[float, ...]
     orientation: tuple[float, ...]
@@ -69,7 +69,7 @@ class Pose:
 
 
 class Walk:
-    """A walk along straight lines between waypoints at constant speed, over in `duration_s`."""
+    """A walk along straight lines between waypoints, at constant speed, which takes `duration_s`."""
 
     def __init__(self, waypoints: list[tuple[float, float, float]], duration_s: float) -> None:
         self.duration_s = duration_s
@@ -78,7 +78,7 @@ class Walk:
 
     @classmethod
     def through(cls, scene: dict, duration_s: float) -> "Walk":
-        """From the scene's starting place by every opening to a metre before its emitter."""
+        """From the scene's starting place through every opening, to a metre before the emitter."""
         start, goal = scene["listener"]["position"], np.array(scene["emitter"]["position"])
         doors = [
             [(opening["start"][axis] + opening["end"][axis]) / 2 for axis in (0, 1)] + [start[2]]
@@ -89,7 +89,7 @@ class Walk:
         return cls([tuple(point) for point in (start, *doors, stop.tolist())], duration_s)
 
     def pose_at(self, time_s: float) -> Pose:
-        """Looks where it goes, and 40 degrees to either side of it, once every four seconds."""
+        """The listener looks ahead, and up to 40 degrees to either side, once every four seconds."""
         walked = np.clip(time_s / self.duration_s, 0, 1) * self._steps.sum()
         ends = np.cumsum(self._steps)
         leg = min(int(np.searchsorted(ends, walked)), len(ends) - 1)
@@ -102,18 +102,18 @@ class Walk:
 
 @dataclass
 class Recording:
-    """Blocks by sample clock, and from which sample on each pose was heard, and each quality level."""
+    """Blocks by sample clock, and the samples from which on each pose and each quality level was heard."""
 
     sample_rate: int
     levels: dict[int, str]
-    """Quality level by first sample."""
+    """Quality level by its first sample."""
     start: int | None = None
-    """Where the clip begins."""
+    """The sample at which the clip begins."""
     blocks: list[tuple[int, np.ndarray]] = field(default_factory=list)
     direct: dict[int, int] = field(default_factory=dict)
-    """First sample by pose id."""
+    """First sample of the direct sound by pose id."""
     reverberation: dict[int, int] = field(default_factory=dict)
-    """Pose id by first sample."""
+    """Pose id by the first sample of its reverberation."""
     late: int = 0
 
     @property
@@ -121,7 +121,7 @@ class Recording:
         return 0 if self.start is None or not self.blocks else self.blocks[-1][0] + BLOCK_SIZE - self.start
 
     def add(self, data: bytes) -> tuple[int, int, int]:
-        """Keep a block; its sequence number and pose ids, of the direct sound and of the reverberation."""
+        """Stores a block. Returns its sequence number, and the pose ids of its direct sound and its reverberation."""
         _, flags, channels, sequence, clock, pose, reverberation_pose, frames = BLOCK.unpack_from(data)
         self.blocks.append((clock, np.frombuffer(data, "<f4", offset=BLOCK.size).reshape(frames, channels)))
         self.late += bool(flags & 2)
@@ -132,7 +132,7 @@ class Recording:
         return sequence, pose, reverberation_pose
 
     def samples(self) -> np.ndarray:
-        """(frame, channel) from sample 0 on, with silence where the server skipped."""
+        """(frame, channel) samples from sample 0 on, with silence where the server skipped blocks."""
         last, block = self.blocks[-1]
         samples = np.zeros((last + len(block), block.shape[1]), np.float32)
         for sample, block in self.blocks:
@@ -140,14 +140,14 @@ class Recording:
         return samples
 
     def change_level(self, level: str, sample: int) -> None:
-        """What is heard from a sample on."""
-        if level != next(reversed(self.levels.values())):  # or else only how often responses come has changed
+        """Records the level that is heard from a sample on."""
+        if level != next(reversed(self.levels.values())):  # otherwise only the rate of responses has changed
             self.levels[sample] = level
 
     def path(self) -> list[tuple[int, int, int | str, str]]:
-        """Pose id, sample of the direct sound, and sample and level of the reverberation or nothing, by rising sample.
+        """Pose id, sample of the direct sound, and sample and level of the reverberation (or empty), in rising order.
 
-        A pose whose reverberation was heard at two levels is there twice.
+        A pose whose reverberation was heard at two levels has two rows.
         """
         heard: dict[int, list[tuple[int, str]]] = {}
         pose, level = None, ""
@@ -157,15 +157,15 @@ class Recording:
                 heard.setdefault(pose, []).append((sample, level))
         rows: list[tuple[int, int, int | str, str]] = []
         for pose in sorted(self.direct.keys() | heard.keys()):
-            # A pose overtaken by a newer one within a block was never heard directly: written down with that one,
-            # which comes later and counts.
+            # A pose that a newer one replaced within a block was never heard directly. It gets the sample of the newer
+            # one, whose row comes later and counts.
             sample = self.direct.get(pose, min(at for newer, at in self.direct.items() if newer >= pose))
             rows += [(pose, sample, *reverberation) for reverberation in heard.get(pose, [("", "")])]
         return rows
 
 
 def say(change: dict, sample_rate: int) -> None:
-    """What a `level_changed` tells."""
+    """Prints a `level_changed`."""
     at_s, rate_hz = change["sample_clock"] / sample_rate, change["ir_rate_hz"]
     pace = "with every pose" if rate_hz is None else f"at most {rate_hz:g} times a second"
     why = {"chosen": "as chosen", "load": "the server is under load", "recovered": "the server has recovered"}
@@ -182,11 +182,11 @@ async def send_poses(socket: ClientConnection, walk: Walk, poses: dict[int, Pose
         try:
             await socket.send(poses[pose_id].to_bytes(pose_id))
         except ConnectionClosed:
-            return  # whoever listens hears of it too, and says so
+            return  # the receiving task sees this too, and reports it
 
 
 async def listen(arguments: argparse.Namespace) -> None:
-    # Compression off: audio does not shrink, and trying takes time.
+    # Without compression, which takes time and does not make audio smaller.
     async with connect(arguments.url, compression=None, max_size=None) as socket:
         hello = {
             "type": "hello",
@@ -205,7 +205,7 @@ async def listen(arguments: argparse.Namespace) -> None:
         scene = welcome["scene"]
         walk = Walk.through(scene, arguments.seconds)
         recording = Recording(welcome["sample_rate"], {0: welcome["level"]})
-        # Before the clip, so that it begins with this pose and not with the scene's own.
+        # The pose is sent before the clip is added, so that the clip begins with this pose and not with the scene's.
         poses = {1: walk.pose_at(0)}
         await socket.send(poses[1].to_bytes(1))
         emitter = {"id": "clip", "clip": arguments.clip, "position": scene["emitter"]["position"]}
@@ -219,7 +219,7 @@ async def listen(arguments: argparse.Namespace) -> None:
             message = await socket.recv()
             if isinstance(message, bytes):
                 if message[:1] != b"\x01":
-                    continue  # no block, but a kind that a newer server knows
+                    continue  # not a block, but a kind of message from a newer server
                 sequence, pose, reverberation_pose = recording.add(message)
                 direct_s.setdefault(pose, time.monotonic())
                 reverberation_s.setdefault(reverberation_pose, time.monotonic())
@@ -266,7 +266,7 @@ def write(arguments: argparse.Namespace, recording: Recording, poses: dict[int, 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Walk through a scene and keep what was heard.")
+    parser = argparse.ArgumentParser(description="Walk through a scene and store the sound.")
     parser.add_argument("--url", default="ws://127.0.0.1:8000/v1/stream")
     parser.add_argument("--scene", default="apartment")
     parser.add_argument("--clip", default="woman-reading", help="one of GET /v1/clips")

@@ -9,6 +9,7 @@ import typer
 
 from reference_text import code, default_text, number, paragraphs, sentence, table
 
+_OF_THE_SHELL = ("install_completion", "show_completion")
 _DEFAULT = re.compile(r" ?\[default: (.*)\]$")
 
 
@@ -27,7 +28,8 @@ def _walk(path: str, command: Any) -> Iterator[tuple[str, Any]]:
 def _described(path: str, command: Any) -> str:
     heading = f"{'##' if ' ' not in path else '###'} `{path}`\n\n{paragraphs(command.help)}\n"
     if hasattr(command, "commands"):
-        return heading
+        rows = [_row(each) for each in command.params if each.name not in {"help", *_OF_THE_SHELL}]
+        return heading + ("\n" + table(["parameter", "default", "meaning"], rows) if rows else "")
     arguments = [each for each in command.params if each.param_type_name == "argument"]
     usage = " ".join([path, *(_place(each) for each in arguments), "[OPTIONS]"])
     rows = [_row(each) for each in command.params if each.name != "help"]

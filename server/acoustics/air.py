@@ -1,4 +1,4 @@
-"""What air takes from sound on its way: atmospheric absorption of pure tones by ISO 9613-1:1993."""
+"""Absorption of sound by air: pure tones by ISO 9613-1:1993."""
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,8 @@ def absorption_db_per_m(
 ) -> npt.NDArray[np.float64]:
     """(...) dB that a pure tone loses per metre; ISO 9613-1 equations (3) to (5), humidity by (B.1) to (B.3).
 
-    `relative_humidity` is a share from 0 to 1. Stated by the standard to 10 % from 50 Hz to 10 kHz and -20 to 50 C;
-    finite beyond. Raises ValueError for air that cannot be.
+    `relative_humidity` is a share from 0 to 1. The standard states an accuracy of 10 % from 50 Hz to 10 kHz and from
+    -20 to 50 C; beyond that the result is still finite. Raises ValueError for impossible air.
     """
     if not 0 <= relative_humidity <= 1:
         raise ValueError("relative humidity must be a share from 0 to 1")
@@ -30,7 +30,7 @@ def absorption_db_per_m(
     pressure = pressure_kpa / _REFERENCE_PRESSURE_KPA
     warmth = kelvin / _REFERENCE_KELVIN
     saturation = 10 ** (4.6151 - 6.8346 * (_TRIPLE_POINT_KELVIN / kelvin) ** 1.261)
-    # Molar concentration of water vapour, per cent; beyond boiling the formula would promise more than all of it.
+    # Molar concentration of water vapour, per cent; above the boiling point the formula would exceed 100.
     vapour = min(100.0, 100 * relative_humidity * saturation / pressure)
     oxygen_hz = pressure * (24 + 4.04e4 * vapour * (0.02 + vapour) / (0.391 + vapour))
     nitrogen_hz = pressure / warmth**0.5 * (9 + 280 * vapour * np.exp(-4.170 * (warmth ** (-1 / 3) - 1)))

@@ -13,13 +13,13 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Threshold:
-    """One JND of a metric of `server.acoustics.metrics`, in that metric's unit; of EDT, percent of the reference."""
+    """One JND of a metric of `server.acoustics.metrics`, in the metric's unit; for EDT, in percent of the reference."""
 
     amount: float
     source: str
 
 
-# Where sources give a range, its strict end.
+# If a source gives a range, this is its strict end.
 THRESHOLDS: Mapping[str, Threshold] = {
     "t60": Threshold(5.0, "ISO 3382-1:2009, table A.1 (for EDT, of which T60 is the late counterpart)"),
     "edt": Threshold(5.0, "ISO 3382-1:2009, table A.1"),
@@ -31,9 +31,9 @@ THRESHOLDS: Mapping[str, Threshold] = {
 
 
 def in_jnd(errors: Mapping[str, _Floats], reference: RoomParameters) -> dict[str, _Floats]:
-    """Errors `(...)` by metric, as `server.acoustics.metrics.parameter_errors` gives them, in JND.
+    """Convert errors `(...)` by metric, from `server.acoustics.metrics.parameter_errors`, to JND.
 
-    Metrics without a threshold are left out; NaN stays NaN.
+    Metrics without a threshold are left out. NaN stays NaN.
     """
     audible = {name: errors[name] / threshold.amount for name, threshold in THRESHOLDS.items() if name in errors}
     if "edt" in audible:
@@ -50,18 +50,18 @@ JND_THRESHOLDS: Mapping[str, Threshold] = {
     "pitch": Threshold(0.2, "Wier, Jesteadt and Green, J. Acoust. Soc. Am. 61 (1977): 0.2 % about 1 kHz"),
     "onset": Threshold(2.0, "Hirsh, J. Acoust. Soc. Am. 31 (1959): 2 ms until two onsets are heard apart"),
 }
-"""Thresholds of everything that leaving out an effect can change. Pitch is in percent, onset in ms, ITD in us."""
+"""Thresholds of every parameter that an effect can change. Pitch is in percent, onset in ms, ITD in us."""
 
-# A ratio of energies is heard best about even shares. From there on the JND grows by e every 8 dB, which takes it from
-# 2 to 7 dB within 10 dB: Larsen et al. (2008) found 2 to 3 dB at 0 and 10 dB and 6 to 9 dB at -10 and 20 dB. So it is a
-# finite number of JND to where one of the two is absent.
+# An energy ratio is heard best when both parts are about equal. Outside that range the JND grows by a factor of e every
+# 8 dB, from 2 to 7 dB within 10 dB: Larsen et al. (2008) found 2 to 3 dB at 0 and 10 dB and 6 to 9 dB at -10 and 20 dB.
+# So even a ratio with one part absent is a finite number of JND away.
 _GROWTH_DB = 8.0
 _EVEN_DB: Mapping[str, tuple[float, float]] = {"drr": (0.0, 10.0), "c50": (-10.0, 10.0)}
 
 
 def ratio_in_jnd(name: str, ratio_db: npt.ArrayLike) -> _Floats:
-    """(...) DRR or C50 on a scale whose unit is one JND wherever one is; of two ratios, how far apart they are on it is
-    how different they are heard to be. -inf and inf have places."""
+    """Map DRR or C50 (...) to a scale on which one unit is one JND at every ratio. The audible difference of two ratios
+    is their distance on this scale. -inf and inf have finite values."""
     low, high = _EVEN_DB[name]
     ratio = np.asarray(ratio_db, dtype=np.float64)
     beyond = _GROWTH_DB * (np.exp((np.minimum(ratio, low) - low) / _GROWTH_DB) - 1)

@@ -1,4 +1,4 @@
-"""Cells: runs of consecutive frames, or frequency bins, that one number stands for."""
+"""Cells: runs of consecutive frames or frequency bins, each represented by one value."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 @dataclass(frozen=True)
 class Axis:
-    """A partition of `edges[-1] - edges[0]` consecutive steps into cells."""
+    """A partition of consecutive steps into cells. `edges` holds the first step of each cell and, last, the end."""
 
     edges: npt.NDArray[np.int64]
 
@@ -21,13 +21,14 @@ class Axis:
         return np.diff(self.edges)
 
     def pool(self) -> npt.NDArray[np.float32]:
-        """(step, cell) averaging matrix, steps counted from the first edge."""
+        """(step, cell) matrix that averages steps into cells; steps count from the first edge."""
         step = np.arange(self.edges[0], self.edges[-1])[:, None]
         inside = (step >= self.edges[:-1]) & (step < self.edges[1:])
         return (inside / self.widths).astype(np.float32)
 
     def spread(self) -> npt.NDArray[np.float32]:
-        """(cell, step) linear interpolation between cell centres, constant beyond the outermost."""
+        """(cell, step) matrix that interpolates linearly between cell centres; constant beyond the outermost
+        centres."""
         centres = (self.edges[:-1] + self.edges[1:] - 1) / 2
         steps = np.arange(self.edges[0], self.edges[-1])
         later = np.clip(np.searchsorted(centres, steps), min(1, self.cells - 1), self.cells - 1)

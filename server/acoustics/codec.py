@@ -1,11 +1,11 @@
-"""Impulse responses to log-magnitude and instantaneous frequency, and back.
+"""Conversion of impulse responses to log-magnitude and instantaneous frequency, and back.
 
-Axes: (..., frequency, frame) for spectrograms, (..., sample) for signals. The transform is that of
-`scipy.signal.ShortTimeFFT` with a periodic Hann window, to the bit, without the half second that its import takes;
-frame 0 is the first that touches the signal.
+Axes: (..., frequency, frame) for spectrograms, (..., sample) for signals. The transform equals that of
+`scipy.signal.ShortTimeFFT` with a periodic Hann window, to the bit, but without that module's import time of half a
+second. Frame 0 is the first whose window touches the signal.
 
-Instantaneous frequency is the phase advance from one frame to the next *less* that of the bin's centre frequency,
-wrapped to [-pi, pi): without the subtraction every fourth bin would sit on the branch cut (hop = n_fft / 4). Frame 0
+Instantaneous frequency is the phase advance from one frame to the next *minus* that of the bin's centre frequency,
+wrapped to [-pi, pi). Without the subtraction every fourth bin would lie on the branch cut (hop = n_fft / 4). Frame 0
 holds the absolute phase.
 """
 
@@ -21,8 +21,8 @@ Array = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Codec:
-    """`samples` is the length of the signals coded; `log_floor` keeps silence finite: magnitudes are stored as
-    log(|S| + log_floor)."""
+    """Parameters of the transform. `samples` is the length of the signals. Magnitudes are stored as
+    log(|S| + log_floor), so that silence is finite."""
 
     sample_rate: int
     n_fft: int
@@ -36,7 +36,7 @@ class Codec:
 
     @property
     def frames(self) -> int:
-        # The last window begins before the signal's last sample; its own first sample is zero.
+        # The last window begins before the signal's last sample, since a window's first sample is zero.
         reached = -(-(self.samples - 1 + self.n_fft // 2) // self.hop)
         return max(reached, self.samples // self.hop + 1) - self._first_frame
 
@@ -58,13 +58,13 @@ class Codec:
 
     @cached_property
     def window(self) -> npt.NDArray[np.float64]:
-        """(n_fft,)"""
+        """(n_fft,) periodic Hann window."""
         return (0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, self.n_fft + 1)))[:-1]
 
     @cached_property
     def dual_window(self) -> npt.NDArray[np.float64]:
-        """(n_fft,) with which slices are weighted before they are added up again: the canonical dual (Groechenig,
-        Foundations of Time-Frequency Analysis, 2001, 7.6)."""
+        """(n_fft,) synthesis window: the canonical dual (Groechenig, Foundations of Time-Frequency Analysis, 2001,
+        7.6)."""
         power = self.window**2
         overlapped = power.copy()
         for shift in range(self.hop, self.n_fft, self.hop):
@@ -87,8 +87,8 @@ class Codec:
         signal = np.asarray(signal)
         lead, frames = self.frame_lead_samples, self.frames
         padded = np.zeros((*signal.shape[:-1], (frames - 1) * self.hop + self.n_fft), signal.dtype)
-        heard = min(signal.shape[-1], padded.shape[-1] - lead)
-        padded[..., lead : lead + heard] = signal[..., :heard]
+        used = min(signal.shape[-1], padded.shape[-1] - lead)
+        padded[..., lead : lead + used] = signal[..., :used]
         spectrogram = np.empty((*signal.shape[:-1], self.bins, frames), np.complex128)
         for frame in range(frames):
             start = frame * self.hop
@@ -96,9 +96,11 @@ class Codec:
         return spectrogram
 
     def log_magnitude(self, spectrogram: npt.NDArray[np.inexact]) -> npt.NDArray[np.float64]:
+        # guard: silence has a logarithm
         return np.asarray(np.log(np.abs(spectrogram).astype(np.float64) + self.log_floor))
 
     def magnitude(self, log_magnitude: Array) -> Array:
+        # guard: beneath the floor is silence
         return np.maximum(np.exp(log_magnitude) - self.log_floor, 0)
 
     def encode(self, signal: Array) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -112,22 +114,26 @@ class Codec:
         return self.synthesise(self.magnitude(log_magnitude) * np.exp(1j * phase))
 
     def instantaneous_frequency(self, phase: Array) -> npt.NDArray[np.float64]:
-        """Demodulated, wrapped phase advance per frame of (..., frequency, frame) phases."""
+        """Phase advance per frame of phases (..., frequency, frame), demodulated and wrapped."""
+        # guard: advances are demodulated
         advance = np.diff(phase, axis=-1) - self.nominal_advance
+        # guard: advances are wrapped to one turn
         wrapped = (advance + np.pi) % (2 * np.pi) - np.pi
         return np.concatenate([phase[..., :1], wrapped], axis=-1)
 
     def integrate(self, instantaneous_frequency: Array) -> Array:
         """Phase from its advances: the inverse of `instantaneous_frequency`, up to whole turns."""
         frames = np.arange(instantaneous_frequency.shape[-1])
+        # guard: phase is summed in double precision
         phase = np.cumsum(instantaneous_frequency, axis=-1, dtype=np.float64) + self.nominal_advance * frames
         # Whole turns are dropped before they can eat the mantissa of a float32.
+        # guard: whole turns come off before single precision
         return (phase % (2 * np.pi)).astype(instantaneous_frequency.dtype)
 
     def synthesise(self, spectrogram: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.floating]:
-        """Complex (..., frequency, frame) to (..., sample), of all frames or of the first few and what they reach.
+        """Complex (..., frequency, frame) to (..., sample). Fewer frames than `frames` give a shorter signal.
 
-        Equals `ShortTimeFFT.istft`, with all frames transformed at once; the precision is that of the input.
+        Equals `ShortTimeFFT.istft`, but transforms all frames at once. The precision is that of the input.
         """
         slices = irfft(np.swapaxes(spectrogram, -1, -2), self.n_fft, axis=-1)
         slices *= self.dual_window.astype(slices.dtype)

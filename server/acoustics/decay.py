@@ -1,11 +1,11 @@
-"""Energy decay of an impulse response: backward integration that knows where the measurement ends.
+"""Energy decay of an impulse response, by backward integration up to the end of the measurable decay.
 
 Axes: impulse responses are `(..., sample)`; every leading axis is a batch. Energies are linear, float64.
 
-The energy decay curve E(t) is the energy still to arrive at t (Schroeder, J. Acoust. Soc. Am. 37, 409, 1965;
-ISO 3382-1:2009, 5.3.3). Two things spoil its end: background noise lifts it, truncation bends it down. Both are found
-from powers in 10 ms windows by iterating between a noise estimate and a line through the late decay (Lundeby et al.,
-Acustica 81, 344, 1995). The integral stops where that line meets the noise; the noise power is subtracted (Chu, J.
+The energy decay curve E(t) is the energy that arrives after t (Schroeder, J. Acoust. Soc. Am. 37, 409, 1965;
+ISO 3382-1:2009, 5.3.3). Background noise lifts its end, and truncation bends it down. Both are estimated from powers in
+10 ms windows, by iterating between a noise estimate and a line through the late decay (Lundeby et al., Acustica 81,
+344, 1995). The integral stops where that line meets the noise; the noise power is subtracted (Chu, J.
 Acoust. Soc. Am. 63, 1444, 1978) and the energy of the exponential beyond the end is added, the combination that Guski
 and Vorlander (Acta Acust. 100, 320, 2014) found least biased.
 """
@@ -32,11 +32,13 @@ _ITERATIONS = 5
 
 @dataclass(frozen=True)
 class EnergyDecay:
-    """energy: (..., sample), never rising. onset: (...), samples; -1 where the response is silent.
+    """The energy decay curves of a batch of responses.
 
-    lowest_db: (...), level relative to the onset down to which the curve may be evaluated: 10 dB above the noise, or
-    the end of the response where no noise is seen. Where no decay can be told from noise, all of it may be noise at the
-    level that the response ends with; 0 for noise throughout.
+    energy: (..., sample), never rising. onset: (...), in samples; -1 where the response is silent.
+
+    lowest_db: (...), the level relative to the onset down to which the curve may be evaluated. That is 10 dB above the
+    noise, or the end of the response if there is no noise. If no decay can be told from noise, the whole response is
+    taken as noise of the level at its end; noise throughout has 0.
     """
 
     energy: _Floats
@@ -50,13 +52,16 @@ def onset_sample(ir: npt.ArrayLike, *, threshold_db: float = ONSET_THRESHOLD_DB)
     Raises ValueError for a response that is empty or not finite.
     """
     magnitude = np.abs(np.asarray(ir))
+    # guard: responses without samples are not measured
     if magnitude.shape[-1] == 0:
         raise ValueError("an impulse response needs at least one sample")
     peak = magnitude.max(axis=-1)
+    # guard: responses that are not finite are not measured
     if not np.all(np.isfinite(peak)):  # max propagates NaN
         raise ValueError("the impulse response has samples that are not finite")
     threshold = peak * np.float64(10.0 ** (threshold_db / 20.0))
     first = np.argmax(magnitude >= threshold[..., np.newaxis], axis=-1)
+    # guard: what is silent has no onset
     return np.where(peak > 0.0, first, -1).astype(np.int64)
 
 
@@ -68,6 +73,7 @@ def energy_decay(ir: npt.ArrayLike, sample_rate: float) -> EnergyDecay:
     responses = np.asarray(ir)
     shape = responses.shape
     onset = onset_sample(responses).reshape(-1)
+    # guard: energies are squared in double precision
     power = np.square(responses.reshape(-1, shape[-1]), dtype=np.float64)
     end, noise, beyond, lowest_power = _ends(power, onset, max(1, round(_WINDOW_S * sample_rate)))
 
@@ -79,6 +85,7 @@ def energy_decay(ir: npt.ArrayLike, sample_rate: float) -> EnergyDecay:
     for row in range(len(energy)):
         energy[row, : end[row]] += beyond[row]
         if noise[row] > 0.0:  # subtracting noise can make the curve rise locally
+            # guard: a decay curve that noise was taken off never rises
             energy[row] = np.maximum.accumulate(energy[row, ::-1])[::-1]
         start = max(onset[row], 0)
         energy[row, :start] = energy[row, start]
@@ -106,12 +113,15 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
     levels = power_to_db(block_power)
     for row in range(rows):
         first, stop = -(-max(int(onset[row]), 0) // window), int(last[row]) // window
-        if onset[row] < 0 or stop - first < 4:  # silent, or an impulse without a tail to analyse
+        # guard: a short response has no tail
+        if onset[row] < 0 or stop - first < 4:  # silent, or an impulse without a late decay
             continue
         tail = _tail(block_power[row, first:stop], levels[row, first:stop])
         if tail is None:
-            # What ends the response may be noise or a decay cut off early: as noise from the onset on, it bounds both.
+            # The end of the response may be noise or a truncated decay. Noise of that level from the onset on is an
+            # upper bound of both.
             late = block_power[row, stop - max(1, round(_TAIL_SHARE * (stop - first))) : stop].mean()
+            # guard: what does not decay may be noise
             lowest[row] = late * (last[row] - onset[row]) * db_to_power(_NOISE_MARGIN_DB)
             continue
         decay_per_sample = tail.decay_db / window * np.log(10.0) / 10.0
@@ -122,6 +132,7 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
             end[row] = max(round((first + at + 0.5) * window), int(onset[row]) + 1)
         noise[row] = tail.noise_power
         beyond[row] = db_to_power(tail.level_db - tail.decay_db * at) / decay_per_sample
+        # guard: a decay is told from noise with a margin
         lowest[row] = max(beyond[row], noise[row] / decay_per_sample * db_to_power(_NOISE_MARGIN_DB))
     return end, noise, beyond, lowest
 
@@ -136,9 +147,9 @@ class _Tail:
 
 
 def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
-    """Lundeby's iteration over windows `(window,)`; None where the late response does not decay."""
+    """The late decay, by Lundeby's iteration over windows `(window,)`; None if the late response does not decay."""
     count = _after_last(block_power > 0.0)
-    if count == 0:  # all there is comes before the first whole window, or after the last
+    if count == 0:  # all energy lies before the first whole window or after the last
         return None
     block_power, levels_db = block_power[:count], levels_db[:count]
     tail_start = count - max(1, round(_TAIL_SHARE * count))
@@ -155,7 +166,7 @@ def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
         decay_db = -line[0]
         level_db = line[1] + decay_db * start
         decayed = float(db_to_power(level_db - decay_db * np.arange(noise_start, count)).mean())
-        # What the line leaves unexplained is noise, once it is more than the scatter of the windows.
+        # Power above the line is noise if it exceeds the scatter of the windows.
         tail = _Tail(level_db, decay_db, observed - decayed if observed > _NOISE_EXCESS * decayed else 0.0)
         noise_from = int(np.ceil((level_db - reference_db + 2.0 * _NOISE_MARGIN_DB) / decay_db))
         moved_to = max(min(noise_from, tail_start), 0)
@@ -171,8 +182,10 @@ def _after_last(condition: npt.NDArray[np.bool_]) -> int:
 
 
 def _line(levels_db: _Floats) -> tuple[float, float] | None:
-    """Least squares (slope, intercept) over the window index; None without a falling line."""
+    """(slope, intercept) of a least-squares line over the window index; None if it does not fall."""
+    # guard: a window of zeros has no level
     finite = np.flatnonzero(np.isfinite(levels_db))  # a window of exact zeros has no level
+    # guard: a line through fewer than three windows is none
     if len(finite) < 3:
         return None
     centred = finite - finite.mean()

@@ -1,7 +1,7 @@
-"""Decibels: the one place where levels are converted.
+"""Conversion to and from decibels.
 
-Powers (and energies) convert with 10 log10, amplitudes with 20 log10. A zero becomes -inf, and -inf becomes zero; a
-negative power is a caller's mistake and becomes NaN, as in NumPy.
+Powers and energies convert with 10 log10, amplitudes with 20 log10. Zero becomes -inf, and -inf becomes zero. A
+negative power is an error of the caller and becomes NaN.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Predicted spectrograms to responses in one go: the compiled counterpart of `server.field.decoder`'s NumPy path.
+"""Predicted spectrograms to responses in one go, in compiled code.
 
 Eight frames are worked on at a time, from prediction to response, so that what is between them never leaves the nearest
 cache. Predictions are read as much earlier as they are delayed, so that frozen noise meets them at its own time; of a

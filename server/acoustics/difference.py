@@ -1,7 +1,7 @@
-"""How different two impulse responses of the same pair are heard to be, in just-noticeable differences (JND).
+"""Audible difference of two impulse responses of the same pair of places, in just-noticeable differences (JND).
 
-Responses are (channel, sample) of one microphone or two ears, of the same sample rate and length, sample 0 the same
-moment. Thresholds are those of `server.acoustics.audibility`.
+Responses are (channel, sample) of one microphone or two ears. Both have the same sample rate and length, and sample 0
+is the same moment. Thresholds are those of `server.acoustics.audibility`.
 """
 
 import numpy as np
@@ -14,28 +14,28 @@ from server.acoustics.room_parameters import DIRECT_SOUND_S, RoomParameters, mea
 _Floats = npt.NDArray[np.float64]
 
 MOST_JND = 100.0
-"""Where something is missing altogether."""
+"""Largest difference reported, for instance where one response is silent."""
 
 _LEAD_S = 0.001
 _EARLY_S = 0.050
 _SILENCE = 1e-12  # of a direct sound at a metre
 _THIRDS_HZ = 1000 * 2 ** (np.arange(-9, 14) / 3)
-_HEARD_BAND_DB = 30.0  # under the loudest third of an octave, in proportion to its width
-# A decay is read where reverberation is what decays: the first 10 dB are more than the direct sound, and the rest can
-# be told from none.
+_AUDIBLE_BAND_DB = 30.0  # under the loudest third of an octave, in proportion to its width
+# A decay time is compared only below these DRRs. Above them the direct sound dominates the first 10 dB of the decay
+# (EDT), or the reverberation is too weak to measure (T60).
 _DECAY_DRR_DB = {"edt": 8.0, "t60": 21.0}
 
 
 def audible_difference(
-    reference: npt.ArrayLike, heard: npt.ArrayLike, sample_rate: int, *, onset_s: float
+    reference: npt.ArrayLike, other: npt.ArrayLike, sample_rate: int, *, onset_s: float
 ) -> dict[str, float]:
-    """By parameter: `level`, `spectrum`, `drr`, `c50`, and what can be measured of both of `edt`, `t60`, and at two
-    ears `iacc`, `itd`, `ild`; of two ears the one that differs more.
+    """Difference by parameter, in JND: `level`, `spectrum`, `drr`, `c50`; `edt` and `t60` if both responses have them;
+    and with two ears `iacc`, `itd`, `ild`. Each is that of the ear that differs more.
 
     `onset_s` is when the direct sound arrives by geometry. Raises ValueError for responses that are not finite or
-    not of one shape.
+    differ in shape.
     """
-    pair = [np.asarray(response, dtype=np.float64) for response in (reference, heard)]
+    pair = [np.asarray(response, dtype=np.float64) for response in (reference, other)]
     if pair[0].shape != pair[1].shape or pair[0].ndim != 2:
         raise ValueError(f"responses of {pair[0].shape} and {pair[1].shape} cannot be compared")
     energies = [np.sum(response**2, axis=-1) + _SILENCE for response in pair]
@@ -66,7 +66,7 @@ def audible_difference(
 
 
 def _most(difference: npt.ArrayLike, name: str) -> float:
-    """NaN where one of them cannot be measured."""
+    """The greatest difference over the ears, in JND; NaN if one of them cannot be measured."""
     return float(np.max(np.abs(np.asarray(difference)))) / JND_THRESHOLDS[name].amount
 
 
@@ -75,26 +75,26 @@ def _decay_s(parameters: RoomParameters, name: str) -> _Floats:
 
 
 def _ratio_db(response: _Floats, sample_rate: int, onset_s: float, until_s: float) -> _Floats:
-    """(channel,) of the energy from just before the onset until some time after it, to what follows."""
+    """(channel,) ratio in dB of the energy up to `until_s` after the onset to the energy after that."""
     start = max(0, round((onset_s - _LEAD_S) * sample_rate))
     stop = round((onset_s + until_s) * sample_rate)
     first, rest = (np.sum(part**2, axis=-1) + _SILENCE for part in (response[:, start:stop], response[:, stop:]))
     return power_to_db(first / rest)
 
 
-def _spectral_difference(reference: _Floats, heard: _Floats, sample_rate: int) -> float:
-    """In dB, in the third of an octave where it is greatest, of those that are heard at all."""
+def _spectral_difference(reference: _Floats, other: _Floats, sample_rate: int) -> float:
+    """Greatest level difference in dB over all audible third-octave bands."""
     frequency = np.fft.rfftfreq(reference.shape[-1], 1 / sample_rate)
     thirds_hz = _THIRDS_HZ[sample_rate / 2 > _THIRDS_HZ * 2 ** (1 / 6)]
     edges_hz = thirds_hz[:, None] * np.array([2 ** (-1 / 6), 2 ** (1 / 6)])
     bounds = np.searchsorted(frequency, edges_hz)
     wide = bounds[:, 1] > bounds[:, 0]
     spectra = []
-    for response in (reference, heard):
+    for response in (reference, other):
         power = np.abs(np.fft.rfft(response)) ** 2
         below = np.concatenate([np.zeros((len(power), 1)), np.cumsum(power, axis=-1)], axis=-1)
         width = np.maximum(bounds[:, 1] - bounds[:, 0], 1)
         spectra.append(power_to_db((below[:, bounds[:, 1]] - below[:, bounds[:, 0]]) / width + _SILENCE))
     loudest_db = np.max(np.maximum(*spectra), axis=-1, keepdims=True)
-    is_heard = (np.maximum(*spectra) > loudest_db - _HEARD_BAND_DB) & wide
-    return float(np.max(np.where(is_heard, np.abs(spectra[1] - spectra[0]), 0.0)))
+    is_audible = (np.maximum(*spectra) > loudest_db - _AUDIBLE_BAND_DB) & wide
+    return float(np.max(np.where(is_audible, np.abs(spectra[1] - spectra[0]), 0.0)))

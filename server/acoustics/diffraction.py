@@ -1,32 +1,34 @@
-"""What a wall's edge between an emitter and a listener takes from the direct sound: the knife-edge law of Kurze and
-Anderson ("Sound attenuation by barriers", Applied Acoustics 4, 1971), which follows Maekawa's measured chart.
+"""Loss of the direct sound by diffraction at an edge: the knife-edge law of Kurze and Anderson ("Sound attenuation by
+barriers", Applied Acoustics 4, 1971), which follows Maekawa's measured chart.
 
-Its argument is the Fresnel number N, the detour over the edge in half wavelengths, positive where the edge hides the
+Its argument is the Fresnel number N, the detour over the edge in half wavelengths, positive if the edge hides the
 emitter. With x = sqrt(2 pi |N|) the loss is 5 + 20 log10(x / tanh x) dB in the shadow and 5 + 20 log10(x / tan x) dB in
-sight: one smooth function of N, 5 dB where the sight line grazes the edge and nothing from N = -0.19 on.
+sight. This is one smooth function of N: 5 dB where the sight line grazes the edge, and nothing below N = -0.19.
 
-The loss comes on top of 1 / length over the bent path. Keller's ray round a half-plane, taken relative to that, is a
-function of N to within 3 dB whatever the angles; relative to the straight line it is not.
+The loss comes on top of 1 / length over the bent path. Keller's ray round a half-plane, relative to that, is a function
+of N to within 3 dB at all angles; relative to the straight line it is not.
 """
 
-import numpy as np
-import numpy.typing as npt
+import math
 
-from server.acoustics.decibels import amplitude_to_db
-
-Numbers = npt.NDArray[np.float64]
+from server.kernels.compiled import compiled
 
 GRAZING_LOSS_DB = 5.0
-# Below this Fresnel number an edge in sight takes nothing: x / tan(x) = 10^(-5 / 20) at x = 1.0972.
+# Below this Fresnel number an edge causes no loss: x / tan(x) = 10^(-5 / 20) at x = 1.0972.
 CLEAR_FRESNEL_NUMBER = -0.1915871349
-# Where x / tanh(x) is its series to double precision, which has no 0 / 0.
+# Below this argument x / tanh(x) is 1 to double precision; computing it would divide 0 by 0.
 SMALL_ARGUMENT = 1e-4
 
 
-def diffraction_gain_db(fresnel_number: npt.ArrayLike) -> Numbers:
-    """(...) <= 0."""
-    number = np.asarray(fresnel_number, dtype=np.float64)
-    x = np.sqrt(2 * np.pi * np.abs(np.maximum(number, CLEAR_FRESNEL_NUMBER)))
-    safe = np.maximum(x, SMALL_ARGUMENT)
-    bent = np.where(x < SMALL_ARGUMENT, 1.0, np.where(number > 0, safe / np.tanh(safe), safe / np.tan(safe)))
-    return np.where(number > CLEAR_FRESNEL_NUMBER, np.minimum(0.0, -(GRAZING_LOSS_DB + amplitude_to_db(bent))), 0.0)
+@compiled
+def diffraction_gain_db(fresnel_number: float) -> float:
+    """Gain in dB, 0 or less."""
+    # guard: beyond its clearance an edge screens nothing
+    if fresnel_number <= CLEAR_FRESNEL_NUMBER:
+        return 0.0
+    x = math.sqrt(2 * math.pi * abs(fresnel_number))
+    # guard: a screen's formula has no nought by nought
+    if x < SMALL_ARGUMENT:
+        return -GRAZING_LOSS_DB
+    bent = x / math.tanh(x) if fresnel_number > 0 else x / math.tan(x)
+    return min(0.0, -(GRAZING_LOSS_DB + 20 * math.log10(bent)))

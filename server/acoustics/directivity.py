@@ -1,8 +1,8 @@
-"""How loud an emitter is in each direction, per octave band.
+"""Directivity of emitters, per octave band.
 
-Directions are unit vectors in the frame of the emitter, which looks along +x with +z up. Patterns turn about the look
-direction, so only the angle away from it counts. Gains are dB on top of the emitter's own sound and never below
-`GAIN_FLOOR_DB`; the reversed polarity of a rear lobe is not kept.
+Directions are unit vectors in the frame of the emitter, whose front is +x and whose top is +z. Patterns are symmetric
+about the front axis, so only the angle to it counts. Gains are dB relative to the emitter's dry sound and never below
+`GAIN_FLOOR_DB`. The reversed polarity of a rear lobe is not modelled.
 """
 
 import math
@@ -37,21 +37,24 @@ class Cardioid:
     def __post_init__(self) -> None:
         if not 0 <= self.omni_share <= 1:
             raise ValueError("omni_share must be from 0 to 1")
+        # guard: a pattern's order is one
         if not 0 < self.order <= _SHARPEST_ORDER:
             raise ValueError(f"order must be above 0 and at most {_SHARPEST_ORDER:g}")
 
     def gain_db(self, directions: npt.ArrayLike) -> Gains:
-        """(..., 3) -> (..., band)."""
+        """Gains (..., band) in dB towards directions (..., 3)."""
         ahead = np.asarray(directions, dtype=np.float64)[..., :1]
         if self.omni_share == 1:
             return np.zeros((*ahead.shape[:-1], _BANDS))
         amplitude = np.abs(self.omni_share + (1 - self.omni_share) * ahead) ** self.order
+        # guard: a pattern's null is finite
         gain = amplitude_to_db(np.maximum(amplitude, _FLOOR))
         return np.repeat(gain, _BANDS, axis=-1)
 
     @cached_property
     def diffuse_gain_db(self) -> Gains:
-        """(band,) the mean power over all directions: the integral of |s + (1 - s) c|^(2 order) over c = cos(angle)."""
+        """(band,) mean power over all directions in dB: the integral of |s + (1 - s) c|^(2 order) over c =
+        cos(angle)."""
         exponent = 2 * self.order + 1
         breadth = 2 * (1 - self.omni_share)
         rear = 1 - breadth
@@ -62,10 +65,10 @@ class Cardioid:
 
 @dataclass(frozen=True)
 class PolarPattern:
-    """A measured pattern: `gains_db` (band, angle) at `angles_deg` (angle,) from 0, ahead, to 180, behind.
+    """A measured pattern: `gains_db` (band, angle) at `angles_deg` (angle,), from 0 (front) to 180 (rear).
 
-    Linear in dB between the angles. Raises ValueError unless the angles rise from 0 to 180 and there is one finite gain
-    of at most 40 dB per band and angle.
+    Gains are linear in dB between the angles. Raises ValueError unless the angles rise from 0 to 180 and each band and
+    angle has one finite gain of at most 40 dB.
     """
 
     angles_deg: tuple[float, ...]
@@ -73,6 +76,7 @@ class PolarPattern:
 
     def __post_init__(self) -> None:
         angles = np.asarray(self.angles_deg, dtype=np.float64)
+        # guard: a measured pattern goes all the way round
         if (
             angles.ndim != 1
             or len(angles) < 2
@@ -83,6 +87,7 @@ class PolarPattern:
             raise ValueError("angles must rise from 0 to 180 degrees")
         if len(self.gains_db) != _BANDS or any(len(row) != len(angles) for row in self.gains_db):
             raise ValueError(f"gains must be {_BANDS} bands of one gain per angle")
+        # guard: a measured pattern does not amplify without end
         if not np.all(np.isfinite(self.gains_db)) or np.max(self.gains_db) > _LARGEST_GAIN_DB:
             raise ValueError(f"gains must be finite and at most {_LARGEST_GAIN_DB:g} dB")
 
@@ -92,13 +97,13 @@ class PolarPattern:
 
     @cached_property
     def _floored_db(self) -> Gains:
-        """(angle, band)"""
+        """(angle, band) gains, at least GAIN_FLOOR_DB."""
         return np.maximum(np.asarray(self.gains_db, dtype=np.float64), GAIN_FLOOR_DB).T
 
     def gain_db(self, directions: npt.ArrayLike) -> Gains:
-        """(..., 3) -> (..., band)."""
+        """Gains (..., band) in dB towards directions (..., 3)."""
         directions = np.asarray(directions, dtype=np.float64)
-        # Not the arc cosine, which is blind to the first hundredth of a microradian and steep at both ends.
+        # Not the arc cosine, which is inaccurate near 0 and 180 degrees.
         angle = np.arctan2(np.hypot(directions[..., 1], directions[..., 2]), directions[..., 0])
         above = np.clip(np.searchsorted(self._angles_rad, angle, side="right"), 1, len(self._angles_rad) - 1)
         low, high = self._angles_rad[above - 1], self._angles_rad[above]
@@ -107,7 +112,7 @@ class PolarPattern:
 
     @cached_property
     def diffuse_gain_db(self) -> Gains:
-        """(band,) the mean power over all directions, exact for the interpolated pattern.
+        """(band,) mean power over all directions in dB, exact for the interpolated pattern.
 
         Between two angles the power is exp(q t) times a constant, and the integral of exp(q t) sin(t) is
         exp(q t) (q sin(t) - cos(t)) / (q^2 + 1).
@@ -127,7 +132,7 @@ Directivity = Cardioid | PolarPattern
 OMNIDIRECTIONAL = Cardioid(1.0)
 SUBCARDIOID = Cardioid(0.75)
 CARDIOID = Cardioid(0.5)
-# The greatest ratio of power from ahead to power from behind, and of power from ahead to power from everywhere.
+# The first of the family has the greatest ratio of front to rear power, the second that of front to total power.
 SUPERCARDIOID = Cardioid((math.sqrt(3) - 1) / 2)
 HYPERCARDIOID = Cardioid(0.25)
 FIGURE_OF_EIGHT = Cardioid(0.0)

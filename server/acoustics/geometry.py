@@ -1,8 +1,8 @@
 """Poses and floor plans.
 
-Metres and radians; right-handed world with x east, y north, z up. An orientation is a unit quaternion (x, y, z, w)
-whose identity looks along +x with +y to the left. Points are arrays whose last axis is (x, y, z); leading axes
-broadcast.
+Units are metres and radians. The world is right-handed: x east, y north, z up. An orientation is a unit quaternion
+(x, y, z, w); the identity looks along +x with +y to the left. Points are arrays whose last axis is (x, y, z); leading
+axes broadcast.
 """
 
 import math
@@ -17,14 +17,15 @@ import numpy.typing as npt
 Points = npt.NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 
-# Nearer than this, a point is on a wall; two points are one.
+# A point nearer to a wall than TOUCH_M is on it. Two points nearer to each other than COINCIDENT_M are the same.
 TOUCH_M = 1e-9
 COINCIDENT_M = 1e-9
 
 FARTHEST_M = 1e7
-"""Of a coordinate: a quarter of the way round the Earth. Squares of what is no place at all overflow."""
+"""Largest coordinate, a quarter of the Earth's circumference. Squares of much larger numbers overflow."""
 _SHORTEST, _LONGEST = 1e-6, 1e12
-"""Of a quaternion as given: shorter ones are rounding errors, longer ones lose their directions when squared."""
+"""Limits of a given quaternion's length. Shorter ones are rounding errors; longer ones lose their direction when
+squared."""
 
 
 class _Components(NamedTuple):
@@ -35,9 +36,9 @@ class _Components(NamedTuple):
 
 
 class Quaternion(_Components):
-    """An orientation; one that exists is finite and has unit length, whatever length it was given with.
+    """An orientation, normalised to unit length.
 
-    Raises ValueError for a component that is not finite and for one too short, or too long, to have a direction.
+    Raises ValueError if a component is not finite, or if the quaternion is too short or too long to have a direction.
     """
 
     __slots__ = ()
@@ -46,13 +47,17 @@ class Quaternion(_Components):
         length = math.hypot(x, y, z, w)
         if not math.isfinite(length):
             raise ValueError("orientation must be four finite numbers")
+        # guard: a quaternion has a length
         if not _SHORTEST < length < _LONGEST:
             raise ValueError(f"orientation must be a quaternion of non-zero length, not of {length:g}")
+        # guard: an orientation is normalised once
         return super().__new__(cls, x / length, y / length, z / length, w / length)
 
     @classmethod
     def from_yaw(cls, yaw_rad: float) -> "Quaternion":
-        """Turned counter-clockwise about the vertical; 0 looks along +x. Raises ValueError unless it is finite."""
+        """Rotation by `yaw_rad` counter-clockwise about the vertical; 0 looks along +x. Raises ValueError if it is not
+        finite."""
+        # guard: a yaw is finite
         if not math.isfinite(yaw_rad):
             raise ValueError("yaw must be a finite number")
         return cls(0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
@@ -62,9 +67,9 @@ LEVEL = Quaternion(0.0, 0.0, 0.0, 1.0)
 
 
 def axes_of(orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(3, 3) from the world to the frame of what is turned by a unit quaternion (x, y, z, w)."""
+    """(3, 3) matrix from the world to the frame of a head or emitter with this orientation (x, y, z, w)."""
     x, y, z, w = map(float, orientation)
-    # The transpose of the usual matrix; rows within rows would take NumPy twice as long.
+    # The transpose of the usual matrix, as a flat tuple: nested rows take NumPy twice as long.
     return np.array(
         (
             *(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
@@ -76,9 +81,9 @@ def axes_of(orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDAr
 
 @dataclass(frozen=True)
 class Pose:
-    """Position in metres and orientation; a pose that exists is finite and its quaternion has unit length.
+    """A position in metres and an orientation.
 
-    Raises ValueError for a position that is not finite or beyond `FARTHEST_M`, and as `Quaternion` does.
+    Raises ValueError for a position that is not finite or beyond `FARTHEST_M`, and for a quaternion without direction.
     """
 
     position: Vector3
@@ -87,20 +92,23 @@ class Pose:
     def __post_init__(self) -> None:
         if len(self.position) != 3:
             raise ValueError("position must be three finite numbers")
-        x, y, z = map(float, self.position)  # listeners move hundreds of times a second: no loops here
+        x, y, z = map(float, self.position)  # no loops: poses come hundreds of times a second
+        # guard: a position is finite
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             raise ValueError("position must be three finite numbers")
+        # guard: a position is somewhere
         if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
             raise ValueError(f"position must lie within {FARTHEST_M:g} m")
         object.__setattr__(self, "position", (x, y, z))
-        if type(self.orientation) is not Quaternion:  # what is one stays as it is, to the last bit
+        # guard: an orientation is normalised no second time
+        if type(self.orientation) is not Quaternion:  # normalising again would change the last bit
             if len(self.orientation) != 4:
                 raise ValueError("orientation must be four finite numbers")
             object.__setattr__(self, "orientation", Quaternion(*(float(c) for c in self.orientation)))
 
     @classmethod
     def from_yaw(cls, position: Vector3, yaw_rad: float) -> "Pose":
-        """Level head turned counter-clockwise by `yaw_rad`; 0 looks along +x."""
+        """A pose with the head level, turned counter-clockwise by `yaw_rad`; 0 looks along +x."""
         return cls(position, Quaternion.from_yaw(yaw_rad))
 
     @property
@@ -112,7 +120,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """A simple polygon of walls, counter-clockwise, extruded from the floor at z = `floor_m` to z = `height_m`."""
+    """A simple polygon of walls, counter-clockwise, extruded from z = `floor_m` to z = `height_m`."""
 
     corners: tuple[tuple[float, float], ...]
     height_m: float
@@ -120,7 +128,7 @@ class FloorPlan:
 
     @cached_property
     def walls(self) -> npt.NDArray[np.float64]:
-        """(wall, end, 2): wall i runs from corner i to corner i + 1, the inside on its left."""
+        """(wall, end, 2) end points. Wall i runs from corner i to corner i + 1, with the inside on its left."""
         corners = np.asarray(self.corners, dtype=np.float64)
         return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
@@ -131,7 +139,7 @@ class FloorPlan:
 
     @cached_property
     def bend_corners(self) -> npt.NDArray[np.float64]:
-        """(corner, 2): the reflex corners, the only points where a shortest path can bend."""
+        """(corner, 2) reflex corners, the only points where a shortest path can bend."""
         outgoing = self.walls[:, 1] - self.walls[:, 0]
         incoming = np.roll(outgoing, 1, axis=0)
         turn = incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0]
@@ -139,19 +147,20 @@ class FloorPlan:
 
     @cached_property
     def bend_lengths_m(self) -> npt.NDArray[np.float64]:
-        """(corner, corner): shortest path between reflex corners (Dijkstra over the visibility graph)."""
+        """(corner, corner) lengths of the shortest paths between reflex corners (Dijkstra over the visibility
+        graph)."""
         bends = self.bend_corners
         points = np.concatenate([bends, np.zeros((len(bends), 1))], axis=-1)
         distance = np.linalg.norm(bends[:, None] - bends[None], axis=-1)
         direct = np.where(self.is_visible(points[:, None], points[None]), distance, np.inf)
         if not len(bends):
             return direct
-        from scipy.sparse.csgraph import shortest_path  # a tenth of a second, which convex rooms do not need
+        from scipy.sparse.csgraph import shortest_path  # takes a tenth of a second, which convex rooms need not spend
 
         return np.asarray(shortest_path(direct, method="D", directed=False))
 
     def contains(self, points: Points) -> npt.NDArray[np.bool_]:
-        """(...,) True inside the room or on its surfaces."""
+        """(...,) whether each point is inside the room or on its surfaces."""
         points = np.asarray(points, dtype=np.float64)
         start, end = self.walls[:, 0], self.walls[:, 1]
         x, y = points[..., None, 0], points[..., None, 1]
@@ -160,10 +169,11 @@ class FloorPlan:
         crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
         inside = np.sum(straddles & (x < crossing), axis=-1) % 2 == 1
         touches = self.wall_distance_m(points) < TOUCH_M
+        # guard: what touches a wall is inside
         return np.asarray((inside | touches) & (points[..., 2] >= self.floor_m) & (points[..., 2] <= self.height_m))
 
     def holds(self, position: Vector3) -> bool:
-        """`contains` of one point: twenty times as fast in scalars, for whoever asks at every pose."""
+        """Whether one point is inside the room or on its surfaces: `contains` in scalars, twenty times as fast."""
         x, y, z = position
         if not self.floor_m <= z <= self.height_m:
             return False
@@ -175,13 +185,14 @@ class FloorPlan:
             along_x, along_y = bx - ax, by - ay
             share = ((x - ax) * along_x + (y - ay) * along_y) / (along_x * along_x + along_y * along_y)
             share = min(1.0, max(0.0, share))
+            # guard: one place that touches a wall is inside
             if math.hypot(x - ax - share * along_x, y - ay - share * along_y) < TOUCH_M:
                 return True
             ax, ay = bx, by
         return is_inside
 
     def wall_distance_m(self, points: Points) -> npt.NDArray[np.float64]:
-        """(...,) distance in plan to the nearest wall, inside or out."""
+        """(...,) horizontal distance to the nearest wall, for points inside and outside."""
         points = np.asarray(points, dtype=np.float64)
         start, along = self.walls[:, 0], self.walls[:, 1] - self.walls[:, 0]
         offset = points[..., None, :2] - start
@@ -189,9 +200,9 @@ class FloorPlan:
         return np.asarray(np.min(np.linalg.norm(offset - share[..., None] * along, axis=-1), axis=-1))
 
     def is_visible(self, a: Points, b: Points) -> npt.NDArray[np.bool_]:
-        """(...,) True where no wall stands between a and b; grazing a wall or a corner does not block.
+        """(...,) whether no wall stands between a and b. A line that grazes a wall or a corner is not blocked.
 
-        Both points are taken to be inside. Walls run from floor to ceiling, so the test is made in plan.
+        Both points have to be inside. Walls run from floor to ceiling, so only x and y count.
         """
         a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
         start, end = self.walls[:, 0], self.walls[:, 1]
@@ -201,18 +212,20 @@ class FloorPlan:
             edge, offset = tip - origin, point - origin
             return np.asarray(edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0])
 
+        # guard: a line that grazes a corner is free
         crosses = (side(start, end, p) * side(start, end, q) < -TOUCH_M) & (
             side(p, q, start) * side(p, q, end) < -TOUCH_M
         )
-        # A sight line through the inside of a wall block may pass exactly through its corners: its midpoint tells.
+        # A sight line through solid wall may pass exactly through its corners, so the midpoint is checked too.
         middle = (a + b) / 2
         level = np.full((*middle.shape[:-1], 1), self.floor_m)
         inside = self.contains(np.concatenate([middle[..., :2], level], axis=-1))
+        # guard: a sight line through a block of wall is none
         return np.asarray(~np.any(crosses, axis=-1) & inside)
 
     def path_length_m(self, a: Points, b: Points) -> npt.NDArray[np.float64]:
-        """(...,) length of the shortest path from a to b that goes through no wall; the straight distance where they
-        see each other, and where nothing leads from one to the other because either is inside a wall."""
+        """(...,) length of the shortest path from a to b around the walls. It is the straight distance if nothing
+        stands between them, and also if there is no path because one of them is inside a wall."""
         a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
         straight = np.linalg.norm(a - b, axis=-1)
         bends = np.concatenate([self.bend_corners, np.zeros((len(self.bend_corners), 1))], axis=-1)
@@ -223,7 +236,8 @@ class FloorPlan:
             plan = np.linalg.norm(points[..., None, :2] - bends[:, :2], axis=-1)
             return np.where(self.is_visible(points[..., None, :], bends), plan, np.inf)
 
-        # Once for each point, however many others it is paired with.
+        # Computed once for each point a, which is paired with many points b.
         to_last = np.min(reach(a)[..., :, None] + self.bend_lengths_m, axis=-2)
         bent = np.hypot(np.min(to_last + reach(b), axis=-1), a[..., 2] - b[..., 2])
+        # guard: a path into a wall is as long as the straight line
         return np.asarray(np.where(self.is_visible(a, b) | ~np.isfinite(bent), straight, bent))

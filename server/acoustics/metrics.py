@@ -1,7 +1,7 @@
-"""Acoustic quality: how far an estimated impulse response is from a reference.
+"""Errors of estimated impulse responses against references.
 
-Errors are magnitudes, one per pair of binaural responses `(...)`; those of per-ear parameters are averaged over the two
-ears. NaN marks a pair in which the parameter of either response, at either ear, could not be measured; `summarise`
+Errors are magnitudes, one per pair of binaural responses `(...)`. Errors of per-ear parameters are averaged over the
+two ears. NaN marks a pair in which the parameter could not be measured at some ear of either response; `summarise`
 counts those.
 """
 
@@ -17,7 +17,7 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Metric:
-    """An error: its key, what a table calls it, its unit, and whether it describes the direct sound only."""
+    """Description of an error: its key, its label in tables, its unit, and whether it needs the direct sound."""
 
     name: str
     label: str
@@ -26,7 +26,7 @@ class Metric:
 
 
 SPECTRAL_LOSS = Metric("spectral_loss", "spectral loss", "ln")
-# Everything `parameter_errors` returns, in the order of a table.
+# All errors that `parameter_errors` returns, in the order of tables.
 PARAMETER_METRICS = (
     Metric("t60", "T60", "%"),
     Metric("edt", "EDT", "ms"),
@@ -65,8 +65,8 @@ def parameter_errors(reference: RoomParameters, estimate: RoomParameters) -> dic
 def spectral_loss(reference: npt.ArrayLike, estimate: npt.ArrayLike) -> _Floats:
     """Mean absolute difference `(...)` of log-magnitude spectrograms `(..., channel, frequency, frame)`.
 
-    Natural log with the codec's floor, as in Luo et al. (NeurIPS 2022): an error of 0.1 is about 0.9 dB.
-    Raises ValueError where the shapes differ or a value is not finite.
+    Logarithms are natural, with the codec's floor, as in Luo et al. (NeurIPS 2022): 0.1 is about 0.9 dB. Raises
+    ValueError if the shapes differ or a value is not finite.
     """
     reference_log, estimate_log = np.asarray(reference), np.asarray(estimate)
     if reference_log.shape != estimate_log.shape:
@@ -79,7 +79,7 @@ def spectral_loss(reference: npt.ArrayLike, estimate: npt.ArrayLike) -> _Floats:
 
 @dataclass(frozen=True)
 class Summary:
-    """mean and median are None where nothing could be measured; `missing` entries are in neither."""
+    """Mean and median of `count` measured errors; None if there are none. `missing` errors could not be measured."""
 
     mean: float | None
     median: float | None

@@ -1,7 +1,8 @@
-"""Minimum phase by the cepstrum: the filter of a given magnitude whose energy comes as early as it can.
+"""Minimum-phase filters by the cepstrum. Of all filters of one magnitude, the minimum-phase one has its energy
+earliest.
 
 A folded cepstrum is the power series of the logarithm of a causal minimum-phase filter, log H(z) = sum_n c[n] z**-n
-(Oppenheim & Schafer, "Discrete-Time Signal Processing", ch. 13). Magnitudes multiply where folded cepstra add.
+(Oppenheim & Schafer, "Discrete-Time Signal Processing", ch. 13). Adding folded cepstra multiplies magnitudes.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ _LONGEST_ADVANCE_S = 0.002
 
 
 def folded_cepstrum(log_magnitude: _Floats) -> _Floats:
-    """(..., n_fft / 2 + 1) natural logarithms of magnitude -> (..., n_fft / 2 + 1) coefficients."""
+    """Natural logarithms of magnitude (..., n_fft / 2 + 1) to coefficients (..., n_fft / 2 + 1)."""
     cepstrum = np.fft.irfft(log_magnitude)
     half = cepstrum.shape[-1] // 2
     cepstrum[..., 1:half] *= 2
@@ -24,13 +25,13 @@ def folded_cepstrum(log_magnitude: _Floats) -> _Floats:
 
 
 def excess_delays_samples(pairs: _Floats, sample_rate: float) -> _Floats:
-    """(..., ear) how much later the impulse responses (..., ear, sample) of two ears are than minimum-phase ones of
+    """(..., ear) delays of the impulse responses (..., ear, sample) of two ears relative to minimum-phase responses of
     the same magnitude.
 
-    The delay between the ears is that of the peak of their cross-correlation below 1.5 kHz, where it is heard
-    (Wightman & Kistler, "The dominant role of low-frequency interaural time differences in sound localization", 1992),
-    less what the minimum-phase pair has of it already. The delay of both is that of the envelope of the correlation
-    with the minimum-phase pair, which the phase of the loudspeaker that measured them does not move.
+    The delay between the ears is the peak of their cross-correlation below 1.5 kHz, where it is audible (Wightman &
+    Kistler, "The dominant role of low-frequency interaural time differences in sound localization", 1992), minus that
+    of the minimum-phase pair. The common delay is the peak of the envelope of the correlation with the minimum-phase
+    pair. The phase of the loudspeaker used in the measurement does not move that envelope.
     """
     n_fft = 4 * 2 ** int(np.ceil(np.log2(max(pairs.shape[-1], 64))))
     spectra = np.fft.rfft(pairs, n_fft)
@@ -50,21 +51,22 @@ def excess_delays_samples(pairs: _Floats, sample_rate: float) -> _Floats:
 
 
 def _peak(circular: _Floats, advance: int) -> _Floats:
-    """(...,) lag of the greatest sample of (..., lag), interpolated; what begins up to `advance` early is negative."""
+    """(...,) interpolated lag of the greatest sample of circular correlations (..., lag). Lags down to -`advance` count
+    as negative."""
     turned = np.roll(circular, advance, axis=-1)
     peak = np.argmax(turned, axis=-1)
     around = np.clip(peak[..., None] + np.array([-1, 0, 1]), 0, turned.shape[-1] - 1)
     before, at, after = np.moveaxis(np.take_along_axis(turned, around, axis=-1), -1, 0)
-    # The vertex of the parabola through three points: what is below 1.5 kHz is smooth between samples.
+    # The vertex of a parabola through three points. A signal below 1.5 kHz is smooth between samples.
     curvature = np.minimum(before - 2 * at + after, -1e-30)
     return np.asarray(peak - advance + np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
 
 
 def band_cepstra(sample_rate: float, taps: int) -> _Floats:
-    """(band, tap) folded cepstrum of one decibel in each octave band: linear over log frequency between the centres of
-    bands, flat beyond the first and the last.
+    """(band, tap) folded cepstrum of a gain of one decibel in each octave band. The gain is linear over log frequency
+    between band centres and flat beyond the first and the last.
 
-    Few taps round the corners off; the shapes are mixed so that at the centres the gains are what they should be.
+    A short cepstrum smooths the corners of this shape. The shapes are mixed so that the gains are exact at the centres.
     """
     centres = np.array(OCTAVE_BANDS_HZ)
     n_fft = 2 ** int(np.ceil(np.log2(64 * taps)))
@@ -73,6 +75,7 @@ def band_cepstra(sample_rate: float, taps: int) -> _Floats:
     decibels = np.maximum(0.0, 1 - np.abs(octave - np.arange(len(centres))[:, None]))
     nepers = np.log(10) / 20
     shapes = folded_cepstrum(nepers * decibels)[:, :taps]
+    # guard: bands above Nyquist's frequency are left out
     audible = centres < sample_rate / 2
     at_centres = shapes @ np.cos(2 * np.pi / sample_rate * np.outer(np.arange(taps), centres)) / nepers
     shapes[audible] = np.linalg.solve(at_centres[np.ix_(audible, audible)], shapes[audible])

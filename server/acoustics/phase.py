@@ -1,21 +1,21 @@
-"""Phase for a predicted binaural spectrogram: what is known is used, the rest is noise with the right correlation
+"""Phase of a predicted binaural spectrogram. Known phase is used; the rest is noise with the predicted coherence
 between the ears.
 
-A field knows the phase of some early reflections, and cannot know that of late reverberation. It says how much it
-knows: `certainty` is the length of the mean phasor, 1 where the phase is determined and 0 where it is anybody's guess.
-A bin is then the known phasor plus frozen noise carrying the remaining energy:
+A field can predict the phase of some early reflections, but not that of late reverberation. Its `certainty` is the
+length of the mean phasor: 1 where the phase is known and 0 where it is random. A bin is the known phasor plus frozen
+noise with the remaining energy:
 
-    S = M (R exp(i phi) + sqrt(1 - R**2) N)
+S = M (R exp(i phi) + sqrt(1 - R**2) N)
 
-The noise is the transform of one white signal per scene. It stands still in time, whatever the pose: a field's frames
-count from the moment sound arrives, so their levels are delayed to the time of emission before they meet the noise, and
-only the known part moves with the emitter. Responses of neighbouring poses therefore crossfade without combing. The
-noise of the right ear is mixed so that the whole has the predicted complex interaural coherence.
+The noise is the transform of one white signal per scene. It does not move with the pose: a field's frames count from
+the arrival of sound, so their levels are delayed to count from emission before they multiply the noise, and only the
+known part moves. Responses of neighbouring poses therefore crossfade without comb filtering. The noise of the right ear
+is mixed so that the sum has the predicted complex interaural coherence.
 
-Where magnitudes are all that is trusted, `griffin_lim` finds the phases that fit them best.
+If only the magnitudes can be trusted, `griffin_lim` finds the phases that fit them best.
 
-Axes: (..., ear, frequency, frame), ear 0 = left; coherence (..., frequency, frame), E[S_left conj(S_right)] over the
-magnitudes.
+Axes: (..., ear, frequency, frame), ear 0 = left. Coherence is (..., frequency, frame): E[S_left conj(S_right)] divided
+by the magnitudes.
 """
 
 from dataclasses import dataclass
@@ -33,11 +33,11 @@ Complex = npt.NDArray[np.complex64]
 Number = TypeVar("Number", np.float32, np.complex64)
 
 UNDECIDED = 1e-6
-"""Noise of two ears below this product of magnitudes, relative to the whole, has whatever coherence."""
+"""Smallest product of the two ears' noise magnitudes, relative to the whole, for which coherence is computed."""
 MOST_COHERENT = 1 - 1e-5
-"""Of noise at two ears: nearer to 1, what is left of 1 - coherence**2 would be rounding."""
+"""Largest coherence of the noise at two ears. Nearer to 1, rounding would dominate 1 - coherence**2."""
 NO_PHASE = 1e-30
-"""Square of a magnitude below which the phase is taken as zero."""
+"""Bins with a smaller squared magnitude are given phase zero."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class FrozenNoise:
 
     @classmethod
     def from_signal(cls, codec: Codec, signal: npt.NDArray[np.floating]) -> "FrozenNoise":
-        """`signal` is (2, sample), of unit variance."""
+        """From white signals (2, sample) of unit variance."""
         scale = 1 / np.sqrt(codec.window_energy)
         return cls((codec.transform(signal.astype(np.float64)) * scale).astype(np.complex64))
 
     @cached_property
     def parts(self) -> Real:
-        """(frame // 8, frequency, 4, 8) left and right, real and imaginary, of eight frames after the other as they are
-        decoded; with silent frames to a multiple of eight."""
+        """(frame // 8, frequency, 4, 8) left real, left imaginary, right real and right imaginary parts, in groups of
+        eight frames as the decoder reads them. Silent frames fill the last group."""
         left, right = self.spectrogram
         parts = np.stack([left.real, left.imag, right.real, right.imag], axis=1)
         parts = np.pad(parts, [(0, 0), (0, 0), (0, -parts.shape[-1] % 8)])
@@ -63,17 +63,19 @@ class FrozenNoise:
 
 
 def separate(magnitude: Real, known_phase: Real, certainty: Real, coherence: Complex) -> tuple[Complex, Real, Complex]:
-    """The known part, and the magnitude and coherence of the noise that makes up the rest.
+    """Split a prediction into the known part, and the magnitude and coherence of the noise.
 
-    `known_phase` and `certainty` cover the first frames only, as many as they have, and so does the known part.
+    `known_phase` and `certainty` may cover only the first frames. The known part covers the same frames.
     """
     known_frames = certainty.shape[-1]
     phasors = (certainty * np.exp(1j * known_phase)).astype(np.complex64)
     unknown = np.sqrt(np.maximum(1 - certainty**2, 0))
-    # The known parts bring a coherence of their own; the noise makes up the difference.
+    # The known parts have a coherence of their own. The noise supplies the difference.
     rest = coherence[..., :known_frames] - phasors[..., 0, :, :] * np.conj(phasors[..., 1, :, :])
+    # guard: noise that is not there has no coherence
     share = np.maximum(unknown[..., 0, :, :] * unknown[..., 1, :, :], UNDECIDED)
     noise_coherence = np.concatenate([rest / share, coherence[..., known_frames:]], axis=-1)
+    # guard: coherence is at most one
     noise_coherence *= MOST_COHERENT / np.maximum(np.abs(noise_coherence), 1)
     noise_magnitude = magnitude.copy()
     noise_magnitude[..., :known_frames] *= unknown
@@ -81,13 +83,16 @@ def separate(magnitude: Real, known_phase: Real, certainty: Real, coherence: Com
 
 
 def delayed(values: npt.NDArray[Number], frames: npt.NDArray[np.float64]) -> npt.NDArray[Number]:
-    """(B, ..., frame) values later by `frames` (B,), not necessarily whole: interpolated linearly, zero before them."""
+    """Delay values (B, ..., frame) by `frames` (B,), which may be fractional: linear interpolation, zero before the
+    first frame."""
     later = np.zeros_like(values)
     count = values.shape[-1]
     for row, delay in enumerate(frames):
         whole = int(np.floor(delay))
+        # guard: levels are delayed by parts of a frame
         share = float(delay - whole)
         for start, weight in ((whole, 1 - share), (whole + 1, share)):
+            # guard: a delayed level stays within its response
             first, last = max(0, start), min(count, count + start)
             if last > first:
                 later[row, ..., first:last] += (
@@ -97,7 +102,7 @@ def delayed(values: npt.NDArray[Number], frames: npt.NDArray[np.float64]) -> npt
 
 
 def correlated_noise(magnitude: Real, coherence: Complex, noise: FrozenNoise) -> Complex:
-    """(..., 2, frequency, frame) frozen noise of the given magnitudes and interaural coherence (at most 1)."""
+    """(..., 2, frequency, frame) frozen noise with these magnitudes and this interaural coherence (at most 1)."""
     left, right = noise.spectrogram
     spectrogram = np.empty(magnitude.shape, dtype=np.complex64)
     spectrogram[..., 0, :, :] = left
@@ -108,17 +113,17 @@ def correlated_noise(magnitude: Real, coherence: Complex, noise: FrozenNoise) ->
 
 
 def zero_phase(magnitude: Real) -> Complex:
-    """(..., frequency, frame) spectrogram whose phase is zero in the middle of each window, where the window lets
-    through what adds up there."""
+    """(..., frequency, frame) spectrogram whose phase is zero at the centre of each window."""
     return (magnitude * (-1) ** np.arange(magnitude.shape[-2])[:, None]).astype(np.complex64)
 
 
 def griffin_lim(codec: Codec, magnitude: Real, signal: Real, iterations: int) -> Real:
-    """(..., sample) whose transform has nearly these magnitudes (..., frequency, frame), from a `signal` (..., sample)
-    near it: the transform's phases with the magnitudes asked for, again and again (Griffin and Lim 1984)."""
+    """(..., sample) signal whose transform has nearly these magnitudes (..., frequency, frame). From `signal` (...,
+    sample), each iteration keeps the transform's phases and replaces its magnitudes (Griffin and Lim 1984)."""
     for _ in range(iterations):
         spectrogram = codec.transform(signal)
         square = spectrogram.real**2 + spectrogram.imag**2
+        # guard: what is silent has no phase
         has_phase = square >= NO_PHASE
         phasors = np.where(has_phase, spectrogram / np.sqrt(np.where(has_phase, square, 1)), 1)
         signal = codec.synthesise((magnitude * phasors).astype(np.complex64)).astype(np.float32)

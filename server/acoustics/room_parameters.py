@@ -1,10 +1,10 @@
 """Room acoustic parameters of impulse responses.
 
 Axes: impulse responses are `(..., channel, sample)`, channel 0 = left; every leading axis is a batch. Results are
-float64 in seconds or dB, one per channel, or one per response where two ears are compared. All are broadband.
+float64 in seconds or dB, one per channel, or one per response if two ears are compared. All are broadband.
 
-Each function raises `UnmeasurableError` when one of the responses given to it has no value of that parameter; `measure`
-takes large batches in one pass and marks such entries as missing instead.
+Each function raises `UnmeasurableError` if the parameter of one of the responses cannot be measured. `measure` computes
+all parameters of large batches and marks such entries as missing instead.
 """
 
 from dataclasses import dataclass
@@ -35,15 +35,16 @@ __all__ = [
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int64]
 
-# The direct sound is the largest sample near its expected arrival and 2.5 ms more (Zahorik, J. Acoust. Soc. Am. 112,
-# 2110, 2002); the lead covers the rise of an HRIR to its peak.
+# The direct sound lasts until 2.5 ms after the largest sample near its expected arrival (Zahorik, J. Acoust. Soc. Am.
+# 112, 2110, 2002). The lead covers the rise of an HRIR to its peak.
 DIRECT_SOUND_S = 0.0025
 _DIRECT_LEAD_S = 0.001
 _DIRECT_SEARCH_S = 0.003
 _DIRECT_PEAK_S = 0.001
-"""From its first sign to its largest sample. What floors and walls return soon after is louder at a far ear."""
+"""Longest time from the onset of the direct sound to its largest sample. At the far ear an early reflection soon after
+may be louder."""
 _BETWEEN_EARS_S = 0.001
-"""Of the direct sound at the nearer ear, for interaural time differences: what follows are reflections."""
+"""Part of the direct sound, after its peak at the nearer ear, that the ITD is measured in. Reflections follow it."""
 _LAG_LIMIT_S = 0.001  # ISO 3382-1 B.2: interaural lags within +-1 ms
 _EARLY_S = 0.080  # ISO 3382-1 B.2: IACC early
 _LOWPASS_HZ = 3000.0  # Katz and Noisternig, J. Acoust. Soc. Am. 135, 3530, 2014
@@ -51,14 +52,15 @@ _UPSAMPLING = 16
 
 
 class UnmeasurableError(ValueError):
-    """The response does not hold what the parameter needs: silent, too short, too noisy, or no such energy."""
+    """The parameter cannot be measured: the response is silent, too short, too noisy or lacks the energy in
+    question."""
 
 
 @dataclass(frozen=True)
 class RoomParameters:
     """Parameters of a batch of responses. NaN marks an entry that cannot be measured; `missing` counts them.
 
-    Shapes: `(..., channel)`, and `(...)` for the last three, which compare two ears and are missing of one channel.
+    Shapes are `(..., channel)`. The last three compare two ears: they are `(...)`, and NaN for one channel.
     """
 
     onset_s: _Floats
@@ -80,9 +82,9 @@ def measure(
 ) -> RoomParameters:
     """All parameters of responses to one microphone or to two ears, `(..., channel, sample)`.
 
-    `onset` `(..., channel)`, samples: where the direct sound is expected within 3 ms (from geometry or from a
-    reference), for the direct-to-reverberant ratio and the interaural time difference; detected where it is not given.
-    Raises ValueError for responses of other channels or not finite.
+    `onset` `(..., channel)`, in samples, is the expected arrival of the direct sound to within 3 ms, from geometry or
+    from a reference. The direct-to-reverberant ratio and the interaural time difference need it; without it the onset
+    is detected. Raises ValueError for other numbers of channels and for values that are not finite.
     """
     responses = np.asarray(ir)
     if responses.ndim < 2 or responses.shape[-2] not in {1, 2}:
@@ -119,8 +121,8 @@ def energy_decay_db(ir: npt.ArrayLike, sample_rate: float) -> _Floats:
 def reverberation_time_s(ir: npt.ArrayLike, sample_rate: float, *, decay_db: float = 30.0) -> _Floats:
     """Reverberation time `(..., channel)`: least squares line through the decay curve from -5 dB down by `decay_db`.
 
-    30 dB gives T30, 20 dB gives T20, both extrapolated to 60 dB (ISO 3382-1:2009, 5.3.3). Never a mixture: a response
-    whose curve does not reach the lower limit (10 dB above the noise) is unmeasurable.
+    30 dB gives T30, 20 dB gives T20, both extrapolated to 60 dB (ISO 3382-1:2009, 5.3.3). A response whose curve does
+    not reach the lower limit 10 dB above the noise is unmeasurable; a shorter range is never used instead.
     """
     decay = energy_decay(ir, sample_rate)
     values = _decay_time_s(decay, sample_rate, -5.0, -5.0 - decay_db)
@@ -145,9 +147,9 @@ def direct_to_reverberant_db(
 ) -> _Floats:
     """Direct-to-reverberant energy ratio `(..., channel)`.
 
-    Direct sound: from 1 ms before its peak to `direct_s` after it; reverberation: everything later. The peak is sought
-    within 3 ms of `onset`, samples, which broadcasts to `(..., channel)`; where not given it is detected, which is
-    right only if the direct sound is the first to arrive.
+    The direct sound lasts from 1 ms before its peak to `direct_s` after it; everything later is reverberation. The peak
+    is sought within 3 ms of `onset`, in samples, which broadcasts to `(..., channel)`. Without `onset` the first
+    arrival is taken, which is right only if that is the direct sound.
     """
     responses = np.asarray(ir)
     decay = energy_decay(responses, sample_rate)
@@ -166,8 +168,8 @@ def interaural_cross_correlation(
 ) -> _Floats:
     """Interaural cross-correlation coefficient `(...)` of binaural responses, 0 to 1 (ISO 3382-1:2009, B.2).
 
-    Largest magnitude of the normalised interaural cross-correlation function within +-1 ms. Time counts from the
-    earlier of the two onsets: `end_s` = 0.080 gives IACC early, `start_s` = 0.080 IACC late.
+    It is the largest magnitude of the normalised interaural cross-correlation function within +-1 ms. Time counts from
+    the earlier of the two onsets: `end_s` = 0.080 gives IACC early, `start_s` = 0.080 IACC late.
     """
     responses = _binaural(ir)
     values = _iacc(responses, onset_sample(responses), sample_rate, start_s, end_s)
@@ -179,8 +181,8 @@ def interaural_time_difference_s(
 ) -> _Floats:
     """Interaural time difference `(...)` of the direct sound, within +-1 ms; positive when the left ear leads.
 
-    Lag of the largest interaural cross-correlation of the direct sound below 3 kHz (Katz and Noisternig 2014), to a
-    fraction of a sample.
+    It is the lag of the largest interaural cross-correlation of the direct sound below 3 kHz (Katz and Noisternig
+    2014), to a fraction of a sample.
     """
     responses = _binaural(ir)
     direct = _direct_sample(responses, onset_sample(responses) if onset is None else onset, sample_rate)
@@ -188,12 +190,13 @@ def interaural_time_difference_s(
 
 
 def _require(condition: npt.ArrayLike, reason: str) -> None:
-    held = np.asarray(condition)
-    if not held.all():
-        raise UnmeasurableError(f"{reason} ({held.size - int(held.sum())} of {held.size})")
+    holds = np.asarray(condition)
+    if not holds.all():
+        raise UnmeasurableError(f"{reason} ({holds.size - int(holds.sum())} of {holds.size})")
 
 
 def _present(values: _Floats, reason: str) -> _Floats:
+    # guard: a parameter that is missing is told
     _require(~np.isnan(values), reason)
     return values
 
@@ -206,13 +209,14 @@ def _binaural(ir: npt.ArrayLike) -> npt.NDArray[np.generic]:
 
 
 def _direct_sample(responses: npt.NDArray[np.generic], onset: npt.ArrayLike, sample_rate: float) -> _Integers:
-    """Largest sample `(..., channel)` of the first sound within 3 ms of the expected onset; -1 where there is none."""
+    """`(..., channel)` index of the peak of the first sound within 3 ms of the expected onset; -1 if there is none."""
     expected = np.broadcast_to(np.asarray(onset, dtype=np.int64), responses.shape[:-1]).reshape(-1)
     reach, length = round(_DIRECT_SEARCH_S * sample_rate), round(_DIRECT_PEAK_S * sample_rate)
     peaks = np.full(len(expected), -1)
     for row, (at, response) in enumerate(zip(expected, responses.reshape(len(expected), -1), strict=True)):
         start = max(int(at) - reach, 0)
         nearby = np.abs(response[start : int(at) + reach + 1])
+        # guard: direct sound is sought where there are samples
         if at >= 0 and len(nearby) and nearby.max() > 0.0:
             first = int(onset_sample(nearby))
             peaks[row] = start + first + int(np.argmax(nearby[first : first + length + 1]))
@@ -220,7 +224,9 @@ def _direct_sample(responses: npt.NDArray[np.generic], onset: npt.ArrayLike, sam
 
 
 def _level_db(responses: npt.NDArray[np.generic]) -> _Floats:
+    # guard: levels are squared in double precision
     levels = power_to_db(np.square(responses, dtype=np.float64).sum(axis=-1))
+    # guard: silence has no level
     return np.where(np.isfinite(levels), levels, np.nan)
 
 
@@ -231,16 +237,19 @@ def _rows(decay: EnergyDecay) -> tuple[_Floats, _Integers]:
 def _decay_time_s(decay: EnergyDecay, sample_rate: float, upper_db: float, lower_db: float) -> _Floats:
     energy, onset = _rows(decay)
     times = np.full(len(energy), np.nan)
+    # guard: a decay is measured as far as it is known
     for row in np.flatnonzero((onset >= 0) & (decay.lowest_db.reshape(-1) <= lower_db)):
         curve = energy[row, onset[row] :]
         rising = curve[::-1]  # searchsorted needs a rising curve
         start = len(curve) - int(np.searchsorted(rising, curve[0] * 10.0 ** (upper_db / 10.0), side="right"))
         stop = len(curve) - int(np.searchsorted(rising, curve[0] * 10.0 ** (lower_db / 10.0), side="left"))
         count = stop - start
+        # guard: two points make a line
         if count < 2:
             continue
         centred = np.arange(count) - (count - 1) / 2.0
         slope = float(centred @ power_to_db(curve[start:stop])) / (count * (count * count - 1) / 12.0)
+        # guard: what does not fall has no reverberation time
         if slope < 0.0:
             times[row] = -60.0 / (slope * sample_rate)
     return times.reshape(decay.onset.shape)
@@ -253,6 +262,7 @@ def _clarity_db(decay: EnergyDecay, sample_rate: float, early_s: float) -> _Floa
     for row in np.flatnonzero((onset >= 0) & (split < energy.shape[-1])):
         late = energy[row, split[row]]
         early = energy[row, onset[row]] - late
+        # guard: clarity needs early and late energy
         if early > 0.0 and late > 0.0:
             values[row] = power_to_db(early / late)
     return values.reshape(decay.onset.shape)
@@ -267,10 +277,12 @@ def _direct_to_reverberant_db(
     lead, length = round(_DIRECT_LEAD_S * sample_rate), round(direct_s * sample_rate)
     for row, at in enumerate(direct_at.reshape(-1)):
         stop = int(at) + length
+        # guard: what follows the direct sound is within the response
         if at < 0 or stop >= energy.shape[-1]:
             continue
         direct = np.square(rows[row, max(int(at) - lead, 0) : stop], dtype=np.float64).sum()
         reverberant = energy[row, stop]
+        # guard: a ratio needs what is direct and what is not
         if direct > 0.0 and reverberant > 0.0:
             values[row] = power_to_db(direct / reverberant)
     return values.reshape(decay.onset.shape)
@@ -304,13 +316,13 @@ def _itd_s(responses: npt.NDArray[np.generic], direct_at: _Integers, sample_rate
     length = lead + round(_BETWEEN_EARS_S * sample_rate) + lags
     size = scipy.fft.next_fast_len(length + lags, real=True)
     frequencies = np.fft.rfftfreq(size, 1.0 / sample_rate)
-    # A raised cosine from pass to stop over an octave: a brick wall would ring for longer than the window.
+    # The low-pass falls as a raised cosine over an octave. A steep one would ring for longer than the window.
     lowpass = 0.5 + 0.5 * np.cos(np.pi * np.clip(frequencies / _LOWPASS_HZ - 1.0, 0.0, 1.0))
     values = np.full(len(ears), np.nan)
     for row, arrivals in enumerate(peaks):
         if arrivals.min() < 0:
             continue
-        # The louder ear is the nearer one, and its direct sound is the surer of the two.
+        # The louder ear is the nearer one, and its peak is the more reliable of the two.
         nearer = int(np.argmax(np.abs(ears[row, [0, 1], arrivals])))
         start = max(int(arrivals[nearer]) - lead, 0)
         left, right = scipy.fft.rfft(ears[row, :, start : start + length].astype(np.float64), size, axis=-1) * lowpass

@@ -10,10 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.diffraction import diffraction_gain_db
-from server.acoustics.geometry import COINCIDENT_M, FloorPlan
+from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path_kernel import find_sound_paths
-from server.kernels.compiled import HAS_NUMBA
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -52,7 +50,6 @@ class SoundPathFinder:
     """Finds the shortest paths through one floor plan; safe to share between threads."""
 
     def __init__(self, plan: FloorPlan, speed_of_sound: float) -> None:
-        self._plan = plan
         self._wavelengths_m = speed_of_sound / np.asarray(OCTAVE_BANDS_HZ, dtype=np.float64)
         self._corners = np.ascontiguousarray(plan.walls[:, 0])
         self._bends = np.ascontiguousarray(plan.bend_corners)
@@ -67,8 +64,6 @@ class SoundPathFinder:
         """
         listener = np.ascontiguousarray(listener, dtype=np.float64)
         emitters = np.ascontiguousarray(emitters, dtype=np.float64)
-        if not HAS_NUMBA:
-            return self.find_with_numpy(listener, emitters)
         paths = SoundPaths.empty(len(emitters)) if into is None else into
         find_sound_paths(
             self._corners,
@@ -85,63 +80,3 @@ class SoundPathFinder:
             paths.screen_db,
         )
         return paths
-
-    def find_with_numpy(self, listener: Floats, emitters: Floats) -> SoundPaths:
-        """What `find` does where nothing can be compiled."""
-        offset = emitters - listener
-        rise, straight = offset[:, 2], np.linalg.norm(offset, axis=-1)
-        coincident = straight < COINCIDENT_M
-        towards = np.where(coincident[:, None], (1.0, 0.0, 0.0), offset / np.where(coincident, 1.0, straight)[:, None])
-        if not len(self._bends):
-            count = len(emitters)
-            silent = np.zeros((count, len(OCTAVE_BANDS_HZ)))
-            return SoundPaths(straight, towards, -towards, np.zeros(count), np.ones(count, dtype=np.bool_), silent)
-
-        from_listener, from_emitters = self._to_bends_m(listener), self._to_bends_m(emitters)
-        via = from_listener[:, None] + self._bend_lengths_m
-        first, to_bend = np.argmin(via, axis=0), np.min(via, axis=0)
-        last = np.argmin(to_bend + from_emitters, axis=-1)
-        around = np.min(to_bend + from_emitters, axis=-1)
-        in_sight = self._plan.is_visible(listener, emitters) | ~np.isfinite(around)
-        around = np.where(in_sight, 1.0, around)
-        length = np.where(in_sight, straight, np.hypot(around, rise))
-        excess = np.where(in_sight, 0.0, np.maximum(0.0, length - straight))
-
-        def leg(points: Floats, bends: npt.NDArray[np.intp], climb: Floats) -> Floats:
-            plan = self._bends[bends] - points[..., :2]
-            apart = np.linalg.norm(plan, axis=-1)
-            level = around / np.where(apart < COINCIDENT_M, 1.0, apart)
-            unfolded = np.concatenate([plan * level[:, None], climb[:, None]], axis=-1)
-            return np.asarray(unfolded / np.hypot(around, climb)[:, None])
-
-        arrival = np.where(in_sight[:, None], towards, leg(listener, first[last], rise))
-        departure = np.where(in_sight[:, None], -towards, leg(emitters, last, -rise))
-        detour = np.where(in_sight, -self._clearance_m(listener, emitters, from_listener), excess)
-        return SoundPaths(
-            length, arrival, departure, excess, in_sight, diffraction_gain_db(2 * detour[:, None] / self._wavelengths_m)
-        )
-
-    def _to_bends_m(self, points: Floats) -> Floats:
-        """(..., corner) distance in plan to each corner in sight, infinite to others and to one that is here."""
-        level = np.concatenate([self._bends, np.zeros((len(self._bends), 1))], axis=-1)
-        distance = np.linalg.norm(points[..., None, :2] - self._bends, axis=-1)
-        reached = self._plan.is_visible(points[..., None, :], level) & (distance >= COINCIDENT_M)
-        return np.where(reached, distance, np.inf)
-
-    def _clearance_m(self, listener: Floats, emitters: Floats, from_listener: Floats) -> Floats:
-        """(n,) how much farther than the straight line it is over the nearest corner, for emitters in sight.
-
-        Divided by the cosine of the turn at the corner: next to 1 where the line grazes it, and without end where one
-        would turn by a right angle or more, since such a corner is beside the line and screens nothing. The nearest
-        corner changes without a jump, and it is enough to ask which corners the listener sees: whatever hides one from
-        the emitter stands in the triangle of the three, so it has a corner that is nearer and that both see.
-        """
-        from_emitters = np.linalg.norm(emitters[:, None, :2] - self._bends, axis=-1)
-        seen = np.isfinite(from_listener) & (from_emitters >= COINCIDENT_M)
-        from_listener = np.where(seen, from_listener, 1.0)
-        ahead = -np.sum((listener[:2] - self._bends) * (emitters[:, None, :2] - self._bends), axis=-1)
-        cosine = np.where(seen, ahead, 0.0) / (from_listener * np.where(seen, from_emitters, 1.0))
-        offset = emitters - listener
-        longer = np.hypot(from_listener + from_emitters, offset[:, 2:]) - np.linalg.norm(offset, axis=-1)[:, None]
-        detour = np.maximum(0.0, longer) / np.where(cosine > 0, cosine, 1.0)
-        return np.asarray(np.min(np.where(cosine > 0, detour, np.inf), axis=-1, initial=np.inf))

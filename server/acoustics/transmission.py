@@ -1,9 +1,9 @@
-"""What a wall takes from sound that goes through it: the mass law at field incidence.
+"""Transmission loss of walls: the mass law at field incidence.
 
-Above the lowest resonances of a limp panel and below its coincidence, the loss at normal incidence follows from mass
-alone: 10 log10(1 + (pi f m / (rho c))**2) (London, "Transmission of reverberant sound through single walls", J. Res.
-NBS 42, 1949; Bies & Hansen, Engineering Noise Control, 4th ed., 2009, sec. 8.2.3). Sound that comes from all angles up
-to 78 degrees, as it does in rooms, loses 5.5 dB less in octave or third-octave bands.
+Above the lowest resonances of a limp panel and below its coincidence frequency, the loss at normal incidence depends
+only on mass: 10 log10(1 + (pi f m / (rho c))**2) (London, "Transmission of reverberant sound through single walls", J.
+Res. NBS 42, 1949; Bies & Hansen, Engineering Noise Control, 4th ed., 2009, sec. 8.2.3). In rooms sound comes from all
+angles up to 78 degrees and loses 5.5 dB less in octave or third-octave bands.
 """
 
 from typing import Protocol
@@ -23,7 +23,7 @@ FIELD_INCIDENCE_DB = 5.5
 
 
 def normal_incidence_loss_db(surface_mass_kg_m2: float, frequencies_hz: npt.ArrayLike) -> _Floats:
-    """(...) >= 0. Raises ValueError for a mass that is negative or not finite."""
+    """(...) dB >= 0, at normal incidence. Raises ValueError for a mass that is negative or not finite."""
     if not 0 <= surface_mass_kg_m2 < np.inf:
         raise ValueError("surface mass must be a number of kg/m2, zero or more")
     frequency = np.asarray(frequencies_hz, dtype=np.float64)
@@ -31,7 +31,7 @@ def normal_incidence_loss_db(surface_mass_kg_m2: float, frequencies_hz: npt.Arra
 
 
 def transmission_loss_db(surface_mass_kg_m2: float, frequencies_hz: npt.ArrayLike) -> _Floats:
-    """(...) >= 0, at field incidence. Coincidence, where stiff panels let more through, is not modelled.
+    """(...) dB >= 0, at field incidence. Coincidence, at which stiff panels transmit more, is not modelled.
 
     Raises ValueError for a mass that is negative or not finite.
     """
@@ -39,8 +39,8 @@ def transmission_loss_db(surface_mass_kg_m2: float, frequencies_hz: npt.ArrayLik
 
 
 def walls_between(plan: FloorPlan, a: Points, b: Points) -> npt.NDArray[np.int64]:
-    """(...,) how many walls a straight line in plan goes through between points inside (..., xyz): what is outside of
-    the polygon is wall, and each is entered and left."""
+    """(...,) number of walls that the straight line between points inside (..., xyz) goes through. Everything outside
+    the polygon is wall, and the line enters and leaves each."""
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     start, along = plan.walls[:, 0], plan.walls[:, 1] - plan.walls[:, 0]
     p, step = a[..., None, :2], (b - a)[..., None, :2]
@@ -55,14 +55,14 @@ def walls_between(plan: FloorPlan, a: Points, b: Points) -> npt.NDArray[np.int64
 
 
 class PathFinder(Protocol):
-    """As `ReflectionFinder`."""
+    """An object that finds paths from emitters to a listener, such as `ReflectionFinder`."""
 
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections: ...
 
 
 class TransmittedPaths:
-    """The paths of a finder, and with them the straight ones through walls, each of which takes `wall_loss_db` (band,).
-    Safe to share between threads if the finder is."""
+    """Adds the straight paths through walls to the paths of a finder. Each wall causes a loss of `wall_loss_db`
+    (band,). Safe to share between threads if the finder is."""
 
     def __init__(self, finder: PathFinder, plan: FloorPlan, wall_loss_db: _Floats) -> None:
         self._finder = finder
@@ -70,7 +70,7 @@ class TransmittedPaths:
         self._wall_loss_db = wall_loss_db
 
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections:
-        """Paths to `listener` (3,) from `emitters` (n, 3), emitter after emitter."""
+        """Paths to `listener` (3,) from `emitters` (n, 3), ordered by emitter."""
         found = self._finder.find(listener, emitters)
         here, places = np.asarray(listener, dtype=np.float64), np.asarray(emitters, dtype=np.float64)
         walls = walls_between(self._plan, here, places)

@@ -1,4 +1,4 @@
-"""The ASGI application: loads scenes, starts the audio engine, warms up, serves."""
+"""The ASGI application. It loads scenes, starts the audio engine, warms up, and serves."""
 
 import asyncio
 import dataclasses
@@ -48,7 +48,7 @@ from server.streaming.session import Session
 _CALIBRATION_POSES = 3
 _COSTS_AFTER_S = 5.0
 _COSTS_SHARE = 0.05
-"""Of a core."""
+"""Share of a core that the measurement of effects' costs may take."""
 WEB = Path(__file__).parents[1] / "web"
 
 _logger = logging.getLogger(__name__)
@@ -61,10 +61,11 @@ def create_app(
     hrtfs: HrtfLibrary | None = None,
     drain: Drain | None = None,
 ) -> FastAPI:
-    """`scenes` by id, and `hrtfs`, where the caller has loaded them already to see their errors first. `drain` is begun
-    by who ends the server.
+    """The application. A caller that wants to report loading errors first passes the loaded `scenes`, by id, and
+    `hrtfs`. `drain` lets the caller begin the shutdown.
 
-    Otherwise they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError for an HRTF.
+    Without `scenes` or `hrtfs` they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError
+    for a damaged HRTF file.
     """
     drain = Drain(settings.drain_s) if drain is None else drain
 
@@ -75,7 +76,7 @@ def create_app(
         with (
             Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers,
             ResponseCache(
-                # One more than there are IR workers, which maps leave to what is cheap.
+                # One more than there are IR workers. Maps never take the last one, so that cheap requests have it.
                 workers=settings.ir_workers + 1,
                 waiting=settings.max_waiting_requests,
                 is_urgent=lambda: workers.are_busy,
@@ -133,37 +134,37 @@ def create_app(
 async def _become_ready(host: StreamHost) -> None:
     try:
         await run_in_own_thread(partial(_warm_up, host), "nafir-warm-up")
-    except Exception:  # whatever it is, the server stays up, and not ready, for an operator to look at
+    except Exception:  # the server stays up but not ready, so that an operator can look at it
         _logger.exception("warm-up failed")
         host.readiness.warm_up = "failed"
         return
     collect_rarely()
     host.readiness.warm_up = "done"
     _logger.info("ready: %s", ", ".join(host.scenes))
-    # Nothing waits for these: whoever came first is served first.
+    # Nothing waits for these measurements, so clients that already wait are served first.
     await asyncio.sleep(_COSTS_AFTER_S)
-    breaks = DutyCycle(_COSTS_SHARE)
+    duty_cycle = DutyCycle(_COSTS_SHARE)
     try:
-        await run_in_own_thread(partial(_measure_effects, host, breaks), "nafir-costs")
-    except Exception:  # plans are made without costs, as they were until now
+        await run_in_own_thread(partial(_measure_effects, host, duty_cycle), "nafir-costs")
+    except Exception:  # plans go on without costs
         _logger.exception("what effects cost could not be measured: plans do not say")
     finally:
-        breaks.call_off()
+        duty_cycle.call_off()
 
 
-def _measure_effects(host: StreamHost, breaks: DutyCycle) -> None:
-    """See what effects cost here. Plans of streams opened before do not say."""
+def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:
+    """Measure what effects cost on this host. Plans have no costs until then."""
     become_background()
     for scene, levels in host.scenes.items():
         try:
-            host.effect_costs[scene] = measure_costs(levels.default, rest=breaks.rest)
-        except CancelledError:  # nobody waits any longer
+            host.effect_costs[scene] = measure_costs(levels.default, rest=duty_cycle.rest)
+        except CancelledError:  # the server shuts down
             return
 
 
 def _warm_up(host: StreamHost) -> None:
-    """Do once what every stream does, so that the first one does not pay for it: decode clips, compute, render. And
-    see how long this host takes for a response of each level."""
+    """Decode clips, compute responses and render once, so that the first stream does not have to wait for it. Also
+    measure how long this host takes for a response of each level."""
     warm_up(get_args(BlockSize))
     for scene, levels in host.scenes.items():
         host.places[scene] = place_of_field(levels.default)

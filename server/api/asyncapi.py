@@ -1,7 +1,7 @@
-"""The AsyncAPI 3 document of the stream at /v1/stream, made of what parses and serialises its messages: the models'
-schemas and docstrings, the layouts of binary headers, and an exchange of messages as the code writes them.
+"""The AsyncAPI 3 document of the stream at /v1/stream. It is generated from the code that parses and serialises the
+messages: schemas and docstrings of the models, layouts of binary headers, and an example exchange.
 
-It is told from the server's side: the application *receives* what clients say and *sends* what they hear.
+The document takes the server's side: the application *receives* messages of clients and *sends* its own.
 """
 
 import inspect
@@ -52,43 +52,43 @@ def _description() -> str:
     exchange = "\n".join(
         f"1. {'client' if step.is_of_client else 'server'}, `{step.name}`: {step.meaning}" for step in EXCHANGE
     )
-    return f"""Live audio from a place, while a listener and emitters move in it. Protocol version {PROTOCOL}.
+    return f"""Live audio from a scene in which a listener and emitters move. Protocol version {PROTOCOL}.
 
-Control travels as JSON text, one object with a `type` per message; audio, and listener poses where wished, as binary
-messages whose first byte is their kind. Binary is little endian. Metres, radians, decibels, samples of the scene's
-rate; x east, y north, z up, yaw counter-clockwise from +x. f32 is IEEE 754 single with full scale 1, s16 two's
-complement with 32767 for full scale.
+Control messages are JSON text, one object with a `type` each. Audio is sent in binary messages, and listener poses may
+be; their first byte is the kind. Binary is little endian. Units are metres, radians, decibels and samples at the
+scene's rate; x is east, y north, z up, and yaw counter-clockwise from +x. f32 is IEEE 754 single precision with full
+scale 1, s16 is two's complement with 32767 for full scale.
 
-**What either side does not know.** The server refuses fields and messages that this version does not have, by their
-name: ignored, a misspelt field would be a wish that nobody hears. Clients ignore unknown fields, messages and kinds of
-binary messages: a server may say more within a version. Whole numbers may be written with a fraction of zero (`1.0`).
-Of a `hello` the version is read first: another is answered `unsupported_protocol`, whatever else it says.
+**Unknown fields and messages.** The server refuses fields and messages that this version does not have, and names them.
+Otherwise a misspelt field would be ignored without notice. Clients ignore unknown fields, messages and kinds of binary
+messages, since a server may add some within a version. Whole numbers may have a fraction of zero (`1.0`). The version
+in a `hello` is read first; another version is answered `unsupported_protocol`, whatever else the hello contains.
 
-**Hello first.** The first message is a `hello`, within {_default("hello_timeout_s"):g} s. A `welcome` answers it, and
-sound flows from then on; or an `error`, and the connection ends. A message has at most
-{_default("max_message_bytes")} bytes, and one of more than {_default("max_frame_bytes")} ends the connection. (So by
-default; an operator may set it otherwise.)
+**Hello first.** The first message is a `hello`, within {_default("hello_timeout_s"):g} s. The server answers with a
+`welcome`, after which audio flows, or with an `error`, after which the connection ends. A message has at most
+{_default("max_message_bytes")} bytes, and one of more than {_default("max_frame_bytes")} ends the connection. These are
+defaults; an operator may set other limits.
 
 **Time.** Blocks are sent when they are due, `buffer_blocks` ahead of real time. `sample_clock` counts samples since the
-start of the stream, whether sent or skipped: what has one takes effect in the block that begins there. Pose 0 is where
-the listener starts; the poses that follow, of the listener and of emitters, have ids that rise. Each block names the
-newest pose of its direct sound and that of its reverberation, so that a client can measure how long they take.
+start of the stream, sent or skipped. A message with a `sample_clock` takes effect in the block that begins there. Pose
+0 is where the listener starts. Later poses, of the listener and of emitters, have rising ids. Each block names the
+newest pose of its direct sound and that of its reflected field, so that a client can measure both latencies.
 
-**Flow control by acknowledgement.** At most `window` blocks (of the `welcome`) are sent that no `acknowledge` has told
-to have arrived; one stands for all blocks before it, so that every fourth block or so is enough. While the window is
-full, blocks are rendered and not sent: `sequence` has no gap then, and `sample_clock` jumps. Once it has been full for
-{PAUSE_AFTER_S:g} s, the stream stands still, its clock included, until an `acknowledge` makes room: it goes on where it
-was. After {_default("stall_timeout_s"):g} s the connection is closed (`stalled`). A client whose answers pile up, since
-it does not read, is cut off.
+**Flow control by acknowledgement.** At most `window` blocks (see `welcome`) are sent without an `acknowledge`. One
+`acknowledge` stands for all earlier blocks, so every fourth block or so is enough. While the window is full, blocks are
+rendered but not sent: `sequence` has no gap then, and `sample_clock` jumps. Once the window has been full for
+{PAUSE_AFTER_S:g} s, the stream and its clock stand still until an `acknowledge` makes room, and then go on from there.
+After {_default("stall_timeout_s"):g} s the connection is closed (`stalled`). A client that does not read is cut off
+once too many messages wait for it.
 
-**Flow control of what clients say.** A client may say as much as a live block of 128 samples of each of its emitters,
-{POSES_PER_S:,} poses a second, an acknowledgement of every block and {MOVES_PER_S} moves a second of each emitter come
-to. Beyond that the server reads more slowly: nothing is lost, nothing is closed, and the rest waits with the client. Of
-poses of the listener that follow one another directly, only the newest may be read.
+**Flow control of client messages.** A client may send, each second, live blocks of 128 samples for all its emitters,
+{POSES_PER_S:,} poses, an acknowledgement of every block, and {MOVES_PER_S} moves of each emitter. Beyond that the
+server reads more slowly: nothing is lost and nothing is closed, but the rest waits at the client. If several listener
+poses come directly after one another, the server may read only the newest.
 
-**Errors.** A message that is refused changes nothing, and the stream goes on, unless it was the hello. An `error` that
-ends the connection is followed by a close frame whose reason is the error's code. A server that is told to stop sends
-every stream the error `server_draining` and closes it with 1012: the client opens it again, there or elsewhere.
+**Errors.** A refused message changes nothing, and the stream goes on, unless it was the hello. An `error` that ends the
+connection is followed by a close frame whose reason is the error's code. A server that shuts down sends every stream
+the error `server_draining` and closes it with 1012; the client may open it again, there or elsewhere.
 
 **An exchange**
 
@@ -97,7 +97,7 @@ every stream the error `server_draining` and closes it with 1012: the client ope
 
 
 class _Draft7(GenerateJsonSchema):
-    """What AsyncAPI's own schemas are a superset of."""
+    """Generates schemas of JSON Schema draft 7, which AsyncAPI's schemas are a superset of."""
 
     def tuple_schema(self, schema: core_schema.TupleSchema) -> JsonSchemaValue:
         generated = super().tuple_schema(schema)
@@ -106,7 +106,7 @@ class _Draft7(GenerateJsonSchema):
         return generated
 
     def field_is_required(self, field: Any, total: bool) -> bool:
-        # What the server sends, it sends whole.
+        # The server sends every field of a message.
         return self.mode == "serialization" or super().field_is_required(field, total)
 
     def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ARG002  no titles that repeat a field's name
@@ -114,7 +114,7 @@ class _Draft7(GenerateJsonSchema):
 
 
 def _schemas() -> Object:
-    """By the models' names. A `type` has a default in the models and has to be sent all the same."""
+    """Schemas by the models' names. `type` is required, although it has a default in the models."""
     _, generated = models_json_schema(
         [*((each, "validation") for each in _CLIENT), *((each, "serialization") for each in _SERVER)],
         ref_template="#/components/schemas/{model}",
@@ -123,7 +123,7 @@ def _schemas() -> Object:
     schemas: Object = generated["$defs"]
     _, of_clients = models_json_schema([(each, "validation") for each in _CLIENT], schema_generator=_Draft7)
     for name in schemas.keys() - of_clients["$defs"].keys():
-        # A client has to ignore what it does not know.
+        # A client has to ignore unknown fields.
         schemas[name].pop("additionalProperties", None)
     for each in _CLIENT:
         schema = schemas[each.__name__]
@@ -136,9 +136,9 @@ def _type(model: type[Message]) -> str:
     return str(model.model_fields["type"].default)
 
 
-def _message(name: str, told: type, **rest: Any) -> Object:
-    """`told` is what the docstring of says what it means."""
-    paragraphs = (inspect.getdoc(told) or "").split("\n\n")
+def _message(name: str, documented: type, **rest: Any) -> Object:
+    """The description of a message, whose text is the docstring of `documented`."""
+    paragraphs = (inspect.getdoc(documented) or "").split("\n\n")
     description = "\n\n".join(" ".join(each.split()) for each in paragraphs)
     summary, *_ = re.split(r"\.(?=\s|$)", description)
     examples = [{"summary": step.meaning, "payload": step.payload} for step in EXCHANGE if step.name == name]
@@ -155,14 +155,14 @@ def _text_message(model: type[Message]) -> Object:
     return message
 
 
-def _binary_message(name: str, told: _Binary) -> Object:
-    """The layout twice: as a table for people, and in `x-layout` for programs."""
+def _binary_message(name: str, model: _Binary) -> Object:
+    """The description of a binary message. Its layout is a table for people, and in `x-layout` for programs."""
     payload = {"type": "string", "format": "binary"}
-    message = _message(name, told, payload=payload, contentType="application/octet-stream")
-    message["description"] += f"\n\nLittle endian, without gaps:\n\n{told.LAYOUT.to_markdown()}"
+    message = _message(name, model, payload=payload, contentType="application/octet-stream")
+    message["description"] += f"\n\nLittle endian, without gaps:\n\n{model.LAYOUT.to_markdown()}"
     for example in message["examples"]:
         example["summary"] += ", in hexadecimal digits"
-    return message | {"x-layout": told.LAYOUT.to_json()}
+    return message | {"x-layout": model.LAYOUT.to_json()}
 
 
 def _operations() -> Object:
@@ -184,10 +184,10 @@ def _operations() -> Object:
 
 
 def describe() -> Object:
-    """The document. The same from every server of this version: only defaults of settings are told."""
+    """The document. It is the same for every server of this version, since it states only defaults of settings."""
     messages = {_type(each): _text_message(each) for each in (*_CLIENT, *_SERVER)}
     binary = {**_CLIENT_BINARY, **_SERVER_BINARY}
-    messages |= {name: _binary_message(name, told) for name, told in binary.items()}
+    messages |= {name: _binary_message(name, model) for name, model in binary.items()}
     host = {"default": f"{_default('host')}:{_default('port')}", "description": "Where `nafir serve` listens."}
     return {
         "asyncapi": "3.0.0",
@@ -223,5 +223,5 @@ def describe() -> Object:
 
 @cache
 def document() -> str:
-    """As JSON."""
+    """The document as JSON."""
     return json.dumps(describe(), indent=2, ensure_ascii=False)

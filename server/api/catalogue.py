@@ -1,4 +1,4 @@
-"""What a server offers: scenes with their fields, clips to hear in them, and heads to hear them through."""
+"""What a server offers: scenes with their fields, clips and heads."""
 
 import logging
 import math
@@ -17,11 +17,11 @@ _logger = logging.getLogger(__name__)
 
 
 def load_scenes(bundles: Iterable[Path]) -> dict[str, FieldsByLevel]:
-    """Quality levels by scene id: the bundled scenes, and `bundles`, which win where one of those has the id.
+    """Quality levels by scene id, of the bundled scenes and of `bundles`, which replace bundled scenes of the same id.
 
-    Raises BundleError for the first bundle that is damaged, or has the id of another of `bundles`.
+    Raises BundleError for the first bundle that is damaged or has the id of another of `bundles`.
     """
-    own: dict[str, Bundle] = {}  # read first: what is wrong with them is told before the others' graphs are read
+    own: dict[str, Bundle] = {}  # read first, so that their errors appear before the bundled graphs are loaded
     for folder in bundles:
         bundle = Bundle.load(folder)
         other = own.setdefault(bundle.id, bundle)
@@ -38,9 +38,9 @@ def load_hrtfs(files: Iterable[Path], scenes: Mapping[str, FieldsByLevel]) -> Hr
 
 
 def open_clips(scenes: Mapping[str, FieldsByLevel], files: Iterable[Path]) -> dict[str, ClipLibrary]:
-    """Clips by scene id; scenes of one sample rate share a library, and files are named by their stem.
+    """Clips by scene id. Scenes of one sample rate share a library, and files are named by their stem.
 
-    Raises ValueError for two of one stem.
+    Raises ValueError if two files have the same stem.
     """
     named = named_by_stem(files)
     rates = {scene: levels.default.sample_rate for scene, levels in scenes.items()}
@@ -49,7 +49,7 @@ def open_clips(scenes: Mapping[str, FieldsByLevel], files: Iterable[Path]) -> di
 
 
 def playable_clips(clips: ClipLibrary) -> list[Clip]:
-    """Every clip that can be decoded, decoded; the log says of the others why not."""
+    """Descriptions of all clips that can be decoded. The log says why the others cannot."""
     playable = []
     for name in clips.names:
         try:

@@ -1,15 +1,15 @@
-"""The asyncio driver of a WebSocket stream: moves bytes between the socket, the session and the audio thread.
+"""The asyncio driver of a WebSocket stream. It moves data between the socket, the session and the audio thread.
 
-One `Connection` per client, living on the event loop. A reader passes what the client says to the audio thread; a
-sender passes on what the audio thread made. Nothing here grows without bound: messages to the audio thread are refused
-beyond `MAX_WAITING_MESSAGES`, audio beyond the window is never made, and a client that reads so slowly that its answers
-pile up is cut off, whether or not it ever reads again. So is one that acknowledges nothing for `stall_timeout_s`.
+Each client has one `Connection`, which lives on the event loop. A reader passes the client's messages to the audio
+thread, and a sender passes the audio thread's output to the socket. Nothing grows without bound: messages to the audio
+thread are refused beyond `MAX_WAITING_MESSAGES`, audio beyond the window is never sent, and a client that reads so
+slowly that its messages pile up is cut off. So is a client that acknowledges nothing for `stall_timeout_s`.
 
-A connection takes one of the server's streams with a hello, and not before. Those without one are few: one too many
-ends that which has been silent for longest, so that nobody who speaks is kept out by those who do not.
+A connection takes up one of the server's streams only with its hello. The number of connections without a hello is
+limited: one too many ends the one that has been silent for longest, so that silent clients keep no others out.
 
-What ends a connection is returned, and not raised: an exception that a task keeps holds the frames that hold the task,
-and a session in them would wait for the collector.
+The reason for ending a connection is returned and not raised. An exception kept by a task refers to frames that refer
+to the task, and a session in that cycle would stay in memory until the garbage collector runs.
 """
 
 import asyncio
@@ -54,7 +54,7 @@ from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
 MAX_WAITING_ANSWERS = 256
 _GOODBYE_S = 1.0
-"""Even closing waits for room in the socket, and a client that does not read makes none."""
+"""Limit for sending the close frame. It waits for room in the socket, which a client that does not read never makes."""
 
 
 def load_clip(clips: ClipLibrary, name: str) -> DryAudio:
@@ -66,7 +66,7 @@ def load_clip(clips: ClipLibrary, name: str) -> DryAudio:
 
 
 def _first_blocks(outgoing: Iterable[Outgoing]) -> Iterator[TimedBlock]:
-    """Those before which nothing else is."""
+    """The blocks at the beginning, up to the first message that is not a block."""
     for each in outgoing:
         if not isinstance(each, TimedBlock):
             return
@@ -75,7 +75,7 @@ def _first_blocks(outgoing: Iterable[Outgoing]) -> Iterator[TimedBlock]:
 
 @dataclass(frozen=True)
 class Goodbye:
-    """The connection ends with this code, after an error message."""
+    """The end of a connection: an error message and the code of the close frame after it."""
 
     close_code: int
     error: Error
@@ -93,12 +93,12 @@ def _refused(refusal: RequestError) -> Goodbye:
 
 @dataclass
 class StreamHost:
-    """What all connections share: loaded scenes, their clips, heads, the audio engine, and how many streams there
-    are. `offers` says what the quality levels of each scene cost here, once that was measured."""
+    """State that all connections share: loaded scenes, clips, heads, the audio engine and the number of streams.
+    `offers` has the cost of each scene's quality levels on this host once it is measured."""
 
     scenes: Mapping[str, FieldsByLevel]
     clips: Mapping[str, ClipLibrary]
-    """By scene, since every scene has its sample rate."""
+    """Clip libraries by scene; each has the scene's sample rate."""
     hrtfs: HrtfLibrary
     audio: AudioEngine
     settings: Settings
@@ -106,23 +106,23 @@ class StreamHost:
     readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     places: dict[str, SceneAcoustics] = dataclasses.field(default_factory=dict)
-    """What plans of effects are made for, by scene."""
+    """Acoustics of each scene, for the planner of effects."""
     effect_costs: dict[str, Costs] = dataclasses.field(default_factory=dict)
-    """By scene, once they were measured."""
+    """Costs of effects by scene, once they are measured."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
-    """What all streams have counted."""
+    """Counts of all streams, open and ended."""
     streams: int = 0
-    """Those open, and those being opened."""
+    """Number of streams that are open or being opened."""
     openings: OneAtATime = dataclasses.field(default_factory=OneAtATime)
-    """Sessions are made one after the other: each takes some 8 ms of a processor."""
+    """Creates sessions one after the other, since each takes about 8 ms of CPU time."""
     silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
-    """How long connections without a hello are waited for; who came first is first."""
+    """Timeouts of the connections that have not sent a hello, oldest first."""
 
     def is_full(self) -> bool:
         return self.streams >= self.settings.max_streams
 
     def await_hello(self, patience: asyncio.Timeout) -> None:
-        """Note that a connection has not spoken yet; where there are too many, wait for the first of them no more."""
+        """Note a connection that has not sent its hello yet. If there are too many, end the oldest."""
         self.silent[patience] = None
         if len(self.silent) > self.settings.max_silent:
             longest = next(iter(self.silent))
@@ -131,23 +131,23 @@ class StreamHost:
 
 
 class Connection:
-    """One client from its hello to its goodbye. `way` is the short one in and out, where there is one."""
+    """One client's connection from its hello to its end. `fast_path` bypasses ASGI if the server has one."""
 
     def __init__(
         self,
         websocket: WebSocket,
         host: StreamHost,
         *,
-        way: FastPath | None = None,
+        fast_path: FastPath | None = None,
         time_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._websocket = websocket
-        self._way = way
+        self._fast_path = fast_path
         self._host = host
         self._time_s = time_s
         self._outgoing: deque[Outgoing] = deque()
         self._has_outgoing = asyncio.Event()
-        self._is_sending = self._is_taking_in = False
+        self._is_sending = self._is_handling = False
         self._capacity = MAX_WAITING_ANSWERS
         self._is_overfull = asyncio.Event()
         self._stream: Stream | None = None
@@ -177,7 +177,7 @@ class Connection:
             return _DRAINING
 
     async def _serve(self) -> Goodbye | None:
-        """Until the client has gone, which returns None, or is to be sent away."""
+        """Serve the client. Returns None if the client has gone, or else the reason to end the connection."""
         host = self._host
         if (obstacle := host.readiness.obstacle) is not None:
             return Goodbye(TRY_AGAIN_LATER, Error(code="not_ready", message=obstacle.message))
@@ -217,7 +217,7 @@ class Connection:
         return message
 
     async def _open(self, hello: Hello) -> Stream | Goodbye | None:
-        """None where the client has gone before it was its turn."""
+        """Open a stream. Returns None if the client has gone meanwhile."""
         settings = self._host.settings
         levels = self._host.scenes.get(hello.scene)
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
@@ -264,7 +264,7 @@ class Connection:
         )
 
     def _is_there(self) -> bool:
-        return self._way is None or self._way.is_open()
+        return self._fast_path is None or self._fast_path.is_open()
 
     def _open_session(
         self, hello: Hello, levels: FieldsByLevel, hrtf: str, quality: QualityStep, window: int
@@ -284,7 +284,7 @@ class Connection:
         )
 
     async def _pump(self, stream: Stream, hello: Hello) -> Goodbye | None:
-        """Read and send until the client has gone or is to be sent away."""
+        """Read and send. Returns None if the client has gone, or else the reason to end the connection."""
         self._stream, self._encoding = stream, hello.encoding
         self._host.ledger.open(stream)
         self._host.audio.open(stream)
@@ -302,25 +302,26 @@ class Connection:
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
-        # Where the client has gone, there is nobody to be told why it is sent away.
+        # If the client has gone, any reason to end the connection no longer matters.
         return None if any(task.result() is None for task in done) else next(iter(done)).result()
 
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
-        """Until the client has gone."""
-        if self._way is not None:
+        """Handle incoming messages until the client has gone."""
+        if self._fast_path is not None:
             emitters, rate = self._host.settings.max_emitters, self._host.scenes[hello.scene].default.sample_rate
-            self._way.allow(Allowance.of(emitters=emitters, sample_rate=rate))
-            self._way.listen(self._hear)
+            self._fast_path.allow(Allowance.of(emitters=emitters, sample_rate=rate))
+            self._fast_path.listen(self._handle_at_once)
         with contextlib.suppress(WebSocketDisconnect):
             while True:
                 data = await self._receive()
-                self._is_taking_in = True
-                await self._take_in(data, stream, hello)
-                self._is_taking_in = False
+                self._is_handling = True
+                await self._handle(data, stream, hello)
+                self._is_handling = False
 
-    def _hear(self, data: str | bytes) -> bool:
-        """Take in what needs nothing but the audio thread, unless something that came before is not yet."""
-        if self._is_taking_in or self._stream is None:
+    def _handle_at_once(self, data: str | bytes) -> bool:
+        """Handle a message that needs only the audio thread. Returns False, and does nothing, for any other message or
+        while an earlier one is being handled."""
+        if self._is_handling or self._stream is None:
             return False
         try:
             message = self._parse(data)
@@ -331,22 +332,22 @@ class Connection:
             self._enqueue([Error.from_refusal(refusal)])
         return True
 
-    async def _take_in(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
+    async def _handle(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
         try:
             message = self._parse(data)
             if isinstance(message, AddEmitter) and message.clip is not None:
-                # Decoded once, here and off the loop, so that the audio thread finds it ready.
+                # Decoded here, off the event loop, so that the audio thread need not wait.
                 await asyncio.to_thread(load_clip, self._host.clips[hello.scene], message.clip)
             self._pass_on(message, stream)
         except RequestError as refusal:
             self._enqueue([Error.from_refusal(refusal)])
 
     def _pass_on(self, message: ClientMessage, stream: Stream) -> None:
-        """Raises RequestError too_many_messages."""
+        """Answer a ping, or put the message into the stream's inbox. Raises RequestError too_many_messages."""
         if isinstance(message, Ping):
             self._enqueue([Pong(id=message.id)])
         elif not stream.offer(message):
-            raise RequestError("too_many_messages", "too many messages in one block: this one was not heeded")
+            raise RequestError("too_many_messages", "too many messages in one block: this one was ignored")
 
     async def _receive(self) -> str | bytes:
         event = await self._websocket.receive()
@@ -363,20 +364,20 @@ class Connection:
         return parse_client_message(data)
 
     def _deliver(self, outgoing: list[Outgoing]) -> None:
-        """Send blocks at once where there is a short way and nothing waits to go before them."""
+        """Send the audio thread's output: blocks at once if there is a fast path and nothing waits to be sent."""
         if self._stream is None:
-            return  # what was made before the audio thread knew that the connection ends
+            return  # rendered before the audio thread knew that the connection ends
         blocks: list[bytes] = []
-        if self._way is not None and not (self._outgoing or self._is_sending):
+        if self._fast_path is not None and not (self._outgoing or self._is_sending):
             now_s = self._time_s()
             blocks = [self._serialize(block, now_s) for block in _first_blocks(outgoing)]
-            if blocks and not self._way.write(blocks):
+            if blocks and not self._fast_path.write(blocks):
                 blocks = []
         if len(blocks) < len(outgoing):
             self._enqueue(outgoing[len(blocks) :])
 
     def _enqueue(self, outgoing: list[Outgoing]) -> None:
-        """Where there is no room, what comes is lost, and the connection ends."""
+        """Queue messages for the sender. If there is no room, they are dropped and the connection ends."""
         if len(self._outgoing) + len(outgoing) > self._capacity:
             self._is_overfull.set()
             return
@@ -384,8 +385,8 @@ class Connection:
         self._has_outgoing.set()
 
     async def _watch(self, stream: Stream) -> Goodbye:
-        """Until the client reads too slowly, or acknowledges nothing. Apart from the sender, which may be waiting for
-        the very client that does not read."""
+        """Return once the client reads too slowly or acknowledges nothing. This is separate from the sender, which may
+        itself wait for a client that does not read."""
         patience_s = left_s = self._host.settings.stall_timeout_s
         while left_s > 0:
             with contextlib.suppress(TimeoutError):
@@ -397,7 +398,7 @@ class Connection:
         return Goodbye(POLICY_VIOLATION, Error(code="stalled", message=message))
 
     async def _send_outgoing(self) -> Goodbye | None:
-        """Until the client has gone, which returns None, or the stream cannot go on."""
+        """Send queued messages. Returns None if the client has gone, or the reason if the stream has failed."""
         with contextlib.suppress(WebSocketDisconnect):
             while True:
                 await self._has_outgoing.wait()

@@ -1,20 +1,20 @@
-"""How much a client may send, how long it may take, and how many connections there may be."""
+"""Limits of HTTP connections: sizes, times and numbers."""
 
 from dataclasses import dataclass
 
 from server.api.settings import Settings
 
 HEALTH_PATHS = "/livez", "/readyz"
-"""What a process supervisor asks: answered whatever `Host` says, and when all other connections are taken."""
+"""Paths for process supervisors. They are answered for any `Host`, and also when all other connections are taken."""
 
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """Of the server's HTTP side, up to a WebSocket's handshake. The settings of the same names say what each is for."""
+    """Limits of HTTP requests and WebSocket handshakes. The settings of the same names explain each."""
 
     max_request_line_bytes: int
     max_header_bytes: int
-    """Of one line, so that the WebSocket handshake, which has a bound of its own (8,192), takes what this lets pass."""
+    """Longest single header line. It is below the limit of the WebSocket library (8,192)."""
     max_headers_bytes: int
     max_headers: int
     max_body_bytes: int
@@ -23,7 +23,7 @@ class ConnectionLimits:
     max_connections: int
     max_connections_per_address: int
     reserve_connections: int = 32
-    """Beyond `max_connections`, for health checks, and to tell others that there is no room."""
+    """Connections beyond `max_connections`, for health checks and for answering others that there is no room."""
 
     @classmethod
     def of(cls, settings: Settings) -> "ConnectionLimits":

@@ -1,16 +1,16 @@
-"""Who may use the server from within a browser.
+"""Protection against requests from other sites' pages in a browser.
 
-Every page that somebody visits can send requests to servers that only they can reach, `localhost` above all. Two checks
-keep such pages out, on HTTP requests and WebSocket upgrades alike:
+Any page that a user visits can send requests to servers that only this user can reach, such as `localhost`. Two checks
+keep such pages out, for HTTP requests and WebSocket upgrades alike:
 
-- **Host.** A page that has the name of its own site point to this server (DNS rebinding) counts as this server's own to
-  the browser, but its requests carry that name. So a server answers to names it knows. Addresses in numbers are never
-  a site's name; a server on a loopback address answers to loopback addresses alone.
+- **Host.** A page can make the name of its own site point to this server (DNS rebinding). The browser then takes the
+  server for the page's own, but its requests carry that name. So the server answers only to names it knows. Numeric
+  addresses are never a site's name, so they are allowed; a server on a loopback address allows only loopback addresses.
 - **Origin.** A browser says from which site a page came (RFC 6454; Fetch, `Sec-Fetch-Site`). The server's own page and
-  sites that the operator named may use it. Programs that are no browsers send no origin, and may.
+  sites that the operator named are allowed. Programs other than browsers send no origin and are allowed.
 
-A header that decides this may be there once: a proxy in front and this server could each believe another of two.
-Health checks are answered whatever they say: they tell nothing and cost nothing.
+Each of these headers may occur only once. Otherwise a proxy and this server could each go by a different one. Health
+checks are answered in any case: they reveal nothing and cost nothing.
 """
 
 import ipaddress
@@ -34,13 +34,13 @@ _METHODS = ("GET", "HEAD")
 _HEADERS = ("If-None-Match",)
 _DECISIVE = ("Host", "Origin", "Sec-Fetch-Site")
 _FOR_PROGRAMS = ("/v1/", "/metrics")
-"""Paths that no link leads to."""
+"""Paths for programs, to which no link of a page leads."""
 
 
 @dataclass(frozen=True)
 class SitePolicy:
-    """`hosts` and `origins` are lower case; `*` among hosts is any. With `is_loopback`, of addresses in numbers only
-    those of the machine itself are answered to."""
+    """Hosts and origins that are allowed, in lower case; the host `*` allows any. With `is_loopback`, only loopback
+    addresses are allowed among numeric addresses."""
 
     hosts: frozenset[str]
     origins: frozenset[str]
@@ -56,8 +56,8 @@ class SitePolicy:
         )
 
     def refusal(self, path: str, headers: Headers, *, scheme: str = "http") -> Refusal | None:
-        """What a request is answered in place of the application, if anything. `scheme` is that of its address: `http`,
-        `https`, `ws` or `wss`."""
+        """The refusal of a request; None if it is allowed. `scheme` is that of its URL: `http`, `https`, `ws` or
+        `wss`."""
         for name in _DECISIVE:
             if (times := len(headers.getlist(name))) > 1:
                 return Refusal(400, "doubled_header", f"{name} is given {times} times: give it once")
@@ -68,7 +68,7 @@ class SitePolicy:
             )
         origin, site = headers.get("origin"), headers.get("sec-fetch-site")
         if origin is None:
-            # As of a picture in another site's page. A visitor may follow a link from there to the page itself.
+            # For instance a picture in another site's page. A visitor may still follow a link from there to our page.
             is_foreign = path.startswith(_FOR_PROGRAMS) and site == "cross-site"
             origin = "another site" if is_foreign else None
         elif origin.lower() in self.origins or _is_own(origin, host, scheme=scheme, site=site):
@@ -82,14 +82,14 @@ class SitePolicy:
     def _may_be_called(self, host: "_Authority") -> bool:
         if _ANY in self.hosts or host.name in self.hosts:
             return True
-        if host.name == "localhost" or host.name.endswith(".localhost"):  # RFC 6761, 6.3: never another's
+        if host.name == "localhost" or host.name.endswith(".localhost"):  # RFC 6761, 6.3: always loopback
             return True
         address = _address(host.name)
         return address is not None and (address.is_loopback or not self.is_loopback)
 
 
 class CrossSiteGate:
-    """ASGI middleware that refuses what a `SitePolicy` does. Sites it allows are given their CORS headers."""
+    """ASGI middleware that applies a `SitePolicy`. Responses to allowed sites get CORS headers."""
 
     def __init__(self, app: ASGIApp, *, policy: SitePolicy) -> None:
         self._policy = policy
@@ -111,14 +111,14 @@ class CrossSiteGate:
         if refusal is None:
             await self._app(scope, receive, _varying(send) if self._policy.origins else send)
         elif scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
-            # Before it is accepted: the upgrade is answered 403, and without a body.
+            # A close before acceptance answers the upgrade with 403 and no body.
             await send({"type": "websocket.close", "code": 1008, "reason": refusal.code})
         else:
             await problem(refusal.status, refusal.code, refusal.detail)(scope, receive, send)
 
 
 class _Cors(CORSMiddleware):
-    """Refuses preflights with a problem document, as every other error."""
+    """CORS middleware whose refusals of preflights are problem documents, like all other errors."""
 
     def preflight_response(self, request_headers: Headers) -> Response:
         response = super().preflight_response(request_headers)
@@ -134,7 +134,7 @@ class _Cors(CORSMiddleware):
 
 @dataclass(frozen=True)
 class _Authority:
-    """A host's name in lower case, without brackets, and its port where one is given."""
+    """A host name in lower case, without brackets, and its port if one is given."""
 
     name: str
     port: int | None
@@ -144,16 +144,16 @@ class _Authority:
         try:
             parts = urlsplit(f"//{text}")
             return cls((parts.hostname or "").rstrip("."), parts.port)
-        except ValueError:  # no authority at all
+        except ValueError:  # not a valid authority
             return cls(text, None)
 
 
 def _is_own(origin: str, host: _Authority, *, scheme: str, site: str | None) -> bool:
-    """Whether a page came from where its request goes, `scheme` included (RFC 6454, 4).
+    """Whether a page has the same origin as its request, `scheme` included (RFC 6454, 4).
 
-    A proxy in front may speak TLS and not say so: then `scheme` is `http` for a page of either kind, and `site`, what
-    the browser says in `Sec-Fetch-Site`, tells the two apart. Browsers disagree on it for WebSockets, whose scheme is
-    another than a page's.
+    A proxy in front may speak TLS without saying so. Then `scheme` is `http` for pages of either scheme, and `site`,
+    the browser's `Sec-Fetch-Site`, tells them apart. Browsers disagree on `site` for WebSockets, so it is not used
+    there.
     """
     page_scheme, _, rest = origin.lower().partition("://")
     if scheme in {"https", "wss"} and page_scheme != "https":
@@ -181,7 +181,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _varying(send: Send) -> Send:
-    """Caches must not give one site what another was answered."""
+    """Add `Vary: Origin`, so that caches do not give one site the response to another."""
 
     async def send_varying(message: Message) -> None:
         if message["type"] == "http.response.start":

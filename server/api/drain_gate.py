@@ -1,5 +1,4 @@
-"""The door for HTTP requests while the server drains: new ones are refused, and those in flight finish or are answered
-503 in time."""
+"""HTTP requests during shutdown. New ones are refused; those in flight finish or are answered 503 in time."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
@@ -16,11 +15,11 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _MESSAGE = "the server is shutting down: ask another, or again once it has restarted"
 _ALWAYS_ANSWERED = frozenset({"/livez", "/readyz", "/metrics"})
-"""How an operator follows the drain."""
+"""Paths that operators watch during the shutdown."""
 
 
 class DrainGate:
-    """ASGI middleware around `app`. WebSockets pass: a stream is told in its own words."""
+    """ASGI middleware around `app`. WebSockets pass, since each connection ends its stream itself."""
 
     def __init__(self, app: App, drain: Drain) -> None:
         self._app = app

@@ -1,4 +1,4 @@
-"""The accuracy of a scene's quality levels against their cost in time, as GET /v1/scenes/{id}/frontier tells it."""
+"""Accuracy and cost of a scene's quality levels, for GET /v1/scenes/{id}/frontier."""
 
 from collections.abc import Mapping
 from typing import Self
@@ -7,11 +7,11 @@ from pydantic import BaseModel, ConfigDict
 
 from server.acoustics.audibility import THRESHOLDS
 from server.field.fields_by_level import FieldsByLevel
-from server.scene.level_titles import LevelOfField, level_titles
+from server.field.level_titles import LevelOfField, level_titles
 from server.scene.manifest import FieldFile, Phase, QualityLevel, Reuse
 
 _RELATIVE = frozenset({"edt"})
-"""Metrics whose threshold is a share of what is there, which means over pairs no longer tell."""
+"""Metrics whose threshold is relative to the reference. It cannot be applied to means over pairs."""
 
 
 class _Document(BaseModel):
@@ -19,21 +19,20 @@ class _Document(BaseModel):
 
 
 class LevelPoint(_Document):
-    """One quality level, None where nothing was measured; one that is not `is_offered` was worth its time when it was
-    measured, and cannot be asked for. Requests and messages call it by its `name`; `title` is for people.
+    """One quality level; values that were not measured are None. Requests and messages use its `name`; `title` is for
+    people. A level that is not `is_offered` was measured on the frontier, but cannot be chosen.
 
-    Milliseconds are what a pose takes on one core until its binaural impulse response is ready to be convolved:
-    `ms_mean`, `ms_p50` and `ms_p99` over a walk, and `ms_miss` for a pose that finds nothing kept, on `measured_on`,
-    where the bundle was made; `ms_here` is a response's on this host, when the server started. `errors` are means over
-    `pairs` held-out pairs at `yaws` head orientations, by metric, and `floor` is the repeatability floor: what two
-    references of the same pair differ by. `audible` and `audible_floor` say the same as one number each: the mean over
-    those metrics that have a just-noticeable difference, in just-noticeable differences, but for EDT, whose is a share
-    of what there is. `steps` are the largest changes seen between poses a centimetre apart, by metric, in
-    just-noticeable differences.
+    Times are milliseconds on one core from a pose until its binaural impulse response is ready to be convolved.
+    `ms_mean`, `ms_p50` and `ms_p99` are over a walk, and `ms_miss` is for poses for which no kept response can be
+    reused; these were measured on the host `measured_on`. `ms_here` was measured on this host when the server started.
+    `errors` are means by metric over `pairs` held-out pairs at `yaws` head orientations. `floor` is the repeatability
+    floor: the difference between two references of the same pair. `audible` and `audible_floor` are the means of these
+    in just-noticeable differences, over all metrics that have one except EDT, whose threshold is relative. `steps` are
+    the largest changes between poses a centimetre apart, by metric, in just-noticeable differences.
 
-    An emitter gets `ir_rate_hz` responses a second at most, or one with every pose; of each, the first `frames` frames
-    are computed, or all; with `reuse`, poses near each other share them. `architecture` is that of the level's field,
-    None where the scene has none.
+    An emitter gets at most `ir_rate_hz` responses a second or, if that is null, one for every pose. If `frames` is
+    given, only that many frames of each are computed. With `reuse`, poses near each other share responses.
+    `architecture` is that of the level's field; None if the scene has no field.
     """
 
     name: str
@@ -63,8 +62,8 @@ class LevelPoint(_Document):
     shared_tail: bool
 
     @classmethod
-    def of(cls, of: LevelOfField, title: str, *, ms_here: float | None = None, is_offered: bool = True) -> Self:
-        level = of.level
+    def of(cls, entry: LevelOfField, title: str, *, ms_here: float | None = None, is_offered: bool = True) -> Self:
+        level = entry.level
         cost, accuracy = level.cost, level.accuracy
         return cls(
             name=level.name,
@@ -85,8 +84,8 @@ class LevelPoint(_Document):
             yaws=accuracy and accuracy.yaws,
             audible=accuracy and mean_jnd(accuracy.errors),
             audible_floor=accuracy and mean_jnd(accuracy.floor),
-            architecture=of.architecture,
-            rank=of.rank,
+            architecture=entry.architecture,
+            rank=entry.rank,
             phase=level.phase,
             frames=level.frames,
             reuse=level.reuse,
@@ -96,8 +95,8 @@ class LevelPoint(_Document):
 
 
 class Frontier(_Document):
-    """`levels` from the cheapest to the most expensive, then those that are not offered; `default` is the one that a
-    request without a level gets."""
+    """All measured levels of a scene: those on offer from the cheapest to the most expensive, then those not offered.
+    `default` is the level of requests that name none."""
 
     scene: str
     default: str
@@ -105,11 +104,11 @@ class Frontier(_Document):
 
     @classmethod
     def of(cls, levels: FieldsByLevel, ms_here: Mapping[str, float]) -> Self:
-        """`ms_here` by level, as far as it was measured."""
+        """The frontier of a scene. `ms_here` has the times on this host by level, as far as they are measured."""
         manifest = levels.bundle.manifest
         offered = [_of_field(levels[name].level, manifest.fields) for name in levels.names]
         measured = [LevelOfField(point.level, point.architecture, point.rank) for point in manifest.frontier]
-        # What is only measured takes no short title from what can be chosen.
+        # Levels that can be chosen get the shortest titles.
         titles = level_titles([*offered, *measured]) | level_titles(offered)
         points = [LevelPoint.of(each, titles[each.name], ms_here=ms_here.get(each.name)) for each in offered]
         points += [LevelPoint.of(each, titles[each.name], is_offered=False) for each in measured]
@@ -122,7 +121,7 @@ def _of_field(level: QualityLevel, fields: Mapping[str, FieldFile]) -> LevelOfFi
 
 
 def mean_jnd(errors: Mapping[str, float]) -> float | None:
-    """Errors by metric in just-noticeable differences, the mean over those that have one; None where none has."""
+    """Mean of the errors in just-noticeable differences, over the metrics that have one; None if there are none."""
     amounts = {name: threshold.amount for name, threshold in THRESHOLDS.items() if name not in _RELATIVE}
     audible = [errors[name] / amount for name, amount in amounts.items() if name in errors]
     return sum(audible) / len(audible) if audible else None

@@ -1,9 +1,9 @@
-"""uvicorn's HTTP protocol with limits: what is too much never reaches the parser, and nothing stays open for ever.
+"""uvicorn's HTTP protocol with limits on sizes and times.
 
-uvicorn's parser collects a request line and headers without a bound. Here every byte is measured first
+uvicorn's parser collects request lines and headers without a limit. Here every byte is measured first
 (`server.api.request_meter`), requests are parsed one at a time, and every connection has a seat (`server.api.seats`)
-that others may claim while nothing is under way on it. A look at all connections, twice a second, ends those that are
-overdue.
+that another connection may take over while no request is in progress. Twice a second all connections are checked, and
+overdue ones are ended.
 """
 
 import asyncio
@@ -25,12 +25,12 @@ from server.api.web_socket import WebSocketProtocol
 
 _CHECK_EVERY_S = 0.5
 _LINGER_S = 2.0
-"""For so long a refused client may go on sending, unheard: a reset would take the answer from it."""
-_MOST_UNHEARD_BYTES = 1024 * 1024
+"""How long a refused client may go on sending. What it sends is ignored; a reset instead would lose the answer."""
+_MOST_IGNORED_BYTES = 1024 * 1024
 _MOST_WAITING_BYTES = 64 * 1024
-"""Of requests behind one that is not answered yet."""
+"""Most bytes of further requests that wait while one is not answered yet."""
 _PACE_BYTES = 64 * 1024
-"""Of a response, or all that is left of it, a client takes within `response_timeout_s`."""
+"""A client has to read this much of a response, or the rest of it, within `response_timeout_s`."""
 _RETRY_AFTER_S = 10
 _HEALTH = frozenset(path.encode() for path in HEALTH_PATHS)
 _MALFORMED = Refusal(400, "malformed_request", "that is not HTTP/1.1")
@@ -38,12 +38,12 @@ _NO_ROOM = Refusal(503, "too_many_connections", "the server has no free connecti
 
 
 def limited_http(limits: ConnectionLimits) -> Any:
-    """What uvicorn takes for `http`: a maker of protocols that share seats."""
+    """A factory of protocols, for uvicorn's option `http`. The protocols share one `Room`."""
     return partial(HttpProtocol, room=Room(limits))
 
 
 class Room:
-    """What all connections of a server share."""
+    """State that all connections of a server share."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.limits = limits
@@ -71,11 +71,11 @@ class Room:
 
 
 class _RefusedError(Exception):
-    """Raised through the parser, which then takes no more."""
+    """Stops the parser when it is raised from one of its callbacks."""
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """A connection until it closes, or becomes a WebSocket's."""
+    """An HTTP connection until it closes or becomes a WebSocket."""
 
     def __init__(
         self,
@@ -91,20 +91,20 @@ class HttpProtocol(HttpToolsProtocol):
         self._meter = RequestMeter(room.limits)
         self._seat: Seat | None = None
         self._refusal = _MALFORMED
-        """The answer to what the parser does not take."""
+        """The answer if the parser refuses the request."""
         self._due_s: float | None = None
-        """When the request has to be whole, or a refused client is cut off."""
+        """When the request has to be complete, or when a refused client is cut off."""
         self._unsent: tuple[int, float] | None = None
-        """Bytes that wait to be taken by the client, and since when they are so many."""
+        """Bytes that the client has not read yet, and since when the number has not fallen."""
         self._waiting = bytearray()
-        """Requests behind the one that is not answered yet."""
-        self._unheard_bytes = 0
+        """Further requests, which wait while one is not answered yet."""
+        self._ignored_bytes = 0
         self._has_head = False
-        """Whether the parser has the head of the request under way."""
+        """Whether the parser has the head of the present request."""
         self._is_whole = False
-        """Whether it has all of it."""
+        """Whether the parser has all of the present request."""
         self._is_last = False
-        """Whether nothing more is heard of the client."""
+        """Whether anything more from the client is ignored."""
         self._is_upgraded = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -125,7 +125,7 @@ class HttpProtocol(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         while data and not self._is_upgraded:
             if self._is_last:
-                self._pass_over(data)
+                self._ignore(data)
                 return
             if self._is_whole:
                 self._keep(data)
@@ -133,7 +133,7 @@ class HttpProtocol(HttpToolsProtocol):
             data = self._read(data)
 
     def pause_writing(self) -> None:
-        """The client does not take its response: its seat is another's who comes when there is no other."""
+        """The client does not read its response, so another connection may take over its seat."""
         super().pause_writing()
         if self._seat is not None:
             self._seat.rest()
@@ -145,7 +145,7 @@ class HttpProtocol(HttpToolsProtocol):
             self._seat.use()
 
     def end_if_overdue(self, now_s: float) -> None:
-        """Called now and then."""
+        """End the connection if the client does not read its response or does not complete its request."""
         unsent_bytes = self.transport.get_write_buffer_size()
         if not unsent_bytes:
             self._unsent = None
@@ -156,11 +156,11 @@ class HttpProtocol(HttpToolsProtocol):
         if self._due_s is not None and now_s > self._due_s:
             self._time_out()
 
-    # What the parser and uvicorn say.
+    # Callbacks of the parser and of uvicorn.
 
     def on_headers_complete(self) -> None:
         if self._is_last:
-            raise _RefusedError  # behind a chunked body, which the parser has together with its end
+            raise _RefusedError  # a further request, which came together with the end of a chunked body
         refusal = self._judge_head()
         if refusal is not None:
             self._refusal = refusal
@@ -179,7 +179,7 @@ class HttpProtocol(HttpToolsProtocol):
         if self._is_upgrading:
             return
         self._is_whole, self._due_s = True, None
-        if not self._meter.has_body:  # its end is the parser's secret, and so is what is behind it
+        if not self._meter.has_body:  # the end of a chunked body is known only to the parser
             self.cycle.keep_alive = False
         self._is_last = not self.cycle.keep_alive
         if self.cycle.response_complete:
@@ -190,7 +190,7 @@ class HttpProtocol(HttpToolsProtocol):
         if self._is_whole:
             self._begin_next()
 
-    def send_400_response(self, msg: str) -> None:  # noqa: ARG002  uvicorn says always the same
+    def send_400_response(self, msg: str) -> None:  # noqa: ARG002  uvicorn always passes the same text
         self._refuse(self._refusal)
 
     def handle_websocket_upgrade(self) -> None:
@@ -203,7 +203,7 @@ class HttpProtocol(HttpToolsProtocol):
         successor.take_seat(seat, partial(self._room.leave, successor), self._room.turns)
         self._room.leave(self)
         self._room.enter(successor, self.loop)
-        # It holds this. uvicorn lets go of it where a connection is lost, and this one never is.
+        # The parser refers to this protocol. uvicorn drops it in `connection_lost`, which is not called here any more.
         self.parser = None  # type: ignore[assignment]
 
     @property
@@ -211,7 +211,7 @@ class HttpProtocol(HttpToolsProtocol):
         return bool(self.parser.should_upgrade()) and self._should_upgrade()
 
     def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
-        """In turn with others' requests, but for health checks."""
+        """Requests of all connections start in turn; health checks start at once."""
         start = partial(super()._start_asgi_task, cycle, app)
         if self._is_health_check:
             start()
@@ -222,10 +222,10 @@ class HttpProtocol(HttpToolsProtocol):
     def _is_health_check(self) -> bool:
         return self.url.partition(b"?")[0] in _HEALTH
 
-    # What becomes of what is heard.
+    # Handling of incoming bytes.
 
     def _read(self, data: bytes) -> bytes:
-        """What is left behind the part of the request that is parsed now."""
+        """Parse the next part of the present request. Returns the bytes after it."""
         if self._due_s is None:
             self._due_s = self.loop.time() + self._room.limits.request_timeout_s
         measured = self._meter.measure(data)
@@ -254,7 +254,7 @@ class HttpProtocol(HttpToolsProtocol):
         return refusal
 
     def _begin_next(self) -> None:
-        """The request is answered, and all of it was heard."""
+        """Continue after a request was read completely and answered."""
         if self.transport.is_closing():
             return
         if self._is_last:
@@ -273,12 +273,12 @@ class HttpProtocol(HttpToolsProtocol):
             self._is_last, self._waiting = True, bytearray()
             self.cycle.keep_alive = False
 
-    def _pass_over(self, data: bytes) -> None:
-        self._unheard_bytes += len(data)
-        if self._unheard_bytes > _MOST_UNHEARD_BYTES:
+    def _ignore(self, data: bytes) -> None:
+        self._ignored_bytes += len(data)
+        if self._ignored_bytes > _MOST_IGNORED_BYTES:
             self.flow.pause_reading()
 
-    # How it ends.
+    # End of the connection.
 
     def _time_out(self) -> None:
         if self._is_last or self.transport.is_closing():
@@ -287,10 +287,10 @@ class HttpProtocol(HttpToolsProtocol):
             self.transport.close()
         else:
             within = f"within {self._room.limits.request_timeout_s:g} s"
-            self._refuse(Refusal(408, "request_timeout", f"a request has to be whole {within}"))
+            self._refuse(Refusal(408, "request_timeout", f"a request has to be complete {within}"))
 
     def _refuse(self, refusal: Refusal) -> None:
-        """Answer with an error, and end the connection once the client has had time to see it."""
+        """Answer with an error, and end the connection once the client has had time to read it."""
         if self._is_last:
             return
         self._is_last = True
@@ -302,13 +302,13 @@ class HttpProtocol(HttpToolsProtocol):
             self.transport.abort()
             return
         if self._has_head:
-            # What the application would still say goes nowhere.
+            # Anything the application still sends is dropped.
             self.cycle.disconnected = True
             self.cycle.message_event.set()
         self._hang_up()
 
     def _hang_up(self) -> None:
-        """Say nothing more, and hear nothing, until the client hangs up too or has had long enough."""
+        """Close our side of the connection. The client may close its side until `_LINGER_S` is over."""
         self._due_s = self.loop.time() + _LINGER_S
         if self._seat is not None:
             self._seat.rest()
@@ -319,7 +319,7 @@ class HttpProtocol(HttpToolsProtocol):
 
 
 def _answer(refusal: Refusal, default_headers: list[tuple[bytes, bytes]]) -> bytes:
-    """A whole response."""
+    """The bytes of a response to a refused request."""
     response = problem(refusal.status, refusal.code, refusal.detail)
     response.headers["Connection"] = "close"
     if refusal.status == 503:

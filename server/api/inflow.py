@@ -1,15 +1,15 @@
-"""How much one WebSocket client may say, so that nobody else is late for it.
+"""Limit on the rate of messages from one WebSocket client, so that no client makes another's audio late.
 
-A client spends from a budget that fills at a steady rate. Where it is spent, nothing is read from that socket until
-there is some again: the rest waits with the client, and nothing is lost. Pure: the clock is passed in, in seconds.
+A client spends from a budget that fills at a steady rate. When the budget is spent, the server stops reading from the
+socket until there is some again. The rest waits at the client, and nothing is lost. The module does no I/O: the caller
+passes the time in seconds.
 
-**What a client may need.** The budget is in messages that take about 20 us each to cut, parse, pass on and, where that
-is due, answer. On the event loop of a busy EPYC core an acknowledgement took 10 us, a ping with its pong 14, a refused
-gain 18, nonsense 24 and a refused pose 26. A pose that a newer one follows at once took 2, and counts as an eighth. A
-live block took 17 and counts as half: players of sixteen instruments send thousands, and with the whole cost everybody
-could say twice as much of all else. The most that a player or an instrument has to say is a live block of 128 samples
-of every emitter, 1,000 poses a second, an acknowledgement of every block of 128 samples, and 120 moves a second of
-every emitter.
+**Size of the budget.** The unit is a message that takes about 20 us to read, parse, pass on and, if due, answer. On the
+event loop of a busy EPYC core an acknowledgement took 10 us, a ping with its pong 14, a refused gain 18, invalid text
+24 and a refused pose 26. A pose directly followed by a newer one took 2 us and counts as an eighth. A live block took
+17 us but counts as half, since a client with sixteen instruments sends thousands of them; at full cost the budget would
+have to allow twice as many of all other messages. The budget allows, for every emitter, live blocks of 128 samples and
+120 moves a second, and also 1,000 poses a second and an acknowledgement of every block of 128 samples.
 """
 
 import re
@@ -21,30 +21,30 @@ from server.protocol.client_messages import ListenerPose
 
 SUPERSEDED_COST: Final = 1 / 8
 READ_COST: Final = 1 / 4
-"""Of each time that bytes come, however few."""
+"""Cost of each read from the socket, however few bytes it brings."""
 OTHER_FRAME_COST: Final = 2.0
-"""Of a frame that is no whole message (a ping, a fragment), which takes the longer way."""
+"""Cost of a frame that is not a whole message (a ping, a fragment), which uvicorn's slower path handles."""
 _LIVE_COST: Final = 1 / 2
 _SHORTEST_BLOCK: Final = 128
 POSES_PER_S = 1_000
 MOVES_PER_S = 120
 _BYTES_PER_SAMPLE = 4
 _BYTES_PER_MESSAGE = 200
-"""Of headers, names and JSON."""
+"""Allowance for headers, names and JSON."""
 _BURST_S = 0.25
-"""What a network that falters for so long delivers at once is not held up."""
+"""Messages of this much time may come at once without delay, as after a short interruption of the network."""
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """What fills a budget, each second."""
+    """The rates at which a budget fills."""
 
     messages_per_s: float
     bytes_per_s: float
 
     @classmethod
     def of(cls, *, emitters: int, sample_rate: int) -> Self:
-        """For a client of so many emitters, all of them live."""
+        """The allowance of a client with this many emitters, all of them live."""
         blocks_per_s = sample_rate / _SHORTEST_BLOCK
         others_per_s = POSES_PER_S + blocks_per_s + MOVES_PER_S * emitters
         live_per_s = emitters * blocks_per_s
@@ -59,14 +59,15 @@ USUAL: Final = Allowance.of(emitters=16, sample_rate=48_000)
 
 
 class Budget:
-    """Starts full, holds what comes in `_BURST_S`, and may be overspent: what has come is heeded, and then awaited."""
+    """A client's budget of messages and bytes. It starts full and holds the allowance of `_BURST_S`. It may go below
+    zero: messages that have arrived are handled, and reading then pauses until it is positive again."""
 
     def __init__(self, allowance: Allowance, now_s: float) -> None:
         self._filled_s = now_s
         self.allow(allowance)
 
     def allow(self, allowance: Allowance) -> None:
-        """Fill it at another rate from now on, and up."""
+        """Change the rate, and fill the budget up."""
         self._allowance = allowance
         self._messages = _BURST_S * allowance.messages_per_s
         self._bytes = _BURST_S * allowance.bytes_per_s
@@ -79,19 +80,19 @@ class Budget:
 
     @property
     def wait_s(self) -> float:
-        """From when it was spent from last until there is something in it; 0 where there is."""
+        """Time from the last spending until the budget is positive again; 0 if it is positive."""
         rate = self._allowance
         return max(0.0, -self._messages / rate.messages_per_s, -self._bytes / rate.bytes_per_s)
 
 
 def message_cost(message: bytes, *, is_text: bool) -> float:
-    """Of a whole message."""
+    """Cost of a whole message."""
     return _LIVE_COST if not is_text and message[:1] == bytes([DryBlock.KIND]) else 1.0
 
 
 def supersedes(newer: bytes, older: bytes) -> bool:
-    """Whether two messages, of which `newer` came directly after `older`, are poses of the listener with rising ids, so
-    that the older would be replaced before anybody hears it. Nothing is parsed: where it is not plain to see, no."""
+    """Whether two successive messages are listener poses with rising ids, so that the older one never takes effect. The
+    messages are not parsed, so the answer is False in unclear cases."""
     newer_id, older_id = _pose_id(newer), _pose_id(older)
     return newer_id is not None and older_id is not None and newer_id > older_id
 
@@ -105,7 +106,7 @@ _TEXT_ID: Final = re.compile(rb'"pose_id"\s*:\s*([0-9]{1,10})\s*[,}]')
 def _pose_id(message: bytes) -> int | None:
     if message[:1] == _BINARY_KIND:
         return int.from_bytes(message[_ID], "little") if len(message) == ListenerPose.LAYOUT.size else None
-    # A key that came twice would count the second time, and behind a backslash it may be part of a name.
+    # Of a duplicate key the second counts, and after a backslash it may be part of a string.
     is_plain = message.count(b'"type"') == message.count(b'"pose_id"') == 1 and b"\\" not in message
     if not is_plain or _TEXT_POSE.search(message) is None:
         return None

@@ -1,4 +1,4 @@
-"""The OpenAPI document, with what is true of every route: how it refuses, and what its tags are for."""
+"""The OpenAPI document, with what all routes have in common: refusals and entity tags."""
 
 from typing import Any, Final
 
@@ -15,16 +15,16 @@ _REFUSED: Final[dict[str, str]] = {
     "413": "The body is longer than the server takes.",
     "414": "The URL is longer than the server takes.",
     "421": "The server does not answer for this host name.",
-    "422": "A parameter is malformed, unknown, missing or there twice; `field` names it.",
-    "429": "More requests or connections than one address may have.",
+    "422": "A parameter is malformed, unknown, missing or given twice; `field` names it.",
+    "429": "One address has more requests or connections than the server takes.",
     "431": "The headers are longer than the server takes.",
     "500": "The server failed to answer.",
     "503": "The server is warming up, busy or shutting down.",
 }
-"""Whatever the route."""
+"""Refusals that every route has."""
 _OF_A_SCENE: Final = {"404": "There is no such scene, or the scene has no such place or level; `code` says which."}
 _OF_A_COMPUTATION: Final = {
-    "409": "Well formed, and more than this scene allows, or settings that contradict each other."
+    "409": "The request asks for more than this scene allows, or its settings contradict each other."
 }
 _PROBLEM: Final[Object] = {
     "description": "A problem document (RFC 9457). `code` is for programs and does not change, `field` is at fault.",
@@ -46,7 +46,7 @@ _TAGGED: Final = ("/impulse-response", "/loudness", "/plan")
 
 
 def install_openapi(app: FastAPI) -> None:
-    """Let the application describe itself by `describe`, once."""
+    """Make the application's OpenAPI document the one from `describe`, computed once."""
 
     def openapi() -> Object:
         if app.openapi_schema is None:
@@ -85,7 +85,7 @@ def _refusals(path: str) -> Object:
 
 
 def _without_null(schema: Object) -> Object:
-    """A query has no null: a parameter that may be left out is left out."""
+    """The schema without null, which a query parameter cannot have; it is left out instead."""
     (*others,) = (each for each in schema.get("anyOf", ()) if each != {"type": "null"})
     if len(others) != 1:
         return schema

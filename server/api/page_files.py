@@ -1,4 +1,4 @@
-"""The page's files: tags by content, and methods that are told truly."""
+"""The page's static files, with entity tags by content and correct `Allow` headers."""
 
 import hashlib
 import os
@@ -17,8 +17,8 @@ _ALLOW = {"Allow": "GET, HEAD, OPTIONS"}
 
 
 class PageFiles(StaticFiles):
-    """Starlette tags a file by its size and time of change, which two builds of one image may share while the bytes
-    differ; and it does not say which methods there are."""
+    """Static files with entity tags by content. Starlette's tags depend on size and modification time, which two builds
+    of one image may share although the bytes differ. Starlette also sends no `Allow`."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         if scope["method"] in {"GET", "HEAD"}:
@@ -47,5 +47,5 @@ def _unconditional(scope: Scope) -> Scope:
 
 
 @lru_cache(maxsize=1024)
-def _tag(path: Path, mtime_ns: int, size: int) -> str:  # noqa: ARG001  a file that was changed is read again
+def _tag(path: Path, mtime_ns: int, size: int) -> str:  # noqa: ARG001  a changed file is another key of the cache
     return f'"{hashlib.sha256(path.read_bytes()).hexdigest()[:32]}"'

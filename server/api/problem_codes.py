@@ -1,4 +1,4 @@
-"""What the `code` of a problem document means: every reason for which an HTTP request is refused."""
+"""Meanings of the `code` of problem documents: every reason for which an HTTP request is refused."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -40,4 +40,4 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "unknown_scene": "404: there is no scene of this id",
     "upgrade_required": "426: the address is a WebSocket; connect with ws:// or wss://",
 }
-"""Each meaning begins with the status that goes with the code."""
+"""Meanings by code. Each begins with the HTTP status."""

@@ -12,14 +12,15 @@ from server.core.errors import RequestError
 
 _POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "height_m"})
 _STATUSES = {"position_out_of_bounds": 404, "unknown_level": 404, "map_too_fine": 409, "map_too_slow": 409}
-"""Of what is well formed and asks for what there is not, or for too much: 422 is for what is malformed."""
+"""Statuses of well-formed requests that ask for something that does not exist, or for too much. Malformed ones get
+422."""
 _CODES = {404: "not_found", 405: "method_not_allowed"}
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """What a request is answered before the application sees it: `status` of HTTP, `code` for programs, `detail` for
-    people."""
+    """An answer to a request that never reaches the application: the HTTP `status`, a `code` for programs and a
+    `detail` for people."""
 
     status: int
     code: str
@@ -29,8 +30,8 @@ class Refusal:
 def problem(
     status: int, code: str, detail: str, field: str | None = None, *, retry_after_s: int | None = None
 ) -> JSONResponse:
-    """`code` is for programs and does not change; `detail` is for people; `field` is the parameter at fault.
-    `retry_after_s` is when it is worth asking again, where the fault passes."""
+    """A problem document. `code` is for programs and does not change, `detail` is for people, and `field` is the
+    parameter at fault. `retry_after_s` says after how long a retry is worthwhile, if it is."""
     return JSONResponse(
         {
             "type": "about:blank",

@@ -1,4 +1,4 @@
-"""The size of a request, counted before anything parses it. No I/O: bytes in, a verdict out."""
+"""Limits on the size of a request, applied before it is parsed. The module does no I/O."""
 
 from dataclasses import dataclass
 
@@ -8,18 +8,18 @@ from server.api.problems import Refusal
 
 @dataclass(frozen=True)
 class Measured:
-    """What to do with bytes that came."""
+    """Incoming bytes, divided at the end of the head or of the body."""
 
     part: bytes
-    """For the parser: of this request's head, or of its body."""
+    """Bytes of this request's head or body, for the parser."""
     rest: bytes = b""
-    """What is behind the end of the head, or of the body where its length is known."""
+    """Bytes after the end of the head, or after the end of a body of known length."""
 
 
 class RequestMeter:
-    """Measures one request after the other on a connection: its head line by line, then its body.
+    """Measures the requests of a connection one after the other: the head line by line, then the body.
 
-    Every byte is looked at once, whatever pieces it comes in.
+    It looks at every byte only once, in whatever pieces the bytes come.
     """
 
     def __init__(self, limits: ConnectionLimits) -> None:
@@ -27,11 +27,11 @@ class RequestMeter:
         self.begin()
 
     def begin(self) -> None:
-        """Measure the next request."""
+        """Begin with the next request."""
         self.has_head = False
-        """Whether the empty line behind the headers has come."""
+        """Whether the empty line after the headers has come."""
         self.is_fresh = True
-        """Whether no byte of this request has come."""
+        """Whether no byte of this request has come yet."""
         self._line_bytes = 0
         self._line_begin = b""
         self._headers = self._headers_bytes = 0
@@ -40,7 +40,8 @@ class RequestMeter:
         self._body_length: int | None = None
 
     def expect_body(self, length: int | None) -> Refusal | None:
-        """The body has so many bytes, or is chunked and ends where the parser says so (None)."""
+        """Set the length of the body; None for a chunked body, whose end the parser finds. Returns a refusal if it is
+        too long."""
         self._body_length = length
         return self._too_large() if length is not None and length > self._limits.max_body_bytes else None
 
@@ -54,7 +55,7 @@ class RequestMeter:
         return self._measure_body(data) if self.has_head else self._measure_head(data)
 
     def _measure_body(self, data: bytes) -> Measured | Refusal:
-        """Chunks are counted as they are sent, with their framing and trailers."""
+        """Measure a part of the body. Chunks count with their framing and trailers."""
         if self._body_length is not None:
             data, rest = data[: self._body_length - self._body_bytes], data[self._body_length - self._body_bytes :]
         else:
@@ -75,7 +76,7 @@ class RequestMeter:
         return self._lengthen(data[at:]) or Measured(data)
 
     def _lengthen(self, piece: bytes) -> Refusal | None:
-        """Count more of the current line."""
+        """Count a piece of the current line. Returns a refusal if a limit is exceeded."""
         if not self._line_bytes:
             self._line_begin = piece[:1]
         self._line_bytes += len(piece)
@@ -94,8 +95,8 @@ class RequestMeter:
         return None
 
     def _end_line(self) -> bool:
-        """Whether the head ends with this line. Empty lines before the request line are skipped (RFC 9112, 2.2), and
-        count as part of it."""
+        """End the current line. Returns whether the head ends with it. Empty lines before the request line are skipped
+        (RFC 9112, 2.2) and count as part of it."""
         is_empty = not self._line_bytes or (self._line_bytes == 1 and self._line_begin == b"\r")
         line_bytes, self._line_bytes = self._line_bytes + 1, 0
         if self._has_request_line:

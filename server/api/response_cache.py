@@ -1,10 +1,11 @@
-"""Bodies of HTTP responses that take time to compute: by few threads behind those of streams, and kept by entity tag,
-which says all there is to say of a body: what one client asks for, others will.
+"""Computation and cache of HTTP response bodies that take time to compute. A few threads compute them, at a lower
+priority than the workers of streams. Bodies are cached by entity tag, which identifies a body completely.
 
-Requests with one tag are one computation, which is cancelled when nobody waits for it any more. Of those that wait, one
-of each kind goes next in turns, and within a kind one of each client. Maps leave one thread to requests that are cheap.
+Requests with the same tag share one computation, which is cancelled when no request waits for it any more. The two
+kinds of computation take turns, and within a kind the clients do. Maps never take the last thread, so that cheap
+requests need not wait for them.
 
-A `ResponseCache` belongs to the event loop; computations run on its threads.
+A `ResponseCache` belongs to the event loop. Computations run on its threads.
 """
 
 import asyncio
@@ -24,14 +25,14 @@ from server.runtime.priority import become_background
 from server.runtime.thread_pool import ThreadPool
 
 Kind = Literal["single", "map"]
-"""What takes milliseconds, and what takes seconds."""
+"""Computations that take milliseconds, and those that take seconds."""
 Compute = Callable[[Checkpoint], bytes]
 
 _MAX_BYTES = 32 * 1024 * 1024
 _NICENESS = 10
-"""Behind the workers of streams, which have 5."""
+"""Niceness of the threads; the workers of streams have 5."""
 _PATIENCE_S = 300.0
-"""The longest map takes two minutes, and longer behind streams."""
+"""The longest map takes two minutes, and longer while streams are busy."""
 _STOP_S = 1.0
 _FIRST_GUESS_S = {"single": 0.05, "map": 5.0}
 _SMOOTHING = 0.3
@@ -40,24 +41,24 @@ _MOST_CLIENTS = 256
 
 
 class _Computation:
-    """What requests with one entity tag wait for."""
+    """The computation of one body, which all requests with its entity tag wait for."""
 
     def __init__(self, etag: str, compute: Compute, kind: Kind, client: str) -> None:
         self.etag = etag
         self.compute = compute
         self.kind: Kind = kind
         self.client = client
-        """Who asked first."""
+        """Address of the first client that asked."""
         self.body: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self.waiters = 0
         self.is_called_off = False
 
 
 class ResponseCache:
-    """Bodies are computed by `workers` threads, and at most `waiting` computations wait for one. `is_urgent` tells, on
-    any thread, whether streams want the processor; computations stand back then.
+    """Computes bodies on `workers` threads; at most `waiting` computations wait for a thread. Computations pause while
+    `is_urgent`, which any thread may call, says that streams need the processor.
 
-    Leaving the context calls everything off.
+    Leaving the context cancels all computations.
     """
 
     def __init__(self, *, workers: int, waiting: int, is_urgent: Callable[[], bool] = lambda: False) -> None:
@@ -74,10 +75,10 @@ class ResponseCache:
         self._running: list[_Computation] = []
         self._turns: deque[Kind] = deque(get_args(Kind))
         self._served: dict[tuple[Kind, str], int] = {}
-        """When each client had its last turn, in turns."""
+        """Number of the last turn of each client, by kind."""
         self._turn = 0
         self._takes_s: dict[str, float] = dict(_FIRST_GUESS_S)
-        """What a computation has taken of late, by kind."""
+        """Smoothed duration of recent computations, by kind."""
 
     def __enter__(self) -> Self:
         return self
@@ -90,18 +91,19 @@ class ResponseCache:
 
     @property
     def waiting(self) -> int:
-        """Computations that wait for a thread."""
+        """Number of computations that wait for a thread."""
         return len(self._waiting)
 
     @property
     def retry_after_s(self) -> int:
-        """When there will be room, in whole seconds: what runs and waits takes about so long."""
+        """Whole seconds until there is room again, estimated from the computations that run and wait."""
         pending_s = sum(self._takes_s[each.kind] for each in (*self._waiting, *self._running))
         return min(_LONGEST_RETRY_S, max(1, math.ceil(pending_s / self._most_running)))
 
     async def get(self, etag: str, compute: Compute, *, kind: Kind, client: str) -> bytes:
-        """The body kept or computed for a `client`, an address. Cancelled, the computation goes on for others who wait
-        for it, or ends. Raises RequestError server_busy where too many wait, and what `compute` raises."""
+        """The cached or computed body. `client` is the client's address. If this call is cancelled, the computation
+        goes on only if other requests wait for it. Raises RequestError server_busy if too many computations wait, and
+        what `compute` raises."""
         if (kept := self._bodies.get(etag)) is not None:
             return kept
         computation = self._by_tag.get(etag)
@@ -116,7 +118,8 @@ class ResponseCache:
                 self._call_off(computation)
 
     def _admit(self, computation: _Computation) -> _Computation:
-        """Where there is no room, the client that waits for most loses its newest, or this one is refused."""
+        """Queue a computation. If there is no room, the client with the most waiting computations loses its newest one,
+        or this one is refused."""
         is_full = len(self._waiting) >= self._most_waiting and not self._may_start(computation.kind)
         if is_full and not self._make_room(computation.client):
             raise self._busy()
@@ -151,7 +154,7 @@ class ResponseCache:
             self._waiting.remove(computation)
 
     def _forget(self, computation: _Computation) -> None:
-        """Who asks for the same from now on has it computed anew."""
+        """Let later requests with the same tag start a new computation."""
         if self._by_tag.get(computation.etag) is computation:
             del self._by_tag[computation.etag]
 
@@ -166,7 +169,7 @@ class ResponseCache:
             self.pool.submit(partial(self._run, computation, asyncio.get_running_loop()))
 
     def _choose(self) -> _Computation | None:
-        """Of the kind that has waited longest for its turn, one of the client that has."""
+        """The next computation: of the kind whose turn is longest ago, and of the client whose turn is longest ago."""
         for kind in tuple(self._turns):
             waiting = [each for each in self._waiting if each.kind == kind]
             if not waiting or not self._may_start(kind):
@@ -182,19 +185,19 @@ class ResponseCache:
         return None
 
     def _run(self, computation: _Computation, loop: asyncio.AbstractEventLoop) -> None:
-        """On a thread of the pool."""
+        """Compute the body, on a thread of the pool."""
         began_s = time.monotonic()
         pace = Pace(is_urgent=self._is_urgent, is_wanted=lambda: not computation.is_called_off)
         body, failure = b"", None
         try:
             pace()
             body = computation.compute(pace)
-        except (Exception, CancelledError) as exc:  # noqa: BLE001  whoever waits for the body has it raised
+        except (Exception, CancelledError) as exc:  # noqa: BLE001  raised where the body is awaited
             failure = exc
         except BaseException as exc:  # noqa: BLE001
             failure = RuntimeError(f"the computation was ended: {exc!r}")
         _post(loop, partial(self._settle, computation, body, failure, time.monotonic() - began_s))
-        # What comes next is no less behind than what comes within.
+        # The next computation waits for streams, too.
         pace.rest()
         _post(loop, partial(self._free, computation))
 
@@ -215,5 +218,5 @@ class ResponseCache:
 
 
 def _post(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+    with contextlib.suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(call)

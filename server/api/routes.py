@@ -1,4 +1,4 @@
-"""HTTP and WebSocket endpoints: they parse, hand over, and answer. Angles in degrees, positions in metres."""
+"""HTTP and WebSocket endpoints. Angles are in degrees and positions in metres."""
 
 import json
 from dataclasses import asdict
@@ -15,7 +15,7 @@ from server.api.connection import Connection, StreamHost
 from server.api.frontier import Frontier
 from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
-from server.api.web_socket import direct_way
+from server.api.web_socket import fast_path
 from server.assets.hrtfs import DEFAULT_HRTF
 from server.core.entity_tags import content_tag
 from server.core.errors import RequestError
@@ -41,9 +41,9 @@ MAX_MAP_SPACING_M = 20.0
 MAX_MAP_S = 120.0
 MAX_PLANNED = 16
 CLIENT_CLOSED_REQUEST = 499
-"""For the log alone: nobody is there to read it."""
+"""Status for the log; the client has gone and never sees it."""
 CACHE_CONTROL = "public, max-age=3600"
-"""Entity tags outlive it: after an hour an unchanged answer costs a 304."""
+"""After the hour an unchanged answer costs only a 304, by its entity tag."""
 
 api = APIRouter(prefix="/v1")
 health = APIRouter()
@@ -53,7 +53,7 @@ _PLACE: dict[str, Any] = {"pattern": POSITION_PATTERN}
 
 
 def _between(low: float, high: float) -> dict[str, Any]:
-    """Bounds, told in the schema too: behind `Number`'s parser pydantic does not."""
+    """Bounds of a number, also for the schema. Pydantic itself leaves them out there, because of `Number`'s parser."""
     return {"ge": low, "le": high, "json_schema_extra": {"minimum": low, "maximum": high}}
 
 
@@ -72,13 +72,13 @@ _MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 
 @health.get("/livez")
 async def livez() -> dict[str, str]:
-    """The process answers."""
+    """Answers as long as the process runs."""
     return {"status": "live"}
 
 
 @health.get("/readyz")
 async def readyz(request: Request) -> dict[str, str]:
-    """Streams may be opened: everything is warmed up, all threads do their work, and the server is not told to stop."""
+    """Answers 200 if streams may be opened: the server is warmed up, its threads work, and it is not shutting down."""
     if (obstacle := _host(request).readiness.obstacle) is not None:
         raise RequestError(obstacle.code, obstacle.message, status=503, retry_after_s=obstacle.retry_after_s)
     return {"status": "ready"}
@@ -86,21 +86,20 @@ async def readyz(request: Request) -> dict[str, str]:
 
 @health.get("/metrics", include_in_schema=False)
 async def metrics(request: Request) -> Response:
-    """For Prometheus."""
+    """Metrics in Prometheus' text format."""
     body = await anyio.to_thread.run_sync(exposition, ServerCollector(_host(request)))
     return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @documents.get("/asyncapi.json")
 def asyncapi() -> Response:
-    """Of the stream what /openapi.json is of the rest; in a thread, for the first answer is long in the making."""
+    """The AsyncAPI document of the stream. FastAPI runs this in a thread, since the first answer takes long."""
     return Response(document(), media_type="application/json")
 
 
 @api.get("/scenes")
 async def scenes(request: Request) -> dict[str, Any]:
-    """All scenes: where one can walk in each, its quality levels, and how accurate it is; and how many emitters a
-    stream may have at once."""
+    """All scenes with their floor plans, bounds and quality levels, and how many emitters a stream may have at once."""
     host = _host(request)
     listed = [describe_scene(levels).model_dump() for levels in host.scenes.values()]
     return {"scenes": listed, "max_emitters": host.settings.max_emitters}
@@ -114,7 +113,7 @@ async def one_scene(request: Request, scene: str) -> dict[str, Any]:
 
 @api.get("/scenes/{scene}/frontier")
 async def frontier(request: Request, scene: str) -> Frontier:
-    """What the accuracy of each quality level costs in time."""
+    """Accuracy and cost of each quality level."""
     levels, offer = _levels(request, scene), _host(request).offers.get(scene)
     return Frontier.of(levels, {} if offer is None else offer.ms_here)
 
@@ -152,13 +151,13 @@ async def loudness(
         Number | None,
         Query(
             **_between(FINEST_M, MAX_MAP_SPACING_M),
-            description="between map points; by default as the scene's size asks",
+            description="between map points; by default chosen by the scene's size",
         ),
     ] = None,
     level: LevelText = None,
     format: Annotated[str, Query(description="png or json", json_schema_extra={"enum": ["png", "json"]})] = "png",  # noqa: A002  the parameter's name
 ) -> Response:
-    """How loud an emitter is at every place of the scene."""
+    """Map of an emitter's loudness over the scene."""
     field = _levels(request, scene).choose(level)
     if format not in {"png", "json"}:
         raise RequestError("unknown_format", f"{format!r} is none of png, json", field="format")
@@ -208,7 +207,7 @@ async def plan(
     ] = "headphones",
     effect: Annotated[list[EffectText] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
 ) -> Response:
-    """Which effects a situation calls for, why, and what they cost on this host."""
+    """The effects that a situation calls for, with reasons and their costs on this host."""
     emitters = emitter or []
     if len(emitters) > MAX_PLANNED:
         raise RequestError("too_many_emitters", f"a plan is made for at most {MAX_PLANNED} emitters", field="emitter")
@@ -224,16 +223,16 @@ async def plan(
     field = _levels(request, scene).default
     query.check(field)
     costs = _host(request).effect_costs.get(scene)
-    # Until they are measured, this process measures its own once, and keeps to them.
-    told = None if costs is None else {name: asdict(cost) for name, cost in costs.items()}
+    # Until the costs are measured, the plan measures them once for this process.
+    costs_by_effect = None if costs is None else {name: asdict(cost) for name, cost in costs.items()}
     body = await _computed(
         request,
-        entity_tag(field, "plan", {**asdict(query), "scene": scene, "costs": told}, "json"),
+        entity_tag(field, "plan", {**asdict(query), "scene": scene, "costs": costs_by_effect}, "json"),
         lambda _: rounded(PlanDocument.of(scene, query.plan(field, costs))).encode(),
     )
     if body is None:
         return Response(status_code=CLIENT_CLOSED_REQUEST)
-    # What it costs is of this host and of this start of the server: nothing but the body itself says so.
+    # Costs depend on this host and this run of the server, so the tag is that of the content.
     headers = {"ETag": content_tag(body), "Cache-Control": "no-cache"}
     if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -242,7 +241,7 @@ async def plan(
 
 @api.get("/clips")
 async def clips(request: Request) -> dict[str, Any]:
-    """Recordings an emitter can play."""
+    """Clips that emitters can play."""
     host = _host(request)
     named = {}
     for library in set(host.clips.values()):
@@ -253,13 +252,13 @@ async def clips(request: Request) -> dict[str, Any]:
 
 @api.get("/hrtfs")
 async def hrtfs(request: Request) -> dict[str, Any]:
-    """Heads a stream can be heard through."""
+    """Heads that a stream can be rendered for."""
     return {"default": DEFAULT_HRTF, "hrtfs": _host(request).hrtfs.names}
 
 
 @api.websocket("/stream")
 async def stream(websocket: WebSocket) -> None:
-    await Connection(websocket, _host(websocket), way=direct_way(websocket.scope)).run()
+    await Connection(websocket, _host(websocket), fast_path=fast_path(websocket.scope)).run()
 
 
 def _host(connection: Request | WebSocket) -> StreamHost:
@@ -276,7 +275,7 @@ def _levels(request: Request, scene: str) -> FieldsByLevel:
 
 
 async def _cached(request: Request, etag: str, media_type: str, compute: Compute, *, kind: Kind = "single") -> Response:
-    """Answer 304 where the client has it already, and else compute it, for as long as the client waits."""
+    """The response: 304 if the client has the body already, or else the body, computed as long as the client waits."""
     headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
     if _has_tag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
@@ -287,7 +286,7 @@ async def _cached(request: Request, etag: str, media_type: str, compute: Compute
 
 
 async def _computed(request: Request, etag: str, compute: Compute, *, kind: Kind = "single") -> bytes | None:
-    """The body kept or computed for as long as the client waits; None where it has gone."""
+    """The cached or computed body; None if the client has gone meanwhile."""
     client = "" if request.client is None else request.client.host
     computing = _host(request).responses.get(etag, compute, kind=kind, client=client)
     try:
@@ -303,6 +302,6 @@ async def _disconnected(request: Request) -> None:
 
 
 def _has_tag(if_none_match: str, etag: str) -> bool:
-    """Weak comparison, as RFC 9110 asks of If-None-Match."""
+    """Whether If-None-Match names the tag, by the weak comparison of RFC 9110."""
     tags = {tag.strip().removeprefix("W/") for tag in if_none_match.split(",")}
     return etag in tags or "*" in tags

@@ -1,8 +1,8 @@
-"""Who may be connected: so many connections from one address, so many in all. No I/O.
+"""Limits on the number of connections, in total and from one address. The module does no I/O.
 
-A connection on which nothing is under way, since its request has not come yet or has been answered, keeps its seat only
-while there are others: whoever comes when all are taken gets the seat that has been idle for longest. Silent sockets
-therefore push each other out, and nobody else. Where every seat is in use, a newcomer gets one of a few in reserve.
+Each connection has a seat. The seat is idle while no request is in progress on the connection. If all seats are taken,
+a new connection gets the seat that has been idle for longest, and that connection ends. So idle connections displace
+only each other. If no seat is idle, a new connection gets one of a few reserve seats.
 """
 
 import ipaddress
@@ -12,7 +12,7 @@ from server.api.connection_limits import ConnectionLimits
 
 
 class Seat:
-    """Of one connection. `vacate` ends the connection, whose seat is another's by then."""
+    """The seat of one connection. `vacate` ends the connection when another one takes the seat."""
 
     def __init__(self, vacate: Callable[[], None], pools: "tuple[_Pool, ...]", *, is_reserve: bool) -> None:
         self.is_reserve = is_reserve
@@ -23,18 +23,18 @@ class Seat:
         self.rest()
 
     def use(self) -> None:
-        """Something is under way: the seat is not given to others."""
+        """Mark the seat as in use: no other connection can take it."""
         for pool in self._pools:
             pool.idle.pop(self, None)
 
     def rest(self) -> None:
-        """Nothing is under way as from now."""
+        """Mark the seat as idle from now on."""
         for pool in self._pools:
             pool.idle.pop(self, None)
             pool.idle[self] = None
 
     def leave(self) -> None:
-        """The connection is lost; or was told to end, and is lost soon."""
+        """Free the seat of a connection that has ended or is about to."""
         for pool in self._pools:
             pool.seats.discard(self)
             pool.idle.pop(self, None)
@@ -52,7 +52,7 @@ class _Pool:
         self.limit = limit
         self.seats: set[Seat] = set()
         self.idle: dict[Seat, None] = {}
-        """Those idle for longest come first."""
+        """Idle seats, longest idle first."""
 
     @property
     def is_full(self) -> bool:
@@ -60,7 +60,7 @@ class _Pool:
 
     @property
     def has_room(self) -> bool:
-        """Perhaps for an idle one's seat."""
+        """Whether a seat is free or idle."""
         return bool(self.idle) or not self.is_full
 
     def make_room(self) -> None:
@@ -69,19 +69,19 @@ class _Pool:
 
 
 class Seats:
-    """Of a server."""
+    """The seats of a server."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self._all = _Pool(limits.max_connections)
         self._reserve = _Pool(limits.reserve_connections)
-        self._most_of_address = limits.max_connections_per_address
-        self._of_address: dict[str, _Pool] = {}
+        self._limit_per_address = limits.max_connections_per_address
+        self._by_address: dict[str, _Pool] = {}
 
     def __len__(self) -> int:
         return len(self._all.seats) + len(self._reserve.seats)
 
     def take(self, address: str, vacate: Callable[[], None]) -> Seat | None:
-        """A seat, idle so far, for a connection from an IP address; None where there is no room even in reserve."""
+        """An idle seat for a connection from an IP address; None if even the reserve seats are in use."""
         own = self._pool_of(address_key(address))
         for pools in ((own, self._all), (self._reserve,)):
             if all(pool.has_room for pool in pools):
@@ -91,13 +91,14 @@ class Seats:
         return None
 
     def _pool_of(self, key: str) -> _Pool:
-        if key not in self._of_address and len(self._of_address) >= 2 * self._all.limit:
-            self._of_address = {name: pool for name, pool in self._of_address.items() if pool.seats}
-        return self._of_address.setdefault(key, _Pool(self._most_of_address))
+        if key not in self._by_address and len(self._by_address) >= 2 * self._all.limit:
+            self._by_address = {name: pool for name, pool in self._by_address.items() if pool.seats}
+        return self._by_address.setdefault(key, _Pool(self._limit_per_address))
 
 
 def address_key(address: str) -> str:
-    """What counts as one address: of IPv6 a network of 64 bits, since whoever has one address has them all."""
+    """The key under which connections of one address are counted. For IPv6 it is the network of 64 bits, since a client
+    usually has the whole network."""
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

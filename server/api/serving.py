@@ -1,7 +1,7 @@
-"""The web server's process: its socket is bound before anything is loaded, it says where it serves once it does, and it
-ends within a stated time of being told to.
+"""The process of the web server. It binds its socket before it loads anything, prints its address once it serves, and
+shuts down within a stated time.
 
-uvicorn's own end closes streams without a word after 0.1 s, and answers requests that take longer 500.
+uvicorn's own shutdown closes streams after 0.1 s without a message, and answers longer requests with 500.
 """
 
 import asyncio
@@ -26,21 +26,21 @@ from server.runtime.drain import Drain
 _BACKLOG = 2048
 _CUT_OFF_CODE = 1
 _CLOSING_SHARE = 0.05
-"""Of the time to drain, for connections to close that nothing is in flight on."""
+"""Share of the drain time in which idle connections close."""
 _OWN_THREADS = "nafir-"
 
 _logger = logging.getLogger(__name__)
 
 
 def bind(host: str, port: int) -> list[socket.socket]:
-    """Listening sockets, one for each address that `host` stands for; `port` 0 is one that is free, of all of them.
+    """Listening sockets, one for each address of `host`. With `port` 0 all share one free port.
 
-    Whoever connects waits until the server takes it. Raises NafirError where an address cannot be had.
+    Connections wait until the server accepts them. Raises NafirError if an address cannot be bound.
     """
     try:
         found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as exc:
-        raise NafirError(f"host: {host!r} is no address of this machine ({exc}): give another with --host") from exc
+        raise NafirError(f"host: {host!r} is not an address of this machine ({exc}): give another with --host") from exc
     listeners: list[socket.socket] = []
     for family, _, _, _, address in dict.fromkeys(found):
         chosen = listeners[0].getsockname()[1] if listeners else port
@@ -60,7 +60,7 @@ def _listening(family: int, address: tuple[object, ...]) -> socket.socket:
         if family == socket.AF_INET6:
             listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         listener.bind(address)
-        # Two servers may be bound to one port as long as neither listens.
+        # Two servers can bind the same port as long as neither listens.
         listener.listen(_BACKLOG)
     except OSError:
         listener.close()
@@ -74,19 +74,19 @@ def _refusal(host: str, port: int, exc: OSError) -> str:
 
 
 def url(listener: socket.socket, host: str) -> str:
-    """Where a listening socket is reached that was bound to `host`."""
+    """URL of a listening socket that was bound to `host`."""
     shown = f"[{host}]" if ":" in host else host
     return f"http://{shown}:{listener.getsockname()[1]}"
 
 
 def uvicorn_options(settings: Settings) -> dict[str, Any]:
-    """How uvicorn has to run the application."""
+    """Options with which uvicorn has to run the application."""
     return {
         "http": limited_http(ConnectionLimits.of(settings)),
         "timeout_keep_alive": settings.keep_alive_s,
         "host": settings.host,
         "port": settings.port,
-        "loop": "auto",  # uvloop wherever it exists
+        "loop": "auto",  # uvloop if it is installed
         "ws": "server.api.web_socket:WebSocketProtocol",
         "ws_max_size": settings.max_frame_bytes,
         "ws_per_message_deflate": False,
@@ -94,10 +94,10 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
 
 
 class Server(uvicorn.Server):
-    """uvicorn, which drains before it ends: at once where nothing is in flight, and within `drain.drain_s` for certain.
+    """uvicorn with an orderly shutdown, which takes at most `drain.drain_s` and no time if nothing is in flight.
 
-    The first SIGTERM or SIGINT has it drain and end with exit code 0; a second one ends the process at once.
-    `on_start` is called when it serves.
+    The first SIGTERM or SIGINT begins the shutdown, and the exit code is 0. A second one ends the process at once.
+    `on_start` is called when the server accepts requests.
     """
 
     def __init__(self, config: uvicorn.Config, drain: Drain, *, on_start: Callable[[], None] = lambda: None) -> None:
@@ -105,7 +105,7 @@ class Server(uvicorn.Server):
         self._drain = drain
         self._on_start = on_start
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._is_told = False
+        self._is_stopping = False
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         self._loop = asyncio.get_running_loop()
@@ -113,11 +113,11 @@ class Server(uvicorn.Server):
         if self.started:
             self._on_start()
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:  # noqa: ARG002  as uvicorn has it
-        """In a signal handler, of the main thread."""
-        if self._is_told:
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:  # noqa: ARG002  uvicorn's signature
+        """Begin the shutdown. uvicorn calls this as a signal handler, on the main thread."""
+        if self._is_stopping:
             _end_process(128 + sig, f"{signal.Signals(sig).name} again: ended at once")
-        self._is_told = self.should_exit = True
+        self._is_stopping = self.should_exit = True
         end = threading.Timer(self._drain.drain_s, _cut_off, [self._drain.drain_s])
         end.daemon = True
         end.start()
@@ -134,8 +134,8 @@ class Server(uvicorn.Server):
 def serve(
     config: uvicorn.Config, listeners: Sequence[socket.socket], drain: Drain, on_start: Callable[[], None]
 ) -> None:
-    """Serve until told to stop. Where a thread of the server's own cannot be stopped, as in the midst of compiling, the
-    process ends here, with exit code 0."""
+    """Serve until a signal. If a thread of the server cannot be stopped, for instance while it compiles, the process
+    ends here with exit code 0."""
     Server(config, drain, on_start=on_start).run(sockets=list(listeners))
     if any(thread.name.startswith(_OWN_THREADS) for thread in threading.enumerate()):
         _end_process(0)
@@ -146,7 +146,7 @@ def _cut_off(drain_s: float) -> NoReturn:
 
 
 def _end_process(code: int, message: str = "") -> NoReturn:
-    """Without waiting for any thread."""
+    """End the process without waiting for any thread."""
     if message:
         os.write(sys.stderr.fileno(), f"nafir: {message}\n".encode())
     sys.stdout.flush()

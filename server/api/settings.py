@@ -1,4 +1,4 @@
-"""What an operator can set: by argument, or by an environment variable that begins with NAFIR_."""
+"""Settings of the server, given by arguments or by environment variables that begin with NAFIR_."""
 
 import os
 import re
@@ -15,11 +15,11 @@ from server.core.numerals import parse_decimal, parse_integer
 
 _PREFIX = "NAFIR_"
 _SERVICE_LINK = re.compile(r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)|(\w+_)?PORT_\d+_(TCP|UDP|SCTP)(_\w+)?")
-"""What Kubernetes puts into every container about a service called nafir, behind the prefix."""
+"""Names after the prefix that Kubernetes sets in every container for a service called nafir."""
 
 
 def _usable_cores() -> int:
-    """Fewer than the machine's where the process is confined to some."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -45,55 +45,55 @@ def _require_origin(value: str) -> str:
 
 
 Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)]
-"""In the environment, separated by commas."""
+"""Names, which the environment separates by commas."""
 Origins = Annotated[
     tuple[Annotated[str, AfterValidator(_require_origin)], ...], NoDecode, BeforeValidator(_split_names)
 ]
-"""In the environment, separated by commas."""
+"""Origins, which the environment separates by commas."""
 Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_split_paths)]
-"""In the environment, separated as in PATH."""
+"""Paths, which the environment separates as in PATH."""
 NamedFiles = Annotated[Paths, AfterValidator(_require_different_names)]
-"""Files that are offered by their stems, no two alike."""
+"""Files offered by their stems, no two of which may be equal."""
 
 
 class Settings(BaseSettings):
-    """Built once, at the edge, and handed down."""
+    """All settings of a server. They are read once at start-up and do not change."""
 
     model_config = SettingsConfigDict(env_prefix=_PREFIX, frozen=True)
 
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 is every IPv4 address of the machine."""
+    """Address to listen on; 0.0.0.0 stands for every IPv4 address of the machine."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """Port to listen on; 0 takes a free one."""
     allowed_hosts: Names = ()
-    """Names by which the server may be asked for, beside `host`, localhost and addresses in numbers; `*` is any."""
+    """Host names that the server answers to, besides `host`, localhost and numeric addresses; `*` allows any."""
     allowed_origins: Origins = ()
-    """Sites whose pages may use the server, as https://example.org; its own page may."""
+    """Sites whose pages may use the server, such as https://example.org. The server's own page always may."""
     bundles: Paths = ()
-    """Scene bundles to serve beside those that come with the package."""
+    """Scene bundles to serve besides those that come with the package."""
     clips: NamedFiles = ()
-    """Audio files to offer as clips, named by their stem, beside those that come with the package."""
+    """Audio files to offer as clips, named by their stem, besides those that come with the package."""
     hrtfs: NamedFiles = ()
-    """SOFA files (SimpleFreeFieldHRIR) to offer as heads, named by their stem, beside KEMAR."""
+    """SOFA files (SimpleFreeFieldHRIR) to offer as heads, named by their stem, besides KEMAR."""
 
     audio_threads: Annotated[int, Field(ge=1)] = _usable_cores()
     """Threads that render streams."""
     realtime: bool = True
-    """Whether to ask for real-time priority for them; where the system refuses, they run without."""
+    """Whether to ask for real-time priority for the audio threads. If the system refuses, they run without."""
     ir_workers: Annotated[int, Field(ge=1)] = max(1, _usable_cores() - 1)
-    """Threads that compute impulse responses, behind all others. One core is left to the audio threads."""
+    """Threads that compute impulse responses, at low priority. The default leaves one core to the audio threads."""
     ir_share: Annotated[float, Field(gt=0)] = 0.25
-    """Cores' worth of impulse responses that streams of one audio thread may take between them under load, or less
-    where rendering leaves less."""
+    """CPU time, in cores, that impulse responses for the streams of one audio thread may take under load. They get less
+    if rendering leaves less."""
     max_streams: Annotated[int, Field(ge=1)] = 64
-    """Live streams that may be open at once; one more is told `server_busy`."""
+    """Live streams that may be open at once; one more is refused with `server_busy`."""
     shared_tail: bool = False
-    """Let all emitters of a stream share one late tail, each at the level of its own: many cost less, and only what
-    comes after 32 blocks is another's."""
+    """Whether all emitters of a stream share one late reverberation, each at its own level. Many emitters cost less,
+    and only the part of a response after 32 blocks is shared."""
     max_emitters: Annotated[int, Field(ge=1, le=64)] = 16
-    """Of one stream."""
+    """Emitters that one stream may have at once."""
     window_blocks: Annotated[int, Field(ge=1)] = 32
-    """Blocks that may be unacknowledged, beyond those a client asks to have in hand."""
+    """Blocks that may be unacknowledged, in addition to the `buffer_blocks` that a client asks for."""
     max_message_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
     """A longer WebSocket message is refused; one longer than `max_frame_bytes` closes the connection."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
@@ -101,35 +101,37 @@ class Settings(BaseSettings):
     hello_timeout_s: Annotated[float, Field(gt=0)] = 10.0
     """How long a WebSocket client may take to send its hello."""
     request_timeout_s: Annotated[float, Field(gt=0)] = 10.0
-    """For a whole HTTP request to come, from the connection or from its first byte: half-sent requests are answered
-    408, connections that say nothing are closed."""
+    """Time for a whole HTTP request to arrive, from the connection or from its first byte. A half-sent request is then
+    answered 408, and a silent connection is closed."""
     response_timeout_s: Annotated[float, Field(gt=0)] = 30.0
-    """For a client to take 64 KiB of a response, or what is left of it."""
+    """Time for a client to read 64 KiB of a response, or the rest of it."""
     keep_alive_s: Annotated[float, Field(gt=0)] = 5.0
-    """For the next request on a connection."""
+    """Time to wait for the next request on a connection."""
     max_headers_bytes: Annotated[int, Field(ge=1024)] = 32 * 1024
-    """Of all headers of a request together; of one, and of the request line, at most 8,000."""
+    """Longest headers of a request, all together. A single header and the request line may have 8,000 bytes each."""
     max_body_bytes: Annotated[int, Field(ge=0, le=64 * 1024)] = 64 * 1024
-    """Of a request. No route has a use for one."""
+    """Longest body of a request. No route needs one."""
     max_connections: Annotated[int, Field(ge=1)] = 1024
-    """In all. When all are taken, who comes gets that on which nothing has been under way for longest; where there is
-    none such, health checks alone are answered."""
+    """Connections in total. If all are taken, a new one replaces the one that has been idle for longest; if none is
+    idle, only health checks are answered."""
     max_connections_per_address: Annotated[int, Field(ge=1)] = 256
-    """Of one IP address, or IPv6 network of 64 bits. Behind a proxy everybody comes from its address."""
+    """Connections from one IP address, or from one IPv6 network of 64 bits. Behind a proxy all clients have the proxy's
+    address."""
     max_silent: Annotated[int, Field(ge=1)] = 64
-    """WebSocket connections that may be open without a hello; one more ends that which has been silent for longest."""
+    """WebSocket connections that may be open without a hello; one more ends the one that has been silent for
+    longest."""
     stall_timeout_s: Annotated[float, Field(gt=0)] = 15.0
     """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
-    """HTTP computations that may wait for a thread, equal requests as one; with one more, a client is answered 503."""
+    """HTTP computations that may wait for a thread; equal requests count once. Beyond that a client is answered 503."""
     drain_s: Annotated[float, Field(ge=2, le=3600)] = 8.0
-    """How long the server may take to end once it is told to (SIGTERM, SIGINT): streams are told at once, requests may
-    go on for 0.7 of it, and whatever has not ended by then is cut off."""
+    """How long the server may take to shut down (SIGTERM, SIGINT). Streams end at once with an error message, requests
+    may go on for 0.7 of this time, and anything still open at its end is cut off."""
 
     @field_validator("*", mode="before")
     @classmethod
     def _read_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """By the grammar of every other number that comes as text, where the setting is one."""
+        """Read a number given as text by the grammar of `server.core.numerals`."""
         annotation = cls.model_fields[info.field_name or ""].annotation
         kinds = {annotation, *get_args(annotation)}
         if isinstance(value, str) and kinds & {int, float}:
@@ -138,7 +140,7 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _knows_the_environment(self) -> Self:
-        """A misspelt variable would otherwise be a setting that stays as it is."""
+        """Refuse misspelt variables, which would otherwise have no effect."""
         known = [name.upper() for name in type(self).model_fields]
         for variable in sorted(os.environ):
             name = variable.upper().removeprefix(_PREFIX)

@@ -1,8 +1,8 @@
-"""What streams have counted, those that are open and those that have ended, such that no sum ever falls.
+"""Total counts of all streams, open and ended. No total ever falls.
 
-A stream that ends moves from one side to the other while another thread reads both. So both sides are one immutable
-value that is replaced at once, and what a stream has counted is final before it moves: a reader counts every stream
-exactly once, whichever value it holds.
+A stream that ends moves from the open streams to the past totals while another thread may read both. So both are one
+immutable value that is replaced at once, and a stream's counts are final before it moves. A reader therefore counts
+every stream exactly once, whichever value it has.
 """
 
 import threading
@@ -15,7 +15,7 @@ from server.streaming.stream import Stream
 
 
 class StreamTotals:
-    """What several streams counted and timed, together."""
+    """Sum of the counts and durations of several streams."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -33,10 +33,10 @@ class StreamTotals:
         totals.counts["limited"] = session.blocks_limited
         totals.counts["silenced"] = session.renderer.samples_silenced
         totals.regrets.merge(stream.regrets)
-        totals.durations["render"].merge(stream.render_times)
-        totals.durations["lateness"].merge(stream.latenesses)
-        totals.durations["ir"].merge(stream.ir_times)
-        totals.durations["pose"].merge(stream.pose_times.durations)
+        totals.durations["render"].merge(stream.times.render)
+        totals.durations["lateness"].merge(stream.times.lateness)
+        totals.durations["ir"].merge(stream.times.response)
+        totals.durations["pose"].merge(stream.times.pose.durations)
         return totals
 
     def merge(self, other: "StreamTotals") -> None:
@@ -47,7 +47,7 @@ class StreamTotals:
 
 
 class _Account:
-    """What one stream has counted: up to now, or, once it is closed, up to then."""
+    """Counts of one stream, up to now or up to when it was closed."""
 
     def __init__(self, stream: Stream) -> None:
         self._stream: Stream | None = stream
@@ -55,7 +55,7 @@ class _Account:
         self._lock = threading.Lock()
 
     def close(self) -> StreamTotals:
-        """Heed nothing that the stream counts from now on, and let go of it."""
+        """Keep the present counts as final, and drop the stream."""
         with self._lock:
             if self._stream is not None:
                 self._final, self._stream = StreamTotals.of(self._stream), None
@@ -67,14 +67,14 @@ class _Account:
 
 
 class _Books(NamedTuple):
-    """`past` is never changed: a reader may hold it for as long as it likes."""
+    """Accounts of open streams, and the sum of the ended ones. `past` is never modified, so a reader may keep it."""
 
     accounts: dict[Stream, _Account]
     past: StreamTotals
 
 
 class StreamLedger:
-    """Of a server. The event loop opens and closes; any thread may ask for the totals."""
+    """Counts of all streams of a server. The event loop opens and closes streams; any thread may read the totals."""
 
     def __init__(self) -> None:
         self._books = _Books({}, StreamTotals())
@@ -85,17 +85,17 @@ class StreamLedger:
         self._books = _Books({**accounts, stream: _Account(stream)}, past)
 
     def close(self, stream: Stream) -> None:
-        """Keep what a stream has counted, and let go of it. Closing twice does no harm."""
+        """Keep the counts of a stream, and drop the stream. A second call changes nothing."""
         accounts, past = self._books
         if stream not in accounts:
             return
-        # Until both sides are replaced, readers find the same figures in its account.
+        # Until `_books` is replaced, readers find the same counts in the account.
         final = accounts[stream].close()
         left = {other: account for other, account in accounts.items() if other is not stream}
         self._books = _Books(left, _sum(past, final))
 
     def totals(self) -> StreamTotals:
-        """Of all streams there have ever been; nothing in it is less than in the totals of before."""
+        """Sum over all streams since the start. No count is less than in earlier totals."""
         accounts, past = self._books
         return _sum(past, *(account.read() for account in accounts.values()))
 

@@ -1,8 +1,8 @@
-"""What is true of every route alike, from what each declares: which methods it answers, and which query parameters it
-has.
+"""Strict checks of methods and query parameters for all routes, from the routes' declarations.
 
-`HEAD` is `GET` without the body wherever there is `GET`. `OPTIONS` and the answer to a method that there is not say in
-`Allow` what there is. A parameter that a route does not have, or has once and gets twice, is refused and not ignored.
+Every route with `GET` also has `HEAD`. `OPTIONS` and the refusal of an unknown method list the methods in `Allow`. A
+parameter that the route does not have, or that is given twice although it is not repeatable, is refused and not
+ignored.
 """
 
 import re
@@ -24,8 +24,8 @@ from server.core.near_names import suggestion
 
 @dataclass(frozen=True)
 class DeclaredRoute:
-    """`parameters` are those of the query, by name whether each may be repeated. A route without `methods` is a
-    WebSocket's."""
+    """Declaration of a route. `parameters` maps each query parameter to whether it is repeatable. A route without
+    `methods` is a WebSocket."""
 
     path: re.Pattern[str]
     methods: frozenset[str]
@@ -33,7 +33,7 @@ class DeclaredRoute:
 
 
 def declared_routes(routes: Sequence[BaseRoute]) -> Iterator[DeclaredRoute]:
-    """Those with a path of their own: not what is mounted, which answers for itself."""
+    """All routes with a path of their own. Mounted applications do their own checks."""
     for context in iter_route_contexts(routes):
         if isinstance(context.original_route, Mount):
             continue
@@ -48,7 +48,7 @@ def _is_list(annotation: Any) -> bool:
 
 
 class StrictRequests:
-    """ASGI middleware over the application that has `routes`, which may still be added to until the first request."""
+    """ASGI middleware over the application with these `routes`. Routes may be added until the first request."""
 
     def __init__(self, app: ASGIApp, *, routes: Sequence[BaseRoute]) -> None:
         self._app = app
@@ -77,7 +77,7 @@ class StrictRequests:
 
 
 def _refusal(scope: Scope, found: Sequence[DeclaredRoute]) -> Response | None:
-    """What is answered in place of the route, if anything."""
+    """The answer in place of the route's; None if the request is allowed."""
     methods = set().union(*(route.methods for route in found))
     if not methods:
         refused = problem(426, "upgrade_required", "this is a WebSocket: connect with ws:// or wss://")
@@ -109,7 +109,7 @@ def _refused_query(query: str, known: dict[str, bool]) -> Response | None:
 
 
 def _without_body(send: Send) -> Send:
-    """A response's start as it is, Content-Length included, and nothing after it."""
+    """A `send` that passes on the response's status and headers but not its body."""
 
     async def pass_on(message: Message) -> None:
         if message["type"] == "http.response.body":

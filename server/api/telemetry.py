@@ -1,6 +1,7 @@
 """Counters and durations of a running server, in Prometheus' text format.
 
-Nothing is counted for it: the figures are those that streams keep for their own clients, read when they are asked for.
+Nothing is counted for this purpose alone. The figures are read on request from those that streams keep for their
+clients.
 """
 
 import platform
@@ -25,11 +26,11 @@ from server.streaming.quality_steps import Offer
 from server.streaming.stream import Stream
 
 _SHORTEST_S, _LONGEST_S = 3e-5, 10.0
-"""Bounds of what durations are told apart."""
+"""Range of the histograms' buckets."""
 
 
 class Host(Protocol):
-    """What is asked of a server."""
+    """The parts of a server that metrics are read from."""
 
     @property
     def audio(self) -> AudioEngine: ...
@@ -48,7 +49,7 @@ class Host(Protocol):
 
 
 class ServerCollector(Collector):
-    """All metrics of a host, as they are when they are collected; on any thread."""
+    """Collects all metrics of a host. Any thread may collect."""
 
     def __init__(self, host: Host) -> None:
         self._host = host
@@ -57,13 +58,15 @@ class ServerCollector(Collector):
         streams = self._host.audio.streams
         totals = self._host.ledger.totals()
         yield InfoMetricFamily(
-            "nafir_build", "What runs.", value={"version": version("nafir"), "python": platform.python_version()}
+            "nafir_build",
+            "Versions of Nafir and Python.",
+            value={"version": version("nafir"), "python": platform.python_version()},
         )
         readiness = self._host.readiness
         is_ready = readiness.obstacle is None
-        yield GaugeMetricFamily("nafir_ready", "1 where streams may be opened.", value=is_ready)
+        yield GaugeMetricFamily("nafir_ready", "1 if streams may be opened.", value=is_ready)
         is_draining = readiness.drain.has_begun
-        yield GaugeMetricFamily("nafir_draining", "1 where the server is shutting down.", value=is_draining)
+        yield GaugeMetricFamily("nafir_draining", "1 if the server is shutting down.", value=is_draining)
         yield from _threads(readiness.watch)
         yield from self._streams(streams)
         yield from self._blocks(totals)
@@ -73,38 +76,44 @@ class ServerCollector(Collector):
         )
         yield GaugeMetricFamily(
             "nafir_ir_requests_waiting",
-            "Streams that wait for impulse responses, for their turn to ask or for an answer.",
+            "Streams that wait for impulse responses, either for their turn to request them or for the result.",
             value=sum(stream.awaits_irs_since_s is not None for stream in streams),
         )
         yield self._level_steps()
         yield GaugeMetricFamily(
             "nafir_blocks_at_once",
-            "Blocks of a stream that the busiest audio thread renders together: more under load.",
+            "Blocks of a stream that the busiest audio thread renders at once; more under load.",
             value=max(thread.blocks_at_once for thread in self._host.audio.threads),
         )
         yield self._level_costs()
         clips = {name for library in self._host.clips.values() for name in library.names}
-        yield GaugeMetricFamily("nafir_clips", "Recordings an emitter can play.", value=len(clips))
+        yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
 
     def _streams(self, streams: Iterable[Stream]) -> Iterator[Metric]:
         levels = Counter((stream.scene, stream.session.quality.level) for stream in streams)
         eased = Counter(stream.scene for stream in streams if stream.ladder.is_eased)
-        by_level = GaugeMetricFamily("nafir_streams", "Open streams, by what they hear.", labels=["scene", "level"])
+        by_level = GaugeMetricFamily(
+            "nafir_streams", "Open streams by scene and quality level.", labels=["scene", "level"]
+        )
         for scene, offer in tuple(self._host.offers.items()):
             for level in offer.levels:
                 by_level.add_metric([scene, level.name], levels[scene, level.name])
         yield by_level
-        below = GaugeMetricFamily("nafir_streams_eased", "Streams below the best quality for them.", labels=["scene"])
+        below = GaugeMetricFamily(
+            "nafir_streams_eased", "Streams below their best quality because of load.", labels=["scene"]
+        )
         for scene in tuple(self._host.offers):
             below.add_metric([scene], eased[scene])
         yield below
 
     def _blocks(self, totals: StreamTotals) -> Iterator[Metric]:
         yield CounterMetricFamily("nafir_blocks_sent", "Audio blocks sent.", value=totals.counts["sent"])
-        yield CounterMetricFamily("nafir_blocks_late", "Of those sent, later than needed.", value=totals.counts["late"])
+        yield CounterMetricFamily(
+            "nafir_blocks_late", "Blocks sent later than the client needed them.", value=totals.counts["late"]
+        )
         yield CounterMetricFamily(
             "nafir_blocks_dropped",
-            "Blocks not sent: too many unacknowledged.",
+            "Blocks not sent because too many were unacknowledged.",
             value=totals.counts["dropped"],
         )
         yield CounterMetricFamily(
@@ -112,26 +121,28 @@ class ServerCollector(Collector):
         )
         yield CounterMetricFamily(
             "nafir_samples_not_finite",
-            "Samples rendered as no number and sent as silence: a fault wherever it is not 0.",
+            "Rendered samples that were not finite and were sent as silence; a fault unless it is 0.",
             value=totals.counts["silenced"],
         )
-        yield _histogram("nafir_block_render_seconds", "What a block costs.", totals.durations["render"])
+        yield _histogram("nafir_block_render_seconds", "Time to render a block.", totals.durations["render"])
         yield _histogram(
             "nafir_block_lateness_seconds",
-            "From when a block is due until it is ready.",
+            "Time from when a block is due until it is ready.",
             totals.durations["lateness"],
         )
         yield _histogram(
-            "nafir_ir_seconds", "What one request for impulse responses takes a worker.", totals.durations["ir"]
+            "nafir_ir_seconds", "Time of a worker for one request for impulse responses.", totals.durations["ir"]
         )
         yield _histogram(
-            "nafir_pose_to_audio_seconds", "From a pose to the first block that follows it.", totals.durations["pose"]
+            "nafir_pose_to_audio_seconds",
+            "Time from a pose to the first block that follows it.",
+            totals.durations["pose"],
         )
 
     def _level_steps(self) -> Metric:
         steps = CounterMetricFamily(
             "nafir_level_steps",
-            "Times that a stream was moved to cheaper quality (load), or back to better (recovered).",
+            "Changes of a stream to a cheaper quality (load) or back to a better one (recovered).",
             labels=["reason"],
         )
         counted = self._host.audio.steps
@@ -141,7 +152,9 @@ class ServerCollector(Collector):
 
     def _level_costs(self) -> Metric:
         costs = GaugeMetricFamily(
-            "nafir_level_ir_seconds", "What an impulse response of a level took at start.", labels=["scene", "level"]
+            "nafir_level_ir_seconds",
+            "Time for an impulse response of a level, measured at start.",
+            labels=["scene", "level"],
         )
         for scene, offer in tuple(self._host.offers.items()):
             for name, ms in offer.ms_here.items():
@@ -152,10 +165,12 @@ class ServerCollector(Collector):
 def _threads(watch: ThreadWatch) -> Iterator[Metric]:
     states = watch.states
     healthy = GaugeMetricFamily(
-        "nafir_thread_healthy", "1 where a thread does its work, 0 where it is stuck or dead.", labels=["thread"]
+        "nafir_thread_healthy", "1 if the thread works, 0 if it is stuck or dead.", labels=["thread"]
     )
     restarts = CounterMetricFamily(
-        "nafir_thread_restarts", "Times that a thread died and was replaced: a fault wherever not 0.", labels=["thread"]
+        "nafir_thread_restarts",
+        "How often the thread died and was replaced; a fault unless it is 0.",
+        labels=["thread"],
     )
     for name, state in states.items():
         healthy.add_metric([name], state == "working")
@@ -166,16 +181,16 @@ def _threads(watch: ThreadWatch) -> Iterator[Metric]:
 
 def _regrets(record: RegretRecord) -> Iterator[Metric]:
     yield CounterMetricFamily(
-        "nafir_effect_checks", "Moments heard as planned and with every effect on.", value=record.checks
+        "nafir_effect_checks", "Audits that compared a plan with a rendering of all effects.", value=record.checks
     )
     yield CounterMetricFamily(
         "nafir_effect_check_failures",
-        "Of these, where an effect that was off was heard to be; it is on from then on.",
+        "Audits in which an effect that was off was audibly missing; it is on from then on.",
         value=record.failures,
     )
     worst = GaugeMetricFamily(
         "nafir_effect_regret_jnd",
-        "The most that any check found, in just-noticeable differences.",
+        "The greatest difference that any audit found, in just-noticeable differences.",
         labels=["parameter"],
     )
     for parameter, jnd in sorted(record.worst_jnd.items()):
@@ -184,7 +199,7 @@ def _regrets(record: RegretRecord) -> Iterator[Metric]:
 
 
 def exposition(collector: Collector) -> bytes:
-    """All of it as text, and beside it what the process takes: memory, CPU time, open files."""
+    """All metrics as text, with memory, CPU time and open files of the process."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(collector)
     ProcessCollector(registry=registry)

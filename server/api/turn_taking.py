@@ -1,4 +1,4 @@
-"""Requests and streams begin one after the other, and leave time for everything else."""
+"""Requests and streams start one after the other, so that they leave time for other work."""
 
 import asyncio
 from collections import deque
@@ -10,10 +10,10 @@ _LONGEST_PAUSE_S = 0.02
 
 
 class TurnTaking:
-    """Begins one thing at a time on an event loop, first come first served.
+    """Starts one piece of work at a time on an event loop, first come first served.
 
-    Before the next one the loop has been through all else that was ready, and then for as long again as that took: what
-    begins here takes at most half of the loop's time, and streams have the other half.
+    After each start the loop runs everything else that is ready, and then other work for as long again. So work started
+    here takes at most half of the loop's time, and streams have the other half.
     """
 
     def __init__(self) -> None:
@@ -21,11 +21,11 @@ class TurnTaking:
         self._is_taken = False
 
     def __len__(self) -> int:
-        """Those that wait."""
+        """Number of pieces of work that wait."""
         return len(self._waiting)
 
     def begin(self, loop: asyncio.AbstractEventLoop, start: Callable[[], None]) -> None:
-        """Call `start` now, or when its turn comes. It returns soon: what is long it leaves to a task."""
+        """Call `start` now or when its turn comes. `start` has to return soon, so it leaves long work to a task."""
         self._waiting.append(start)
         if not self._is_taken:
             self._next(loop)
@@ -35,7 +35,7 @@ class TurnTaking:
         if self._waiting:
             begin_s = loop.time()
             start = self._waiting.popleft()
-            # The task that it makes takes its first step before this is called.
+            # A task created by `start` takes its first step before this is called.
             start()
             loop.call_soon(self._pause, loop, begin_s)
 
@@ -44,15 +44,16 @@ class TurnTaking:
 
 
 class OneAtATime:
-    """Does one piece of work at a time on another thread, first come first served, and then rests for as long again as
-    that took: however many ask, it takes at most half of a processor, and others have the interpreter's lock between.
+    """Does one piece of work at a time on another thread, first come first served, and then rests for as long again. So
+    it takes at most half of a core, and other threads can take the interpreter's lock in between.
     """
 
     def __init__(self) -> None:
         self._lock = asyncio.Lock()
 
     async def run(self, work: Callable[[], T], *, is_wanted: Callable[[], bool]) -> T | None:
-        """What `work` returns or raises; None, and nothing done, where it is no longer wanted when its turn comes."""
+        """Return or raise what `work` returns or raises. Returns None without calling it if it is not wanted any more
+        when its turn comes."""
         loop = asyncio.get_running_loop()
         await self._lock.acquire()
         begin_s = loop.time()

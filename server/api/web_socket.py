@@ -1,13 +1,13 @@
-"""uvicorn's WebSocket protocol, with a short way for what an application sends and hears hundreds of times a second.
+"""uvicorn's WebSocket protocol with a fast path for messages that are sent and received hundreds of times a second.
 
-By way of ASGI a message passes through three layers, a task that wakes for it, and a state machine, which for a block
-of audio is most of what its listener costs beside rendering. A whole binary message needs none of that where the
-connection is open and its buffer has room: a header of a few bytes (RFC 6455, 5.2), and the transport; nor does a
-message that comes, where none waits before it. ASGI allows such *extensions*: an application finds this one in its
-scope, and does without where another server runs it.
+Through ASGI a message passes three layers, a task that wakes for it, and a state machine. For a block of audio that is
+most of a listener's cost besides rendering. On the fast path a whole binary message needs only a header of a few bytes
+(RFC 6455, 5.2) and the transport, if the connection is open and its buffer has room. A received message is handed over
+directly if none waits before it. The fast path is an ASGI *extension*: the application finds it in its scope, and works
+without it on another server.
 
-No client keeps others waiting: of what comes, a few frames are taken in at a time, between which others have their
-turn, and once a client has spent its budget (`server.api.inflow`) nothing is read from it for a while.
+No client delays others. Only a few frames of a client are handled at a time, and once a client has spent its budget
+(`server.api.inflow`), nothing is read from it for a while.
 """
 
 import asyncio
@@ -44,77 +44,82 @@ from server.api.seats import Seat
 from server.api.turn_taking import TurnTaking
 from server.api.web_socket_frames import FrameSplitter, ReceivedFrame, header
 
-Hear = Callable[[str | bytes], bool]
-"""Takes a message in at once, or says False and has not: then it goes the way of all others."""
+Handler = Callable[[str | bytes], bool]
+"""Handles a message at once. Returns False if it does not; the message then goes through ASGI."""
 
 _EXTENSION: Final = "nafir.direct"
 _END_OF_REQUEST: Final = b"\r\n\r\n"
 _MOST_WAITING = 16
-"""Messages that may wait for the application before its client is heard no more."""
+"""Messages that may wait for the application before reading pauses."""
 _FRAMES_AT_ONCE = 32
-"""Taken in before others have their turn: at most a millisecond."""
+"""Frames of one client handled before other clients' turn; they take at most a millisecond."""
 _SHORTEST_WAIT_S = 0.01
-"""Once a budget is spent: more comes at once then, which costs less than many small pieces."""
+"""Shortest pause once a budget is spent. After it more bytes come at once, which costs less than many small reads."""
 _MOST_FRAGMENTS = 64
-"""Of a message, that wait in pieces."""
+"""Fragments of one message that may wait separately."""
 
 
 def _no_allowance(_: Allowance) -> None:
-    """Where a server has no budgets."""
+    """The default of `FastPath.allow`, for servers without budgets."""
 
 
 @dataclass(frozen=True)
 class FastPath:
-    """Past ASGI, in order with what goes by way of it."""
+    """Direct access to a WebSocket connection that bypasses ASGI. Messages stay in order with those sent through
+    ASGI."""
 
     write: Callable[[Sequence[bytes]], bool]
-    """Sends binary messages at once, or says False and has not sent any."""
-    listen: Callable[[Hear], None]
-    """From now on, whoever is given is told of messages before which none waits, if they come in one piece; but not of
-    poses of the listener that a newer one follows directly."""
+    """Sends binary messages at once. Returns False if it could not, and then none was sent."""
+    listen: Callable[[Handler], None]
+    """Sets the handler, which from then on gets whole messages before which none waits. It does not get listener poses
+    that a newer one follows directly."""
     allow: Callable[[Allowance], None] = _no_allowance
-    """Has the client's budget fill at this rate."""
+    """Sets the rate at which the client's budget fills."""
     is_open: Callable[[], bool] = lambda: True
-    """Whether the client is still there, as far as is known."""
+    """Whether the connection is still open, as far as is known."""
 
 
-def direct_way(scope: Mapping[str, Any]) -> FastPath | None:
-    """That of a connection, where its server has one."""
-    way: FastPath | None = scope.get("extensions", {}).get(_EXTENSION, {}).get("way")
-    return way
+def fast_path(scope: Mapping[str, Any]) -> FastPath | None:
+    """The fast path of a connection; None if the server has none."""
+    path: FastPath | None = scope.get("extensions", {}).get(_EXTENSION, {}).get("path")
+    return path
 
 
 def watched(
-    scope: MutableMapping[str, Any], *, sent: Callable[[Sequence[bytes]], None], heard: Callable[[str | bytes], None]
+    scope: MutableMapping[str, Any],
+    *,
+    sent: Callable[[Sequence[bytes]], None],
+    received: Callable[[str | bytes], None],
 ) -> MutableMapping[str, Any]:
-    """A scope that tells of what went the direct way: of what was `sent`, and of what was `heard`."""
-    way = direct_way(scope)
-    if way is None:
+    """A scope whose fast path calls `sent` for messages sent through it and `received` for messages handled through
+    it."""
+    path = fast_path(scope)
+    if path is None:
         return scope
 
     def write(payloads: Sequence[bytes]) -> bool:
-        is_sent = way.write(payloads)
+        is_sent = path.write(payloads)
         if is_sent:
             sent(payloads)
         return is_sent
 
-    def listen(hear: Hear) -> None:
-        def hear_watched(message: str | bytes) -> bool:
-            is_heard = hear(message)
-            if is_heard:
-                heard(message)
-            return is_heard
+    def listen(handler: Handler) -> None:
+        def watched_handler(message: str | bytes) -> bool:
+            is_handled = handler(message)
+            if is_handled:
+                received(message)
+            return is_handled
 
-        way.listen(hear_watched)
+        path.listen(watched_handler)
 
     return {
         **scope,
-        "extensions": {**scope["extensions"], _EXTENSION: {"way": replace(way, write=write, listen=listen)}},
+        "extensions": {**scope["extensions"], _EXTENSION: {"path": replace(path, write=write, listen=listen)}},
     }
 
 
 class _Handshake(ServerProtocol):
-    """The library's state of a connection, whose refusals to open it are problem documents."""
+    """The library's handshake, with refusals as problem documents."""
 
     def reject(self, status: HTTPStatus | int, text: str) -> Response:
         response = super().reject(status, text)
@@ -127,18 +132,18 @@ class _Handshake(ServerProtocol):
 
 
 class WebSocketProtocol(WebSocketsSansIOProtocol):
-    """For uvicorn, by `ws="server.api.web_socket:WebSocketProtocol"`, without extensions of the protocol's own: what is
-    written here is neither compressed nor cut."""
+    """The protocol for uvicorn's option `ws`. It uses no WebSocket extensions, so messages are neither compressed nor
+    split."""
 
-    _hear: Hear | None = None
-    _cutter: FrameSplitter | None = None
+    _handler: Handler | None = None
+    _splitter: FrameSplitter | None = None
     _has_failed = False
-    """Whether the client broke the protocol, and was told so."""
+    """Whether the client broke the protocol and was told so."""
     _budget: Budget | None = None
     _next_slice: asyncio.Handle | None = None
-    """When what waits is taken in, or reading goes on: until then nothing is read."""
+    """The scheduled call that handles waiting frames or resumes reading. Nothing is read until then."""
     _pong: bytes = b""
-    """The newest that there was no room to send."""
+    """The newest pong that could not be sent for lack of room."""
     _seat: Seat | None = None
     _leave_room: Callable[[], None] | None = None
     _turns: TurnTaking | None = None
@@ -155,12 +160,13 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         self.conn = _Handshake(max_size=config.ws_max_size, logger=logging.getLogger("uvicorn.error"))
 
     def take_seat(self, seat: Seat, leave_room: Callable[[], None], turns: TurnTaking) -> None:
-        """That of the HTTP connection which became this. It is in use once the application listens; until then it is
-        another's who comes when there is no other. `turns` are those of requests, which a handshake is."""
+        """Take over the seat of the HTTP connection that became this WebSocket. The seat is in use once the application
+        listens; until then another connection may take it. The handshake takes its turn in `turns` with other
+        requests."""
         self._seat, self._leave_room, self._turns = seat, leave_room, turns
 
     async def run_asgi(self) -> None:
-        """In turn with requests; not at all where the client has gone by then."""
+        """Start the application when the connection's turn comes, unless the client has gone by then."""
         if self._turns is not None:
             turn: asyncio.Future[None] = self.loop.create_future()
             self._turns.begin(self.loop, lambda: None if turn.done() else turn.set_result(None))
@@ -175,15 +181,15 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self._seat is not None and self._leave_room is not None:
             self._seat.leave()
             self._leave_room()
-            self._seat = self._leave_room = None  # which hold the transport and this
+            self._seat = self._leave_room = None  # these refer to the transport and to this protocol
         super().connection_lost(exc)
         if self._next_slice is not None:
             self._next_slice.cancel()
             self._next_slice = None
 
     def end_if_overdue(self, now_s: float) -> None:
-        """Called now and then. A transport that closes first sends what waits, to which a client that does not read
-        never lets it come."""
+        """Reset a connection that has been closing for too long. A closing transport first sends waiting data, which
+        never happens if the client does not read."""
         if not self.transport.is_closing():
             return
         if self._closing_since_s is None:
@@ -193,60 +199,60 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
 
     def handle_connect(self, event: Request) -> None:
         super().handle_connect(event)
-        if not self.handshake_complete:  # as it is where the request was refused
+        if not self.handshake_complete:  # it is complete if the request was refused
             self.scope["extensions"][_EXTENSION] = {
-                "way": FastPath(self._write, self._listen, self._allow, self._is_open)
+                "path": FastPath(self._write, self._listen, self._allow, self._is_open)
             }
 
     def on_task_complete(self, task: asyncio.Task[None]) -> None:
-        """The application is done. It holds this protocol by the way, and is held by whom it has listen: with neither,
-        nothing of either waits for the collector."""
+        """The application has ended. The fast path refers to this protocol, and the handler to the application. Both
+        are dropped, so that no reference cycle waits for the garbage collector."""
         super().on_task_complete(task)
-        self._hear = None
+        self._handler = None
         self.scope["extensions"].pop(_EXTENSION, None)
 
     def data_received(self, data: bytes) -> None:
         if self._has_failed:
-            return  # the client does not know yet
-        if self._cutter is None:
+            return  # the client has not seen the close frame yet
+        if self._splitter is None:
             was_open = self.handshake_initiated
             super().data_received(data)
-            # With bytes behind the request, the parser may be in the midst of a frame.
+            # If bytes follow the request, the parser may be in the middle of a frame.
             is_request = data.partition(_END_OF_REQUEST)[1:] == (_END_OF_REQUEST, b"")
             if is_request and self.handshake_initiated and not was_open:
-                self._cutter = FrameSplitter(self.config.ws_max_size)
+                self._splitter = FrameSplitter(self.config.ws_max_size)
             return
         self._spend(READ_COST, len(data))
         if self._next_slice is None:
             self._take_slice(data)
-        else:  # reading has been resumed by others
-            self._cutter.keep(data)
+        else:  # uvicorn has resumed reading
+            self._splitter.keep(data)
             self.transport.pause_reading()
 
     def _take_slice(self, data: bytes = b"") -> None:
-        """Take in a few frames, and see when to go on."""
-        assert self._cutter is not None
-        cuts = self._cutter.cut(data, most=_FRAMES_AT_ONCE)
-        unheard: list[bytes] = []
-        for cut, then in zip_longest(cuts, cuts[1:]):
-            if self._is_superseded(cut, then):
+        """Handle a few frames, and schedule the next ones."""
+        assert self._splitter is not None
+        frames = self._splitter.split(data, most=_FRAMES_AT_ONCE)
+        for_asgi: list[bytes] = []
+        for frame, following in zip_longest(frames, frames[1:]):
+            if self._is_superseded(frame, following):
                 self._spend(SUPERSEDED_COST)
                 continue
-            if cut.message is None:
-                self._spend(OTHER_FRAME_COST * cut.frames)
+            if frame.message is None:
+                self._spend(OTHER_FRAME_COST * frame.frames)
             else:
-                self._spend(message_cost(cut.message, is_text=cut.is_text))
-            # After the first that is not heard, all wait their turn.
-            if unheard or cut.message is None or not self._is_heard(cut.message, is_text=cut.is_text):
-                unheard.append(cut.raw)
-        if unheard:
-            super().data_received(b"".join(unheard))
+                self._spend(message_cost(frame.message, is_text=frame.is_text))
+            # After the first frame for ASGI all others have to wait behind it.
+            if for_asgi or frame.message is None or not self._is_handled(frame.message, is_text=frame.is_text):
+                for_asgi.append(frame.raw)
+        if for_asgi:
+            super().data_received(b"".join(for_asgi))
         self._go_on_later()
 
     def _go_on_later(self) -> None:
-        """Read no more where more waits, or the budget is spent."""
+        """Pause reading if more frames wait or the budget is spent."""
         wait_s = 0.0 if self._budget is None else self._budget.wait_s
-        if self._cutter is None or not (self._cutter.has_more or wait_s):
+        if self._splitter is None or not (self._splitter.has_more or wait_s):
             return
         self.transport.pause_reading()
         if wait_s:
@@ -258,7 +264,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         self._next_slice = None
         if self._has_failed or self.transport.is_closing():
             return
-        if self.read_paused:  # until the application has taken in what waits
+        if self.read_paused:  # until the application has received what waits
             return
         self._spend(0.0)
         self._take_slice()
@@ -270,7 +276,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self.read_paused and self.queue.empty():
             self.read_paused = False
             if self._next_slice is None:
-                # Not at once: what comes next would be heard before this message is returned.
+                # Not at once: the next message would be handled before this one is returned.
                 self._next_slice = self.loop.call_soon(self._go_on)
         return message
 
@@ -283,22 +289,22 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
     def _allow(self, allowance: Allowance) -> None:
         self._budget = Budget(allowance, self.loop.time())
 
-    def _is_superseded(self, cut: ReceivedFrame, then: ReceivedFrame | None) -> bool:
-        if self._hear is None or cut.message is None or then is None or then.message is None:
+    def _is_superseded(self, frame: ReceivedFrame, following: ReceivedFrame | None) -> bool:
+        if self._handler is None or frame.message is None or following is None or following.message is None:
             return False
-        return cut.is_text == then.is_text and supersedes(then.message, cut.message)
+        return frame.is_text == following.is_text and supersedes(following.message, frame.message)
 
     def handle_cont(self, event: Frame) -> None:
-        """However small the pieces are in which a message comes, few of them wait."""
+        """Join the fragments of a message from time to time, so that few of them wait."""
         super().handle_cont(event)
         if len(self.frames) > _MOST_FRAGMENTS:
             self.frames = [b"".join(self.frames)]
 
     def send_receive_event_to_app(self) -> None:
-        """uvicorn stops reading with every message, until the application has taken it in."""
+        """Pass a message to the application. uvicorn pauses reading after every message; here some may wait."""
         try:
             super().send_receive_event_to_app()
-        except InvalidState:  # text that is none, before the connection is open or once the client closes it
+        except InvalidState:  # text that is not UTF-8, before the connection is open or once the client closes it
             if self.conn.state is CONNECTING:
                 self.transport.close()
         if self.read_paused and self.queue.qsize() < _MOST_WAITING:
@@ -307,20 +313,21 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
                 self.transport.resume_reading()
 
     def handle_parser_exception(self) -> None:
-        """uvicorn closes the connection at once, and a client that is still sending then meets a reset in place of the
-        reason: here it may finish, unheard, until it has closed its side or `close_timeout` is over (RFC 6455, 7.1.1).
+        """End the connection after a breach of the protocol. uvicorn closes it at once, so that a client that is still
+        sending gets a reset instead of the reason. Here the client may go on, ignored, until it closes its side or
+        `close_timeout` is over (RFC 6455, 7.1.1).
         """
         if self.close_sent:
-            return  # the application said so first
+            return  # the application has closed it already
         failure = self.conn.close_sent
         if failure is None:  # a breach before the connection is open
             self.transport.close()
             return
         self.queue.put_nowait({"type": "websocket.disconnect", "code": failure.code, "reason": failure.reason})
         self.transport.write(b"".join(self.conn.data_to_send()))
-        # To the application it is lost: what that may still send is no fault of its own.
+        # For the application the connection is lost, so that sending more is not an error.
         self.close_sent = self.disconnected = self._has_failed = True
-        if not self.transport.can_write_eof():  # as with TLS, which has a close of its own
+        if not self.transport.can_write_eof():  # TLS has its own way to close
             self.transport.close()
             return
         self.transport.write_eof()
@@ -330,8 +337,8 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             self.transport.resume_reading()
 
     def handle_ping(self) -> None:
-        """Of pings that came together the newest is answered, and of those that come while the client reads nothing the
-        newest once it does (RFC 6455, 5.5.3)."""
+        """Answer the newest of several pings (RFC 6455, 5.5.3). While the client does not read, the newest pong
+        waits."""
         if self._has_failed:
             return
         if self.conn.state is not OPEN:
@@ -348,19 +355,20 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             self.transport.write(self._pong)
         self._pong = b""
 
-    def _is_heard(self, message: bytes, *, is_text: bool) -> bool:
-        if self._hear is None or self.close_sent or self.conn.state is not OPEN or not self.queue.empty():
+    def _is_handled(self, message: bytes, *, is_text: bool) -> bool:
+        """Whether the handler has handled the message."""
+        if self._handler is None or self.close_sent or self.conn.state is not OPEN or not self.queue.empty():
             return False
         if not is_text:
-            return self._hear(message)
+            return self._handler(message)
         try:
             text = message.decode()
         except UnicodeDecodeError:
-            return False  # uvicorn knows what to do
-        return self._hear(text)
+            return False  # uvicorn refuses it
+        return self._handler(text)
 
-    def _listen(self, hear: Hear) -> None:
-        self._hear = hear
+    def _listen(self, handler: Handler) -> None:
+        self._handler = handler
         if self._seat is not None:
             self._seat.use()
 

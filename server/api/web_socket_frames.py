@@ -1,4 +1,4 @@
-"""Frames of WebSocket messages as they lie on the wire (RFC 6455, 5.2), as far as messages come whole, in one frame."""
+"""Reading and writing of WebSocket frames (RFC 6455, 5.2) that are whole messages."""
 
 import struct
 import sys
@@ -6,19 +6,19 @@ from typing import Final, NamedTuple
 
 try:
     from websockets.speedups import apply_mask
-except ImportError:  # as where the library is built without a compiler
+except ImportError:  # the library was built without a compiler
     from websockets.utils import apply_mask
 
 _WHOLE_TEXT, _WHOLE_BINARY = 0x81, 0x82
 _FINAL, _MASKED, _CONTROL = 0x80, 0x80, 0x08
 _SHORT, _LONG = 126, 127
-"""Lengths that say that the length follows, in two bytes or in eight."""
+"""Values of the length field that say that the length follows in two or in eight bytes."""
 _SHORTEST_HEADER: Final = 2
 _KEY_BYTES: Final = 4
 
 
 def header(length: int) -> bytes:
-    """Of a whole binary message that a server sends, of so many bytes."""
+    """Header of a server's binary message of `length` bytes."""
     if length < _SHORT:
         return struct.pack(">BB", _WHOLE_BINARY, length)
     if length < 1 << 16:
@@ -27,43 +27,43 @@ def header(length: int) -> bytes:
 
 
 class ReceivedFrame(NamedTuple):
-    """Bytes of a stream as they came, and the message that they are where they are a whole one."""
+    """Received bytes, and the message in them if they are exactly one whole message."""
 
     raw: bytes
     message: bytes | None = None
     is_text: bool = False
     frames: int = 1
-    """How many of them begin in it."""
+    """Number of frames that begin in these bytes."""
 
 
 class FrameSplitter:
-    """Cuts what one client sends, from the first byte after the handshake, into whole messages and what else there is.
+    """Splits the bytes of one client, after the handshake, into whole messages and other frames.
 
-    All that comes in goes out in order, in `raw`. What there is so far of a header, and of a message of less than 126
-    bytes, waits for the rest. Nothing is checked here: what is no whole message of at most `longest` bytes, masked and
-    without the bits of an extension, is left to a parser that is given everything else, too.
+    All bytes come out again in order, in `raw`. An incomplete header, or an incomplete message of less than 126 bytes,
+    waits for the rest. Nothing is checked here. A parser handles everything that is not a whole message of at most
+    `longest` bytes, masked and without extension bits.
     """
 
     def __init__(self, longest: int) -> None:
         self._longest = longest
         self._begun = b""
         self._to_come = 0
-        """Bytes of a frame that is passed on in parts."""
+        """Bytes still missing from a frame that is passed on in parts."""
         self._is_fragmented = False
-        """Whether the rest of a message comes in frames of its own."""
+        """Whether more frames of the same message follow."""
         self.has_more = False
-        """Whether whole frames may wait, since there were more than were to be cut."""
+        """Whether whole frames may wait here, because the last call reached its limit."""
 
     def keep(self, data: bytes) -> None:
-        """Have more wait for the next time."""
+        """Keep bytes for the next call of `split`."""
         self._begun += data
         self.has_more = True
 
-    def cut(self, data: bytes = b"", *, most: int = sys.maxsize) -> list[ReceivedFrame]:
-        """Of what came before and `data`, so many frames at the most; others wait for the next time."""
+    def split(self, data: bytes = b"", *, most: int = sys.maxsize) -> list[ReceivedFrame]:
+        """Split kept bytes and `data` into at most `most` frames. Further frames are kept for the next call."""
         data = self._begun + data
         end = len(data)
-        cuts = []
+        found = []
         passed, at = 0, min(self._to_come, end)
         self._to_come -= at
         others = 0  # frames from `passed` on, none of which is a whole message
@@ -81,9 +81,9 @@ class FrameSplitter:
                 break
             if is_message and past <= end:
                 if at > passed:
-                    cuts.append(ReceivedFrame(data[passed:at], frames=others))
+                    found.append(ReceivedFrame(data[passed:at], frames=others))
                 message = apply_mask(data[start:past], data[start - _KEY_BYTES : start])
-                cuts.append(ReceivedFrame(data[at:past], message, first == _WHOLE_TEXT))
+                found.append(ReceivedFrame(data[at:past], message, first == _WHOLE_TEXT))
                 passed, others = past, 0
             else:
                 others += 1
@@ -95,5 +95,5 @@ class FrameSplitter:
         self._begun = data[at:]
         self.has_more = most == 0 and at < end
         if at > passed:
-            cuts.append(ReceivedFrame(data[passed:at], frames=others))
-        return cuts
+            found.append(ReceivedFrame(data[passed:at], frames=others))
+        return found

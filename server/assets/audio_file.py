@@ -1,7 +1,7 @@
-"""Audio files, read as what they hold and not as what their headers claim.
+"""Reading audio files whose headers may be wrong.
 
-Programs that write to a pipe leave the size of the sound at zero or at its largest; transfers break off; editors forget
-to correct a size. So the header is compared with the file, and what was found is said.
+Programs that write to a pipe leave the size field at zero or at its maximum, transfers break off, and editors forget to
+correct a size. So the header is compared with the file, and differences are reported.
 
 Arrays are `(sample, channel)`.
 """
@@ -21,22 +21,22 @@ FloatArray = npt.NDArray[np.float32]
 
 MOST_BYTES = 2**31
 MOST_VALUES = 2**28
-"""Of all channels: an hour and a half of mono at 48 kHz, a gigabyte."""
+"""Most samples over all channels: a gigabyte, or an hour and a half of mono at 48 kHz."""
 SLOWEST_RATE_HZ, FASTEST_RATE_HZ = 2_000, 768_000
 _BLOCKS = (16_384, 1024, 16)
 _UNKNOWN_SIZES = range(0x7FFFF000, 0x100000000)
-"""What programs write who cannot know how long the sound will be."""
+"""Sizes that programs write when they do not know the length beforehand."""
 _CHUNK_NAME = re.compile(rb"[ -~]{4}")
 
 
 class AudioFileError(Exception):
-    """A file that holds no sound that can be read; says why."""
+    """The file holds no sound that can be read. The message says why."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """`samples` (sample, channel). `finding` says what the header has wrong and what was read, if anything; `is_cut`
-    that the end is missing."""
+    """Decoded audio: `samples` (sample, channel). `finding` says how the header and the file differ, and is empty if
+    they agree. With `is_cut` the end is missing."""
 
     samples: FloatArray
     sample_rate: int
@@ -49,8 +49,8 @@ class Recording:
 
 
 def read_audio(path: Path) -> Recording:
-    """Any file that libsndfile reads; its content decides what it is. Raises AudioFileError, also for one that holds
-    more than `MOST_VALUES`."""
+    """Read any file that libsndfile reads. The content decides the format, not the name. Raises AudioFileError, also
+    for more than `MOST_VALUES` samples."""
     content = _content(path)
     sizes = _sizes(content)
     if sizes is not None and sizes.is_short:
@@ -80,12 +80,12 @@ def _content(path: Path) -> bytes:
 
 
 def _decoded(content: bytes) -> tuple[FloatArray, int, int]:
-    """Samples, rate, and how many samples the header promises. A stream that breaks off is read until there."""
+    """Samples, rate, and the number of samples by the header. A damaged stream is read up to the damage."""
     parts: list[FloatArray] = []
     rate = promised = 0
-    # An error takes all of its block with it, so smaller blocks follow.
+    # A decoding error loses its whole block, so smaller blocks are tried next.
     for block in _BLOCKS:
-        # Without a name, so that the content alone decides what it is.
+        # Without a file name, so that the content alone decides the format.
         with soundfile.SoundFile(BytesIO(content)) as file:
             rate, promised = file.samplerate, file.frames
             for part in parts:
@@ -98,7 +98,7 @@ def _decoded(content: bytes) -> tuple[FloatArray, int, int]:
 
 
 def _is_read_to_its_end(file: soundfile.SoundFile, block: int, parts: list[FloatArray]) -> bool:
-    """Whether the rest was read, and put behind `parts`; False where it breaks off before."""
+    """Read the rest and append it to `parts`. Returns False if a decoding error ends it early."""
     values = sum(part.size for part in parts)
     while True:
         try:
@@ -114,43 +114,43 @@ def _is_read_to_its_end(file: soundfile.SoundFile, block: int, parts: list[Float
 
 
 def _compared(read: Recording, sizes: "_Sizes | None", promised: int, content: bytes) -> Recording:
-    """With what the header and the file disagree about."""
-    told = f"{len(read.samples)} samples ({read.duration_s:.3g} s) were read"
+    """The recording with a finding, if the header and the file disagree."""
+    amount = f"{len(read.samples)} samples ({read.duration_s:.3g} s) were read"
     finding, is_cut = "", False
     if sizes is not None and sizes.is_short:
         claimed = "does not say how much sound follows" if sizes.is_unknown else f"tells of {sizes.declared} bytes"
-        finding = f"its header {claimed}, and the file holds {sizes.held}: {told}"
+        finding = f"its header {claimed}, and the file holds {sizes.present}: {amount}"
     elif sizes is not None and sizes.is_unknown:
-        finding = f"its header does not say how much sound follows: {told}"
-    elif sizes is not None and sizes.held < sizes.declared:
-        finding, is_cut = f"it is cut off: of {sizes.declared} bytes of sound it holds {sizes.held}; {told}", True
+        finding = f"its header does not say how much sound follows: {amount}"
+    elif sizes is not None and sizes.present < sizes.declared:
+        finding, is_cut = f"it is cut off: of {sizes.declared} bytes of sound it holds {sizes.present}; {amount}", True
     elif promised > len(read.samples) or _lacks_its_last_page(content):
-        finding, is_cut = f"it is cut off: it promises more than it holds; {told}", True
+        finding, is_cut = f"it is cut off: it promises more than it holds; {amount}", True
     return Recording(read.samples, read.sample_rate, finding, is_cut)
 
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Bytes of sound by the header, `declared`, and by the file, from `start` on, `held`; `fields` are the places and
-    formats of the numbers that declare them."""
+    """Size of the sound in bytes: `declared` by the header, and `present` in the file from byte `start` on. `fields`
+    has the offset and the `struct` format of each size field."""
 
     declared: int
-    held: int
+    present: int
     start: int
     is_unknown: bool
     fields: tuple[tuple[int, str], ...]
     is_short: bool
-    """More sound follows than is declared."""
+    """Whether more sound follows than the header declares."""
 
     def corrected(self, content: bytes) -> bytes:
         changed = bytearray(content)
         for at, form in self.fields:
-            struct.pack_into(form, changed, at, min(self.held, 2 ** (8 * struct.calcsize(form)) - 1))
+            struct.pack_into(form, changed, at, min(self.present, 2 ** (8 * struct.calcsize(form)) - 1))
         return bytes(changed)
 
 
 def _sizes(content: bytes) -> _Sizes | None:
-    """Of the RIFF family, AIFF and AU; None of others, and of what is none."""
+    """Sizes in a file of the RIFF family, AIFF or AU; None for any other content."""
     kind, form = content[:4], content[8:12]
     if kind in {b"RIFF", b"RIFX", b"RF64", b"BW64"} and form == b"WAVE":
         return _sizes_in_chunks(content, b"data", ">I" if kind == b"RIFX" else "<I")
@@ -158,9 +158,9 @@ def _sizes(content: bytes) -> _Sizes | None:
         return _sizes_in_chunks(content, b"SSND", ">I")
     if kind == b".snd" and len(content) >= 24:
         start, declared = struct.unpack(">II", content[4:12])
-        held = max(0, len(content) - start)
+        present = max(0, len(content) - start)
         is_unknown = declared == 0xFFFFFFFF
-        return _Sizes(declared, held, start, is_unknown, (), is_short=False)
+        return _Sizes(declared, present, start, is_unknown, (), is_short=False)
     return None
 
 
@@ -176,32 +176,32 @@ def _sizes_in_chunks(content: bytes, sound: bytes, form: str) -> _Sizes | None:
             if size == 0xFFFFFFFF and long_size is not None:
                 (size,) = struct.unpack_from("<Q", content, long_size)
                 fields = [(long_size, "<Q")]
-            held = len(content) - start
-            is_unknown = (size in _UNKNOWN_SIZES and size > held) or (size == 0 and held > 0)
-            follows = content[start + size :] if size < held else b""
-            is_short = size < held and sound == b"data" and not _is_chunks(follows, size % 2, form)
-            # Chunks behind the sound that is declared are no sound.
-            return _Sizes(size, held, start, is_unknown and (size > 0 or is_short), tuple(fields), is_short)
+            present = len(content) - start
+            is_unknown = (size in _UNKNOWN_SIZES and size > present) or (size == 0 and present > 0)
+            follows = content[start + size :] if size < present else b""
+            is_short = size < present and sound == b"data" and not _is_chunks(follows, size % 2, form)
+            # Chunks after the declared sound are not sound.
+            return _Sizes(size, present, start, is_unknown and (size > 0 or is_short), tuple(fields), is_short)
         at = start + size + size % 2
     return None
 
 
 def _is_chunks(content: bytes, padding: int, form: str) -> bool:
-    """Whether these bytes are chunks to their end, tags that players append, or nothing."""
+    """Whether these bytes are whole chunks, tags that players append, or nothing."""
     if not content.strip(b"\0") or content[padding:].startswith((b"TAG", b"APETAGEX")):
         return True
-    for at in {padding, 0}:  # not everybody pads
+    for at in {padding, 0}:  # not all programs pad
         while at + 8 <= len(content) and _CHUNK_NAME.fullmatch(content, at, at + 4):
             (size,) = struct.unpack_from(form, content, at + 4)
             at += 8 + size + size % 2
         if at >= len(content) or (at + 8 > len(content) and not content[at:].strip(b"\0")):
-            # One that reaches beyond the file by more than its padding is sound that happens to look like a name.
+            # A chunk that reaches beyond the file by more than its padding is sound that looks like a chunk's name.
             return at <= len(content) + 1
     return False
 
 
 def _lacks_its_last_page(content: bytes) -> bool:
-    """Of Ogg: whether the page that ends the stream is missing, or is not whole."""
+    """Whether an Ogg file lacks the page that ends its stream, or a part of it."""
     if not content.startswith(b"OggS"):
         return False
     at = content.rfind(b"OggS")
@@ -213,11 +213,10 @@ def _lacks_its_last_page(content: bytes) -> bool:
 
 
 def to_mono(samples: FloatArray, channel: int | None = None) -> tuple[FloatArray, str]:
-    """(sample,) the average of the channels (sample, channel), or the one that is asked for, counted from 0; and what
-    is to be said of it.
+    """Mix (sample, channel) down to (sample,); also returns a warning, which may be empty.
 
-    Where averaging would cancel what the channels hold, since they are of opposite phase, the louder one stands for
-    all. Raises AudioFileError for a channel that is not there.
+    The result is the average of the channels, or the one that `channel` names, counted from 0. If the channels have
+    opposite phase and would cancel, the louder one is used. Raises AudioFileError if the channel does not exist.
     """
     channels = samples.shape[1]
     if channel is not None:
@@ -226,11 +225,11 @@ def to_mono(samples: FloatArray, channel: int | None = None) -> tuple[FloatArray
         return np.ascontiguousarray(samples[:, channel]), ""
     if channels > 1 and (share := _cancelled_share(samples)) > _MOST_CANCELLED:
         louder = int(np.argmax(np.sum(np.square(samples, dtype=np.float64), axis=0)))
-        told = (
+        warning = (
             f"its {channels} channels cancel each other ({share:.0%} of the sound is of opposite phase); "
             f"channel {louder + 1}, the louder, is played alone"
         )
-        return np.ascontiguousarray(samples[:, louder]), told
+        return np.ascontiguousarray(samples[:, louder]), warning
     return samples.mean(axis=1, dtype=np.float32), ""
 
 
@@ -240,8 +239,8 @@ _LEAST_OF_UNRELATED = 0.4
 
 
 def _cancelled_share(samples: FloatArray) -> float:
-    """How much of the energy lies in stretches in which averaging leaves less than 0.4 of what it leaves of channels
-    that have nothing to do with each other: of two that are equally loud, a correlation below -0.6."""
+    """Share of the energy in stretches where channels cancel. There averaging leaves less than 0.4 of the energy that
+    it would leave of uncorrelated channels; for two equally loud channels that is a correlation below -0.6."""
     starts = np.arange(0, len(samples), _STRETCH)
     energy = np.add.reduceat(np.square(samples, dtype=np.float64).sum(axis=1), starts)
     of_sum = np.add.reduceat(np.square(samples.sum(axis=1, dtype=np.float64)), starts)

@@ -1,7 +1,7 @@
-"""Dry recordings that emitters play: the bundled ones and files of the user's.
+"""Clips: dry recordings that emitters play, bundled or from the user's files.
 
-A clip is decoded once, to mono at the rate of the scene, and checked there: at least one sample, and a file that holds
-what is no audio is refused as a whole.
+A clip is decoded once, to mono at the rate of the scene. A file without samples, or with samples that are not audio, is
+refused as a whole.
 """
 
 import logging
@@ -27,7 +27,7 @@ _BUNDLED = Path(__file__).parent / "clips_data"
 
 
 class DecodeError(NafirError):
-    """A file that cannot be played; `reason` says why."""
+    """A file cannot be played; `reason` says why."""
 
     def __init__(self, name: str, reason: str) -> None:
         super().__init__(f"{name}: {reason}")
@@ -36,7 +36,7 @@ class DecodeError(NafirError):
 
 
 class UnknownClipError(RequestError):
-    """No clip of that name."""
+    """There is no clip of that name."""
 
     def __init__(self, name: str) -> None:
         super().__init__("unknown_clip", f"there is no clip {name!r}", field="clip", status=404)
@@ -45,7 +45,7 @@ class UnknownClipError(RequestError):
 
 @dataclass(frozen=True)
 class Clip:
-    """What to show of a clip. `credit` is empty for the user's own files."""
+    """Description of a clip. `credit` is empty for the user's own files."""
 
     name: str
     title: str
@@ -54,10 +54,10 @@ class Clip:
 
 
 def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAudio:
-    """Read an audio file (wav, flac, ogg, and whatever else libsndfile reads) as mono at `sample_rate`.
+    """Read an audio file (wav, flac, ogg or another format of libsndfile) as mono at `sample_rate`.
 
-    Channels are averaged, or `channel`, counted from 0, is taken; where they cancel each other, the louder one. The
-    log warns of that, and of headers that lie. Raises DecodeError.
+    The channels are averaged, unless `channel`, counted from 0, selects one. If they would cancel each other, the
+    louder one is used. The log warns of that and of wrong headers. Raises DecodeError.
     """
     try:
         recording = read_audio(path)
@@ -66,8 +66,10 @@ def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAu
             raise AudioFileError("it holds no samples")
         # Before averaging and resampling, which would spread one bad sample over many.
         is_bad = ~np.isfinite(samples).all(axis=1)
+        # guard: a file of no audio is refused
         if is_bad.any():
             raise AudioFileError(f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
+        # guard: a file beyond the loudest is refused
         if (peak := np.abs(samples).max()) > LOUDEST:
             raise AudioFileError(f"its peak of {peak:.3g} is not audio, where full scale is 1")
         mono, downmix = to_mono(samples, channel)
@@ -83,9 +85,9 @@ def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAu
 
 
 class ClipLibrary:
-    """Clips by name at one sample rate: the bundled ones, and `files`, which win where a name is taken.
+    """Clips by name at one sample rate: the bundled ones and `files`, which replace bundled ones of the same name.
 
-    Safe to use from any thread. Clips are decoded when first asked for and kept.
+    Safe to use from any thread. A clip is decoded on its first use and kept.
     """
 
     def __init__(self, sample_rate: int, files: Mapping[str, Path] | None = None) -> None:
@@ -103,7 +105,7 @@ class ClipLibrary:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """In alphabetical order."""
+        """Names of all clips in alphabetical order."""
         return tuple(sorted(self._paths))
 
     def load(self, name: str) -> DryAudio:

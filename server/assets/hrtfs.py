@@ -1,4 +1,4 @@
-"""Heads to hear through: measured sets of HRTFs, ready for the sample rates of the scenes."""
+"""Heads: measured sets of HRTFs, prepared for the sample rates of the scenes."""
 
 import logging
 from collections.abc import Iterable
@@ -14,10 +14,11 @@ _logger = logging.getLogger(__name__)
 
 
 class HrtfLibrary:
-    """The KEMAR set, and `files` (SOFA, SimpleFreeFieldHRIR) by stem, which win where a name is taken.
+    """The KEMAR set and `files` (SOFA, SimpleFreeFieldHRIR), each named by its stem. A file of the same name replaces
+    KEMAR.
 
-    Everything is read and filtered here, at `sample_rates`, so that a stream finds it ready. Raises HrtfError for the
-    first file that cannot be used, and ValueError for two of one stem.
+    All sets are read and filtered here, at each of `sample_rates`, so that a stream need not wait. Raises HrtfError for
+    the first file that cannot be used, and ValueError if two files have the same stem.
     """
 
     def __init__(self, files: Iterable[Path], sample_rates: Iterable[int]) -> None:

@@ -1,11 +1,12 @@
-"""Names of files that a server offers: that of each is its stem, so no two may share one."""
+"""Names of the files that a server offers: the stem of each. No two files may have the same stem."""
 
 from collections.abc import Iterable
 from pathlib import Path
 
 
 def named_by_stem(files: Iterable[Path]) -> dict[str, Path]:
-    """Files by their stems; one that is given twice is one. Raises ValueError that names two files of one stem."""
+    """Files by their stems. The same file may be given twice. Raises ValueError, which names both, for two files with
+    the same stem."""
     named: dict[str, Path] = {}
     for path in files:
         other = named.setdefault(path.stem, path)

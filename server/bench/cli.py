@@ -1,12 +1,18 @@
-"""`nafir bench`: what things cost on this host. Medians of several rounds; run it on an idle machine.
+"""`nafir bench`: performance on this host. Results are medians of several rounds; run it on an idle machine.
 
-Exit code 1 where a goal is not reached that the run was to reach, with a line on standard error that says why.
+Every command returns an `Outcome`. `_finish` adds it to the history if `--record` is given. It ends with exit code 1 if
+a goal of the run is not reached, with a line on standard error that says why. A command that raises adds nothing to the
+history.
 """
 
 import asyncio
+import shlex
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -22,10 +28,46 @@ from server.bench.report import (
     print_measures,
     print_rows,
 )
-from server.core.command_line import StrictTyper, require_at_most_one
+from server.core.command_line import StrictTyper, require_at_most_one, writable_folder
 from server.core.errors import NafirError
 
-app = StrictTyper(help="Measure what things cost on this host.", no_args_is_help=True)
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of a run of `bench`: figures by name, and failures."""
+
+    bench: str
+    figures: Mapping[str, float | None]
+    problems: tuple[str, ...] = ()
+
+    @classmethod
+    def judged(cls, bench: str, judgements: list[Judgement], problems: Iterable[str] = ()) -> "Outcome":
+        figures = {each.measure: each.value for each in judgements if not each.is_skipped}
+        return cls(bench, figures, (*missed(judgements), *problems))
+
+
+def _finish(outcome: Outcome, *, record: bool, history: Path) -> None:
+    if record:
+        from server.bench.history import Run, append_run
+
+        path = history / f"{outcome.bench}.json"
+        append_run(path, Run.now(shlex.join(["nafir", *sys.argv[1:]]), outcome.figures, outcome.problems))
+        typer.echo(f"recorded in {path}", err=True)
+    end_with(outcome.problems)
+
+
+app = StrictTyper(help="Measure what things cost on this host.", no_args_is_help=True, result_callback=_finish)
+
+
+@app.callback()
+def _bench(
+    record: Annotated[bool, typer.Option("--record", help="Add the run to the history of its benchmark.")] = False,
+    history: Annotated[
+        Path, typer.Option(help="Folder of histories, one JSON file each.", callback=writable_folder)
+    ] = Path("benchmarks/history"),
+) -> None:
+    pass
+
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
@@ -37,7 +79,7 @@ def field(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds, of which the median counts.")] = 20,
     poses: Annotated[int, typer.Option(min=1, help="Random poses per round.")] = 20,
     as_json: AsJson = False,
-) -> None:
+) -> Outcome:
     """Time from a pose to a binaural impulse response, one at a time on one core, at every quality level."""
     from server.bench.field import measure_levels
     from server.field.fields_by_level import FieldsByLevel
@@ -51,7 +93,8 @@ def field(
         print_measures("Host", measured["host"])
         print_rows(f"One impulse response of scene {measured['scene']}, {measured['ir_s']:g} s", measured["levels"])
         print_judgements("Goals", judgements)
-    end_with(missed(judgements))
+    figures = {f"{scene}, {level['name']}, {name}": level[name] for level in measured["levels"] for name in _TIMES}
+    return Outcome("field", figures, tuple(missed(judgements)))
 
 
 @app.command()
@@ -60,8 +103,8 @@ def convolver(
         bool, typer.Option("--quick", help="Only blocks of 256, 1 s of impulse response, 1 and 16 sources.")
     ] = False,
     as_json: AsJson = False,
-) -> None:
-    """The convolver beside pedalboard and SciPy: speed, exactness, evenness, exchanges, drift, start.
+) -> Outcome:
+    """The convolver compared with pedalboard and SciPy: speed, error, evenness, exchanges, drift, start-up.
 
     Two to six minutes, or one at most with --quick. Without pedalboard (extra `dev`) its columns stay empty.
     """
@@ -77,7 +120,7 @@ def convolver(
         if measured["peer"] is None:
             Console().print("pedalboard is not installed: there is nothing to compare with (pip install pedalboard)")
         _print_convolver(measured, judgements)
-    end_with(missed(judgements))
+    return Outcome.judged("convolver", judgements)
 
 
 @app.command()
@@ -91,11 +134,11 @@ def stream(
     duration_s: Annotated[float, typer.Option(min=1, help="How long the run is that counts.")] = 60.0,
     poses_per_second: Annotated[float, typer.Option(min=0, help="Of each listener; 0 to stand still.")] = 30.0,
     as_json: AsJson = False,
-) -> None:
+) -> Outcome:
     """How many sessions one core serves, with fewer than one block in a thousand late.
 
-    A search takes about five minutes for each number of emitters, a number of sessions one and a half. Every step is
-    told as it ends; what Ctrl-C interrupts, prints what it has.
+    A search takes about five minutes for each number of emitters; a given number of sessions takes one and a half. Each
+    step is reported when it ends. After Ctrl-C the results so far are printed.
     """
     from server.bench.sessions import Plan, failures, measure_sessions
 
@@ -108,15 +151,15 @@ def stream(
     else:
         _print_sessions(measured, judgements)
     interrupted = [] if measured["is_complete"] else ["it was interrupted"]
-    end_with([*missed(judgements), *failures(measured["cases"]), *interrupted])
+    return Outcome.judged("stream", judgements, [*failures(measured["cases"]), *interrupted])
 
 
 @app.command()
 def effects(
     as_json: AsJson = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a table for a README.")] = False,
-) -> None:
-    """What a plan of effects saves, and what it gets wrong, in six situations."""
+) -> Outcome:
+    """How much time a plan of effects saves, and how large its error is, in six situations."""
     require_at_most_one({"--json": as_json, "--markdown": markdown})
     from server.bench.effects import SCENARIOS, measure_effects
     from server.bench.effects_table import markdown_table, terminal_rows
@@ -132,6 +175,7 @@ def effects(
     else:
         print_measures("Host", describe_machine())
         print_rows("Effects by plan, beside all of them and none", terminal_rows(measured))
+    return Outcome("effects", {f"{each['situation']}, {name}": each[name] for each in measured for name in _BY_PLAN})
 
 
 @app.command()
@@ -142,8 +186,8 @@ def listen(
     duration_s: Annotated[float, typer.Option(min=1, help="How long to listen.")] = 60.0,
     poses_per_second: Annotated[float, typer.Option(min=0.1, help="How often the listener moves.")] = 30.0,
     as_json: AsJson = False,
-) -> None:
-    """Listen to a running server while walking in circles: late blocks, and the time from a pose to its sound."""
+) -> Outcome:
+    """Listen to a running server while walking in circles: late blocks and pose-to-sound latency."""
     from websockets.exceptions import WebSocketException
 
     from server.bench import listen as one_stream
@@ -154,17 +198,18 @@ def listen(
     except (OSError, WebSocketException) as exc:
         raise NafirError(f"{url}: {exc}") from exc
     _report(as_json, f"One stream of {url}", {"listener_host": describe_machine(), **measured})
+    return Outcome("listen", {name: value for name, value in measured.items() if isinstance(value, int | float)})
 
 
 def _steps_told() -> Callable[[str], None]:
-    """A line for each step, where nobody knows how many there will be."""
+    """A callback that prints a line for each step, for runs whose number of steps is unknown."""
     console, began_s = Console(stderr=True), time.monotonic()
     return lambda step: console.print(f"{time.monotonic() - began_s:6.0f} s  {step}", highlight=False)
 
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Redrawn between measurements only: a thread that redraws would be measured too."""
+    """A progress bar that is redrawn only between measurements, since a thread that redraws would affect them."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
         task = progress.add_task("", total=total)
@@ -211,6 +256,10 @@ def _print_sessions(measured: dict[str, Any], judgements: list[Judgement]) -> No
     print_judgements("Goals", judgements)
 
 
+_TIMES = ("ms_p50", "ms_p99")
+_BY_PLAN = ("plan_us", "ratio", "error_jnd")
+"""Figures of each level, and of each situation, that go into a history."""
+
 _CASE = {"block": "block_size", "ir s": "ir_s", "sources": "sources"}
 _ALONE = {
     "ours": "x_realtime",
@@ -225,4 +274,4 @@ _SHARED = {
     "ratio": "shared_tail_ratio",
     "worst / mean": "shared_tail_worst_to_mean_block",
 }
-"""Headings short enough for a terminal."""
+"""Columns of tables: short headings and the keys of their values."""

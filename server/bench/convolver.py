@@ -1,7 +1,7 @@
-"""The convolver beside pedalboard and SciPy, and what can only be measured of ours; everything in one run.
+"""Benchmark of the convolver against pedalboard and SciPy, and of properties that only ours has, in one run.
 
-At 48 kHz, with stereo IRs. The modules say what each measure means: `server.bench.throughput`, `.exchanges`,
-`.endurance` and `.startup`.
+All cases are at 48 kHz with stereo IRs. Each measure is explained in its module: `server.bench.throughput`,
+`.exchanges`, `.endurance` and `.startup`.
 """
 
 import itertools
@@ -22,12 +22,12 @@ from server.bench.startup import cold_start_s, warm_start_s
 from server.bench.throughput import SAMPLE_RATE, Case, Rooms, measure_case
 
 Advance = Callable[[str], None]
-"""Told what has just been measured."""
+"""Progress callback; it gets a description of the measurement just done."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure, and for how long."""
+    """Measurements to make, and their lengths."""
 
     cases: tuple[Case, ...]
     rounds: int
@@ -37,7 +37,7 @@ class Plan:
     thread_sources: int = 16
     thread_blocks: int = 1_000
     has_cold_start: bool = True
-    """It takes half a minute."""
+    """Whether to measure the cold start, which takes half a minute."""
 
     @property
     def steps(self) -> int:
@@ -67,11 +67,11 @@ _SPLATTER = Goal("splatter above 4 kHz of a 997 Hz tone at 90 exchanges/s, dB", 
 _DRIFT = Goal("growth of the error over 10 minutes, dB", 0, is_at_most=True)
 _WARM_START = Goal("fresh process to its first block, s", 1, is_at_most=True)
 _PEER_DB = -90.0
-"""Where pedalboard's error is larger, it does other work."""
+"""Largest error of pedalboard, relative to its largest sample, at which the comparison counts."""
 
 
 def measure_convolver(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
-    """Everything in the plan; `advance` is called `plan.steps` times."""
+    """Make all measurements of the plan. `advance` is called `plan.steps` times."""
     peer = find_pedalboard()
     measured: dict[str, Any] = {"host": describe_machine(), "rounds": plan.rounds}
     measured["peer"] = None if peer is None else {"name": "pedalboard", "error_db": peer_error_db(peer)}
@@ -109,10 +109,10 @@ def measure_convolver(plan: Plan, advance: Advance = lambda _: None) -> dict[str
 
 
 def judge(measured: dict[str, Any]) -> list[Judgement]:
-    """Beside the goals, which are for 256-sample blocks and 1 s of IR; of the largest error, any case counts. How fast
-    a convolver is counts only where what it plays is right."""
+    """Judge the measurements against the goals, which are for 256-sample blocks and 1 s of IR. The largest error is
+    over all cases. Speed counts only if the output is correct."""
     typical = {case["sources"]: case for case in measured["cases"] if (case["block_size"], case["ir_s"]) == (256, 1)}
-    error_db = np.max([case["max_error_db"] for case in measured["cases"]], initial=-np.inf)  # keeps what is no number
+    error_db = np.max([case["max_error_db"] for case in measured["cases"]], initial=-np.inf)  # np.max keeps NaN
     return [
         _judge_ratio(_RATIO_1, typical.get(1), measured["peer"]),
         _judge_ratio(_RATIO_16, typical.get(16), measured["peer"]),
@@ -141,18 +141,19 @@ def _judge_evenness(case: dict[str, Any] | None) -> Judgement:
 
 
 def _judge_drift(drift: dict[str, Any]) -> Judgement:
-    """What is wrong from the beginning does not drift either."""
+    """Judge the drift. Drift counts only if the output is correct at the beginning."""
     failure = _wrong("the first second", drift["first_second_error_db"], _ERROR.limit)
     return _DRIFT.judge(drift["drift_db"], failure=failure)
 
 
 def _wrong(what: str, error_db: float, limit_db: float) -> str | None:
-    """None where `what` is right, to `limit_db`."""
+    """A message that `what` is wrong; None if its error is at most `limit_db`."""
     return None if error_db <= limit_db else f"{what} is off by {show(error_db)} dB, and may be by {show(limit_db)}"
 
 
 def peer_error_db(peer: ModuleType) -> float:
-    """Whether pedalboard does the same work: its largest error, but for the level to which it normalises an IR."""
+    """Pedalboard's largest error, which shows whether it computes the same convolution. Its normalisation of the IR's
+    level is compensated."""
     block_size = 256
     dry, ir = noise(1, 300 * block_size), room(2, SAMPLE_RATE)
     player = Pedalboard(peer, ir[np.newaxis], SAMPLE_RATE)

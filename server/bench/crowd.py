@@ -1,7 +1,7 @@
-"""Many listeners of one server in one event loop, who walk in circles and listen to nothing but headers.
+"""Many clients of one server in one event loop. They walk in circles and read only the headers of audio blocks.
 
-A WebSocket client as small as can be, so that the load does not become what is measured: of a server that sends whole
-messages and no extensions, over the loopback interface.
+The WebSocket client is minimal, so that it does not dominate the measured load. It needs a server that sends whole
+messages without extensions over the loopback interface.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ _RADIUS_M = 1.0
 _TURN_S = 12.0
 _PLACES = (0.5, 0.5, 0.5), (7.5, 2.5, 2.3)
 _GOLDEN = 0.618
-"""Of a period, from one walker's poses to the next one's: any number of them is spread evenly."""
+"""Phase between the poses of successive walkers, as a share of the period. It spreads any number of them evenly."""
 _PATIENCE_S = 10.0
 _SEQUENCE = struct.Struct("<4xI")
 _TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
@@ -37,20 +37,20 @@ _WHOLE, _MASKED = 0x80, 0x80
 
 
 def frame(opcode: int, payload: bytes) -> bytes:
-    """A message (n < 65536) as a client sends it, masked with zeros, which leave it as it is (RFC 6455, 5.3)."""
+    """A client's message of n < 65536 bytes. Its mask is zero, which leaves the bytes unchanged (RFC 6455, 5.3)."""
     short = len(payload) < 126
     length = bytes([_MASKED | len(payload)]) if short else struct.pack(">BH", _MASKED | 126, len(payload))
     return bytes([_WHOLE | opcode]) + length + bytes(4) + payload
 
 
 class FrameReader:
-    """Cuts what a server sends into messages."""
+    """Splits the bytes from a server into messages."""
 
     def __init__(self) -> None:
         self._data = bytearray()
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Opcode and payload of every message that is complete by now."""
+        """Opcode and payload of every message that these bytes complete."""
         self._data += data
         messages = []
         start, end = 0, len(self._data)
@@ -75,7 +75,8 @@ class FrameReader:
 
 
 class Walker(asyncio.Protocol):
-    """One listener. `sounds` is done when all its emitters do, and fails with ConnectionError when it never will."""
+    """One client. The future `sounds` is done when all its emitters are heard, and fails with ConnectionError if that
+    becomes impossible."""
 
     def __init__(self, places: Sequence[Vector3], *, phase: float, poses_per_s: float) -> None:
         self.sounds: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -88,7 +89,7 @@ class Walker(asyncio.Protocol):
         self._poses_per_s = poses_per_s
         self._reader = FrameReader()
         self._reply: bytearray | None = bytearray()
-        """To the request to upgrade, as far as it has come; None after it."""
+        """Reply to the upgrade request as far as it has arrived; None once it is complete."""
         self._transport: asyncio.Transport | None = None
         self._next_pose: asyncio.TimerHandle | None = None
         self._pose_ids = itertools.count(1)
@@ -117,9 +118,9 @@ class Walker(asyncio.Protocol):
             self._begin()
         for opcode, payload in self._reader.feed(data):
             if opcode == _BINARY:
-                self._hear(payload)
+                self._receive_audio(payload)
             elif opcode == _TEXT:
-                self._read(payload)
+                self._receive_text(payload)
             elif opcode == _PING:
                 self._send(_PONG, payload)
             elif opcode == _CLOSE:
@@ -130,12 +131,12 @@ class Walker(asyncio.Protocol):
             self._fail(f"the connection was lost: {exc}")
 
     @property
-    def is_content(self) -> bool:
-        """Hears all its emitters."""
+    def hears_all(self) -> bool:
+        """Whether all emitters are heard and the connection is open."""
         return self._silent == 0 and not self.is_lost
 
     def begin(self) -> None:
-        """Count and time anew."""
+        """Reset counts and times."""
         self.poses.times = DurationHistogram()
         self.blocks = 0
         self.errors = []
@@ -155,7 +156,7 @@ class Walker(asyncio.Protocol):
         if self._poses_per_s > 0:
             self._next_pose = asyncio.get_running_loop().call_later(self._phase / self._poses_per_s, self._walk)
 
-    def _read(self, payload: bytes) -> None:
+    def _receive_text(self, payload: bytes) -> None:
         message = json.loads(payload)
         if message["type"] == "emitter_added":
             self._silent -= 1
@@ -164,7 +165,7 @@ class Walker(asyncio.Protocol):
         elif message["type"] == "error":
             self.errors.append(message["code"])
 
-    def _hear(self, payload: bytes) -> None:
+    def _receive_audio(self, payload: bytes) -> None:
         if payload[0] != AudioBlock.KIND:
             return
         self.blocks += 1
@@ -176,7 +177,7 @@ class Walker(asyncio.Protocol):
     def _walk(self) -> None:
         loop = asyncio.get_running_loop()
         pose_id = next(self._pose_ids)
-        # From the first pose's time on, so that no delay adds up.
+        # Scheduled from the previous due time, so that delays do not add up.
         assert self._next_pose is not None
         self._next_pose = loop.call_at(self._next_pose.when() + 1 / self._poses_per_s, self._walk)
         angle = 2 * math.pi * ((pose_id + self._phase) / self._poses_per_s / _TURN_S + self._phase)
@@ -200,8 +201,8 @@ class Walker(asyncio.Protocol):
 
 
 class Crowd:
-    """So many walkers of the server at `port`, each with `emitters` that sound in places of its own. Without poses they
-    stand still."""
+    """The walkers at the server on `port`. Each has `emitters` emitters at places of its own. With no poses they stand
+    still."""
 
     def __init__(self, port: int, *, emitters: int, poses_per_s: float) -> None:
         self._port = port
@@ -211,8 +212,9 @@ class Crowd:
         self.walkers: list[Walker] = []
 
     async def resize(self, count: int) -> None:
-        """Have `count` walkers hear all their emitters. Raises ConnectionError and TimeoutError where that fails."""
-        kept = [walker for walker in self.walkers if walker.is_content][:count]
+        """Change to `count` walkers, and wait until all their emitters are heard. Raises ConnectionError or
+        TimeoutError if that fails."""
+        kept = [walker for walker in self.walkers if walker.hears_all][:count]
         for walker in self.walkers:
             if walker not in kept:
                 walker.close()

@@ -46,12 +46,12 @@ from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import EmitterEffects, SharedEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.full_response import kemar
 from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import CATALOGUE, EffectName, Overrides
 from server.scene.plan import Plan
-from server.streaming.emitters import Emitter as SessionEmitter
 from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
@@ -182,7 +182,7 @@ def heard(scenario: Scenario, plan: Plan) -> FloatArray:
         effects = EmitterEffects.of(plan, str(number), has_early=True, has_late=bool(field.bundle.manifest.fields))
         # Delays that follow and delays that stand still are the same where nobody has moved yet.
         effects = replace(effects, propagation_delay=True)
-        emitters.append(SessionEmitter(number, Pose(place), effects=effects))
+        emitters.append(EmitterState(Pose(place), effects=effects))
     listener = Pose(scenario.listener)
     looked_from = listener
     if not shared.head_rotation and scenario.turns:

@@ -1,4 +1,4 @@
-"""The table of what plans of effects save."""
+"""Tables of the effects benchmark."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ _HEADINGS = (
 
 
 def terminal_rows(measured: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Short enough for a terminal: how many effects are on, in place of their names."""
+    """Rows short enough for a terminal: they have the number of effects that are on, not their names."""
     return [
         {
             "situation": row["situation"],

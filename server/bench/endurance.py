@@ -1,4 +1,4 @@
-"""Whether a convolver stays exact for minutes, and whether two run side by side."""
+"""Drift of a convolver over minutes, and scaling with two threads."""
 
 import statistics
 import threading
@@ -14,12 +14,14 @@ from server.rendering.convolver import Convolver
 
 _BLOCK_SIZE = 256
 _LOOP_BLOCKS = 1_024
-"""Whole cycles of the stages: whatever does not drift says the same to the last bit each time round."""
+"""Length of the loop. It is a whole number of the convolver's cycles, so that without drift every round has the same
+bits."""
 
 
 def measure_drift(*, duration_s: float, ir_s: float = 1.0) -> dict[str, Any]:
-    """The largest error against float64 in the first and in the last second of a stream of looped noise, in dB of the
-    second's largest sample; and by how much that of the last has grown since the same stretch was played first."""
+    """Largest error against float64 in the first and in the last second of a stream of looped noise, in dB relative to
+    that second's largest sample. The drift is the error of the last second minus that of the same part of the loop in
+    its first round."""
     ir_samples = round(ir_s * SAMPLE_RATE)
     loop = noise(3, _LOOP_BLOCKS, 1, _BLOCK_SIZE)
     ir = room(4, ir_samples)
@@ -27,17 +29,17 @@ def measure_drift(*, duration_s: float, ir_s: float = 1.0) -> dict[str, Any]:
     convolver.set_ir(0, ir)
     second = -(-SAMPLE_RATE // _BLOCK_SIZE)
     blocks = max(4 * _LOOP_BLOCKS, round(duration_s * SAMPLE_RATE / _BLOCK_SIZE))
-    # The first time round, no earlier than the room has filled.
+    # The same part of the loop in the first round in which the reverberation has built up.
     like_last = _LOOP_BLOCKS + (blocks - second) % _LOOP_BLOCKS
     errors_db: dict[int, float] = {}
-    heard: dict[int, list[FloatArray]] = {start: [] for start in (0, like_last, blocks - second)}
+    stretches: dict[int, list[FloatArray]] = {start: [] for start in (0, like_last, blocks - second)}
     for number in range(blocks):
         wet = convolver.process(loop[number % _LOOP_BLOCKS])
-        for start, stretch in heard.items():
+        for start, stretch in stretches.items():
             if start <= number < start + second:
                 stretch.append(wet)
-    for start, stretch in heard.items():
-        since = max(0, start - -(-ir_samples // _BLOCK_SIZE))  # what the IR reaches back to
+    for start, stretch in stretches.items():
+        since = max(0, start - -(-ir_samples // _BLOCK_SIZE))  # the IR reaches back to here
         dry = loop[np.arange(since, start + second) % _LOOP_BLOCKS].reshape(-1)
         expected = reference(dry, ir)[:, -second * _BLOCK_SIZE :]
         errors_db[start] = error_db(np.concatenate(stretch, axis=1), expected)
@@ -51,8 +53,8 @@ def measure_drift(*, duration_s: float, ir_s: float = 1.0) -> dict[str, Any]:
 
 
 def threads_scale(*, sources: int, rounds: int, blocks: int, ir_s: float = 1.0) -> float:
-    """Blocks per second of wall time of two threads with a convolver each, over those of one; 2 is perfect, and needs
-    two idle cores."""
+    """Throughput of two threads with a convolver each, divided by that of one, by wall time. 2 is perfect and needs two
+    idle cores."""
     ir_samples = round(ir_s * SAMPLE_RATE)
     convolvers = [
         Convolver(sources=sources, channels=2, block_size=_BLOCK_SIZE, ir_samples=ir_samples) for _ in range(2)

@@ -1,4 +1,4 @@
-"""What it costs to exchange impulse responses (IRs), in sound and in time."""
+"""Cost of exchanging impulse responses (IRs), as splatter and as CPU time."""
 
 import itertools
 import statistics
@@ -14,12 +14,12 @@ _ROOMS = 12
 _TONE_HZ = 997.0
 _SPLATTER_ABOVE_HZ = 4_000.0
 _WINDOW = 20.0
-"""Kaiser beta: what it leaks is far below -120 dB."""
+"""Kaiser beta; the window's leakage is far below -120 dB."""
 
 
 def splatter_db(*, exchanges_per_s: float, duration_s: float, block_size: int = 256, ir_s: float = 1.0) -> float:
-    """Energy above 4 kHz, relative to all, of a 997 Hz tone while its room is exchanged for an unrelated one so often;
-    of both ears the worse. The first second, in which the room fills, is left out."""
+    """Energy above 4 kHz relative to the total, in dB, of a 997 Hz tone while its IR is exchanged for an unrelated one
+    at this rate. It is that of the worse ear. The first second, in which the reverberation builds up, is left out."""
     ir_samples = round(ir_s * SAMPLE_RATE)
     blocks = -(-(ir_samples + round(duration_s * SAMPLE_RATE)) // block_size) + 1
     dry = tone(_TONE_HZ, blocks * block_size, SAMPLE_RATE).reshape(blocks, 1, block_size)
@@ -40,7 +40,7 @@ def splatter_db(*, exchanges_per_s: float, duration_s: float, block_size: int = 
 
 
 def fade_cost_ratio(*, sources: int, rounds: int, block_size: int = 256, ir_s: float = 1.0) -> float:
-    """CPU time while every source gets another IR in every block, prepared beforehand, over that while none does."""
+    """CPU time with a new prepared IR for every source in every block, divided by the CPU time without exchanges."""
     ir_samples = round(ir_s * SAMPLE_RATE)
     convolvers = [
         Convolver(sources=sources, channels=2, block_size=block_size, ir_samples=ir_samples) for _ in range(2)

@@ -1,4 +1,4 @@
-"""What impulse responses (IRs) cost at each quality level: from a pose to a binaural IR, one at a time on one core."""
+"""Time for an impulse response (IR) at each quality level: from a pose to a binaural IR, one at a time on one core."""
 
 import math
 import statistics
@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.geometry import Vector3
 from server.bench.machine import describe_machine
 from server.bench.report import Goal
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES
+from server.field.node_responses import NODE_CACHE_BYTES
 
 Floats = npt.NDArray[np.float64]
 
@@ -23,14 +24,14 @@ _STEP_M = 0.1
 
 
 def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[str, Any]:
-    """Wall time of single IRs, by level: the median of the rounds' medians, and p99 of all; and of these the part that
-    the graph takes, the rest being decoding.
+    """Wall time of single IRs by level: the median of the rounds' medians, and the p99 of all. Also the part of it that
+    the graph takes; the rest is decoding.
 
-    A listener walks about. Levels take turns from round to round, so that what else the host does meanwhile is alike
-    for all; within a round each has the caches to itself, as it has when it is served. Where responses are kept for
-    poses nearby, the room for them is full from the beginning, as in a server that has run for minutes.
+    The poses are those of a walking listener. Levels take turns from round to round, so that other load on the host
+    affects all alike; within a round each level has the CPU caches to itself, as in a server. For levels that reuse
+    responses, the store of kept responses is full from the beginning, as in a server that has run for minutes.
     """
-    _fill_kept(levels)
+    _fill_node_cache(levels)
     times_ms: dict[str, list[list[tuple[float, float]]]] = {name: [] for name in levels}
     for number in range(rounds + 1):
         walk = _walk(levels, number, poses)
@@ -51,23 +52,26 @@ def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[st
     }
 
 
-def _fill_kept(levels: FieldsByLevel) -> None:
-    """With responses of the level that has most nodes, or as many as it has; the next take the place of others."""
-    by_nodes = {(reuse.spacing_m, reuse.turn_deg): field for field in levels.values() if (reuse := field.level.reuse)}
-    if not by_nodes:
+def _fill_node_cache(levels: FieldsByLevel) -> None:
+    """Fill the cache with responses of the level that has the most nodes."""
+    reusing = [field for field in levels.values() if field.kind.reuses_responses]
+    if not reusing:
         return
-    field = by_nodes[min(by_nodes)]
-    fitting = KEPT_BYTES // (np.dtype(np.float32).itemsize * field.channels * field.ir_samples)
+    fitting = NODE_CACHE_BYTES // (np.dtype(np.float32).itemsize * reusing[0].channels * reusing[0].ir_samples)
     bounds, plan = levels.bundle.manifest.bounds, levels.bundle.floor_plan
     rng = np.random.default_rng(0)
+    poses: list[tuple[Vector3, Vector3, float]] = []
     for _ in range(2 * fitting):
         listener, emitter = rng.uniform(bounds.minimum, bounds.maximum, (2, 3))
         if np.all(plan.contains(np.stack([listener, emitter]))):
-            field.impulse_responses([listener], [emitter], [rng.uniform(-math.pi, math.pi)])
+            poses.append((tuple(listener.tolist()), tuple(emitter.tolist()), rng.uniform(-math.pi, math.pi)))
+    finest = max(reusing, key=lambda field: len({field.snap(*pose).node for pose in poses}))
+    for listener, emitter, yaw in poses:
+        finest.impulse_responses([listener], [emitter], [yaw])
 
 
 def _summary(rounds: list[list[tuple[float, float]]]) -> dict[str, Any]:
-    whole, graph = (np.array([[times[part] for times in one] for one in rounds]) for part in (0, 1))
+    whole, graph = (np.array([[times[part] for times in each] for each in rounds]) for part in (0, 1))
     p50, graph_p50 = (statistics.median(np.median(part, axis=1).tolist()) for part in (whole, graph))
     return {
         "ms_p50": p50,
@@ -78,7 +82,7 @@ def _summary(rounds: list[list[tuple[float, float]]]) -> dict[str, Any]:
 
 
 def _time(field: AcousticField, listener: Floats, emitter: Floats, yaw: float) -> tuple[float, float]:
-    """Milliseconds of an IR, and of the graph alone right after it."""
+    """Milliseconds for an IR, and for the graph alone right after it."""
     started_s = time.perf_counter()
     field.impulse_responses([listener], [emitter], [yaw], remember=True)
     done_s = time.perf_counter()
@@ -87,7 +91,8 @@ def _time(field: AcousticField, listener: Floats, emitter: Floats, yaw: float) -
 
 
 def _walk(levels: FieldsByLevel, seed: int, poses: int) -> list[tuple[Floats, Floats, float]]:
-    """A listener's steps from a place to one in its sight, towards an emitter somewhere, and on from another place."""
+    """Poses of walks, each from one random place straight to another that is visible from it, with one random emitter
+    per walk."""
     bounds, plan = levels.bundle.manifest.bounds, levels.bundle.floor_plan
     rng = np.random.default_rng(seed)
     walk: list[tuple[Floats, Floats, float]] = []

@@ -1,9 +1,9 @@
-"""Measures a server from within, at its edge: how long poses take from the moment the application is given one to the
-moment it has handed the socket the first audio block that follows it, or a newer one.
+"""Measures latencies inside a server: from when the application receives a pose until it has passed the socket the
+first audio block with that pose or a newer one.
 
-`/bench/begin` begins a measurement of the streams that are open, and `/bench/report` tells what was measured since;
-`/bench/blocks` only how many blocks there were, which costs next to nothing.
-`/bench/settled` says whether the server is done with what it does only once, after it has started.
+`/bench/begin` starts a measurement of the open streams, and `/bench/report` returns the results since then.
+`/bench/blocks` returns only the numbers of blocks, which takes hardly any time. `/bench/settled` says whether the
+server has finished its one-time work after the start.
 """
 
 import json
@@ -26,14 +26,14 @@ from server.protocol.server_messages import Durations
 from server.streaming.stream import Stream
 
 POSE_ID = struct.Struct("<4xI")
-"""Where it stands in a binary pose of a listener."""
+"""The pose id in a binary listener pose."""
 POSE_IDS = struct.Struct("<16xII")
-"""Where they stand in an audio block: that of the direct paths, and that of the impulse responses."""
+"""The two pose ids in an audio block: of the direct sound and of the impulse responses."""
 
 
 @dataclass
 class Waiting:
-    """Poses on their way: how long each took until one came out that is not older."""
+    """Latencies of poses: the time of each until a block with that pose or a newer one."""
 
     times: DurationHistogram = field(default_factory=DurationHistogram)
     _since_s: deque[tuple[int, float]] = field(default_factory=deque)
@@ -47,21 +47,21 @@ class Waiting:
 
 
 class _Watch:
-    """The poses of one connection."""
+    """The latencies of one connection."""
 
     def __init__(self) -> None:
         self.direct, self.reverberation = Waiting(), Waiting()
 
 
 class _Counts:
-    """What a stream counted before the measurement began; what it times anew from there on."""
+    """A stream's counts at the beginning of a measurement. Its duration histograms start anew."""
 
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
         self._late, self._dropped, self._sent = self._now()
-        # Whoever times a block next finds the new ones; nobody else writes these.
-        stream.render_times, stream.latenesses = DurationHistogram(), DurationHistogram()
-        stream.ir_times = DurationHistogram()
+        # The audio thread finds the new histograms with the next block. Nothing else replaces them.
+        times = stream.times
+        times.render, times.lateness, times.response = (DurationHistogram() for _ in range(3))
 
     def _now(self) -> tuple[int, int, int]:
         session = self.stream.session
@@ -69,13 +69,13 @@ class _Counts:
 
     @property
     def since(self) -> tuple[int, int, int]:
-        """Blocks late, dropped and sent."""
+        """Numbers of blocks late, dropped and sent since the beginning."""
         late, dropped, sent = self._now()
         return late - self._late, dropped - self._dropped, sent - self._sent
 
 
 class Gauge:
-    """An ASGI application around the server's; everything happens on its event loop."""
+    """An ASGI application around the server's. Everything runs on its event loop."""
 
     def __init__(self, app: ASGIApp, *, time_s: Callable[[], float] = time.monotonic) -> None:
         self._app = app
@@ -118,7 +118,7 @@ class Gauge:
             return message
 
         def see_blocks(messages: Sequence[bytes]) -> None:
-            """Those of one moment."""
+            """Record the blocks among messages sent at one moment."""
             now_s = self._time_s()
             blocks = {POSE_IDS.unpack_from(data) for data in messages if data[0] == AudioBlock.KIND}
             for pose_id, reverberation_pose_id in blocks:
@@ -132,7 +132,7 @@ class Gauge:
 
         self._watches.add(watch)
         try:
-            await self._app(watched(scope, sent=see_blocks, heard=see_pose), receive_pose, send_block)
+            await self._app(watched(scope, sent=see_blocks, received=see_pose), receive_pose, send_block)
         finally:
             self._watches.remove(watch)
 
@@ -144,7 +144,7 @@ class Gauge:
         self._began_thread_cpu_s = {thread: _thread_cpu_s(thread) for thread in threading.enumerate()}
 
     def _count_blocks(self) -> dict[str, Any]:
-        """Of streams that ended meanwhile only until then."""
+        """Numbers of blocks since the beginning; of streams that have ended, until their end."""
         duration_s = self._time_s() - self._began_s
         blocks = [counts.since for counts in self._counts]
         late, dropped, sent = (sum(column) for column in zip(*blocks, strict=True)) if blocks else (0, 0, 0)
@@ -155,7 +155,7 @@ class Gauge:
             "blocks_sent": sent,
             "blocks_late": late,
             "blocks_dropped": dropped,
-            # A stream that fell behind is moved to later; one block each may be on its way at either end.
+            # A stream that falls behind skips time. One block of each stream may be in progress at either end.
             "blocks_missing": max(0, round(due) - sent - dropped - len(self._counts)),
         }
 
@@ -164,9 +164,9 @@ class Gauge:
         duration_s = blocks["duration_s"]
         return {
             **blocks,
-            "block_ms": merged(counts.stream.render_times for counts in self._counts),
-            "lateness_ms": merged(counts.stream.latenesses for counts in self._counts),
-            "ir_ms": merged(counts.stream.ir_times for counts in self._counts),
+            "block_ms": merged(counts.stream.times.render for counts in self._counts),
+            "lateness_ms": merged(counts.stream.times.lateness for counts in self._counts),
+            "ir_ms": merged(counts.stream.times.response for counts in self._counts),
             "pose_to_audio_ms": merged(watch.direct.times for watch in self._watches),
             "pose_to_reverberation_ms": merged(watch.reverberation.times for watch in self._watches),
             "server_load": (time.process_time() - self._began_cpu_s) / duration_s,
@@ -174,7 +174,7 @@ class Gauge:
         }
 
     def _loads_by_thread(self, duration_s: float) -> dict[str, float]:
-        """Of those that were there at the beginning and still are, by name."""
+        """CPU load by name, of the threads that exist since the beginning."""
         return {
             thread.name: (_thread_cpu_s(thread) - began_s) / duration_s
             for thread, began_s in self._began_thread_cpu_s.items()
@@ -188,7 +188,7 @@ def _thread_cpu_s(thread: threading.Thread) -> float:
 
 
 def merged(histograms: Iterable[DurationHistogram]) -> dict[str, float | None]:
-    """Milliseconds of all together, as in a status."""
+    """Quantiles in milliseconds of all histograms together, as in a status message."""
     together = DurationHistogram()
     for histogram in histograms:
         together.merge(histogram)

@@ -1,7 +1,6 @@
-"""A server of the bench's scene, in a process of its own, confined to one core: `python -m server.bench.host CORE`.
+"""A server of the benchmark's scene in a process of its own, confined to one core: `python -m server.bench.host CORE`.
 
-It says in one line of JSON which port it listens on, and ends when its standard input does. Started by
-`server.bench.sessions`.
+It prints its port in one line of JSON, and ends when its standard input is closed. `server.bench.sessions` starts it.
 """
 
 import json
@@ -21,7 +20,7 @@ _CLIP_S = 10
 
 def main() -> None:
     os.sched_setaffinity(0, {int(sys.argv[1])})
-    serve()  # imports what starts threads, and counts cores, only now
+    serve()  # imported modules start threads and count cores, so they are imported only now
 
 
 def serve() -> None:

@@ -1,4 +1,4 @@
-"""One stream of a running server, as its listener finds it: late blocks, and the time from a pose to its sound."""
+"""Measurement of one stream of a running server from the client's side: late blocks and pose-to-sound latency."""
 
 import math
 import statistics
@@ -20,7 +20,7 @@ _ACKNOWLEDGE_EVERY = 4
 
 
 class _Waits:
-    """Milliseconds from a pose to the first block that has it, or a newer one."""
+    """Latencies in milliseconds from sending a pose to the first block that has it or a newer one."""
 
     def __init__(self) -> None:
         self._sent_s: dict[int, float] = {}
@@ -29,9 +29,9 @@ class _Waits:
     def send(self, pose_id: int, now_s: float) -> None:
         self._sent_s[pose_id] = now_s
 
-    def hear(self, pose_id: int, now_s: float) -> None:
-        heard = [number for number in self._sent_s if number <= pose_id]
-        self.waits_ms += [(now_s - self._sent_s.pop(number)) * 1000 for number in heard]
+    def receive(self, pose_id: int, now_s: float) -> None:
+        reached = [number for number in self._sent_s if number <= pose_id]
+        self.waits_ms += [(now_s - self._sent_s.pop(number)) * 1000 for number in reached]
 
     def summary(self, name: str) -> dict[str, float | None]:
         waits_ms = self.waits_ms
@@ -42,7 +42,8 @@ class _Waits:
 
 
 async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_per_second: float) -> dict[str, Any]:
-    """Raises NafirError where the server refuses, OSError and WebSocketException where there is none."""
+    """Listen to a stream and return the measurements. Raises NafirError if the server refuses the stream, and OSError
+    or WebSocketException if it cannot be reached."""
     async with connect(url, compression=None) as socket:
         await socket.send(Hello(protocol=PROTOCOL, scene=scene).serialize())
         answer = parse_server_message(str(await socket.recv()))
@@ -68,8 +69,8 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
             next_clock = block.sample_clock + answer.block_size
             late_at_s += [round(now_s - started_s, 1)] if block.is_late else []
             exchanges += block.is_exchange
-            to_block.hear(block.pose_id, now_s)
-            to_reverberation.hear(block.reverberation_pose_id, now_s)
+            to_block.receive(block.pose_id, now_s)
+            to_reverberation.receive(block.reverberation_pose_id, now_s)
             if blocks % _ACKNOWLEDGE_EVERY == 0:
                 await socket.send(Acknowledge(sequence=block.sequence).serialize())
             if now_s - started_s > pose_id / poses_per_second:
@@ -95,7 +96,8 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
 
 
 def _sounding(welcome: Welcome, count: int) -> list[AddEmitter]:
-    """Clips in turn, and in turn where the scene's own emitter is and where a visitor starts: two differ in both."""
+    """`count` emitters. They use the clips in turn, and alternate between the scene's places of emitter and
+    listener."""
     clips = ClipLibrary(welcome.sample_rate).names
     places = welcome.scene.emitter.position, welcome.scene.listener.position
     return [
@@ -105,7 +107,7 @@ def _sounding(welcome: Welcome, count: int) -> list[AddEmitter]:
 
 
 def _walking(pose_id: int, centre: Vector3, time_s: float) -> ListenerPose:
-    """A circle of half a metre around where a visitor starts, looking about."""
+    """A pose on a circle of half a metre around `centre`; the head turns once per round."""
     angle = 2 * math.pi * time_s / _TURN_S
     position = (centre[0] + 0.5 * math.cos(angle), centre[1] + 0.5 * math.sin(angle), centre[2])
     return ListenerPose(pose_id=pose_id, position=position, yaw=math.remainder(angle, 2 * math.pi))

@@ -1,4 +1,4 @@
-"""The machine that a bench ran on: figures say nothing without it."""
+"""Description of the machine that a benchmark ran on."""
 
 import os
 import platform
@@ -18,11 +18,11 @@ _INSTRUCTION_SETS = {
     "sve": "SVE",
     "neon": "NEON",
 }
-"""By the feature of LLVM's that means them, the widest of each family first."""
+"""Instruction sets by LLVM's name of the feature, the widest of each family first."""
 
 
 def describe_machine() -> dict[str, Any]:
-    """What to tell with every figure; a load beyond a few tenths spoils them."""
+    """Properties of the host, for every report. A load above a few tenths makes measurements unreliable."""
     return {
         "processor": processor(),
         "instruction_set": instruction_set(),
@@ -34,15 +34,15 @@ def describe_machine() -> dict[str, Any]:
 
 
 def processor() -> str:
-    """As it names itself."""
+    """Name of the processor."""
     cpuinfo = Path("/proc/cpuinfo")
     names = re.findall(r"^model name\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else []
     return names[0] if names else platform.processor() or platform.machine()
 
 
 def instruction_set(features: str | None = None) -> str:
-    """The widest that compiled code uses, of LLVM's `features` ("+avx2,-avx512f,..."): by default the processor's, or
-    NUMBA_CPU_FEATURES where that is set."""
+    """The widest instruction set that compiled code uses, by LLVM's `features` ("+avx2,-avx512f,..."). By default these
+    are NUMBA_CPU_FEATURES if that is set, or else the processor's."""
     if features is None:
         features = config.CPU_FEATURES
     if features is None:

@@ -1,7 +1,7 @@
-"""Others that convolve, called as a Python user calls them: pedalboard (JUCE) block by block, SciPy all at once.
+"""Other convolvers, called as usual in Python: pedalboard (JUCE) block by block, and SciPy over a whole signal.
 
-pedalboard's `Convolution` has one input per channel, so a mono source is fed to both; there is one per source, and what
-they return is not even mixed.
+pedalboard's `Convolution` has one input per channel, so a mono source is fed to both channels. There is one
+`Convolution` per source, and their outputs are not mixed.
 """
 
 from types import ModuleType
@@ -16,7 +16,7 @@ from server.bench.rooms import FloatArray
 
 
 class Pedalboard:
-    """One `Convolution` per IR (2, n); `process` takes one block for each, (sources, 2, b)."""
+    """One `Convolution` per IR (2, n). `process` takes one block for each source, (sources, 2, b)."""
 
     def __init__(self, module: ModuleType, irs: FloatArray, sample_rate: int) -> None:
         self._convolutions: list[Any] = [module.Convolution(ir, 1.0, sample_rate) for ir in irs]
@@ -31,7 +31,7 @@ class Pedalboard:
 
 
 def find_pedalboard() -> ModuleType | None:
-    """None where it is not installed."""
+    """The module pedalboard; None if it is not installed."""
     try:
         import pedalboard
     except ImportError:
@@ -40,16 +40,16 @@ def find_pedalboard() -> ModuleType | None:
 
 
 def convolve_at_once(dry: FloatArray, ir: FloatArray) -> FloatArray:
-    """SciPy's fastest for long signals: (n,) with (channels, m), overlap-add over the whole signal."""
+    """Convolve (n,) with (channels, m) by SciPy's fastest method for long signals, overlap-add."""
     return np.asarray(scipy.signal.oaconvolve(dry[np.newaxis], ir, axes=1))
 
 
 def reference(dry: npt.NDArray[np.floating], ir: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """The truth: (n,) with (channels, m) in float64, the first n samples."""
+    """The exact convolution of (n,) with (channels, m) in float64; the first n samples."""
     wet = scipy.signal.fftconvolve(dry[np.newaxis].astype(np.float64), ir.astype(np.float64), axes=1)
     return np.asarray(wet[:, : dry.size])
 
 
 def error_db(wet: FloatArray, expected: npt.NDArray[np.float64]) -> float:
-    """The largest error, relative to the largest sample."""
+    """Largest error in dB, relative to the largest sample."""
     return float(amplitude_to_db(np.abs(wet - expected).max() / np.abs(expected).max()))

@@ -1,4 +1,4 @@
-"""How measurements are printed: one JSON document for programs, tables for people, goals beside what was reached."""
+"""Output of measurements: JSON for programs, tables for people, and goals with the values reached."""
 
 import json
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ Reached = Literal["stretch", "goal"]
 
 @dataclass(frozen=True)
 class Goal:
-    """What a measure should be at least, `limit`, and better, `stretch`; with `is_at_most`, at most."""
+    """A goal for a measure: at least `limit`, or better `stretch`. With `is_at_most` these are upper limits."""
 
     measure: str
     limit: float
@@ -22,8 +22,8 @@ class Goal:
     is_at_most: bool = False
 
     def judge(self, value: float | None, *, failure: str | None = None) -> "Judgement":
-        """`value` beside the goal. Where the run that measured it did not pass, `failure` says why, and nothing is
-        reached, whatever the value. Neither is it by None, which could not be measured, nor by what is not a number."""
+        """Compare `value` with the goal. The goal is not reached if `failure` says why the run did not pass, if the
+        value is None because it could not be measured, or if it is NaN."""
         reached: Reached | None = None
         if failure is None and value is not None:
             if self._is_met(value, self.limit):
@@ -34,7 +34,7 @@ class Goal:
         return Judgement(self.measure, value, self.limit, self.stretch, self.is_at_most, reached, reason)
 
     def skip(self, reason: str) -> "Judgement":
-        """For a run that was not asked for what this goal is about."""
+        """The judgement of a goal that this run does not cover."""
         return Judgement(self.measure, None, self.limit, self.stretch, self.is_at_most, None, reason, is_skipped=True)
 
     def _is_met(self, value: float, limit: float) -> bool:
@@ -48,7 +48,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A measure beside its goal; `reason` says why nothing was reached, None where something was."""
+    """A measure compared with its goal. `reason` says why the goal was not reached; None if it was."""
 
     measure: str
     value: float | None
@@ -65,12 +65,12 @@ class Judgement:
 
 
 def missed(judgements: Iterable[Judgement]) -> list[str]:
-    """One line for each goal that was not reached, but for those that were skipped."""
+    """One line for each goal that was not reached; skipped goals have none."""
     return [f"{judgement.measure}: {judgement.reason}" for judgement in judgements if judgement.is_missed]
 
 
 def end_with(problems: Iterable[str]) -> None:
-    """Tell each problem on standard error. Raises typer.Exit with code 1 where there is any."""
+    """Print each problem on standard error. Raises typer.Exit with code 1 if there is any."""
     if lines := list(problems):
         for line in lines:
             typer.echo(f"not reached: {line}", err=True)
@@ -82,7 +82,7 @@ def print_json(measured: dict[str, Any]) -> None:
 
 
 def print_measures(title: str, measured: dict[str, Any]) -> None:
-    """One row per measure."""
+    """Print a table with one row per measure."""
     table = Table("measure", "value", title=title)
     for name, value in measured.items():
         table.add_row(name.replace("_", " "), show(value))
@@ -90,7 +90,7 @@ def print_measures(title: str, measured: dict[str, Any]) -> None:
 
 
 def print_rows(title: str, rows: Iterable[dict[str, Any]]) -> None:
-    """One column per key, which all rows share."""
+    """Print a table with one column per key. All rows have the same keys."""
     rows = list(rows)
     table = Table(*(name.replace("_", " ") for name in rows[0]), title=title)
     for row in rows:
@@ -99,7 +99,7 @@ def print_rows(title: str, rows: Iterable[dict[str, Any]]) -> None:
 
 
 def print_judgements(title: str, judgements: Iterable[Judgement]) -> None:
-    """Limits with their direction: what may be at most 0.05 is not reached by more."""
+    """Print a table of goals; each limit has its direction (≤ or ≥)."""
     print_rows(title, [_row(judgement) for judgement in judgements])
 
 
@@ -116,7 +116,7 @@ def _row(judgement: Judgement) -> dict[str, object]:
 
 
 def show(value: object) -> str:
-    """As short as it can be told apart."""
+    """The value as a short text."""
     if value is None:
         return "–"
     if isinstance(value, dict):

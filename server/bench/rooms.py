@@ -1,4 +1,4 @@
-"""What benchmarks convolve: noise in rooms of noise, reproducible by seed."""
+"""Signals of the benchmarks: noise and noise-like impulse responses, reproducible by seed."""
 
 import numpy as np
 import numpy.typing as npt
@@ -7,7 +7,7 @@ FloatArray = npt.NDArray[np.float32]
 
 
 def noise(seed: int, *shape: int) -> FloatArray:
-    """White, of unit variance."""
+    """White noise of unit variance."""
     return np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
 
 
@@ -18,6 +18,6 @@ def room(seed: int, samples: int, channels: int = 2) -> FloatArray:
 
 
 def tone(frequency_hz: float, samples: int, sample_rate: int) -> FloatArray:
-    """(samples,) of a sine of unit amplitude."""
+    """(samples,) sine of unit amplitude."""
     phase = 2 * np.pi * frequency_hz / sample_rate * np.arange(samples, dtype=np.float64)
     return np.sin(phase).astype(np.float32)

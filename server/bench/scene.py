@@ -1,5 +1,5 @@
-"""A scene whose field costs next to nothing, so that rendering is what is measured: an L-shaped room whose impulse
-responses (IRs), a second long at 48 kHz, come from a small bank by the listener's and the emitter's pose."""
+"""A scene whose field takes hardly any time, so that benchmarks measure rendering. It is an L-shaped room. Its impulse
+responses (IRs), a second long at 48 kHz, come from a small bank, selected by the poses of listener and emitter."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ SAMPLE_RATE = 48_000
 IR_S = 1.0
 
 _BANK = 32
-_SPARES = ArrayPool(16 * 1024 * 1024)
+_POOL = ArrayPool(16 * 1024 * 1024)
 _LEVEL = 0.01
 _POSES_PER_M = 50.0
 _PLAIN = Material(absorption=(0.2,) * len(OCTAVE_BANDS_HZ), scattering=(0.1,) * len(OCTAVE_BANDS_HZ))
@@ -48,7 +48,7 @@ _MANIFEST = Manifest(
 
 
 class BankField(AcousticField):
-    """Looks IRs up instead of computing them: another one every two centimetres."""
+    """A field that looks IRs up instead of computing them. The IR changes every two centimetres."""
 
     def __init__(self) -> None:
         self.bundle = Bundle(
@@ -68,10 +68,10 @@ class BankField(AcousticField):
         emitters: npt.ArrayLike,
         yaws: npt.ArrayLike,
         *,
-        remember: bool = False,  # noqa: ARG002  there is no phase to look for
+        remember: bool = False,  # noqa: ARG002  there is no phase to remember
     ) -> FloatArray:
-        """As `AcousticField`'s, of poses that lie where they like."""
+        """IRs as of `AcousticField`; poses outside of the bounds are allowed."""
         places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), np.atleast_1d(yaws)])
         entry = np.floor(places @ np.arange(1, places.shape[1] + 1) * _POSES_PER_M).astype(np.int64)
-        answer = _SPARES.floats(len(entry), *self._bank.shape[1:])
-        return self._bank.take(entry, axis=0, out=answer, mode="wrap")  # any other mode makes another copy first
+        answer = _POOL.floats(len(entry), *self._bank.shape[1:])
+        return self._bank.take(entry, axis=0, out=answer, mode="wrap")  # other modes make an additional copy

@@ -1,26 +1,26 @@
-"""How many listeners one core serves: a server of its own, confined to one core, and a crowd of listeners on the
-others, over the loopback interface.
+"""Number of listeners that one core serves. A server runs on one core, and many clients on the others, connected over
+the loopback interface.
 
-The scene costs next to nothing (`server.bench.scene`), the rest is what `nafir serve` does: blocks of 256 samples at
-48 kHz, impulse responses (IRs) of a second for each of the emitters, which play noise without end. Every listener sends
-30 poses a second unless told otherwise; direct paths follow each, and all IRs as fast as the core has time for them.
+The scene's field takes hardly any time (`server.bench.scene`); everything else is as in `nafir serve`: blocks of 256
+samples at 48 kHz, and impulse responses (IRs) of a second for each emitter. The emitters play noise without end. Every
+listener sends 30 poses a second by default. Direct paths follow each pose, and IRs as fast as the core can.
 
-- A run passes, and can reach a goal, where every session has a stream, hears what it is sent and sees its poses
-  followed, where there was no error, and where fewer than one block in a thousand was late.
-- A block is late where it reaches the socket later than a player needs it that keeps the usual 8 blocks in hand, or
-  where it is never made. `late_share` is theirs of all blocks that were due.
-- `sessions`: the largest number with fewer late than one in a thousand; steps of a few seconds find it, to within 5 %,
-  and a long one confirms it, or one a tenth lower, and so on. A step ends as soon as it has failed,
-  and one that is not hopeless is tried once more: other tenants of a machine are heard too.
-- `with_20_sessions`: the same of 16 emitters with the goal's number of listeners, where there can be more: how soon
-  poses are heard is judged there, not at the very limit.
-- `block_ms`: what a block costs, of blocks rendered together its share. `lateness_ms`: how long after it was due a
-  block was ready.
-- `pose_to_audio_ms`: from a pose's arrival at the server to the first block that follows it, handed to the socket;
-  `pose_to_reverberation_ms`: to the first block with IRs for it. `client_pose_to_audio_ms` is the former as a listener
-  sees it.
-- `server_load`, `client_load`: CPU time over wall time, the server's also by thread: audio, impulse responses, and the
-  event loop (`MainThread`). Clients near 1 are the bottleneck, not the server.
+- A run passes if every session has a stream, gets the blocks that are sent to it and sees its poses followed, if there
+  was no error, and if fewer than one block in a thousand was late. Only a run that passes can reach a goal.
+- A block is late if it reaches the socket later than a player with the usual reserve of 8 blocks needs it, or if it is
+  never made. `late_share` is the share of late blocks among all blocks that were due.
+- `sessions`: the largest number that passes. Steps of a few seconds find it to within 5 %, and a long run confirms it;
+  if that fails, a tenth less is tried, and so on. A step ends as soon as it has failed. Unless it fails by far, it is
+  tried once more, since other tenants of the machine may have disturbed it.
+- `with_20_sessions`: the same with 16 emitters and the goal's number of listeners, if more are possible. Latency is
+  judged there and not at the limit.
+- `block_ms`: time to render a block, or its share of blocks rendered together. `lateness_ms`: time from when a block
+  was due until it was ready.
+- `pose_to_audio_ms`: time from a pose's arrival at the server until the first block that follows it is passed to the
+  socket. `pose_to_reverberation_ms`: the same for the first block with IRs of that pose. `client_pose_to_audio_ms`: the
+  former as a client measures it.
+- `server_load`, `client_load`: CPU time divided by wall time; the server's also by thread: audio, impulse responses,
+  and the event loop (`MainThread`). If the clients' load is near 1, they limit the result and not the server.
 """
 
 import asyncio
@@ -48,13 +48,13 @@ _BLOCK_SIZE = 256
 _LATE_SHARE = 0.001
 _HOPELESS = 0.5
 _ON_THEIR_WAY = 64
-"""Blocks of a session that may be sent and not heard yet when a run ends."""
+"""Blocks of a session that may be sent but not received yet when a run ends."""
 _SETTLE_S = 2.0
 _LOOK_EVERY_S = 2.0
 _MOST = 512
 _PATIENCE_S = 20.0
 _READY_S = 120.0
-"""Machine code may have to be made first."""
+"""Limit for becoming ready. Kernels may have to be compiled first."""
 
 _GOAL = 20
 _AT_GOAL = f"with_{_GOAL}_sessions"
@@ -62,24 +62,24 @@ _SESSIONS = Goal("sessions per core, 16 emitters", _GOAL, 40)
 _POSE_TO_AUDIO = Goal("pose to audio on the server, p99, ms", 15, 8, is_at_most=True)
 
 Advance = Callable[[str], None]
-"""Told what has just been measured."""
+"""Progress callback; it gets a description of the step just done."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """`sessions` is how many there are; by default as many as there can be."""
+    """Parameters of a run. Without `sessions` the largest possible number is searched."""
 
     emitters: tuple[int, ...] = (1, 4, 16)
     sessions: int | None = None
     duration_s: float = 60.0
     step_s: float = 8.0
     poses_per_s: float = 30.0
-    """Of each listener; none at 0, who stand still."""
+    """Poses per second of each listener; with 0 they stand still."""
 
 
 def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
-    """One case for each number of emitters; what there is so far, with `is_complete` false, where it is interrupted
-    after the first. Raises NafirError where a process cannot be confined to a core, and where the server does not
+    """Measure one case for each number of emitters. If interrupted after the first case, it returns the cases so far
+    with `is_complete` false. Raises NafirError if a process cannot be confined to a core or the server does not
     start."""
     if not hasattr(os, "sched_setaffinity"):
         raise NafirError("this system cannot confine a process to one core")
@@ -111,7 +111,7 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
 
 
 def judge(cases: list[dict[str, Any]]) -> list[Judgement]:
-    """Beside the goals, which are for 16 emitters; only a run that passed reaches one."""
+    """Judge the cases against the goals, which are for 16 emitters. Only a run that passed can reach a goal."""
     sixteen = next((case for case in cases if case["emitters"] == 16), None)
     if sixteen is None:
         return [goal.skip("needs 16 emitters") for goal in (_SESSIONS, _POSE_TO_AUDIO)]
@@ -133,7 +133,7 @@ def _judge_poses(run: dict[str, Any]) -> Judgement:
 
 
 def failure(run: dict[str, Any]) -> str | None:
-    """Why a run did not pass; None where it did."""
+    """Why a run did not pass; None if it passed."""
     if run["sessions"] == 0:
         return "no number of sessions passed"
     if run["errors"]:
@@ -160,11 +160,11 @@ def failures(cases: list[dict[str, Any]]) -> list[str]:
 
 
 async def find_most(passes: Callable[[int], Awaitable[bool]], *, most: int) -> int:
-    """The largest number up to `most` that passes, to within 5 %, where all below a number that passes do; 0 if none
-    does."""
+    """The largest number up to `most` that passes, to within 5 %; 0 if none does. Assumes that all numbers below one
+    that passes pass, too."""
     good, bad = 0, most + 1
     while bad - good > max(1, good // 20):
-        # Far too many take long to fail, since they can hardly be opened: hence no doubling.
+        # Numbers are not doubled: a run with far too many sessions takes long to fail, since they hardly open.
         number = min(max(8, good + good // 2), most) if bad > most else (good + bad) // 2
         if await passes(number):
             good = number
@@ -205,7 +205,7 @@ async def _measure_case(plan: Plan, trial: "_Trial") -> dict[str, Any]:
 
 
 class _Trial:
-    """Trials with one number of emitters; the listeners of one go on in the next."""
+    """Trials with one number of emitters. Clients stay connected from one trial to the next."""
 
     def __init__(self, port: int, emitters: int, poses_per_s: float, advance: Advance) -> None:
         self.crowd = Crowd(port, emitters=emitters, poses_per_s=poses_per_s)
@@ -216,8 +216,8 @@ class _Trial:
         self._advance = advance
 
     async def run(self, sessions: int, duration_s: float, *, until_failed: bool = False) -> dict[str, Any]:
-        """Where the server cannot even open that many streams or tell of them, `late_share` is 1, and `errors` says
-        why."""
+        """Run one trial. If the server cannot open that many streams or cannot report, `late_share` is 1, and `errors`
+        says why."""
         try:
             measured = await self._run(sessions, duration_s, until_failed)
         except (OSError, TimeoutError) as exc:
@@ -251,7 +251,7 @@ class _Trial:
         }
 
     async def _wait(self, duration_s: float, too_many: float) -> None:
-        """Or until so many blocks are late."""
+        """Wait for the duration, or until `too_many` blocks are late."""
         until_s = time.monotonic() + duration_s
         while (left_s := until_s - time.monotonic()) > 0:
             await asyncio.sleep(min(left_s, _LOOK_EVERY_S) if too_many < math.inf else left_s)
@@ -268,9 +268,9 @@ def _count_late(measured: dict[str, Any]) -> int:
 
 @contextlib.contextmanager
 def _serve(core: int) -> Iterator[int]:
-    """The port of a server on one core, which is ready and has measured what effects cost there."""
+    """Run a server on one core. Yields its port once it is ready and has measured the costs of effects."""
     command = [sys.executable, "-m", "server.bench.host", str(core)]
-    # In a group of its own: Ctrl-C is for us alone, and it ends when we do.
+    # In a process group of its own, so that Ctrl-C does not reach it. It ends with this process.
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
     ) as process:

@@ -1,4 +1,4 @@
-"""How long a fresh process takes to its first convolved block."""
+"""Time of a new process until its first convolved block."""
 
 import os
 import statistics
@@ -20,19 +20,19 @@ print("heard", flush=True)
 
 
 def warm_start_s(rounds: int) -> float:
-    """With the machine code on disk already."""
+    """Time with the compiled kernels already on disk."""
     _first_block_s(os.environ)
     return statistics.median(_first_block_s(os.environ) for _ in range(rounds))
 
 
 def cold_start_s() -> float:
-    """With everything to be translated to machine code."""
+    """Time if all kernels have to be compiled."""
     with tempfile.TemporaryDirectory() as folder:
         return _first_block_s({**os.environ, "NUMBA_CACHE_DIR": folder})
 
 
 def _first_block_s(environment: "os._Environ[str] | dict[str, str]") -> float:
-    """From the process' start until it tells of the block; what its end takes does not count."""
+    """Time from the start of the process until it reports the block, without the end of the process."""
     started_s = time.perf_counter()
     with (
         tempfile.TemporaryFile("w+") as complaint,

@@ -1,10 +1,10 @@
-"""A field without a network: the reverberation that statistical room acoustics expects, in rooms that are boxes.
+"""A field without a network: the late reverberation of box-shaped rooms by statistical room acoustics.
 
-Sound is diffuse in each room: its energy is 16 pi / A beside that of the direct sound at a metre, with A the absorption
-area in m2, and what walls mirror first is taken from it (Kuttruff, Room Acoustics, 5.1 and 5.5). It decays as Sabine
-has it with Eyring's exponent. In a room next door it is the share S / (A + S) of that, with S the area of the doorway
-between them (Cremer and Mueller, Principles and Applications of Room Acoustics). Between the ears it is as coherent as
-diffuse sound is at two points 0.175 m apart. The noise is the scene's own, the same wherever one stands.
+Sound is diffuse in each room. Its energy relative to the direct sound at one metre is 16 pi / A, with A the absorption
+area in m2, minus the early reflections (Kuttruff, Room Acoustics, 5.1 and 5.5). The reverberation time is that of
+Eyring. In the adjacent room the energy is the share S / (A + S) of it, with S the area of the doorway between the rooms
+(Cremer and Mueller, Principles and Applications of Room Acoustics). The interaural coherence is that of diffuse sound
+at two points 0.175 m apart. The noise is the same at every pose.
 """
 
 import math
@@ -18,6 +18,7 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
+from server.field.kinds.every_pose import ComputedResponses
 from server.responses.full_response import diffuse_energy, kemar
 from server.scene.bundle import Bundle
 from server.scene.geometry import Geometry, Material, Materials
@@ -41,7 +42,8 @@ _BANDS = len(OCTAVE_BANDS_HZ)
 
 @dataclass(frozen=True)
 class Room:
-    """A box from `corner`, in plan, of `size_m`; all surfaces absorb `absorption` and scatter a tenth of the rest."""
+    """A box-shaped room with its south-west corner at `corner`. All surfaces have the coefficient `absorption` and
+    scatter a tenth of the rest."""
 
     corner: tuple[float, float]
     size_m: tuple[float, float, float]
@@ -70,19 +72,20 @@ class Room:
 
     @property
     def energy(self) -> float:
-        """Of what comes later than what walls mirror first: reflected twice or more, or scattered."""
+        """Energy of the late reverberation: sound that was reflected twice or more, or scattered."""
         reflected = 16 * math.pi / self.absorption_area_m2 * (1 - self.absorption)
         return reflected * (1 - 0.9 * self.absorption)
 
 
 def box(corner: tuple[float, float], size_m: tuple[float, float, float]) -> tuple[tuple[float, float], ...]:
-    """Its corners, counter-clockwise."""
+    """Corners of a box's floor plan, counter-clockwise."""
     (x, y), (along, across, _) = corner, size_m
     return (x, y), (x + along, y), (x + along, y + across), (x, y + across)
 
 
 class StatisticalField(AcousticField):
-    """`rooms` of one height, the second behind a doorway of `doorway_m2`; the plan's `corners` hold both."""
+    """The field of one room, or of two connected by a doorway of `doorway_m2`. All `rooms` have one height, and
+    `corners` is the floor plan around them."""
 
     def __init__(
         self,
@@ -103,18 +106,18 @@ class StatisticalField(AcousticField):
             frozen_noise=np.zeros((2, samples), np.float32),
         )
         self.level = self.bundle.manifest.levels[0]
-        self.nodes = None
+        self.source = ComputedResponses(self.impulse_responses)
         self._paths = SoundPathFinder(self.bundle.floor_plan, self.bundle.manifest.speed_of_sound)
 
     def impulse_responses(
         self,
         listeners: npt.ArrayLike,
         emitters: npt.ArrayLike,
-        yaws: npt.ArrayLike,  # noqa: ARG002  diffuse sound comes from everywhere
+        yaws: npt.ArrayLike,  # noqa: ARG002  diffuse sound comes from all directions
         *,
         remember: bool = False,  # noqa: ARG002
     ) -> npt.NDArray[np.float32]:
-        """As `AcousticField`'s."""
+        """Responses as of `AcousticField`."""
         listeners, emitters = np.atleast_2d(listeners), np.atleast_2d(emitters)
         starts = np.round(self.onset_s(listeners, emitters) * SAMPLE_RATE).astype(int)
         responses = np.zeros((len(starts), 2, self.ir_samples), np.float32)
@@ -132,7 +135,7 @@ class StatisticalField(AcousticField):
 
     @cached_property
     def _tails(self) -> dict[float, npt.NDArray[np.float32]]:
-        """(2, sample) of unit energy, as heard by an ear, by decay."""
+        """Late reverberation (2, sample) of unit energy at an ear, by reverberation time."""
         samples, rng = self.ir_samples, np.random.default_rng(0)
         spectra = np.fft.rfft(rng.standard_normal((2, samples)))
         frequency = np.fft.rfftfreq(samples, 1 / SAMPLE_RATE)

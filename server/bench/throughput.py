@@ -1,18 +1,19 @@
-"""How much sound a core convolves, ours and others' in turns, and how evenly.
+"""Throughput of convolvers on one core, and how evenly the work is spread over blocks.
 
-A case is a block size, an IR length and a number of sources; each source is white noise with a stereo room of its own.
-All are fed the same blocks of the same sources, as many of them, prepared beforehand; all have run before they are
-timed. In every round ours convolves a number of blocks, then pedalboard the same ones, then `oaconvolve` one source of
-ten seconds, which is all the same to it however many there are.
+A case has a block size, an IR length and a number of sources. Each source is white noise with a stereo IR of its own.
+All convolvers get the same blocks of the same sources, prepared beforehand, and each has run before it is timed. In
+every round our convolver processes a number of blocks, then pedalboard the same ones, and then `oaconvolve` one source
+of ten seconds, since its time per source does not depend on their number.
 
-- `x_realtime`: source-seconds per CPU-second, the median of the rounds. CPU time is the process's
-  (`time.process_time`), so helper threads would count, and what other processes do disturbs little. One call to
-  `Convolver.process` per block for all sources, mixed; one to `Convolution.process` per block and source, not mixed.
-- `ratio`: ours to pedalboard's.
-- `max_error_db`: of a stream longer than the IR and two cycles of its stages, from the first block on, the largest
-  difference from `scipy.signal.fftconvolve` in float64, relative to the largest sample.
-- `worst_to_mean_block`: the stages' work repeats after a cycle of twice the longest partition. Each block of the cycle
-  is timed by the wall clock in many cycles, of which the median counts; then the slowest block over their mean.
+- `x_realtime`: source-seconds per CPU-second, the median of the rounds. CPU time is that of the process
+  (`time.process_time`), so helper threads count, and other processes have little influence. Ours takes one call to
+  `Convolver.process` per block for all sources and mixes them. Pedalboard takes one call to `Convolution.process` per
+  block and source, without mixing.
+- `ratio`: our throughput divided by pedalboard's.
+- `max_error_db`: largest difference from `scipy.signal.fftconvolve` in float64, relative to the largest sample, over a
+  stream longer than the IR and two cycles of the stages.
+- `worst_to_mean_block`: time of the slowest block divided by the mean. The work of the stages repeats after a cycle of
+  twice the longest partition. Each block of the cycle is timed by the wall clock in many cycles, and its median counts.
 - `shared_tail_…`: the same with `Convolver(shared_tail=True)`.
 """
 
@@ -48,25 +49,25 @@ class Case:
 
     @property
     def cycle(self) -> int:
-        """Blocks after which the work of the stages repeats."""
+        """Number of blocks after which the work of the stages repeats."""
         return 2 * Partitioning(self.block_size, self.ir_samples).stages[-1].ticks
 
     @property
     def blocks(self) -> int:
-        """Of a round: whole cycles, and fewer for more sources so that rounds last about as long."""
+        """Number of blocks in a round: whole cycles, and fewer for more sources, so that rounds last about as long."""
         return self.cycle * max(1, 32 // self.sources)
 
 
 @dataclass(frozen=True)
 class Rooms:
-    """Sources and their IRs of one length, with the exact mix of the first 1, 4, ... of them, for cases to share."""
+    """Sources with IRs of one length, and the exact mix of the first 1, 4, ... of them. Cases share them."""
 
     dry: FloatArray
-    """(sources, samples)"""
+    """(sources, samples) dry signals."""
     irs: FloatArray
-    """(sources, 2, samples)"""
+    """(sources, 2, samples) impulse responses."""
     expected: dict[int, Any]
-    """(2, samples) float64 by number of sources."""
+    """Exact mix (2, samples), float64, by number of sources."""
 
     @classmethod
     def of(cls, ir_samples: int, counts: set[int]) -> "Rooms":
@@ -84,7 +85,7 @@ class Rooms:
 
 
 def measure_case(case: Case, rooms: Rooms, *, rounds: int, peer: ModuleType | None) -> dict[str, Any]:
-    """The columns of one case; those of a peer that is not installed are None."""
+    """The measurements of one case. Those of pedalboard are None if it is not installed."""
     irs, blocks = rooms.irs[: case.sources], _cut(rooms.dry[: case.sources], case.block_size)
     ours = _convolver(case, irs)
     wet = np.concatenate([ours.process(block) for block in blocks], axis=1)
@@ -119,7 +120,7 @@ def measure_case(case: Case, rooms: Rooms, *, rounds: int, peer: ModuleType | No
 
 
 def time_in_turns(lanes: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """CPU-seconds of each lane in each round, one lane after another, after a round that warms up."""
+    """CPU-seconds of each lane in each round. The lanes run one after another; a first round warms up."""
     times_s: dict[str, list[float]] = {name: [] for name in lanes}
     for number in range(rounds + 1):
         for name, lane in lanes.items():
@@ -155,12 +156,12 @@ def _convolver(case: Case, irs: FloatArray, *, shared_tail: bool = False) -> Con
 
 
 def _cut(dry: FloatArray, block_size: int) -> FloatArray:
-    """(sources, n) to (n / b, sources, b), each block contiguous."""
+    """Cut (sources, n) into contiguous blocks (n / b, sources, b)."""
     return np.ascontiguousarray(dry.reshape(len(dry), -1, block_size).swapaxes(0, 1))
 
 
 def _playing(player: Convolver | Pedalboard, blocks: FloatArray, count: int) -> Callable[[], object]:
-    """Round and round through `blocks`, `count` of them each time."""
+    """A function that processes `count` blocks, starting over in `blocks` as often as necessary."""
     order = [blocks[number % len(blocks)] for number in range(count)]
 
     def play() -> None:

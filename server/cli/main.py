@@ -1,6 +1,6 @@
 """The `nafir` command: serve scenes, write impulse responses, render paths.
 
-Errors a person can act on end the process with one line and exit code 2, as wrong usage does.
+Errors that a user can correct end the process with one line and exit code 2, as wrong usage does.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ app.command()(soak)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]
-AsJson = Annotated[bool, typer.Option("--json", help="Say what was done as JSON, for programs.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, for programs.")]
 
 
 def main() -> None:
@@ -95,7 +95,7 @@ def serve(
         for path in getattr(settings, name):
             require_readable(path, name)
     with contextlib.ExitStack() as opened:
-        # Before what takes time: a port that cannot be had is told of at once.
+        # Before the slow part, so that a port that cannot be bound is reported at once.
         listeners = [opened.enter_context(listener) for listener in serving.bind(settings.host, settings.port)]
         scenes = load_scenes(settings.bundles)
         if not scenes:
@@ -104,12 +104,12 @@ def serve(
         drain = Drain(settings.drain_s)
         application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain)
         url = serving.url(listeners[0], settings.host)
-        said = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
+        announcement = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
         serving.serve(
             uvicorn.Config(application, **serving.uvicorn_options(settings)),
             listeners,
             drain,
-            on_start=lambda: Console().print(said, highlight=False),
+            on_start=lambda: Console().print(announcement, highlight=False),
         )
 
 
@@ -167,32 +167,31 @@ def render(
     path: Annotated[
         Path,
         typer.Option(
-            help="CSV: sample or time_s; x, y, z; qx, qy, qz, qw or yaw_deg; reverberation_sample where it is later; "
-            "level where it changes."
+            help="CSV: sample or time_s; x, y, z; qx, qy, qz, qw or yaw_deg; optionally reverberation_sample and level."
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="WAV file to write, float32.", callback=writable_file)],
     block_size: Annotated[
-        int, typer.Option(help=f"Poses take effect at multiples of it, samples: {BLOCK_SIZES}.")
+        int, typer.Option(help=f"Samples per block, {BLOCK_SIZES}; poses take effect at its multiples.")
     ] = 256,
     level: Level = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
-    hrtf: Annotated[
-        Path | None, typer.Option(help="SOFA file with the head to hear through, instead of KEMAR.")
-    ] = None,
+    hrtf: Annotated[Path | None, typer.Option(help="SOFA file with the head to use instead of KEMAR.")] = None,
     effects: Annotated[
         str,
         typer.Option(
-            help="all, plan (those the walk calls for), or names between commas.", metavar="all|plan|NAME,..."
+            help="all, plan (those that the walk calls for), or names separated by commas.", metavar="all|plan|NAME,..."
         ),
     ] = "plan",
-    mono: Annotated[bool, typer.Option("--mono", help="For one loudspeaker: one channel, no head.")] = False,
+    mono: Annotated[
+        bool, typer.Option("--mono", help="Render one channel for one loudspeaker, without a head.")
+    ] = False,
     duration_s: Annotated[
-        float | None, typer.Option(help="Length to render; by default until all has rung out.")
+        float | None, typer.Option(help="Length to render; by default until the reverberation has decayed.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Render to a file what a listener hears who walks along a path."""
+    """Render to a file what a listener hears along a path."""
     import scipy.io.wavfile
 
     from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
@@ -282,16 +281,16 @@ def plan(
     ] = 0.0,
     still: Annotated[bool, typer.Option("--still", help="The listener neither walks nor turns the head.")] = False,
     moving: Annotated[bool, typer.Option("--moving", help="The emitters move.")] = False,
-    mono: Annotated[bool, typer.Option("--mono", help="One loudspeaker plays it, not headphones.")] = False,
+    mono: Annotated[bool, typer.Option("--mono", help="Plan for one loudspeaker instead of headphones.")] = False,
     effect: Annotated[
         list[str] | None, typer.Option(help="Switch an effect on or off; repeatable.", metavar="NAME=on|off")
     ] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Draw it to this file, too: .png or .svg.", callback=figure_file)
+        Path | None, typer.Option(help="Also draw the plan to this file: .png or .svg.", callback=figure_file)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which effects a situation calls for, why, and what they cost on this host."""
+    """Show which effects a situation calls for, why, and what they cost on this host."""
     from server.field.field import AcousticField
     from server.planning.plan_figure import draw
     from server.planning.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
@@ -320,14 +319,14 @@ def plan(
 
 @app.command()
 def protocol() -> None:
-    """Print the AsyncAPI document of the live stream, as a server has it at /asyncapi.json."""
+    """Print the AsyncAPI document of the live stream, which a server offers at /asyncapi.json."""
     from server.api.asyncapi import document
 
     typer.echo(document())
 
 
 def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "RenderedEmitter":
-    """`CLIP@x,y,z`, where CLIP names a bundled clip, or else an audio file."""
+    """Read `CLIP@x,y,z`. CLIP is the name of a bundled clip, or else an audio file."""
     from server.acoustics.geometry import Pose
     from server.assets.clips import ClipLibrary, decode
     from server.offline.render import RenderedEmitter

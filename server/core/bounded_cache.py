@@ -1,4 +1,4 @@
-"""Values kept for whoever asks for them next, as long as there is room."""
+"""A cache with a limit on its size in bytes. It drops the least recently used values first."""
 
 import threading
 from collections import OrderedDict
@@ -10,7 +10,8 @@ Value = TypeVar("Value")
 
 
 class BoundedCache(Generic[Key, Value]):
-    """The values used most recently, of `max_bytes` in all. Safe to share between threads, as far as the values are."""
+    """Holds the most recently used values, up to `max_bytes` in total. Threads may share it if they may share the
+    values."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
@@ -20,7 +21,7 @@ class BoundedCache(Generic[Key, Value]):
 
     @property
     def bytes(self) -> int:
-        """What the values kept take."""
+        """Total size of the values in the cache."""
         return self._bytes
 
     def get(self, key: Key) -> Value | None:
@@ -32,8 +33,8 @@ class BoundedCache(Generic[Key, Value]):
             return entry[0]
 
     def put(self, key: Key, value: Value, size_bytes: int) -> None:
-        """Keep a value, in place of an older one of that key, and let go of those unused for longest until all fit.
-        What is larger than everything is not kept."""
+        """Store a value, replace an older one of the same key, and drop the least recently used values until the rest
+        fits. A value larger than the whole cache is not stored."""
         with self._lock:
             _, replaced_bytes = self._entries.pop(key, (None, 0))
             self._bytes -= replaced_bytes

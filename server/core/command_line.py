@@ -1,9 +1,9 @@
-"""Command lines that take what they are told: numbers by one grammar, every option at most once, no two that contradict
-each other, and no output that cannot be written.
+"""Strict command lines: one grammar for numbers, each option at most once, no options that contradict each other, and
+output paths that are checked before the work begins.
 
-Without this, `--yaw-deg 0_1` is 1, of `--yaw-deg 90 --yaw-deg 0` the first is dropped without a word, and a command
-that worked for an hour says at its end that its folder is a file. `writable_file`, `writable_folder` and `figure_file`
-are callbacks of options: they are called before the command is.
+Without these checks `--yaw-deg 0_1` would mean 1, `--yaw-deg 90 --yaw-deg 0` would drop the first value without a word,
+and a command could work for an hour and then find that its output folder is a file. `writable_file`, `writable_folder`
+and `figure_file` are callbacks of options: typer calls them before the command.
 """
 
 from collections import Counter
@@ -22,8 +22,8 @@ _PARSERS: dict[Any, Callable[[str], float]] = {int: parse_integer, float: parse_
 
 
 class StrictCommand(TyperCommand):
-    """A command whose numbers are those of `server.core.numerals`, and which takes an option twice only where it is
-    repeatable. Raises NafirError otherwise, naming the option."""
+    """A command that reads numbers by the grammar of `server.core.numerals` and refuses an option that is given twice,
+    unless the option is repeatable. The NafirError it raises names the option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         values, _, given = self.make_parser(ctx).parse_args(args=list(args))
@@ -41,7 +41,7 @@ class StrictCommand(TyperCommand):
 
 
 class StrictTyper(typer.Typer):
-    """An application whose commands are strict."""
+    """A typer application whose commands are `StrictCommand`s."""
 
     def command(self, *args: Any, **options: Any) -> Callable[[Any], Any]:
         options.setdefault("cls", StrictCommand)
@@ -49,17 +49,18 @@ class StrictTyper(typer.Typer):
 
 
 def writable_file(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
-    """Raises NafirError, naming the option, where a file cannot be written to what it was given."""
+    """Option callback. Raises NafirError, which names the option, if no file can be written to `path`."""
     return _checked(require_writable, parameter, path)
 
 
 def writable_folder(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
-    """As `writable_file`, of a folder, which may not exist yet."""
+    """Option callback. Raises NafirError, which names the option, if `path` neither is nor can become a folder that can
+    be written to."""
     return _checked(require_writable_folder, parameter, path)
 
 
 def figure_file(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
-    """As `writable_file`, of a picture that matplotlib will draw."""
+    """Option callback. Raises NafirError, which names the option, if matplotlib cannot draw a picture to `path`."""
     return _checked(require_figure, parameter, path)
 
 
@@ -70,15 +71,15 @@ def _checked(require: Callable[[Path, str], None], parameter: typer.CallbackPara
 
 
 def require_at_most_one(options: Mapping[str, bool]) -> None:
-    """`options` are those of which only one can have its way, by name whether they are given. Raises NafirError for
-    several."""
+    """Raises NafirError if more than one of these mutually exclusive options is given. `options` maps each name to
+    whether it is given."""
     given = [name for name, is_given in options.items() if is_given]
     if len(given) > 1:
         raise NafirError(f"{' and '.join(given)} contradict each other: leave one out")
 
 
 def _check_numbers(parameter: Any, given: Any) -> None:
-    """Raises NafirError for a text that is no number where one is wanted."""
+    """Raises NafirError if a parameter of a number type was given text that is not a number."""
     descriptor = getattr(parameter, "type_descriptor", None)
     if descriptor is None:
         return
@@ -93,5 +94,5 @@ def _check_numbers(parameter: Any, given: Any) -> None:
 
 
 def _kinds(annotation: Any) -> tuple[Any, ...]:
-    """A type, or those of its items."""
+    """The annotated type and the types of its items, if it is generic."""
     return (annotation, *get_args(annotation))

@@ -1,7 +1,7 @@
-"""Strong entity tags (RFC 9110): equal tags, equal bytes.
+"""Strong entity tags (RFC 9110): equal tags mean equal bytes.
 
-A tag that is known before its body is computed has to say everything the body depends on: what is asked, and what
-computes it. On another processor, or with another release of a library, a response differs in its last bits.
+A tag that is known before its body is computed has to cover everything the body depends on: the request, the code, the
+libraries and the processor. Another processor or another release of a library changes the last bits of a response.
 """
 
 import hashlib
@@ -15,13 +15,14 @@ from pathlib import Path
 import llvmlite.binding as llvm
 
 _COMPUTE = ("numpy", "scipy", "numba", "llvmlite", "onnxruntime", "pillow", "pydantic", "sofar", "soxr", "soundfile")
-"""Distributions whose arithmetic or encoding is in a body."""
+"""Python distributions whose arithmetic or encoding affects the bytes of a body."""
 _PACKAGE = Path(__file__).parents[1]
 
 
 @cache
 def fingerprint() -> str:
-    """Digest of what computes: this package's code and data, the libraries under it, interpreter and processor."""
+    """Digest of everything that computes a body: this package's code and data, its libraries, the interpreter and the
+    processor."""
     source = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         source.update(f"{path.relative_to(_PACKAGE)}\0".encode() + path.read_bytes())
@@ -43,12 +44,12 @@ def fingerprint() -> str:
 
 
 def computed_tag(*inputs: object) -> str:
-    """Tag of a body that this process computes from `inputs`, values that JSON can hold, and from nothing else."""
+    """Tag of a body that this process computes from `inputs` alone. JSON has to be able to hold the inputs."""
     return f'"{_digest([fingerprint(), *inputs])[:32]}"'
 
 
 def content_tag(body: bytes) -> str:
-    """Tag of a body that depends on what nobody can list beforehand, such as measurements of this host."""
+    """Tag of a body whose inputs cannot be listed beforehand, such as measurements of this host."""
     return f'"{hashlib.sha256(body).hexdigest()[:32]}"'
 
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 
 class NafirError(Exception):
-    """Base of every error Nafir raises on purpose."""
+    """Base class of all errors that Nafir raises on purpose."""
 
 
 class BundleError(NafirError):
-    """A scene bundle that cannot be used; names the file and the field at fault."""
+    """A scene bundle cannot be used. The message names the file and the field at fault."""
 
     def __init__(self, path: Path, field: str, problem: str) -> None:
         super().__init__(f"{path}: {field}: {problem}")
@@ -18,10 +18,10 @@ class BundleError(NafirError):
 
 
 class RequestError(NafirError):
-    """A request that cannot be answered as asked.
+    """A request cannot be answered.
 
-    `code` is stable and machine-readable, `field` names the offending input where there is one, and `status` is the
-    HTTP status (a WebSocket client gets the code instead). `retry_after_s` is when it is worth asking again.
+    `code` is stable and machine-readable, `field` names the input at fault if there is one, and `status` is the HTTP
+    status (a WebSocket client gets the code instead). `retry_after_s` says after how long a retry is worthwhile.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class RequestError(NafirError):
 
 
 class FieldError(RequestError):
-    """A field that has no response for poses that may be asked for: its graph, and nobody's request, is at fault."""
+    """A field gives no usable response for valid poses. Its ONNX graph is at fault, not the request."""
 
     def __init__(self, message: str) -> None:
         super().__init__("no_response", message, status=500)

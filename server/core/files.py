@@ -1,4 +1,4 @@
-"""Files that a command is given, looked at before its work and not after it."""
+"""Checks of the files and folders given to a command, made before its work begins."""
 
 import importlib.util
 import os
@@ -10,7 +10,7 @@ FIGURES = (".png", ".svg", ".pdf")
 
 
 def require_readable(path: Path, option: str) -> None:
-    """Raises NafirError, naming `option`, for what is no file or may not be read."""
+    """Raises NafirError, which names `option`, if `path` is not a readable file."""
     if not path.exists():
         raise NafirError(f"{option}: {path}: there is no such file")
     if path.is_dir():
@@ -20,7 +20,7 @@ def require_readable(path: Path, option: str) -> None:
 
 
 def require_writable(path: Path, option: str) -> None:
-    """Raises NafirError, naming `option`, where a file cannot be written to `path`. Makes and changes nothing."""
+    """Raises NafirError, which names `option`, if no file can be written to `path`. Creates and changes nothing."""
     if path.is_dir():
         raise NafirError(f"{option}: {path} is a folder: name a file in it")
     _require_folder(path.parent, option)
@@ -29,8 +29,8 @@ def require_writable(path: Path, option: str) -> None:
 
 
 def require_figure(path: Path, option: str) -> None:
-    """As `require_writable`, of a picture that matplotlib will draw. Raises NafirError, too, where that is not
-    installed, and for another ending than those of `FIGURES`."""
+    """Raises NafirError, which names `option`, if matplotlib is not installed, if the suffix of `path` is not one of
+    `FIGURES`, or if no file can be written there."""
     require_matplotlib(option)
     if path.suffix not in FIGURES:
         raise NafirError(f"{option}: {path}: a picture's name ends in {', '.join(FIGURES)}")
@@ -38,14 +38,14 @@ def require_figure(path: Path, option: str) -> None:
 
 
 def require_matplotlib(option: str) -> None:
-    """Raises NafirError, naming the `option` that asks for a picture, where matplotlib is not installed."""
+    """Raises NafirError, which names `option`, if matplotlib is not installed."""
     if importlib.util.find_spec("matplotlib") is None:
         raise NafirError(f"{option}: needs matplotlib; pip install matplotlib, or leave {option} out")
 
 
 def require_writable_folder(path: Path, option: str) -> None:
-    """Raises NafirError, naming `option`, where `path` is no folder that can be written to, and cannot become one: it
-    and the folders it lies in may not exist yet. Makes and changes nothing."""
+    """Raises NafirError, which names `option`, if `path` neither is nor can become a folder that can be written to. The
+    folder and its parents need not exist yet. Creates and changes nothing."""
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
     if not existing.is_dir():
         raise NafirError(f"{option}: {existing} is a file, and a folder is needed")

@@ -1,7 +1,7 @@
-"""Objects in JSON name each key once.
+"""A check that JSON objects have no duplicate keys.
 
-RFC 8259, 4, leaves open what a key means that is there twice, and readers differ: most take the last value, some the
-first, so two of them can understand one text differently.
+RFC 8259, section 4, leaves the meaning of a duplicate key open. Most parsers take the last value and some the first, so
+two parsers can understand one text differently.
 """
 
 import json
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class DoubledKeyError(ValueError):
-    """An object that names a `key` twice."""
+    """A JSON object has the key `key` twice."""
 
     def __init__(self, key: str) -> None:
         super().__init__(f"{key} is there twice: give it once")
@@ -17,7 +17,7 @@ class DoubledKeyError(ValueError):
 
 
 def require_distinct_keys(text: str | bytes) -> None:
-    """Of a text that is known to be JSON. Raises DoubledKeyError for the innermost, first object with a key twice."""
+    """Raises DoubledKeyError for the first, innermost object with a duplicate key. `text` has to be valid JSON."""
     json.loads(text, object_pairs_hook=_distinct)
 
 

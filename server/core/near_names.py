@@ -1,15 +1,15 @@
-"""What somebody may have meant who wrote a name that there is not."""
+"""Suggestions for misspelt names."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 
 _LONGEST = 64
-"""Comparing names takes quadratic time."""
+"""Longer names are cut before they are compared, since the comparison takes quadratic time."""
 
 
 def suggestion(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """For the end of a message: "; did you mean 'x'?" or, where nothing is near, what there is. `prefix` is what all
-    the names begin with, and is written before them."""
+    """The end of an error message: "; did you mean 'x'?", or all known names if none is similar. `prefix` is written
+    before each name."""
     names = sorted(known)
     near = get_close_matches(name[:_LONGEST], names, n=1, cutoff=0.6)
     if near:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 _MAGIC = b"\x93NUMPY"
 MOST_HEADER_BYTES = 10_000
-"""As in NumPy: an array of plain numbers needs some hundred."""
+"""The limit that NumPy itself has. The header of an array of plain numbers has about a hundred bytes."""
 _HEADER = re.compile(
     r"""\s*\{\s*
     ['"]descr['"]\s*:\s*['"](?P<dtype>[<>=|]?[A-Za-z][0-9]{0,4})['"]\s*,\s*
@@ -29,12 +29,12 @@ _HEADER = re.compile(
 
 
 class NpyError(ValueError):
-    """Bytes that are no array file, or one whose header and data disagree; says what is wrong."""
+    """The bytes are not an array file, or its header and data disagree. The message says what is wrong."""
 
 
 @dataclass(frozen=True)
 class NpyHeader:
-    """What an array file says of itself. `header_bytes` come before the data."""
+    """Header of an array file. The data begin `header_bytes` after the start of the file."""
 
     dtype: np.dtype[np.generic]
     shape: tuple[int, ...]
@@ -47,7 +47,8 @@ class NpyHeader:
 
     @classmethod
     def read(cls, stream: IO[bytes]) -> "NpyHeader":
-        """Leaves the stream where the data begins. Raises NpyError; objects and records are refused."""
+        """Read a header and leave the stream at the start of the data. Raises NpyError, also for arrays of objects and
+        of records."""
         start = stream.read(8)
         if len(start) < 8 or not start.startswith(_MAGIC) or start[6] not in {1, 2, 3}:
             raise NpyError("is no array file of NumPy's")
@@ -67,14 +68,14 @@ class NpyHeader:
         try:
             dtype = np.dtype(found["dtype"])
         except TypeError as exc:
-            raise NpyError(f"holds {found['dtype']!r}, which is no type of numbers") from exc
+            raise NpyError(f"holds {found['dtype']!r}, which is not a type of numbers") from exc
         if dtype.kind not in "biufcSU":
             raise NpyError(f"holds {dtype}, not numbers")
         shape = tuple(int(size) for size in re.findall(r"[0-9]+", found["shape"]))
         return cls(dtype, shape, found["fortran"] == "True", 8 + width + length)
 
     def array(self, data: bytes) -> npt.NDArray[np.generic]:
-        """The array of `data_bytes` that follow the header. Raises NpyError for another number of them."""
+        """The array whose bytes are `data`. Raises NpyError unless there are `data_bytes` of them."""
         if len(data) != self.data_bytes:
             raise NpyError(f"claims {self.data_bytes} bytes of {self.dtype} {self.shape} and has {len(data)}")
         order = "F" if self.is_fortran else "C"
@@ -82,10 +83,10 @@ class NpyHeader:
 
 
 def read_npy(path: Path) -> npt.NDArray[np.generic]:
-    """The array of a file. Raises OSError, and NpyError before anything that its header claims is allocated."""
+    """Read an array from a file. Raises OSError, or NpyError before any memory that the header claims is allocated."""
     with path.open("rb") as stream:
         header = NpyHeader.read(stream)
-        held = path.stat().st_size - header.header_bytes
-        if held != header.data_bytes:
-            raise NpyError(f"claims {header.data_bytes} bytes of {header.dtype} {header.shape} and has {held}")
+        present = path.stat().st_size - header.header_bytes
+        if present != header.data_bytes:
+            raise NpyError(f"claims {header.data_bytes} bytes of {header.dtype} {header.shape} and has {present}")
         return header.array(stream.read())

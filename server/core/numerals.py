@@ -1,8 +1,8 @@
-"""How a number is written where people and programs write text: URLs, options, CSV, lists of points, the environment.
+"""One grammar for numbers in text: URLs, options, CSV, lists of points, environment variables.
 
-Python's `float` and `int` take much more than people mean by a number: `0_1` is 1, Arabic digits count, `nan` and
-`infinity` are numbers. Here a number is ASCII digits with a sign, a point and an exponent, nothing else, and it is
-finite however it is written. Blanks around it are allowed.
+Python's `float` and `int` accept more than people mean by a number: `0_1` is 1, Arabic digits count, `nan` and
+`infinity` are numbers. Here a number has ASCII digits and optionally a sign, a point and an exponent. It is always
+finite. Blanks around it are allowed.
 """
 
 import math
@@ -12,8 +12,9 @@ from typing import Final
 DECIMAL: Final = (
     r"[+-]?([0-9]{1,40}(\.[0-9]{0,40})?|\.[0-9]{1,40})([eE](-[0-9]{1,3}|\+?([0-9]{1,2}|1[0-9]{2}|2[0-5][0-9])))?"
 )
-"""As a regular expression of JSON Schema, of what is finite in double precision however many of its forty digits there
-are: 10^260 and more have a place in no scene, and `parse_decimal` takes them all the same."""
+"""A decimal number as a regular expression for JSON Schema. It matches only numbers that are finite in double
+precision, whatever their up to forty digits are. `parse_decimal` also takes the finite ones above 10^260, which no
+scene needs."""
 INTEGER: Final = r"[+-]?[0-9]{1,40}"
 
 _DECIMAL: Final = re.compile(r"[+-]?([0-9]{1,40}(\.[0-9]{0,40})?|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?")
@@ -23,7 +24,7 @@ _UNBOUNDED: Final = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9
 
 
 def parse_decimal(text: str) -> float:
-    """A finite number. Raises ValueError with a reason that quotes the text."""
+    """Read a finite number. Raises ValueError with a reason that quotes the text."""
     number = text.strip(" ")
     if _DECIMAL.fullmatch(number) is None or math.isinf(float(number)):
         raise ValueError(f"{_quoted(text)} is {_fault(number)}")
@@ -31,7 +32,7 @@ def parse_decimal(text: str) -> float:
 
 
 def parse_integer(text: str) -> int:
-    """Raises ValueError with a reason that quotes the text."""
+    """Read a whole number. Raises ValueError with a reason that quotes the text."""
     number = text.strip(" ")
     if _INTEGER.fullmatch(number) is None:
         raise ValueError(f"{_quoted(text)} is not a whole number")

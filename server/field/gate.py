@@ -10,11 +10,8 @@ Axes: B poses; responses (B, channel, sample).
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels.compiled import HAS_NUMBA
+from server.field.gate_kernel import open_gates
 from server.scene.manifest import CodecParameters
-
-if HAS_NUMBA:
-    from server.field.gate_kernel import open_gates
 
 Float32 = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
@@ -32,19 +29,11 @@ class Gate:
     it at once and less and less of it then: of each sample's square, one plus a share of a falling raised cosine.
     """
 
-    def __init__(
-        self,
-        parameters: CodecParameters,
-        *,
-        rise_s: float = RISE_S,
-        gives_back: bool = False,
-        is_compiled: bool = HAS_NUMBA,
-    ) -> None:
+    def __init__(self, parameters: CodecParameters, *, rise_s: float = RISE_S, gives_back: bool = False) -> None:
         self._rise = _rise(round(rise_s * parameters.sample_rate))
         self._answer = _rise(round(RISE_S * parameters.sample_rate))
         fall = np.arange(parameters.n_fft if gives_back else 0) / parameters.n_fft
         self._given = (0.5 + 0.5 * np.cos(np.pi * fall)).astype(np.float32)
-        self._is_compiled = is_compiled
         # Compiled here, where it may take its time, and not for the first pose.
         self.open(np.zeros((1, 1, 1), np.float32), np.zeros(1, np.int64))
 
@@ -56,30 +45,11 @@ class Gate:
         if not len(onsets) == len(begins) == len(responses):
             raise ValueError(f"{len(onsets)} onsets and {len(begins)} echoes of {len(responses)} responses")
         begins = begins - len(self._answer)
-        if self._is_compiled:
-            open_gates(self._rise, self._answer, self._given, MOST_GIVEN, onsets, begins, responses)
-        else:
-            self._open(responses, onsets, begins)
+        self._open(responses, onsets, begins)
 
     def _open(self, responses: Float32, onsets: Indices, begins: Indices) -> None:
-        samples = np.arange(responses.shape[-1])
-        for response, onset, begin in zip(responses, onsets.tolist(), begins.tolist(), strict=True):
-            opens = max(0, onset, begin)
-            gain = np.where(
-                samples < opens, 0.0, _at(self._rise, samples - onset, 1) * _at(self._answer, samples - begin, 1)
-            )
-            given = _at(self._given, samples - opens, 0)
-            squares = response.astype(np.float64) ** 2
-            taken, held = (squares * (1 - gain**2)).sum(axis=-1), (squares * gain**2 * given).sum(axis=-1)
-            share = np.divide(taken, held, out=np.full_like(held, MOST_GIVEN), where=taken < MOST_GIVEN * held)
-            response *= gain * np.sqrt(1 + share[:, None] * given)
+        open_gates(self._rise, self._answer, self._given, MOST_GIVEN, onsets, begins, responses)
 
 
 def _rise(samples: int) -> Float32:
     return (np.sin(np.pi / 2 * (np.arange(samples) + 0.5) / samples) ** 2).astype(np.float32)
-
-
-def _at(curve: Float32, index: Indices, after: float) -> npt.NDArray[np.float64]:
-    """The curve's values, its first before it and `after` behind it."""
-    values = np.append(curve.astype(np.float64), after)
-    return np.asarray(values[np.clip(index, 0, len(curve))])

@@ -1,4 +1,4 @@
-"""The compiled counterpart of `server.field.gate`'s NumPy path."""
+"""The compiled part of `server.field.gate`."""
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ def open_gates(
             held = 0.0
             for n in range(opens, until):
                 held += given[n - opens] * float(response[n]) ** 2
+            # guard: what is there is made up of what was taken to an extent
             share = taken / held if taken < most * held else most
             for n in range(opens, until):
                 response[n] *= np.sqrt(1.0 + share * given[n - opens])

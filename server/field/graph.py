@@ -161,6 +161,7 @@ class FieldGraph:
 
 
 def _feed(listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> dict[str, Float32]:
+    # guard: whole turns come off in double precision
     return {
         "listener": np.asarray(listeners, dtype=np.float32),
         "emitter": np.asarray(emitters, dtype=np.float32),

@@ -1,4 +1,4 @@
-"""The node of a lattice that stands for a pair of places, in compiled code or, without a compiler, in Python.
+"""The node of a lattice that stands for a pair of places, in compiled code.
 
 `corners` is (corner, 2), the polygon of a floor plan; `low`, `high` and `offset` (3,) metres.
 """

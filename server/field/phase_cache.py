@@ -39,6 +39,7 @@ class PhaseCache:
         with self._lock:
             distance = np.linalg.norm(self._poses - pose, axis=-1)
             place = int(np.argmin(distance))
+            # guard: warm phases are those near by
             if not distance[place] <= RADIUS_M:
                 return None
             self._places.move_to_end(_cell(self._poses[place]))
@@ -46,6 +47,7 @@ class PhaseCache:
 
     def keep(self, listener: Floats, emitter: Floats, yaw: float, response: Float32) -> None:
         """Copies the response; one that is silent has no phase to give, and is not kept."""
+        # guard: a silent response gives no phase
         if not response.any():
             return
         pose, own = _pose(listener, emitter, yaw), response.copy()

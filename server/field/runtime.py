@@ -32,6 +32,7 @@ _ERRORS_ONLY = 3
 def open_session(model: bytes, *, threads: int = 1) -> InferenceSession:
     """A session for the bytes of an ONNX file. Raises ValueError for bytes that are no usable graph, or not all of
     one."""
+    # guard: a graph has its weights in it
     if refers_to_other_files(model):
         raise ValueError("it keeps weights in other files; save it with all of them inside")
     # Not session.set_denormal_as_zero: it reaches the runtime's own threads, and a session of one thread has none.

@@ -1,8 +1,8 @@
-"""The health of a scene bundle: laws that hold of every room and of every computation, tried at its corners, all over
-it, and at the worst poses that a search finds.
+"""The health check of a scene bundle. It tests laws that hold in every room and for every computation: at the corners
+of the scene, at poses all over it, and at the worst poses that a search finds.
 
-Laws of what a field predicts are checked once per field, before decoding; laws of responses, and of how they are
-computed, once per quality level.
+Laws of a field's predictions are checked once per field, before decoding. Laws of responses and of their computation
+are checked once per quality level.
 """
 
 import time
@@ -53,17 +53,17 @@ _CONTINUITY = {
     "emitter": (LEVEL_PER_CM, SPECTRUM_PER_CM),
     "yaw": (LEVEL_PER_DEGREE, SPECTRUM_PER_DEGREE),
 }
-"""By what moves."""
+"""Laws of continuity, by what moves."""
 
 
 class HealthError(NafirError):
-    """A bundle that breaks a law; the message names each with the worst pose."""
+    """A bundle breaks a law. The message names each broken law with its worst pose."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How many poses are tried of each field, and responses of each level; fewer where a field would take longer than
-    `field_s` seconds."""
+    """Numbers of poses tried for each field, and of responses for each level. They are reduced for a field that would
+    take longer than `field_s` seconds."""
 
     scattered: int = 192
     halved: int = 24
@@ -72,15 +72,15 @@ class Effort:
     field_s: float = 12.0
 
     def of_share(self, share: float) -> "Effort":
-        """That share of the poses, one at least, but none to climb from where there is no time for that."""
+        """This share of the effort: at least one pose of each kind, but possibly none to start a search from."""
         counts = {name: max(1, round(getattr(self, name) * share)) for name in ("scattered", "halved", "responses")}
         return replace(self, **counts, climbing=int(self.climbing * share))
 
 
 @dataclass(frozen=True)
 class FieldEvidence:
-    """What figures are drawn from: of each pose tried (pose, 7) its energy excess (pose,) and the level of each window
-    (pose, channel, window); by what moves, the greatest changes of level over one step."""
+    """Data for the figure: the poses tried (pose, 7), their energy excess (pose,) and window levels (pose, channel,
+    window), and the greatest changes of level over one step, by what moves."""
 
     poses: Poses
     excess_db: Floats | None
@@ -97,12 +97,12 @@ class Health:
 
     @property
     def broken(self) -> tuple[Finding, ...]:
-        """Laws that do not hold, and that the scene's manifest does not accept."""
+        """Findings of broken laws that the scene's manifest does not accept."""
         return tuple(finding for finding in self.findings if not finding.holds and finding.accepted is None)
 
     @property
     def accepted(self) -> tuple[Finding, ...]:
-        """Laws that do not hold, and that the manifest accepts."""
+        """Findings of broken laws that the manifest accepts."""
         return tuple(finding for finding in self.findings if not finding.holds and finding.accepted is not None)
 
     def require(self) -> None:
@@ -127,7 +127,7 @@ def advice(law: Law) -> str:
 
 @dataclass(frozen=True)
 class FieldsHealth:
-    """What was found of a bundle's fields; `worst` (pose, 7) by field is where levels are to be tried."""
+    """The health of a bundle's fields. `worst` has the poses (pose, 7) of each field at which its levels are tried."""
 
     health: Health
     worst: dict[str, Poses]
@@ -141,8 +141,8 @@ def check(
     track: Callable[[Iterable[str]], Iterable[str]] = iter,
     fields: FieldsHealth | None = None,
 ) -> Health:
-    """All findings, fields first. `track` is given the names of fields and levels, and hands them on as they are done.
-    `fields` is what was found of the same fields already.
+    """Check a bundle. Findings about fields come first. `track` gets the names of fields and levels and yields them one
+    by one, to show progress. `fields` is an earlier result for the same fields, which are then not checked again.
 
     Raises BundleError for a graph that does not fit the manifest.
     """
@@ -154,7 +154,7 @@ def check(
     for name in track([f"{_LEVEL}{name}" for name in levels]):
         level = levels[name.removeprefix(_LEVEL)]
         poses = fields.worst.get(level.level.field)
-        if poses is None:  # in a scene without a field
+        if poses is None:  # a scene without fields
             poses = scattered(bundle, effort.responses, seed)
         findings += _check_level(level, poses)
     found = (*fields.health.findings, *_with_reasons(bundle, findings))
@@ -162,7 +162,7 @@ def check(
 
 
 def check_fields(bundle: Bundle, effort: Effort | None = None, *, seed: int = 0) -> FieldsHealth:
-    """What does not depend on how a field's answers are decoded: neither on a scene's noise nor on its levels."""
+    """Check only the fields' predictions, which depend neither on the scene's noise nor on its levels."""
     return _check_fields(bundle, FieldsByLevel.load(bundle), effort or Effort(), seed, iter)
 
 
@@ -188,7 +188,7 @@ def _check_fields(
 
 
 def _with_reasons(bundle: Bundle, findings: Iterable[Finding]) -> list[Finding]:
-    """With why the manifest accepts those that break a law."""
+    """The findings, with the manifest's reasons for accepting broken laws."""
     reasons = {entry.law: entry.reason for entry in bundle.manifest.accepted}
     return [
         finding
@@ -199,11 +199,11 @@ def _with_reasons(bundle: Bundle, findings: Iterable[Finding]) -> list[Finding]:
 
 
 def _affordable(graph: FieldGraph, bundle: Bundle, effort: Effort, seed: int) -> Effort:
-    """As much of the effort as takes no longer than it allows, judged by the quicker of two predictions."""
+    """The effort, reduced to its time limit. The time is estimated from the quicker of two predictions."""
     predictions, pose = Predictions(graph), scattered(bundle, 1, seed)
     times_s = []
     for _ in range(2):
-        started_s = time.thread_time()  # other processes must not decide what is found
+        started_s = time.thread_time()  # CPU time, since other processes must not influence the findings
         predictions.energies(pose)
         times_s.append(time.thread_time() - started_s)
     asked = 6 * effort.scattered + 3 * search.HALVINGS * effort.halved + search.NEIGHBOURS * effort.climbing
@@ -213,7 +213,7 @@ def _affordable(graph: FieldGraph, bundle: Bundle, effort: Effort, seed: int) ->
 def _check_field(
     bundle: Bundle, graph: FieldGraph, effort: Effort, seed: int
 ) -> tuple[list[Finding], FieldEvidence, Poses]:
-    """Findings, what they rest on, and poses from the worst on: those of each law, then others."""
+    """Findings, their evidence, and poses for the levels: the worst of each law first, then others."""
     rng = np.random.default_rng([seed, 2])
     predictions = Predictions(graph)
     at_corners, spread = corners(bundle), scattered(bundle, effort.scattered, seed)
@@ -245,7 +245,7 @@ def _check_field(
         )
         for what, moved in search.moves(spread, rng).items()
     }
-    # Measured responses step from one place to the next, as they were measured; what is learned of them does not.
+    # Measured responses change in steps from one measured place to the next. Fields learned from them do not.
     is_recording = graph.gives_responses and manifest.direct_sound == "field"
     for what, (level, spectrum) in () if is_recording else _CONTINUITY.items():
         for law, change_db in ((level, laws.level_change_db), (spectrum, laws.spectral_change_db)):
@@ -258,7 +258,7 @@ def _check_field(
         share = laws.branch_cut_share(predictions.spectrograms(some).instantaneous_frequency)
         findings.append(Finding(BRANCH_CUT, graph.name, share, len(some)))
     worst = np.array([finding.pose for finding in findings if finding.pose is not None])
-    findings.insert(0, Finding(FINITE, graph.name, float(predictions.faults), predictions.asked))
+    findings.insert(0, Finding(FINITE, graph.name, float(predictions.faults), predictions.poses))
     evidence = FieldEvidence(
         poses,
         excess_db,
@@ -269,7 +269,7 @@ def _check_field(
 
 
 def _change(manifest: Manifest, step: search.Steps) -> Floats:
-    """In units of what is allowed, of level or spectrum, whichever is more."""
+    """Change of level or of spectrum, whichever is more, as a multiple of its bound."""
     spreading_db = laws.spreading_db(manifest, step.poses, step.moved)
     level = (laws.level_change_db(step.before, step.after) - spreading_db) / LEVEL_PER_CM.bound
     spectrum = (laws.spectral_change_db(step.before, step.after) - spreading_db) / SPECTRUM_PER_CM.bound
@@ -277,7 +277,7 @@ def _change(manifest: Manifest, step: search.Steps) -> Floats:
 
 
 def _check_level(field: AcousticField, poses: Poses) -> list[Finding]:
-    """Of responses at some poses: how loud, how exact, and whether they are the same again, and alone."""
+    """Findings about a level's responses: peak, exactness, and whether repeated and single computations agree."""
     name = field.level.name
     answers = np.array([_answers(field, poses[row : row + 1]) for row in range(len(poses))])
     findings = [_worst(FINITE, name, poses, np.where(answers, 0.0, 1.0))]
@@ -290,7 +290,7 @@ def _check_level(field: AcousticField, poses: Poses) -> list[Finding]:
     whole = _responses(FullResponse(field, head), poses)
     exact = _responses(DoubleFullResponse(field, head), poses)
     from_zero_phase = field.level.phase.kind == "griffin_lim" and not field.level.phase.warm
-    if field.bundle.manifest.direct_sound == "geometry":  # else, in whatever unit it was measured
+    if field.bundle.manifest.direct_sound == "geometry":  # measured responses have an unknown unit
         findings.append(_worst(PEAK, name, poses, np.abs(together).max(axis=(1, 2)).astype(np.float64)))
     return [
         *findings,
@@ -313,7 +313,8 @@ def _responses(field: AcousticField | FullResponse, poses: Poses) -> Responses:
 
 
 def _difference_db(responses: Responses, reference: Responses) -> Floats:
-    """(pose,) energy of the difference of (pose, channel, sample) re that of the reference; -inf where they agree."""
+    """(pose,) energy in dB of the difference of responses (pose, channel, sample), relative to the reference; -inf if
+    they are equal."""
     exact = reference.astype(np.float64)
     difference = np.linalg.norm(responses - exact, axis=(1, 2))
     whole = np.maximum(np.linalg.norm(exact, axis=(1, 2)), np.finfo(np.float32).tiny)

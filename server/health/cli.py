@@ -16,13 +16,14 @@ def check(
     figure: Annotated[
         Path | None, typer.Option(help="Draw what was measured to this PNG (needs matplotlib).", callback=figure_file)
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the poses that are tried.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the poses that are tried.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
-    """Check the numerical health of a scene bundle at its corners, all over it and at the worst poses a search finds.
+    """Check the numerical health of a scene bundle at its corners, all over it and at the worst poses that a search
+    finds.
 
-    Exit code 1 where a law is broken, unless the scene was exported with a reason to accept that. Fields that take long
-    are asked for fewer poses, in about a quarter of a minute.
+    The exit code is 1 if a law is broken, unless the scene was exported with a reason to accept that. Slow fields are
+    checked at fewer poses, for about 15 seconds each.
     """
     from server.health.check import check as check_bundle
     from server.health.report import reasons, table, to_json

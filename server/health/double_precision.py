@@ -1,10 +1,9 @@
-"""Whole impulse responses in double precision: the oracle that what is served is compared with.
+"""Full impulse responses in double precision, the reference for the server's responses.
 
-The network's outputs are read as it gives them, float32; so are the tables of heads and of the windowed sinc. All that
-is done with them is done anew here, in float64 and by other algorithms where there are any: NumPy's transforms in place
-of compiled ones, the recursion of a power series in place of an unrolled kernel, all triangles of a head in place of a
-walk across them. Responses are rounded to float32 when they are decoded and when the gate has opened, 150 dB below
-them.
+The network's outputs and the tables of heads and of the windowed sinc are float32, as they are. Everything after them
+is computed independently in float64, with other algorithms if possible: NumPy's transforms instead of compiled ones,
+the recursion of a power series instead of an unrolled kernel, a search over all triangles of a head instead of a walk
+across them. Responses are rounded to float32 twice, after decoding and after the gate, which is 150 dB below them.
 
 Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample).
 """
@@ -20,7 +19,7 @@ from server.acoustics.geometry import axes_of
 from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
 from server.field.decoder import Decoder
 from server.field.field import AcousticField, Silence
-from server.field.gate import Gate
+from server.field.gate import MOST_GIVEN, Gate, Indices
 from server.field.graph import Spectrograms
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.hrtf import HeadFilters
@@ -35,7 +34,7 @@ _Number = TypeVar("_Number", np.float64, np.complex128)
 
 
 class DoubleDecoder(Decoder):
-    """A field's decoder, in float64 between the network's outputs and the response."""
+    """A field's decoder in float64."""
 
     def __init__(self, field: AcousticField) -> None:
         parameters = field.graph.parameters
@@ -79,7 +78,8 @@ class DoubleDecoder(Decoder):
         return response
 
     def _separate(self, predicted: Spectrograms, magnitude: _Floats) -> tuple[_Complex, _Floats, _Complex]:
-        """As `server.acoustics.phase.separate`, of one response."""
+        """The known part, and the magnitude and coherence of the noise, as in `server.acoustics.phase.separate`, for
+        one response."""
         known = self._known
         phase = self._codec.integrate(_double(predicted.instantaneous_frequency[0, ..., :known]))
         certainty = _double(predicted.certainty[0, ..., :known])
@@ -97,7 +97,7 @@ class DoubleDecoder(Decoder):
         return magnitude[..., :known] * phasors, unknown, coherence
 
     def _griffin_lim(self, magnitude: _Floats, response: _Floats, near: _Float32 | None) -> _Floats:
-        """Griffin and Lim's, from a response or from zero phase."""
+        """The Griffin-Lim algorithm, from a response or from zero phase."""
         codec = self._codec
         if self._phase.warm or near is not None:
             signal = _fitted(response, codec.samples)
@@ -113,12 +113,24 @@ class DoubleDecoder(Decoder):
         return _fitted(signal, self.ir_samples)
 
 
-class _DoubleGate(Gate):
-    """The same without a compiler: gains and energies in float64, of float32 samples."""
+class DoubleGate(Gate):
+    """The gate in NumPy: gains and energies in float64, samples in float32."""
 
     def __init__(self, gate: Gate) -> None:
         self._rise, self._answer, self._given = gate._rise, gate._answer, gate._given
-        self._is_compiled = False
+
+    def _open(self, responses: _Float32, onsets: Indices, begins: Indices) -> None:
+        samples = np.arange(responses.shape[-1])
+        for response, onset, begin in zip(responses, onsets.tolist(), begins.tolist(), strict=True):
+            opens = max(0, onset, begin)
+            gain = np.where(
+                samples < opens, 0.0, _at(self._rise, samples - onset, 1) * _at(self._answer, samples - begin, 1)
+            )
+            given = _at(self._given, samples - opens, 0)
+            squares = response.astype(np.float64) ** 2
+            taken, kept = (squares * (1 - gain**2)).sum(axis=-1), (squares * gain**2 * given).sum(axis=-1)
+            share = np.divide(taken, kept, out=np.full_like(kept, MOST_GIVEN), where=taken < MOST_GIVEN * kept)
+            response *= gain * np.sqrt(1 + share[:, None] * given)
 
 
 class _DoubleField(AcousticField):
@@ -126,7 +138,7 @@ class _DoubleField(AcousticField):
         super().__init__(field.bundle, field.level, field.graph)
         if self._decoder is not None:
             self._decoder = DoubleDecoder(field)
-        self._gate = _DoubleGate(self._gate)
+        self._gate = DoubleGate(self._gate)
 
     def _placed(self, coded: _Float32, aligned: _Floats) -> _Float32:
         start = np.floor(aligned).astype(int)
@@ -142,7 +154,7 @@ class _DoubleField(AcousticField):
 
 
 class DoubleStillPaths(StillPaths):
-    """Responses of paths at rest, added up in float64 before they are added to what is there."""
+    """Responses of paths at rest. They are summed in float64 before they are added to the output."""
 
     def add(
         self,
@@ -153,7 +165,7 @@ class DoubleStillPaths(StillPaths):
         out: _Float32,
     ) -> None:
         tables = self._tables
-        heard = np.zeros(out.shape)
+        total = np.zeros(out.shape)
         for length, arrival, gains_db in zip(lengths_m, arrivals, band_gains_db, strict=True):
             corners, weights = self._triangle(axes_of(orientation) @ arrival)
             levels_db = gains_db - tables.air_db_per_m * length
@@ -170,11 +182,11 @@ class DoubleStillPaths(StillPaths):
                 begin = whole + BEFORE - (TAPS - 1)
                 first, last = max(0, begin), min(out.shape[1], begin + part.size)
                 if last > first:
-                    heard[ear, first:last] += part[first - begin : last - begin]
-        out += heard
+                    total[ear, first:last] += part[first - begin : last - begin]
+        out += total
 
     def _triangle(self, direction: _Floats) -> tuple[npt.NDArray[np.int64], _Floats]:
-        """The three measured directions around one, and their shares: the triangle whose least share is the
+        """The three measured directions around a direction, and their weights. It is the triangle whose least weight is
         greatest."""
         weights = self._tables.inverses @ direction
         best = int(np.argmax(weights.min(axis=-1)))
@@ -188,7 +200,7 @@ class _DoubleEarlyReflections(EarlyReflections):
 
 
 class DoubleFullResponse(FullResponse):
-    """What `FullResponse` answers with, in float64."""
+    """`FullResponse` computed in float64."""
 
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
         super().__init__(field if isinstance(field, Silence) else _DoubleField(field), filters)
@@ -200,12 +212,18 @@ class DoubleFullResponse(FullResponse):
             self._early = _DoubleEarlyReflections(self._early, paths)
 
 
+def _at(curve: _Float32, index: Indices, after: float) -> _Floats:
+    """Values of the curve at indices. Before its beginning it has its first value, and `after` after its end."""
+    values = np.append(_double(curve), after)
+    return np.asarray(values[np.clip(index, 0, len(curve))])
+
+
 def _double(values: npt.NDArray[np.floating]) -> _Floats:
     return np.asarray(values, dtype=np.float64)
 
 
 def _fitted(signal: npt.NDArray[np.floating], samples: int) -> _Floats:
-    """(..., sample) cut, or silent from where it ends."""
+    """The signal (..., sample) cut or padded with zeros to `samples`."""
     fitted = np.zeros((*signal.shape[:-1], samples))
     count = min(samples, signal.shape[-1])
     fitted[..., :count] = signal[..., :count]
@@ -213,8 +231,7 @@ def _fitted(signal: npt.NDArray[np.floating], samples: int) -> _Floats:
 
 
 def _later(values: npt.NDArray[_Number], frames: float) -> npt.NDArray[_Number]:
-    """(..., frame) values at a time later by `frames`, not necessarily whole: between those of two frames, zero where
-    there are none."""
+    """Values (..., frame) delayed by `frames`, which may be fractional: linear interpolation, zero outside."""
     at = np.arange(values.shape[-1]) - frames
     before = np.floor(at).astype(int)
 

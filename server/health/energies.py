@@ -1,7 +1,7 @@
-"""Energies that a field predicts, before anything is decoded: by octave band and by windows of time.
+"""Energies of a field's predictions, by octave band and time window, without decoding.
 
-Axes: (pose, channel, band, window). The sum over bands and windows is the energy of the response, unit pressure at one
-metre; windows follow the moment at which sound can first arrive.
+Axes: (pose, channel, band, window). The sum over bands and windows is the energy of the response, relative to unit
+pressure at one metre. Windows count from the moment at which sound can first arrive.
 """
 
 import numpy as np
@@ -19,12 +19,12 @@ _CHUNK = 16
 
 
 class Windows:
-    """Sorts a codec's spectrograms by octave band and window of time."""
+    """Sums a codec's spectrograms over octave bands and time windows."""
 
     def __init__(self, codec: Codec) -> None:
         frequency = np.maximum(np.fft.rfftfreq(codec.n_fft, 1 / codec.sample_rate), 1.0)
         nearest = np.argmin(np.abs(np.log2(frequency[:, None] / np.array(OCTAVE_BANDS_HZ))), axis=-1)
-        # Bins between DC and Nyquist stand for two.
+        # Bins between DC and Nyquist count twice.
         weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
         self._bands = (np.eye(len(OCTAVE_BANDS_HZ))[nearest] * weight[:, None]).T.astype(np.float32)
         self._frames = max(1, round(WINDOW_S * codec.sample_rate / codec.hop))
@@ -32,24 +32,24 @@ class Windows:
         self.window_s = self._frames * codec.hop / codec.sample_rate
 
     def energies(self, magnitude: npt.NDArray[np.floating]) -> Energies:
-        """(..., band, window) of magnitudes (..., frequency, frame)."""
+        """Energies (..., band, window) of magnitudes (..., frequency, frame)."""
         in_bands = self._bands @ np.square(magnitude)
         starts = np.arange(0, in_bands.shape[-1], self._frames)
         return np.add.reduceat(in_bands.astype(np.float64), starts, axis=-1)
 
 
 class Predictions:
-    """What one field's graph says of poses; counts those asked for."""
+    """Predictions of one field's graph. Counts the poses asked for."""
 
     def __init__(self, graph: FieldGraph) -> None:
         self.graph = graph
-        self.asked = 0
+        self.poses = 0
         self.faults = 0
-        """Values that were not finite, so far."""
+        """Number of values so far that were not finite."""
         self.windows = Windows(graph.parameters.codec)
 
     def energies(self, poses: Poses) -> Energies:
-        """NaN where the graph's outputs are not finite."""
+        """Energies at poses (pose, 7); NaN if the graph's outputs are not finite."""
         energies = np.empty((len(poses), self.graph.channels, len(OCTAVE_BANDS_HZ), self.windows.count))
         for start in range(0, len(poses), _CHUNK):
             energies[start : start + _CHUNK] = self._energies(poses[start : start + _CHUNK])
@@ -59,8 +59,9 @@ class Predictions:
         return self.graph.spectrograms(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
 
     def _energies(self, poses: Poses) -> Energies:
-        self.asked += len(poses)
+        self.poses += len(poses)
         outputs = self.graph.run(poses[:, LISTENER], poses[:, EMITTER], poses[:, YAW])
+        # guard: faults of a graph are counted
         self.faults += sum(int(np.count_nonzero(~np.isfinite(output))) for output in outputs)
         codec = self.graph.parameters.codec
         if self.graph.gives_responses:

@@ -1,4 +1,4 @@
-"""The picture of a health check: what was measured beside each bound, and where the worst of it is."""
+"""Figure of a health check: measurements, bounds, and the places of the worst poses."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ _MOVING = {"listener": "listener, per cm", "emitter": "emitter, per cm", "yaw": 
 
 
 def draw(health: Health, bundle: Bundle, path: Path) -> None:
-    """Writes a PNG. Raises NafirError where matplotlib, which the server does without, is not installed."""
+    """Write a PNG. Raises NafirError if matplotlib, an optional dependency, is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -47,7 +47,7 @@ def draw(health: Health, bundle: Bundle, path: Path) -> None:
 
 
 def _draw_energy(axes: "Axes", health: Health) -> None:
-    axes.set(title="Energy of responses", xlabel="distance (m)", ylabel="re what the walls let remain (dB)")
+    axes.set(title="Energy of responses", xlabel="distance (m)", ylabel="re limit by the walls' absorption (dB)")
     for colour, (name, evidence) in zip(_COLOURS, health.evidence.items(), strict=False):
         if evidence.excess_db is None:
             continue

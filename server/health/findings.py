@@ -1,6 +1,6 @@
-"""What a health check looks for: each law with its bound and the reason for it, and what was found.
+"""Laws of the health check, each with its bound and the reason for it, and findings.
 
-Every value is one that has to stay at or below its bound; one that is not a number breaks it.
+A law holds if its value is at most the bound. A value that is not a number breaks the law.
 """
 
 import math
@@ -13,7 +13,7 @@ from server.rendering.direct_path import NEAR_LIMIT_M
 
 @dataclass(frozen=True)
 class Law:
-    """Something that holds of every sound field, or of every computation, at any pose."""
+    """A law that holds for every sound field, or for every computation, at any pose."""
 
     name: str
     label: str
@@ -21,11 +21,11 @@ class Law:
     bound: float
     reason: str
     remedy: str = ""
-    """What whoever trained the field can do about it; nothing where the fault is the program's."""
+    """What the trainer of the field can do about it; empty if the program is at fault."""
 
     @property
     def can_be_accepted(self) -> bool:
-        """Whether a scene may be offered all the same, with a reason: never where the computation is at fault."""
+        """Whether a scene may break the law for a stated reason. It may not if the program is at fault."""
         return bool(self.remedy)
 
 
@@ -125,7 +125,7 @@ LAWS = (
 
 @dataclass(frozen=True)
 class Situation:
-    """A listener, its heading and an emitter; metres, radians."""
+    """A listener with its heading, and an emitter; in metres and radians."""
 
     listener: Vector3
     emitter: Vector3
@@ -133,7 +133,7 @@ class Situation:
 
     @classmethod
     def of(cls, pose: Poses) -> "Situation":
-        """Of one pose (7,)."""
+        """The situation of one pose (7,)."""
         x, y, z, ex, ey, ez, yaw = (float(value) for value in pose)
         return cls((x, y, z), (ex, ey, ez), yaw)
 
@@ -144,8 +144,8 @@ class Situation:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """The worst `value` found of a law, of a field or a quality level, over `poses` poses, and the `pose` (7,) of it,
-    where there is one."""
+    """The worst `value` of a law for a field or quality level, over `poses` poses, with its `pose` (7,) if there is
+    one."""
 
     law: Law
     of: str
@@ -155,7 +155,7 @@ class Finding:
     moving: str | None = None
     """What moved: listener, emitter or yaw."""
     accepted: str | None = None
-    """Why the scene is offered all the same, where the law is broken and the scene's manifest accepts that."""
+    """The manifest's reason for accepting that the law is broken; None if it is not accepted."""
 
     @property
     def holds(self) -> bool:

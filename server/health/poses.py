@@ -1,6 +1,6 @@
-"""Poses to try a scene at, all of them such as a client may ask for.
+"""Poses at which a scene is checked. A client may ask for each of them.
 
-A pose is a row of seven: listener x, y, z, emitter x, y, z, yaw; metres and radians.
+A pose is a row of seven: listener x, y, z, emitter x, y, z, and yaw, in metres and radians.
 """
 
 from itertools import product
@@ -12,14 +12,14 @@ from scipy.stats import qmc
 from server.scene.bundle import Bundle
 
 Poses = npt.NDArray[np.float64]
-"""(pose, 7)"""
+"""(pose, 7) array of poses."""
 
 LISTENER, EMITTER, YAW = slice(0, 3), slice(3, 6), 6
 _QUARTERS = np.array([0.0, 0.5, 1.0, -0.5]) * np.pi
 
 
 def allowed(bundle: Bundle, poses: Poses) -> npt.NDArray[np.bool_]:
-    """(pose,) True where both ends are within bounds and not inside a wall."""
+    """(pose,) whether listener and emitter are within bounds and not inside a wall."""
     bounds, plan = bundle.manifest.bounds, bundle.floor_plan
     return np.asarray(
         np.logical_and.reduce(
@@ -32,8 +32,8 @@ def allowed(bundle: Bundle, poses: Poses) -> npt.NDArray[np.bool_]:
 
 
 def corners(bundle: Bundle) -> Poses:
-    """Both ends at every corner of the bounds that a client may ask for, the head turned by a quarter each time; among
-    them those with the emitter in the listener's head."""
+    """Poses with listener and emitter at every corner of the bounds that is allowed, also both at the same corner. The
+    head turns by a quarter from pose to pose."""
     bounds = bundle.manifest.bounds
     points = list(product(*zip(bounds.minimum, bounds.maximum, strict=True)))
     poses = np.array([(*listener, *emitter) for listener in points for emitter in points])
@@ -42,7 +42,8 @@ def corners(bundle: Bundle) -> Poses:
 
 
 def scattered(bundle: Bundle, count: int, seed: int) -> Poses:
-    """`count` poses evenly over all that are allowed, the same ones first whatever the count (Sobol's sequence)."""
+    """`count` poses spread evenly over all that are allowed (Sobol sequence). A larger count adds poses and keeps the
+    first ones."""
     bounds = bundle.manifest.bounds
     low = np.array([*bounds.minimum, *bounds.minimum, -np.pi])
     high = np.array([*bounds.maximum, *bounds.maximum, np.pi])
@@ -54,5 +55,5 @@ def scattered(bundle: Bundle, count: int, seed: int) -> Poses:
 
 
 def within(bundle: Bundle, poses: Poses) -> Poses:
-    """Those that are allowed."""
+    """The poses that are allowed."""
     return poses[allowed(bundle, poses)]

@@ -1,4 +1,4 @@
-"""What a health check found, for people and for programs."""
+"""Reports of a health check, as a table for people and as JSON for programs."""
 
 import math
 from typing import Any
@@ -12,7 +12,7 @@ _MOVING = {"listener": "the listener moves", "emitter": "the emitter moves", "ya
 
 
 def table(health: Health) -> Table:
-    """A row per finding, worst pose included."""
+    """A table with one row per finding and its worst pose."""
     title = f"Scene {health.scene}: {verdict(health)}"
     rows = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
     for column in ("", "field or level", "law"):
@@ -46,7 +46,7 @@ def verdict(health: Health) -> str:
 
 
 def reasons(health: Health) -> list[str]:
-    """Why each law that is broken has the bound that it has, and what to do; why others are accepted."""
+    """Lines that explain each broken law: the reason for its bound and what to do, or why it is accepted."""
     broken = {finding.law.name: finding.law for finding in health.broken}
     accepted = {finding.law.label: finding.accepted for finding in health.accepted}
     return [
@@ -66,7 +66,7 @@ def to_json(health: Health) -> dict[str, Any]:
                 "of": finding.of,
                 "holds": finding.holds,
                 "accepted": finding.accepted,
-                # JSON knows no infinity: silence differs by minus infinity from silence, and what is NaN has no value.
+                # JSON has neither infinity, the difference in dB of two equal responses, nor NaN.
                 "value": finding.value if math.isfinite(finding.value) else None,
                 "bound": finding.law.bound,
                 "unit": finding.law.unit,

@@ -1,4 +1,4 @@
-"""Looking for the worst pose: from the worst of many, into ever smaller neighbourhoods."""
+"""Search for the worst poses: from the worst of many poses, in ever smaller neighbourhoods."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,13 +25,14 @@ def climb(
     poses: Poses,
     rng: np.random.Generator,
 ) -> tuple[Poses, Floats]:
-    """Poses (n, 7) as given or better, and what they are worth (n,): eight neighbours of each are tried in every round,
-    and the neighbourhood halves, from a metre and a quarter of a turn on."""
+    """Maximise `worth` from each of the poses (n, 7). Returns the best poses found and their worth (n,). Every round
+    tries eight neighbours of each pose; the neighbourhood begins at a metre and a quarter turn, and halves every
+    round."""
     best, values = poses.copy(), known(worth(poses))
     for number in range(_ROUNDS):
         reach = np.array([1.0] * 6 + [np.pi / 2]) / 2**number
         shape = len(best), _CANDIDATES, 7
-        # Half of the coordinates at a time: all at once hardly ever get better.
+        # Half of the coordinates change at a time. A change of all of them is hardly ever an improvement.
         tried = best[:, None] + rng.uniform(-reach, reach, shape) * (rng.random(shape) < 0.5)
         flat = tried.reshape(-1, 7)
         found = np.full(len(flat), -np.inf)
@@ -47,7 +48,8 @@ def climb(
 
 
 def moves(poses: Poses, rng: np.random.Generator) -> dict[str, Poses]:
-    """Where listener, emitter or head are after sixteen steps in any one direction: a centimetre each, or a degree."""
+    """Poses after sixteen steps of the listener, the emitter or the head, by what moves. Steps are a centimetre in a
+    random direction, or a degree."""
     moved = {}
     for name, end in (("listener", LISTENER), ("emitter", EMITTER)):
         directions = rng.standard_normal((len(poses), 3))
@@ -61,7 +63,7 @@ def moves(poses: Poses, rng: np.random.Generator) -> dict[str, Poses]:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Poses before a step and after it (n, 7), with the energies there."""
+    """Poses (n, 7) before and after a step, with their energies."""
 
     poses: Poses
     moved: Poses
@@ -78,11 +80,11 @@ def steepest(
     *,
     kept: int,
 ) -> Steps:
-    """Steps of much change. Of ways of sixteen steps the `kept` of the greatest change are halved, again and again,
-    towards the half that has more of it: a jump anywhere on a way is in one of its halves."""
+    """Single steps with a large change. Of the moves of sixteen steps, the `kept` with the greatest change are halved
+    again and again, each time keeping the half with more change. A jump anywhere on a move is in one of its halves."""
     plan = bundle.floor_plan
     usable = allowed(bundle, poses) & allowed(bundle, moved)
-    for part in (LISTENER, EMITTER):  # nobody moves through walls
+    for part in (LISTENER, EMITTER):  # moves do not go through walls
         usable &= plan.is_visible(poses[:, part], moved[:, part])
     start, end = poses[usable], moved[usable]
     before, after = energies(start), energies(end)
@@ -100,5 +102,5 @@ def steepest(
 
 
 def known(values: Floats) -> Floats:
-    """What is not a number is as bad as can be."""
+    """The values with NaN replaced by infinity, the worst value."""
     return np.where(np.isnan(values), np.inf, values)

@@ -2,7 +2,7 @@
 
 Numba passes a tuple by value: every array of it, field by field, at every call. With tens of arrays that takes longer
 than what is done with them, and longer still to compile. A `Reference` is one address there, and has the attributes of
-the tuple.
+the tuple, as it has in Python.
 """
 
 from typing import Any, NamedTuple
@@ -31,6 +31,9 @@ class Reference:
         words = [word for field in value for word in _words(field)]
         self._words = np.array(words, np.int64)
         self.address = int(self._words.ctypes.data)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.value, name)
 
 
 def _words(field: Any) -> list[int]:

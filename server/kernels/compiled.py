@@ -1,4 +1,4 @@
-"""Compilation of hot loops, where numba is installed; elsewhere each has a NumPy counterpart.
+"""Compilation of hot loops, and its results on disk.
 
 Compiled code runs without the interpreter's lock, follows NumPy's rules for division by zero, and is kept on disk: in
 NUMBA_CACHE_DIR if that is set, else beside the source, else in the user's cache folder. Numba by itself would take code
@@ -17,19 +17,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-try:
-    import numba
-    from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
-except ImportError:  # a Python too new for it, or a platform it is not built for
-    numba = None
-
-HAS_NUMBA: bool = numba is not None
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Compile on first call; without numba, the function as it is."""
+    """Compile on first call."""
     return _compile(function)
 
 
@@ -40,8 +35,6 @@ def compiled_in_place(function: Function) -> Function:
 
 
 def _compile(function: Function, **options: bool) -> Function:
-    if numba is None:
-        return function
     dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
     dispatcher._cache = _Cache(function)
     return dispatcher  # type: ignore[no-any-return]
@@ -89,44 +82,46 @@ def _is_writable(folder: Path) -> bool:
     return True
 
 
-if numba is not None:
-    _look_for_no_blas()
+_look_for_no_blas()
 
-    class _Locator(_CacheLocator):  # type: ignore[misc]
-        def __init__(self, function: Callable[..., Any], file: str) -> None:
-            self._line = function.__code__.co_firstlineno
-            beside = Path(file).parent / "__pycache__"
-            if "NUMBA_CACHE_DIR" in os.environ:
-                self._folder = Path(os.environ["NUMBA_CACHE_DIR"]) / "nafir" / beside.parent.name
-            elif _is_writable(beside) or any(beside.glob("*.nbi")):
-                self._folder = beside
-            else:
-                self._folder = Path(UserWideCacheLocator(function, file).get_cache_path())
 
-        def get_cache_path(self) -> str:
-            return str(self._folder)
+class _Locator(_CacheLocator):  # type: ignore[misc]
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._line = function.__code__.co_firstlineno
+        beside = Path(file).parent / "__pycache__"
+        if "NUMBA_CACHE_DIR" in os.environ:
+            self._folder = Path(os.environ["NUMBA_CACHE_DIR"]) / "nafir" / beside.parent.name
+        elif _is_writable(beside) or any(beside.glob("*.nbi")):
+            self._folder = beside
+        else:
+            self._folder = Path(UserWideCacheLocator(function, file).get_cache_path())
 
-        def get_source_stamp(self) -> str:
-            return _digest_of_sources()
+    def get_cache_path(self) -> str:
+        return str(self._folder)
 
-        def get_disambiguator(self) -> str:
-            return str(self._line)
+    def get_source_stamp(self) -> str:
+        return _digest_of_sources()
 
-        @classmethod
-        def from_function(cls, function: Callable[..., Any], file: str) -> "_Locator":
-            return cls(function, file)
+    def get_disambiguator(self) -> str:
+        return str(self._line)
 
-    class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
-        _locator_classes = (_Locator,)
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> "_Locator":
+        return cls(function, file)
 
-    class _Cache(FunctionCache):  # type: ignore[misc]
-        _impl_class = _CacheFiles
 
-        def __init__(self, function: Callable[..., Any]) -> None:
-            super().__init__(function)
-            # Read before anything is unpickled, which of other sources may name modules that are no more.
-            self._cache_file._version = f"{self._cache_file._version} {_digest_of_sources()}"
+class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (_Locator,)
 
-        def save_overload(self, signature: Any, result: Any) -> None:
-            if _is_writable(Path(self.cache_path)):
-                super().save_overload(signature, result)
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    _impl_class = _CacheFiles
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        # Read before anything is unpickled, which of other sources may name modules that are no more.
+        self._cache_file._version = f"{self._cache_file._version} {_digest_of_sources()}"
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        if _is_writable(Path(self.cache_path)):
+            super().save_overload(signature, result)

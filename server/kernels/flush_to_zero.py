@@ -17,6 +17,7 @@ _WORD32, _WORD64 = ir.IntType(32), ir.IntType(64)
 _MACHINE = platform.machine().lower()
 _X86 = _MACHINE in {"x86_64", "amd64"}
 _ARM = _MACHINE in {"aarch64", "arm64"}
+# guard: denormal products are zero
 _FLUSH_X86 = 0x8040
 """MXCSR: flush results to zero (bit 15), and take denormal operands for zero (bit 6)."""
 _FLUSH_ARM = 1 << 24

@@ -1,27 +1,26 @@
-"""Vectors of eight float32 for compiled code: what a loop over contiguous samples becomes when it must.
+"""Vectors of float32 for compiled code: what a loop over contiguous samples becomes when it must.
 
 LLVM vectorises simple loops by itself, but keeps no accumulators in registers and gives up where it cannot prove that
 arrays do not overlap. The inner loops of the convolver, and of decoding, decide what a host can carry, so they say
-what they mean. `Float32x8` is one LLVM vector: one register with AVX, two with SSE or NEON.
+what they mean. A vector is one of LLVM: of eight lanes, one register with AVX, two with SSE or NEON.
 
-Memory is addressed as (byte address, index of a float32): inside a compiled function, of an array, by `.ctypes.data`.
+`lanes` makes what makes vectors of so many lanes; what works on vectors takes those of any. Memory is addressed as
+(byte address, index of a float32): inside a compiled function, of an array, by `.ctypes.data`.
 """
 
 import math
 from collections.abc import Callable
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
-LANES = 8
-
-_VECTOR = ir.VectorType(ir.FloatType(), LANES)
+_FLOAT = ir.FloatType()
 _INT32 = ir.IntType(32)
 _INT64 = ir.IntType(64)
-_INTEGERS = ir.VectorType(_INT32, LANES)
 
 # Split so that small multiples of the first parts are exact (Cody and Waite 1980).
 _LN_2 = (0.693359375, math.log(2) - 0.693359375)
@@ -29,35 +28,121 @@ _LN_2 = (0.693359375, math.log(2) - 0.693359375)
 _EXPONENTIAL = [8.31250137619232e-3, 4.1890331599848334e-2, 0.16667115387827203, 0.49999230308875753]
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
-_LAST_FIRST = [7, 0, 1, 2, 3, 4, 5, 6]
-# Lanes of two vectors, 0-7 and 8-15: the first of one and the rest of the other; and what the steps of a transposition
-# bring together.
-_FIRST_THEN = [0, 9, 10, 11, 12, 13, 14, 15]
-_LOW_1, _HIGH_1 = [0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]
-_LOW_2, _HIGH_2 = [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]
-_LOW_4, _HIGH_4 = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
+
+class Vector(types.Type):
+    """So many float32."""
+
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        super().__init__(f"Float32x{lanes}")
 
 
-class Float32x8(types.Type):
-    def __init__(self) -> None:
-        super().__init__("Float32x8")
-
-
-float32x8 = Float32x8()
-
-
-@register_model(Float32x8)
-class _Float32x8Model(models.PrimitiveModel):
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, front_end_type: Any) -> None:
-        super().__init__(manager, front_end_type, _VECTOR)
+        super().__init__(manager, front_end_type, _floats(front_end_type.lanes))
+
+
+def _floats(lanes: int) -> Any:
+    return ir.VectorType(_FLOAT, lanes)
+
+
+def _same(first: Any, *others: Any) -> Vector | None:
+    """The type that all values have; None, which numba takes for no function of such values, where it is no vector's,
+    or not that of all."""
+    return first if isinstance(first, Vector) and all(other == first for other in others) else None
 
 
 def _pointer(builder: Any, address: Any, index: Any, to: Any, size: int) -> Any:
     return builder.inttoptr(builder.add(address, builder.mul(index, ir.Constant(_INT64, size))), to.as_pointer())
 
 
+def _load(builder: Any, address: Any, index: Any, lanes: int) -> Any:
+    return builder.load(_pointer(builder, address, index, _floats(lanes), 4), align=4)
+
+
 def _shuffle(builder: Any, a: Any, b: Any, lanes: list[int]) -> Any:
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT32, len(lanes)), lanes))
+
+
+def _in_every_lane(builder: Any, value: Any, lanes: int) -> Any:
+    undefined = ir.Constant(_floats(lanes), ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(_INT32, 0))
+    return _shuffle(builder, first, undefined, [0] * lanes)
+
+
+# What makes vectors.
+
+
+class Lanes(NamedTuple):
+    """What makes vectors of so many float32."""
+
+    load: Any
+    """`load(address, index)`: the floats from `index` on."""
+    load_broadcast: Any
+    """`load_broadcast(address, index)`: the float at `index` in every lane."""
+    broadcast: Any
+    """`broadcast(value)`: one float32 in every lane."""
+    load_twice: Any
+    """`load_twice(address, index)`: half as many floats from `index` on, in either half."""
+    load_opposed: Any
+    """`load_opposed(address, index)`: half as many floats from `index` on in the second half, and what they are the
+    negatives of in the first."""
+
+
+@cache
+def lanes(count: int) -> Lanes:
+    """Of a power of two."""
+    vector, half = Vector(count), count // 2
+
+    @intrinsic
+    def load(_context: Any, _address: Any, _index: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            return _load(builder, *args, count)
+
+        return vector(types.int64, types.int64), generate
+
+    @intrinsic
+    def load_broadcast(_context: Any, _address: Any, _index: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            value = builder.load(_pointer(builder, *args, _FLOAT, 4), align=4)
+            return _in_every_lane(builder, value, count)
+
+        return vector(types.int64, types.int64), generate
+
+    @intrinsic
+    def broadcast(_context: Any, _value: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            return _in_every_lane(builder, args[0], count)
+
+        return vector(types.float32), generate
+
+    @intrinsic
+    def load_twice(_context: Any, _address: Any, _index: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            values = _load(builder, *args, half)
+            return _shuffle(builder, values, values, [*range(half), *range(half)])
+
+        return vector(types.int64, types.int64), generate
+
+    @intrinsic
+    def load_opposed(_context: Any, _address: Any, _index: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            values = _load(builder, *args, half)
+            return _shuffle(builder, builder.fneg(values), values, list(range(count)))
+
+        return vector(types.int64, types.int64), generate
+
+    return Lanes(load, load_broadcast, broadcast, load_twice, load_opposed)
+
+
+LANES = 8
+"""Of the vectors that most loops work on."""
+_usual = lanes(LANES)
+load, load_broadcast, broadcast = _usual.load, _usual.load_broadcast, _usual.broadcast
+
+
+# What reads memory otherwise.
 
 
 @intrinsic
@@ -68,25 +153,6 @@ def pointer(_context: Any, _address: Any) -> Any:
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
 
     return types.voidptr(types.int64), generate
-
-
-@intrinsic
-def load(_context: Any, _address: Any, _index: Any) -> Any:
-    """The eight floats from `index` on."""
-
-    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        return builder.load(_pointer(builder, *args, _VECTOR, 4), align=4)
-
-    return float32x8(types.int64, types.int64), generate
-
-
-@intrinsic
-def store(_context: Any, _address: Any, _index: Any, _value: Any) -> Any:
-    def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        builder.store(args[2], _pointer(builder, args[0], args[1], _VECTOR, 4), align=4)
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, float32x8), generate
 
 
 @intrinsic
@@ -124,38 +190,27 @@ def load_short_int(_context: Any, _address: Any, _index: Any) -> Any:
     return types.int64(types.int64, types.int64), generate
 
 
-@intrinsic
-def broadcast(_context: Any, _value: Any) -> Any:
-    """One float32 in every lane."""
-
-    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        undefined = ir.Constant(_VECTOR, ir.Undefined)
-        first = builder.insert_element(undefined, args[0], ir.Constant(_INT32, 0))
-        return _shuffle(builder, first, undefined, [0] * LANES)
-
-    return float32x8(types.float32), generate
+# What works on vectors, all of as many lanes.
 
 
 @intrinsic
-def load_broadcast(_context: Any, _address: Any, _index: Any) -> Any:
-    """The float at `index` in every lane."""
+def store(_context: Any, _address: Any, _index: Any, value: Any) -> Any:
+    """Write a vector from `index` on."""
 
-    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        value = builder.load(_pointer(builder, *args, ir.FloatType(), 4), align=4)
-        undefined = ir.Constant(_VECTOR, ir.Undefined)
-        first = builder.insert_element(undefined, value, ir.Constant(_INT32, 0))
-        return _shuffle(builder, first, undefined, [0] * LANES)
+    def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        builder.store(args[2], _pointer(builder, args[0], args[1], _floats(value.lanes), 4), align=4)
+        return context.get_dummy_value()
 
-    return float32x8(types.int64, types.int64), generate
+    return (types.void(types.int64, types.int64, value), generate) if _same(value) else None
 
 
 def _binary(instruction: str) -> Callable[..., Any]:
     @intrinsic
-    def operation(_context: Any, _a: Any, _b: Any) -> Any:
+    def operation(_context: Any, a: Any, b: Any) -> Any:
         def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
             return getattr(builder, instruction)(*args)
 
-        return float32x8(float32x8, float32x8), generate
+        return (a(a, b), generate) if _same(a, b) else None
 
     return operation
 
@@ -168,14 +223,12 @@ divide = _binary("fdiv")
 
 def _fused(negate_product: bool) -> Callable[..., Any]:
     @intrinsic
-    def operation(_context: Any, _a: Any, _b: Any, _c: Any) -> Any:
+    def operation(_context: Any, a: Any, b: Any, c: Any) -> Any:
         def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-            kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
-            fused = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{LANES}f32")
-            a, b, c = args
-            return builder.call(fused, (builder.fneg(a) if negate_product else a, b, c))
+            factor, other, term = args
+            return _call(builder, "fma", builder.fneg(factor) if negate_product else factor, other, term)
 
-        return float32x8(float32x8, float32x8, float32x8), generate
+        return (a(a, b, c), generate) if _same(a, b, c) else None
 
     return operation
 
@@ -186,117 +239,140 @@ multiply_subtract = _fused(negate_product=True)
 """c - a b, rounded once."""
 
 
-def _constant(value: float) -> Any:
-    return ir.Constant(_VECTOR, [value] * LANES)
-
-
 def _call(builder: Any, name: str, *args: Any) -> Any:
-    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(args))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), args)
+    """A function of LLVM of vectors."""
+    kind = args[0].type
+    function = ir.FunctionType(kind, [kind] * len(args))
+    return builder.call(cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.v{kind.count}f32"), args)
+
+
+def _constant(like: Any, value: float) -> Any:
+    return ir.Constant(like.type, [value] * like.type.count)
+
+
+def _integer(like: Any, value: int) -> Any:
+    return ir.Constant(_integers(like), [value] * like.type.count)
+
+
+def _integers(like: Any) -> Any:
+    return ir.VectorType(_INT32, like.type.count)
 
 
 def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
     """The highest power first."""
-    value = _constant(coefficients[0])
+    value = _constant(x, coefficients[0])
     for coefficient in coefficients[1:]:
-        value = _call(builder, "fma", value, x, _constant(coefficient))
+        value = _call(builder, "fma", value, x, _constant(x, coefficient))
     return value
 
 
 def _nearest_multiple(builder: Any, x: Any, parts: tuple[float, ...], inverse: float) -> tuple[Any, Any]:
     """How often the period, a sum of `parts`, goes into x, as integers modulo 2**22, and the remainder."""
     # Added to 1.5 * 2**23, a number is rounded to an integer, which then is in the low bits.
-    shifted = _call(builder, "fma", x, _constant(inverse), _constant(12582912.0))
-    times = builder.fneg(builder.fsub(shifted, _constant(12582912.0)))
+    shifted = _call(builder, "fma", x, _constant(x, inverse), _constant(x, 12582912.0))
+    times = builder.fneg(builder.fsub(shifted, _constant(x, 12582912.0)))
     for part in parts:
-        x = _call(builder, "fma", times, _constant(part), x)
-    return builder.bitcast(shifted, _INTEGERS), x
+        x = _call(builder, "fma", times, _constant(x, part), x)
+    return builder.bitcast(shifted, _integers(x)), x
 
 
 @intrinsic
-def at_least(_context: Any, _x: Any, _limit: Any) -> Any:
+def at_least(_context: Any, x: Any, limit: Any) -> Any:
     """max(x, limit); what is not a number stays so."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        x, limit = args
-        return builder.select(builder.fcmp_ordered("<", x, limit), limit, x)
+        value, least = args
+        return builder.select(builder.fcmp_ordered("<", value, least), least, value)
 
-    return float32x8(float32x8, float32x8), generate
+    return (x(x, limit), generate) if _same(x, limit) else None
 
 
 @intrinsic
-def choose_below(_context: Any, _x: Any, _limit: Any, _below: Any, _else: Any) -> Any:
-    """`below` in lanes where x < limit, `else` in the others."""
+def choose_below(_context: Any, x: Any, limit: Any, below: Any, otherwise: Any) -> Any:
+    """`below` in lanes where x < limit, `otherwise` in the others."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        x, limit, below, otherwise = args
-        return builder.select(builder.fcmp_ordered("<", x, limit), below, otherwise)
+        value, most, then, other = args
+        return builder.select(builder.fcmp_ordered("<", value, most), then, other)
 
-    return float32x8(float32x8, float32x8, float32x8, float32x8), generate
+    return (x(x, limit, below, otherwise), generate) if _same(x, limit, below, otherwise) else None
 
 
 @intrinsic
-def any_above(_context: Any, _x: Any, _limit: Any) -> Any:
+def any_above(_context: Any, x: Any, limit: Any) -> Any:
     """Whether x > limit in any lane."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        lanes = builder.bitcast(builder.fcmp_ordered(">", *args), ir.IntType(LANES))
-        return builder.icmp_unsigned("!=", lanes, ir.Constant(ir.IntType(LANES), 0))
+        bits = ir.IntType(x.lanes)
+        found = builder.bitcast(builder.fcmp_ordered(">", *args), bits)
+        return builder.icmp_unsigned("!=", found, ir.Constant(bits, 0))
 
-    return types.boolean(float32x8, float32x8), generate
+    return (types.boolean(x, limit), generate) if _same(x, limit) else None
 
 
 @intrinsic
-def rotate(_context: Any, _x: Any) -> Any:
+def rotate(_context: Any, x: Any) -> Any:
     """The last value first."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        return _shuffle(builder, args[0], args[0], _LAST_FIRST)
+        return _shuffle(builder, args[0], args[0], [x.lanes - 1, *range(x.lanes - 1)])
 
-    return float32x8(float32x8), generate
+    return (x(x), generate) if _same(x) else None
 
 
 @intrinsic
-def with_first(_context: Any, _first: Any, _x: Any) -> Any:
+def with_first(_context: Any, first: Any, x: Any) -> Any:
     """x but for its first value, which is that of the other."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        return _shuffle(builder, *args, _FIRST_THEN)
+        return _shuffle(builder, *args, [0, *range(x.lanes + 1, 2 * x.lanes)])
 
-    return float32x8(float32x8, float32x8), generate
+    return (x(first, x), generate) if _same(first, x) else None
 
 
 @intrinsic
-def square_root(_context: Any, _x: Any) -> Any:
+def swap_halves(_context: Any, x: Any) -> Any:
+    """The second half first."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        half = x.lanes // 2
+        return _shuffle(builder, args[0], args[0], [*range(half, x.lanes), *range(half)])
+
+    return (x(x), generate) if _same(x) else None
+
+
+@intrinsic
+def square_root(_context: Any, x: Any) -> Any:
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return _call(builder, "sqrt", *args)
 
-    return float32x8(float32x8), generate
+    return (x(x), generate) if _same(x) else None
 
 
 @intrinsic
-def exponential(_context: Any, _x: Any) -> Any:
+def exponential(_context: Any, x: Any) -> Any:
     """exp(x) to 2.2e-7; of less than -87 or more than 88 that of these."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        low, high = _constant(-87.0), _constant(88.0)
-        x = builder.select(builder.fcmp_ordered("<", args[0], low), low, args[0])
-        x = builder.select(builder.fcmp_ordered(">", x, high), high, x)
-        halvings, rest = _nearest_multiple(builder, x, _LN_2, 1 / math.log(2))
+        (value,) = args
+        low, high = _constant(value, -87.0), _constant(value, 88.0)
+        value = builder.select(builder.fcmp_ordered("<", value, low), low, value)
+        value = builder.select(builder.fcmp_ordered(">", value, high), high, value)
+        halvings, rest = _nearest_multiple(builder, value, _LN_2, 1 / math.log(2))
         # Its halves side by side: one after the other, powers would wait for each other.
         square = builder.fmul(rest, rest)
         high = _polynomial(builder, rest, _EXPONENTIAL[:2])
         value = _call(builder, "fma", square, high, _polynomial(builder, rest, _EXPONENTIAL[2:]))
-        value = _call(builder, "fma", square, value, builder.fadd(rest, _constant(1.0)))
-        bits = builder.shl(halvings, ir.Constant(_INTEGERS, [23] * LANES))
-        scale = builder.add(bits, ir.Constant(_INTEGERS, [127 << 23] * LANES))
-        return builder.fmul(value, builder.bitcast(scale, _VECTOR))
+        value = _call(builder, "fma", square, value, builder.fadd(rest, _constant(rest, 1.0)))
+        bits = builder.shl(halvings, _integer(rest, 23))
+        scale = builder.add(bits, _integer(rest, 127 << 23))
+        return builder.fmul(value, builder.bitcast(scale, value.type))
 
-    return float32x8(float32x8), generate
+    return (x(x), generate) if _same(x) else None
 
 
 @intrinsic
-def cosine_sine(_context: Any, _x: Any) -> Any:
+def cosine_sine(_context: Any, x: Any) -> Any:
     """cos(x) and sin(x) to 2e-7, of x within some hundred turns."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -304,8 +380,7 @@ def cosine_sine(_context: Any, _x: Any) -> Any:
         square = builder.fmul(rest, rest)
         even = _polynomial(builder, square, [1 / 40320, -1 / 720, 1 / 24, -0.5, 1.0])
         odd = builder.fmul(_polynomial(builder, square, [1 / 362880, -1 / 5040, 1 / 120, -1 / 6, 1.0]), rest)
-        one, two = ir.Constant(_INTEGERS, [1] * LANES), ir.Constant(_INTEGERS, [2] * LANES)
-        zero = ir.Constant(_INTEGERS, [0] * LANES)
+        zero, one, two = (_integer(rest, number) for number in range(3))
         is_odd = builder.icmp_signed("!=", builder.and_(quarters, one), zero)
 
         def signed(value: Any, quarters: Any) -> Any:
@@ -316,25 +391,67 @@ def cosine_sine(_context: Any, _x: Any) -> Any:
         sine = signed(builder.select(is_odd, even, odd), quarters)
         return context.make_tuple(builder, signature.return_type, (cosine, sine))
 
-    return types.UniTuple(float32x8, 2)(float32x8), generate
+    return (types.UniTuple(x, 2)(x), generate) if _same(x) else None
 
 
 @intrinsic
-def transpose(_context: Any, _rows: Any) -> Any:
-    """Eight vectors as the rows of a matrix; its columns."""
-    rows_type = types.UniTuple(float32x8, LANES)
+def transpose(_context: Any, rows: Any) -> Any:
+    """As many vectors as they have lanes, the rows of a matrix; its columns."""
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        rows = cgutils.unpack_tuple(builder, args[0], LANES)
-        # Pairs of rows, then of pairs, then of fours; within halves of a register but for the last step.
-        pairs = [_shuffle(builder, rows[i], rows[i + 1], lanes) for i in (0, 2, 4, 6) for lanes in (_LOW_1, _HIGH_1)]
-        fours = [
-            _shuffle(builder, pairs[i + j], pairs[i + j + 2], lanes)
-            for i in (0, 4)
-            for j in (0, 1)
-            for lanes in (_LOW_2, _HIGH_2)
-        ]
-        columns = [_shuffle(builder, fours[i], fours[i + 4], lanes) for lanes in (_LOW_4, _HIGH_4) for i in range(4)]
-        return context.make_tuple(builder, rows_type, columns)
+        return context.make_tuple(builder, rows, _transposed(builder, cgutils.unpack_tuple(builder, args[0])))
 
-    return rows_type(rows_type), generate
+    return (rows(rows), generate) if _count(rows) and _count(rows) == rows.dtype.lanes else None
+
+
+def _count(rows: Any) -> int:
+    """Of the vectors in a tuple; 0 where it is none of vectors."""
+    return rows.count if isinstance(rows, types.UniTuple) and _same(rows.dtype) else 0
+
+
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """Pairs of rows, then of pairs and so on; up to the last steps within fours of lanes, where that takes least."""
+    count = len(rows)
+
+    def paired(a: Any, b: Any, lanes: list[int], step: int) -> list[Any]:
+        """What two vectors have in some lanes, and in those `step` on."""
+        return [_shuffle(builder, a, b, [lane + further for lane in lanes]) for further in (0, step)]
+
+    fours = range(0, count, 4)
+    one = [lane for four in fours for lane in (four, count + four, four + 1, count + four + 1)]
+    two = [lane for four in fours for lane in (four, four + 1, count + four, count + four + 1)]
+    rows = [vector for i in range(0, count, 2) for vector in paired(rows[i], rows[i + 1], one, 2)]
+    rows = [vector for i in fours for j in (0, 1) for vector in paired(rows[i + j], rows[i + j + 2], two, 2)]
+    width = 4
+    while width < count:
+        blocks = range(0, count, 2 * width)
+        lanes = [lane for block in blocks for start in (block, count + block) for lane in range(start, start + width)]
+        rows = [
+            _shuffle(builder, rows[i + k], rows[i + width + k], [lane + further for lane in lanes])
+            for i in blocks
+            for further in (0, width)
+            for k in range(width)
+        ]
+        width *= 2
+    return rows
+
+
+@intrinsic
+def sum_each(_context: Any, rows: Any) -> Any:
+    """Half as many vectors as they have lanes; their sums, one after the other, in a vector of half as many lanes."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        vectors = cgutils.unpack_tuple(builder, args[0])
+        count = 2 * len(vectors)
+        width = count
+        while len(vectors) > 1:  # each holds partial sums of ever more of them, in ever fewer lanes
+            width //= 2
+            low = [lane for lane in range(2 * count) if lane // width % 2 == 0]
+            high = [lane + width for lane in low]
+            pairs = zip(vectors[::2], vectors[1::2], strict=True)
+            vectors = [builder.fadd(_shuffle(builder, a, b, low), _shuffle(builder, a, b, high)) for a, b in pairs]
+        (row,) = vectors
+        even, odd = list(range(0, count, 2)), list(range(1, count, 2))
+        return builder.fadd(_shuffle(builder, row, row, even), _shuffle(builder, row, row, odd))
+
+    return (Vector(_count(rows))(rows), generate) if _count(rows) and 2 * _count(rows) == rows.dtype.lanes else None

@@ -1,8 +1,8 @@
-"""Rendering to a file: the live renderer, fed from a path instead of a connection.
+"""Rendering to a file: the live renderer, driven by a path instead of a connection.
 
-A path says from which sample on the listener has which pose, for the direct sound and for what follows it. Poses take
-effect at block boundaries, as they do live; so a live session whose poses are written down with the sample clocks of
-the blocks that first applied them renders the same.
+A path gives the listener's poses with the samples from which they apply, separately for the direct sound and for the
+reflected field. Poses take effect at block boundaries, as they do live. So a path with the poses of a live session, and
+the sample clocks of the blocks that first applied them, renders the same samples.
 """
 
 import csv
@@ -26,20 +26,21 @@ from server.planning.scene_acoustics import Output
 from server.rendering.ingest import DryAudio, require_gain
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.ir_request import EmitterSnapshot, Field, composed_irs
+from server.responses.emitter_state import EmitterState
+from server.responses.ir_request import composed_irs
 from server.responses.radiation import reverberation_gain
 from server.scene.effects import EffectName, require_effect
 from server.streaming.active_effects import ActiveEffects, as_asked
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import Stage, StreamedEmitter
 
 FloatArray = npt.NDArray[np.float32]
 
 MAX_RENDER_S = 2 * 3600
-"""A render is held in memory as a whole: two hours of stereo at 48 kHz are 2.8 GB."""
+"""Longest render. It is held in memory as a whole: two hours of stereo at 48 kHz are 2.8 GB."""
 
 _LEAST_GAIN = 1e-6
-"""A plan takes what is softer for this."""
+"""Least amplitude that a plan assumes, since silence has no level in dB."""
 _CLOCKS = ("sample", "time_s")
 _REVERBERATION = "reverberation_sample"
 _LEVEL = "level"
@@ -49,12 +50,12 @@ _YAW = ("yaw_deg",)
 
 
 class PathError(NafirError):
-    """A path file that cannot be followed; the message names the line and the column."""
+    """A path file is invalid. The message names the line and the column."""
 
 
 @dataclass(frozen=True)
 class RenderedEmitter:
-    """A clip (n,) at the scene's rate, played at a place; `gain` is linear amplitude.
+    """An emitter that plays a clip (n,) at the scene's rate. `gain` is a linear amplitude.
 
     Raises ValueError for a gain that is not finite or beyond `LOUDEST_GAIN`.
     """
@@ -71,9 +72,9 @@ class RenderedEmitter:
 
 @dataclass(frozen=True)
 class PathPoint:
-    """The listener's pose: that of the direct sound from `sample` on, and that of what follows it, the field's impulse
-    responses, from `reverberation_sample` on; with None, never, since another pose was faster. From then on responses
-    are of quality level `level`; with None, of the same as before."""
+    """A pose of the listener. It applies to the direct sound from `sample` on, and to the reflected field from
+    `reverberation_sample` on; None means never, because a later pose overtook it. Responses are of quality level
+    `level` from then on; None keeps the level."""
 
     sample: int
     pose: Pose
@@ -82,17 +83,17 @@ class PathPoint:
 
     @classmethod
     def at(cls, sample: int, pose: Pose) -> "PathPoint":
-        """For both from the same sample on."""
+        """A pose that applies to direct sound and reflected field from the same sample on."""
         return cls(sample, pose, sample)
 
 
 def read_path(path: Path, sample_rate: int, levels: Collection[str] | None = None) -> list[PathPoint]:
-    """Read a CSV file with a header line, columns in any order.
+    """Read a CSV file with a header line and columns in any order.
 
-    They are `sample` or `time_s`; `x`, `y`, `z` in metres; `qx`, `qy`, `qz`, `qw` or `yaw_deg` (counter-clockwise, 0
-    looks along +x); and, or else it is the same, `reverberation_sample`, empty for never; and `level`, one of `levels`
-    where those are given, empty for the same as before. Neither clock goes back from line to line, nor beyond
-    `MAX_RENDER_S`. Raises PathError.
+    The columns are `sample` or `time_s`; `x`, `y`, `z` in metres; and `qx`, `qy`, `qz`, `qw` or `yaw_deg`
+    (counter-clockwise, 0 looks along +x). Optional columns are `reverberation_sample`, by default the same sample and
+    empty for never, and `level`, empty to keep the level. If `levels` are given, `level` has to be one of them. Times
+    never go back from line to line nor exceed `MAX_RENDER_S`. Raises PathError.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -189,11 +190,12 @@ def _pose(values: dict[str, float], where: str) -> Pose:
     try:
         return Pose(position, Quaternion(values["qx"], values["qy"], values["qz"], values["qw"]))
     except ValueError as exc:
+        # guard: a path file's orientation is refused by its line
         raise PathError(f"{where}, columns 'qx' to 'qw': {exc}") from exc
 
 
 def render(
-    field: Field,
+    field: AcousticField,
     direct_sound: DirectSound,
     emitters: Sequence[RenderedEmitter],
     path: Sequence[PathPoint],
@@ -202,16 +204,17 @@ def render(
     length: int | None = None,
     progress: Callable[[float], None] | None = None,
     planned: PlannedEffects | None = None,
-    levels: Mapping[str, Field] | None = None,
+    levels: Mapping[str, AcousticField] | None = None,
 ) -> FloatArray:
-    """What a listener on `path` (one point or more, by rising sample) hears of `emitters` (one or more): (channel,
-    length), two ears or, from a mono loudspeaker, one channel.
+    """Render at least one emitter for a listener on `path`, which has at least one point. Returns (channel, length):
+    two ears, or one channel for a mono loudspeaker.
 
     A point takes effect with the first block that begins at its sample or later, unless a later point does too. The
-    emitters start where the path begins. `length` in samples defaults to the end of the path or of the longest clip,
-    whichever is later, and the reverberation after it. `progress` is told the fraction done. Only the effects are
-    rendered that are `planned`, or all. Responses are those of `field` until a point names another of `levels`; for the
-    same samples as a stream's these are all that its scene has. Raises KeyError for a level that is none of them.
+    emitters start at the beginning of the path. `length`, in samples, defaults to the end of the path or of the longest
+    clip, whichever is later, and the reverberation after it. `progress` gets the fraction done. With `planned` only the
+    planned effects are rendered, otherwise all. Responses are those of `field` until a point names another of
+    `levels`. To get the same samples as a stream, `levels` has to have all levels of the scene. Raises KeyError for a
+    level that is not among them.
     """
     if not path or not emitters:
         raise ValueError("a render needs a path and an emitter")
@@ -226,7 +229,7 @@ def render(
         for point, each in zip(path, fields, strict=True)
         if point.reverberation_sample is not None
     }
-    shares_tail = any(each.level.shared_tail for each in (field, *(levels or {}).values()))
+    shares_tail = any(each.kind.shares_tail for each in (field, *(levels or {}).values()))
     walk = _Walk(fields[0], direct_sound, emitters, path[0].pose, block_size, planned, ir_samples, shares_tail)
     blocks = -(-length // block_size)
     output = np.empty((walk.renderer.outputs, blocks, block_size), np.float32)
@@ -238,8 +241,10 @@ def render(
     return output.reshape(len(output), -1)[:, :length]
 
 
-def _fields(field: Field, path: Sequence[PathPoint], levels: Mapping[str, Field]) -> list[Field]:
-    """What gives the responses of each point; `field` before any names a level."""
+def _fields(
+    field: AcousticField, path: Sequence[PathPoint], levels: Mapping[str, AcousticField]
+) -> list[AcousticField]:
+    """The field that computes the responses of each point; it is `field` until a point names a level."""
     fields = []
     for point in path:
         field = field if point.level is None else levels[point.level]
@@ -248,7 +253,8 @@ def _fields(field: Field, path: Sequence[PathPoint], levels: Mapping[str, Field]
 
 
 def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output: Output) -> PlannedEffects | None:
-    """What to render: `all` effects (None), those that a `plan` calls for, or those named between commas and no other.
+    """The effects to render by the option `choice`: `all` (returns None), those that a `plan` calls for, or exactly
+    those named, separated by commas.
 
     Raises RequestError unknown_effect.
     """
@@ -264,11 +270,11 @@ def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output
 
 
 class _Walk:
-    """A renderer and what it is told, block by block, as a session would: plans and responses at once."""
+    """Drives a renderer block by block as a session does, but with plans and responses computed at once."""
 
     def __init__(
         self,
-        field: Field,
+        field: AcousticField,
         direct_sound: DirectSound,
         emitters: Sequence[RenderedEmitter],
         start: Pose,
@@ -277,7 +283,8 @@ class _Walk:
         ir_samples: int,
         shares_tail: bool,
     ) -> None:
-        """`ir_samples` at most has any response; `shares_tail` says whether emitters share a tail at any level."""
+        """`ir_samples` is the length of the longest response. `shares_tail` says whether any level has a shared
+        tail."""
         self.renderer = direct_sound.renderer(
             block_size=block_size,
             ir_samples=ir_samples,
@@ -288,7 +295,7 @@ class _Walk:
             has_head=planned is None or planned.shared.head,
         )
         self._field = field
-        self.renderer.share_tail(field.level.shared_tail)
+        self.renderer.share_tail(field.kind.shares_tail)
         self._direct_sound = direct_sound
         self._effects = ActiveEffects(
             self.renderer,
@@ -299,7 +306,7 @@ class _Walk:
         )
         self._listener = start
         self._has_begun = False
-        self._emitters: dict[str, Emitter] = {}
+        self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(direct_sound, self.renderer, self._emitters)
         for number, emitter in enumerate(emitters):
             name = str(number)
@@ -307,13 +314,15 @@ class _Walk:
             if emitter.directivity != OMNIDIRECTIONAL:
                 self.renderer.set_reverberation_gain(name, reverberation_gain(emitter.directivity))
             gain_db = float(amplitude_to_db(max(emitter.gain, _LEAST_GAIN)))
-            self._emitters[name] = Emitter(number, emitter.pose, emitter.directivity, gain_db=gain_db)
-            self._emitters[name].is_decided = planned is None
+            state = EmitterState(emitter.pose, emitter.directivity, gain_db=gain_db)
+            stage = Stage.DECIDED if planned is None else Stage.UNDECIDED
+            self._emitters[name] = StreamedEmitter(number, state, stage=stage)
             if planned is not None:
                 planned.follow_emitter(name, emitter.pose, 0.0)
 
-    def go_on(self, direct: Pose | None, reverberation: tuple[Pose, Field] | None) -> None:
-        """What is heard from the next block on: direct sound of this pose and responses of that, or as before."""
+    def go_on(self, direct: Pose | None, reverberation: tuple[Pose, AcousticField] | None) -> None:
+        """Set the state for the next block: the pose of the direct sound, and the pose and field of the responses. None
+        keeps the present one."""
         if direct is not None:
             self._move(direct)
         self._plan()
@@ -326,7 +335,7 @@ class _Walk:
             is_other, self._field = field is not self._field, field
             self._respond(pose)
             if is_other:
-                self._effects.share_tail(field.level.shared_tail, self._emitters)
+                self._effects.share_tail(field.kind.shares_tail, self._emitters)
         elif self._effects.planned is not None and self._has_begun:
             self._respond(self._listener)
 
@@ -344,31 +353,29 @@ class _Walk:
         planned = self._effects.planned
         if planned is None:
             return
-        request = planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+        states = {name: emitter.state for name, emitter in self._emitters.items()}
+        request = planned.take_request(self._listener, states, self._effects.clock_s)
         if request is not None:
             planned.accept(request.plan())
             self._effects.enforce(self._emitters)
-            self._effects.share_tail(self._field.level.shared_tail, self._emitters)
+            self._effects.share_tail(self._field.kind.shares_tail, self._emitters)
 
     def _respond(self, listener: Pose) -> None:
-        """Hand in the responses that are out of date."""
+        """Compute the outdated responses and give them to the renderer."""
         named = {
             name: emitter
             for name, emitter in self._emitters.items()
-            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_folding)
+            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_baking)
         }
         if self._effects.awaits_ears:
             self.renderer.set_channels(self._effects.channels)
         if not named:
             return
-        asked = [
-            EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity, effects=as_asked(emitter))
-            for emitter in named.values()
-        ]
+        asked = [as_asked(emitter) for emitter in named.values()]
         irs = composed_irs(self._field, self._direct_sound, listener, asked, self._effects.channels)
-        for (name, emitter), snapshot, ir in zip(named.items(), asked, irs, strict=True):
+        for (name, emitter), state, ir in zip(named.items(), asked, irs, strict=True):
             emitter.is_outdated = False
-            self._effects.accept_ir(name, emitter, self.renderer.prepare(ir), snapshot.effects, 0)
+            self._effects.accept_ir(name, emitter, self.renderer.prepare(ir), state.effects, 0)
 
 
 def _block_at(sample: int, block_size: int) -> int:

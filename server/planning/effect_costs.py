@@ -11,12 +11,12 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.directivity import CARDIOID, OMNIDIRECTIONAL, Directivity
+from server.acoustics.directivity import CARDIOID
 from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
@@ -25,7 +25,8 @@ from server.rendering.convolver import FloatArray
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.effect_flags import ALL_ON, EmitterEffects
+from server.responses.effect_flags import EmitterEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.full_response import kemar
 from server.responses.ir_request import composed_irs
 from server.responses.radiation import departure_gain_db
@@ -45,12 +46,6 @@ Rest = Callable[[], None]
 
 def _no_rest() -> None:
     pass
-
-
-class _Placed(NamedTuple):
-    pose: Pose
-    directivity: Directivity = OMNIDIRECTIONAL
-    effects: EmitterEffects = ALL_ON
 
 
 class _Lane:
@@ -232,7 +227,7 @@ def _finders(field: AcousticField) -> dict[str, float]:
     manifest = bundle.manifest
     listener, emitters = np.array(manifest.start.listener), np.tile(manifest.start.emitter, (_EMITTERS, 1))
     finder = SoundPathFinder(bundle.floor_plan, manifest.speed_of_sound)
-    beam, departure = _Placed(Pose((0.0, 0.0, 0.0)), CARDIOID), np.array([0.6, 0.8, 0.0])
+    beam, departure = EmitterState(Pose((0.0, 0.0, 0.0)), CARDIOID), np.array([0.6, 0.8, 0.0])
     computed: dict[str, Callable[[], object]] = {
         "occlusion": lambda: finder.find(listener, emitters),
         "directivity": lambda: [departure_gain_db(beam, departure) for _ in range(_EMITTERS)],
@@ -253,7 +248,7 @@ def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: R
             rest()
             meanwhile()
             started_s = time.thread_time()
-            composed_irs(field, direct, listener, [_Placed(Pose(start.emitter), effects=effects)])
+            composed_irs(field, direct, listener, [EmitterState(Pose(start.emitter), effects=effects)])
             of_it.append(1e6 * (time.thread_time() - started_s))
         if turn and sum(map(sum, times_us.values())) > 1e6 * _LONGEST_S:
             break

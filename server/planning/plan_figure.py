@@ -8,21 +8,32 @@ from server.planning.plan_query import Decided, PlanDocument
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _ON, _OFF, _ASKED = "#0b6e99", "#b9c2c8", "#d1495b"
 _LEAST_JND, _MOST_JND = 0.02, 150.0
 
 
 def draw(plan: PlanDocument, path: Path) -> None:
-    """Writes a PNG or SVG, by the suffix. Of several emitters the one is drawn for which an effect changes most.
+    """Writes a PNG or SVG, by the suffix.
 
     Raises NafirError where matplotlib, which the server does without, is not installed.
     """
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+        figure = figure_of(plan)
     except ImportError as exc:
         raise NafirError("figure: needs matplotlib; pip install matplotlib, or leave --figure out") from exc
+    try:
+        figure.savefig(path, dpi=110)
+    except (OSError, ValueError) as exc:
+        raise NafirError(f"{path}: {exc}") from exc
+
+
+def figure_of(plan: PlanDocument) -> "Figure":
+    """Of several emitters the one is drawn for which an effect changes most. Raises ImportError without matplotlib."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     rows = _rows(plan)
     figure = Figure(figsize=(10.5, 0.36 * len(rows) + 1.3), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
@@ -30,10 +41,7 @@ def draw(plan: PlanDocument, path: Path) -> None:
     figure.suptitle(f"What {plan.scene} calls for: {plan.cost_us:.1f} us per block on, {plan.saved_us:.1f} us saved")
     _draw_changes(change, rows)
     _draw_costs(cost, rows, plan)
-    try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as exc:
-        raise NafirError(f"{path}: {exc}") from exc
+    return figure
 
 
 def _rows(plan: PlanDocument) -> list[Decided]:

@@ -9,14 +9,13 @@ than their share of time. Clocks are seconds of sound.
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
-from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
 from server.planning.motion import Motion
 from server.planning.planner import Costs, make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Output, SceneAcoustics, Situation
 from server.responses.effect_flags import EmitterEffects, SharedEffects
+from server.responses.emitter_state import EmitterState
 from server.scene.effects import EffectName, Overrides
 from server.scene.plan import Decision, Plan
 
@@ -27,22 +26,6 @@ _LONGEST_S = 2.0
 """All are made well within the `HORIZON_S` that they look ahead."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
-
-
-class Placed(Protocol):
-    """An emitter, as far as a plan is concerned; `pattern` is how it radiates, heard or not."""
-
-    @property
-    def pose(self) -> Pose: ...
-
-    @property
-    def pattern(self) -> Directivity: ...
-
-    @property
-    def gain_db(self) -> float: ...
-
-    @property
-    def is_live(self) -> bool: ...
 
 
 @dataclass(frozen=True)
@@ -151,7 +134,7 @@ class PlannedEffects:
         """Have at least so much time pass from one plan to the next while poses change, as far as plans last."""
         self._interval_s = min(interval_s, _LONGEST_S)
 
-    def take_request(self, listener: Pose, emitters: Mapping[str, Placed], clock_s: float) -> PlanRequest | None:
+    def take_request(self, listener: Pose, emitters: Mapping[str, EmitterState], clock_s: float) -> PlanRequest | None:
         """None where an earlier one is unanswered, or nothing has changed."""
         if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
             return None
@@ -198,15 +181,14 @@ class PlannedEffects:
         turns = listener.turns(clock_s) and self.output == "headphones"
         return self._emitters[name].moves(clock_s) or listener.moves(clock_s) or turns
 
-    def _emitter(self, name: str, emitter: Placed, clock_s: float) -> Emitter:
+    def _emitter(self, name: str, state: EmitterState, clock_s: float) -> Emitter:
         motion = self._emitters[name]
         return Emitter(
-            emitter.pose,
-            emitter.pattern,
-            emitter.gain_db,
-            motion.speed_m_s(clock_s),
-            motion.turns(clock_s),
-            emitter.is_live,
+            state.pose,
+            state.pattern,
+            gain_db=state.gain_db,
+            speed_m_s=motion.speed_m_s(clock_s),
+            turns=motion.turns(clock_s),
         )
 
 

@@ -1,7 +1,7 @@
-"""Audio on the wire of /v1/stream, both ways: stereo blocks down, dry mono blocks of live emitters up.
+"""Audio on the wire of /v1/stream: rendered blocks from the server, dry mono blocks of live emitters from the client.
 
-Binary messages, little endian, full scale 1, at the scene's rate; the first byte is the kind. `f32` is IEEE 754 single,
-`s16` two's complement with 32767 for full scale.
+Both are binary messages, little endian, at the scene's sample rate, with full scale at 1. The first byte is the kind.
+`f32` is IEEE 754 single precision, `s16` is two's complement with 32767 for full scale.
 """
 
 from collections.abc import Mapping
@@ -21,14 +21,14 @@ _FULL_SCALE: Final = 32767
 
 
 def _encode(samples: FloatArray, encoding: Encoding) -> bytes:
-    """In C order."""
+    """Bytes of the samples in C order."""
     if encoding == "s16":
         return np.rint(np.clip(samples, -1, 1) * _FULL_SCALE).astype("<i2").tobytes()
     return samples.astype("<f4", copy=False).tobytes()
 
 
 def _decode(data: bytes, encoding: Encoding, offset: int) -> FloatArray:
-    """(n,) from `offset` to the end; raises ValueError for part of a sample."""
+    """(n,) samples from byte `offset` to the end. Raises ValueError if the last sample is incomplete."""
     if encoding == "s16":
         return np.frombuffer(data, "<i2", offset=offset).astype(np.float32) / np.float32(_FULL_SCALE)
     return np.frombuffer(data, "<f4", offset=offset).astype(np.float32)
@@ -36,13 +36,13 @@ def _decode(data: bytes, encoding: Encoding, offset: int) -> FloatArray:
 
 @dataclass(slots=True)
 class AudioBlock:
-    """One block of audio: `samples` (channel, frame).
+    """One block of rendered audio: `samples` (channel, frame).
 
-    `sequence` counts blocks sent and has no gaps; `sample_clock` is the clock of the first frame and jumps over blocks
-    the server skipped. `pose_id` is the newest pose that the direct paths of this block are on their way to;
-    `reverberation_pose_id` is the newest pose whose impulse responses are all in effect, and with `is_exchange` this
-    block fades to them. With `is_late` it left when a player that keeps `buffer_blocks` in hand had run out of them.
-    With `is_limited` it would have been too loud, and was turned down.
+    `sequence` counts the blocks sent and has no gaps. `sample_clock` is the clock of the first frame; it jumps over
+    blocks that the server skipped. `pose_id` is the newest pose that the direct sound of this block moves to.
+    `reverberation_pose_id` is the newest pose whose impulse responses are all in effect; with `is_exchange` this block
+    fades to them. With `is_late` the block was sent after a player with `buffer_blocks` in reserve had run out of
+    audio. With `is_limited` the block would have been too loud and was turned down.
     """
 
     sequence: int
@@ -57,33 +57,35 @@ class AudioBlock:
     type: ClassVar[str] = "audio_block"
     KIND: ClassVar[int] = 1
     FLAGS: ClassVar[Mapping[str, int]] = {"is_exchange": 1, "is_late": 2, "is_limited": 4}
+    # guard: the sample clock has 64 bits
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
         ("flags", "B", "sum of " + ", ".join(f"{bit} {name}" for name, bit in FLAGS.items())),
         ("channels", "H", "2, or 1 for a mono output"),
-        ("sequence", "I", "of blocks sent, from 0, without gaps, modulo 2^32"),
+        ("sequence", "I", "number of the block among those sent, from 0, without gaps, modulo 2^32"),
         ("sample_clock", "Q", "samples from the start of the stream to the first frame"),
         ("pose_id", "I", "newest pose of the direct sound"),
-        ("reverberation_pose_id", "I", "newest pose of what follows the direct sound"),
+        ("reverberation_pose_id", "I", "newest pose of the reflected field"),
         ("frames", "I", "samples of each channel"),
         then="the frames, channels interleaved (left, right), in the encoding of the hello",
     )
     HEADER_BYTES: ClassVar[int] = LAYOUT.size
 
     def serialize(self, encoding: Encoding) -> bytes:
-        """By LAYOUT."""
+        """The block as bytes: the header of LAYOUT, then the frames."""
         channels, frames = self.samples.shape
         flags = 0
         for name, bit in self.FLAGS.items():
             if getattr(self, name):
                 flags |= bit
         poses = self.pose_id, self.reverberation_pose_id
+        # guard: sequences wrap round
         header = self.LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
         return header + _encode(self.samples.T, encoding)
 
     @classmethod
     def parse(cls, data: bytes, encoding: Encoding) -> Self:
-        """Raises ValueError for anything but a whole audio block."""
+        """Read a block from bytes. Raises ValueError unless they are one whole audio block."""
         if len(data) < cls.HEADER_BYTES or data[0] != cls.KIND:
             raise ValueError("not an audio block")
         _, flags, channels, sequence, sample_clock, pose_id, reverberation_pose_id, frames = cls.LAYOUT.unpack_from(
@@ -104,7 +106,7 @@ class AudioBlock:
 
 @dataclass(frozen=True)
 class DryBlock:
-    """What a live emitter `id` makes next: `samples` (n,), n >= 1. `sequence` rises from block to block."""
+    """The next dry samples (n,), n >= 1, of the live emitter `id`. `sequence` rises from block to block."""
 
     id: str
     sequence: int
@@ -116,19 +118,25 @@ class DryBlock:
     _LONGEST_ID: ClassVar[int] = 256
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
-        ("encoding", "B", "of the frames: " + ", ".join(f"{code} {name}" for code, name in enumerate(_ENCODINGS))),
+        (
+            "encoding",
+            "B",
+            "encoding of the frames: " + ", ".join(f"{code} {name}" for code, name in enumerate(_ENCODINGS)),
+        ),
         ("id_bytes", "H", f"length of the id, at most {_LONGEST_ID}"),
-        ("sequence", "I", "greater than that of the emitter's block before"),
+        ("sequence", "I", "greater than that of the emitter's previous block"),
         ("frames", "I", "samples, at least 1"),
-        then="the id in UTF-8, filled up with zeros to a multiple of four bytes; the samples, of one channel",
+        then="the id in UTF-8, padded with zeros to a multiple of four bytes, and the samples of one channel",
     )
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """By LAYOUT. Raises RequestError malformed_block."""
+        """Read a block from bytes. Raises RequestError malformed_block."""
+        # guard: a dry block has a header
         if len(data) < cls.LAYOUT.size:
             raise _malformed(f"a dry block begins with {cls.LAYOUT.size} bytes, not {len(data)}", "header")
         _, encoding, id_bytes, sequence, frames = cls.LAYOUT.unpack_from(data)
+        # guard: a dry block is of a known encoding
         if encoding >= len(cls._ENCODINGS):
             raise _malformed(f"encoding {encoding} is neither 0 (f32) nor 1 (s16)", "encoding")
         if id_bytes > cls._LONGEST_ID:
@@ -137,9 +145,11 @@ class DryBlock:
         try:
             identifier = data[cls.LAYOUT.size : start].decode()
         except UnicodeDecodeError as exc:
+            # guard: an id is text
             raise _malformed("the id is not UTF-8", "id") from exc
         start += -id_bytes % 4
         size = frames * (2 if cls._ENCODINGS[encoding] == "s16" else 4)
+        # guard: a block is as long as it says
         if frames == 0 or len(data) != start + size:
             raise _malformed(f"{frames} frames are {size} bytes, not {max(0, len(data) - start)}", "frames")
         return cls(identifier, sequence, _decode(data, cls._ENCODINGS[encoding], start))

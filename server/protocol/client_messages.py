@@ -1,11 +1,11 @@
-"""Messages of the WebSocket stream at /v1/stream, protocol version 2.
+"""Messages from the client in the WebSocket stream at /v1/stream, protocol version 2.
 
-Control travels as JSON text, one object with a `type` per message; listener poses may travel as 36-byte binary messages
-instead, and audio always travels as binary blocks (`server.protocol.blocks`). Binary is little endian. Metres, radians,
-decibels, samples of the scene's rate.
+Control messages are JSON text, one object with a `type` each. Listener poses may also be 36-byte binary messages, and
+audio is always binary blocks (`server.protocol.blocks`). Binary is little endian. Units are metres, radians, decibels
+and samples at the scene's rate.
 
-Every type here parses and serialises itself, so the tests, the documentation and both ends of the wire read one
-definition. What a client sends is validated here, once; a `RequestError` carries the code that goes back to it.
+Every type here parses and serialises itself, so that the tests, the documentation and both ends of the stream share one
+definition. Client messages are validated here and nowhere else. A `RequestError` carries the code for the client.
 """
 
 import json
@@ -30,20 +30,24 @@ from server.protocol.message import WHOLE, Integer, Message, Position
 
 PROTOCOL: Final = 2
 AUTO = "auto"
-"""The level that leaves the choice to the server."""
+"""Name of a level in messages; it lets the server choose the quality level."""
 
+# guard: a block is as long as blocks may be
 BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
+# guard: a pose id ends where its number does
 PoseId = Annotated[int, Field(ge=0, lt=2**32), WHOLE]
 Orientation = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 LevelName = Annotated[str, Field(max_length=256)]
+# guard: a gain in a message is one that can be heard
 GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
 
 _POSE_FIELDS = frozenset({"position", "orientation", "yaw", "listener"})
 
 
 class _Directed(Message):
-    """A position and where front is: a quaternion, or a yaw where up is up; with neither, front is along +x."""
+    """A position with an orientation, given as a quaternion or as a yaw about the vertical axis. With neither, the
+    front points along +x."""
 
     position: Position
     orientation: Orientation | None = None
@@ -61,7 +65,7 @@ class _Directed(Message):
 
     @property
     def has_front(self) -> bool:
-        """Whether the message says where front is."""
+        """Whether the message has an orientation or a yaw."""
         return self.orientation is not None or self.yaw is not None
 
     @cached_property
@@ -72,16 +76,16 @@ class _Directed(Message):
 
 
 class ListenerStart(_Directed):
-    """Where the listener stands when the stream begins: pose 0."""
+    """Pose of the listener when the stream begins: pose 0."""
 
 
 class Hello(Message):
-    """The first message: asks for a scene, and how to hear it. `sample_rate` may be left out; given, it has to be the
-    scene's. `buffer_blocks` is how many blocks ahead of real time the server runs: more survives a worse network, less
-    is heard sooner. `hrtf` names the head to hear through, one of GET /v1/hrtfs. `level` names a quality level of the
-    scene, or leaves it to the server (auto): the best that its host computes in time, and a cheaper one under load.
-    `output` is what the sound is heard from: a mono loudspeaker gets blocks of one channel. `effects` switches some on
-    or off whatever the plan would decide."""
+    """The first message asks for a scene and says how it is to be rendered. `sample_rate` may be left out; if given, it
+    has to be the scene's. `buffer_blocks` is how many blocks ahead of real time the server sends: a higher number copes
+    with a worse network, a lower one has less latency. `hrtf` names a head, one of GET /v1/hrtfs. `level` names a
+    quality level of the scene; with `auto` the server takes the best one that its host computes in time, and a cheaper
+    one under load. `output` says what plays the sound: for a mono loudspeaker, blocks have one channel. `effects`
+    switches effects on or off, whatever the plan would decide."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer
@@ -94,13 +98,14 @@ class Hello(Message):
     level: LevelName = AUTO
     output: Output = "headphones"
     effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
+    # guard: a buffer has blocks, and not too many
     buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
 
 
 class DirectivityPattern(Message):
-    """How loud an emitter is in each direction, as seen by itself: one of the cardioid family, narrowed by `order`, or
-    measured: `gains_db`, seven octave bands from 125 Hz of one gain for each of `angles_deg`, which rise from 0 (its
-    front) to 180."""
+    """How loud an emitter is in each direction, relative to its front. A pattern of the cardioid family is narrowed by
+    `order`. A measured pattern has `gains_db`: seven octave bands from 125 Hz, each with one gain for each of
+    `angles_deg`, which rise from 0 (front) to 180 (rear)."""
 
     pattern: Literal[
         "omnidirectional", "subcardioid", "cardioid", "supercardioid", "hypercardioid", "figure_of_eight", "measured"
@@ -131,9 +136,9 @@ class DirectivityPattern(Message):
 
 
 class AddEmitter(_Directed):
-    """An emitter that plays a clip, or, with `live`, what the client sends for it in dry blocks.
+    """Adds an emitter, which plays a clip or, with `live`, the dry blocks that the client sends for it.
 
-    Its front matters to its directivity only; without one it is equally loud all round.
+    Its orientation affects only its directivity. Without a directivity it is equally loud in all directions.
     """
 
     type: Literal["add_emitter"] = "add_emitter"
@@ -152,7 +157,7 @@ class AddEmitter(_Directed):
 
 
 class MoveEmitter(_Directed):
-    """Where an emitter is from now on; without orientation and yaw its front stays where it was."""
+    """Moves an emitter. Without `orientation` and `yaw` its front keeps its direction."""
 
     type: Literal["move_emitter"] = "move_emitter"
     id: EmitterId
@@ -160,7 +165,7 @@ class MoveEmitter(_Directed):
 
 
 class SetGain(Message):
-    """How loud an emitter is from now on, direct sound and reverberation alike."""
+    """Sets the gain of an emitter, for direct sound and reflected field alike."""
 
     type: Literal["set_gain"] = "set_gain"
     id: EmitterId
@@ -168,15 +173,15 @@ class SetGain(Message):
 
 
 class SetLevel(Message):
-    """The quality level to hear from now on, or auto; a level changed says when."""
+    """Chooses a quality level, or auto. A `level_changed` says from when it is heard."""
 
     type: Literal["set_level"] = "set_level"
     level: LevelName
 
 
 class SetEffects(Message):
-    """Effects to switch on or off whatever the plan of effects would decide, or, with null, to leave to it; and what
-    the sound is heard from, from now on. A plan changed says what came of it."""
+    """Switches effects on or off, whatever the plan would decide; null leaves an effect to the plan. Also sets what
+    plays the sound. A `plan_changed` says which effects are on then."""
 
     type: Literal["set_effects"] = "set_effects"
     effects: dict[str, bool | None] = Field(default_factory=dict, max_length=32)
@@ -184,14 +189,14 @@ class SetEffects(Message):
 
 
 class RemoveEmitter(Message):
-    """An emitter falls silent and its id is free again."""
+    """Removes an emitter. Its id may be used again."""
 
     type: Literal["remove_emitter"] = "remove_emitter"
     id: EmitterId
 
 
 class ListenerPose(_Directed):
-    """Newest pose of the listener, as text or in 36 bytes."""
+    """The newest pose of the listener, as text or as 36 bytes."""
 
     type: Literal["listener"] = "listener"
     pose_id: PoseId
@@ -199,26 +204,29 @@ class ListenerPose(_Directed):
     KIND: ClassVar[int] = 2
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
-        ("zeros", "3x", "fill the header up"),
-        ("pose_id", "I", "greater than any before, of the listener and of emitters"),
+        ("zeros", "3x", "padding"),
+        ("pose_id", "I", "greater than all earlier ones, of the listener and of emitters"),
         ("position", "3f", "x, y, z in metres"),
         ("orientation", "4f", "quaternion x, y, z, w; the identity looks along +x"),
     )
 
     @classmethod
     def parse_binary(cls, data: bytes) -> Self:
-        """By LAYOUT.
+        """Read a pose from bytes.
 
         Raises RequestError: unknown_message for another kind, malformed_pose for a wrong length or impossible numbers.
         """
+        # guard: an empty message has no kind
         if not data or data[0] != cls.KIND:
             raise RequestError("unknown_message", f"binary message of unknown kind {data[0] if data else 'none'}")
+        # guard: a binary pose is as long as it is
         if len(data) != cls.LAYOUT.size:
             raise RequestError("malformed_pose", f"a binary pose has {cls.LAYOUT.size} bytes, not {len(data)}")
         _, pose_id, *numbers = cls.LAYOUT.unpack(data)
         try:
             return cls(pose_id=pose_id, position=tuple(numbers[:3]), orientation=tuple(numbers[3:]))
         except ValidationError as exc:
+            # guard: a binary pose that is none is refused by code
             raise _refusal(exc, is_tagged=False) from exc
 
     def serialize_binary(self) -> bytes:
@@ -227,17 +235,17 @@ class ListenerPose(_Directed):
 
 
 class Acknowledge(Message):
-    """Every block up to and including `sequence` has arrived."""
+    """Says that every block up to and including `sequence` has arrived."""
 
     type: Literal["acknowledge"] = "acknowledge"
     sequence: Annotated[int, Field(ge=0, lt=2**32), WHOLE]
 
 
 class Ping(Message):
-    """Asks for a pong at once, to measure the way there and back."""
+    """Asks for a pong at once, to measure the round-trip time."""
 
     type: Literal["ping"] = "ping"
-    id: Annotated[int, Field(ge=0, lt=2**53), WHOLE]  # what JavaScript counts exactly
+    id: Annotated[int, Field(ge=0, lt=2**53), WHOLE]  # JavaScript counts exactly up to here
 
 
 TextMessage = (
@@ -260,12 +268,11 @@ _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(dis
 
 
 def parse_client_message(data: str | bytes) -> ClientMessage:
-    """One message as it came off the socket: text or binary.
+    """Read one message as it came from the socket, text or binary.
 
-    Of a hello the version is read before all else, since other versions have other fields. A key that is there twice is
-    refused, in whichever object. Raises RequestError with
-    code unsupported_protocol, malformed_message, unknown_message, malformed_pose, malformed_directivity or
-    malformed_block, naming the field at fault.
+    The version in a hello is read first, since other versions have other fields. A duplicate key in any object is
+    refused. Raises RequestError, which names the field at fault, with code unsupported_protocol, malformed_message,
+    unknown_message, malformed_pose, malformed_directivity or malformed_block.
     """
     if isinstance(data, bytes):
         return DryBlock.parse(data) if data[:1] == bytes([DryBlock.KIND]) else ListenerPose.parse_binary(data)
@@ -273,9 +280,10 @@ def parse_client_message(data: str | bytes) -> ClientMessage:
         message = _CLIENT.validate_json(data)
     except ValidationError as exc:
         _require_version(data)
+        # guard: a message that is none is refused by code
         raise _refusal(exc, is_tagged=True) from exc
-    # Every key has a colon: where there are no more of those than fields, no key is there twice. Nearly all messages
-    # are known by that, at a hundredth of what reading them once more would take.
+    # Every key has a colon, so a message with no more colons than fields has no duplicate key. This settles nearly all
+    # messages at a hundredth of the cost of parsing them again.
     if data.count(":") > len(message.model_fields_set):
         _require_distinct_keys(data)
     return message
@@ -289,17 +297,17 @@ def _require_distinct_keys(data: str) -> None:
 
 
 def _require_version(data: str) -> None:
-    """Raises RequestError for a hello of another version, or of none."""
+    """Raises RequestError for a hello of another version, or without one."""
     try:
-        # Digits without end are no number that Python makes.
-        said = json.loads(data, parse_int=lambda digits: int(digits) if len(digits) < 20 else math.inf)
+        # Python refuses to convert very long integers.
+        hello = json.loads(data, parse_int=lambda digits: int(digits) if len(digits) < 20 else math.inf)
     except (ValueError, RecursionError):
         return
-    if not isinstance(said, dict) or said.get("type") != "hello":
+    if not isinstance(hello, dict) or hello.get("type") != "hello":
         return
-    version = said.get("protocol")
+    version = hello.get("protocol")
     if isinstance(version, bool) or not isinstance(version, int | float) or version % 1 > 0:
-        problem = f"protocol: is to be the version, a whole number; this server speaks {PROTOCOL}"
+        problem = f"protocol: has to be the version, a whole number; this server speaks {PROTOCOL}"
         raise RequestError("malformed_message", problem, field="protocol")
     if version != PROTOCOL:
         problem = f"this server speaks protocol {PROTOCOL}, not {version:g}"
@@ -307,12 +315,13 @@ def _require_version(data: str) -> None:
 
 
 def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
-    """`is_tagged`: the places pydantic names begin with the message's type."""
+    """The refusal for a validation error. With `is_tagged`, pydantic's locations begin with the message's type."""
     first: Mapping[str, Any] = error.errors(include_url=False, include_input=False)[0]
     kind, place = first["type"], [part for part in first["loc"][is_tagged:] if isinstance(part, str)]
     field = ".".join(place) or None
     if kind in {"union_tag_invalid", "union_tag_not_found"}:
         code, field = "unknown_message", "type"
+    # guard: a pose that is impossible is refused by code
     elif kind == "malformed_pose" or (place and place[0] in _POSE_FIELDS):
         code = "malformed_pose"
     elif place and place[0] == "directivity":

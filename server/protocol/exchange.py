@@ -1,4 +1,4 @@
-"""A conversation over /v1/stream, as its documentation tells it: every message there is, at least once."""
+"""An example exchange over /v1/stream for the documentation. It has every kind of message at least once."""
 
 from typing import Any, Final, NamedTuple, get_args
 
@@ -42,7 +42,7 @@ from server.scene.manifest import AcceptedLaw, Bounds, QualityLevel
 
 
 class Step(NamedTuple):
-    """With `is_binary` a pose travels as bytes, as blocks always do."""
+    """One message of the exchange and its meaning. `is_binary` marks a pose that is sent as bytes."""
 
     meaning: str
     message: ClientMessage | ServerMessage | AudioBlock
@@ -54,20 +54,20 @@ class Step(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of this kind of message."""
+        """Name of the kind of message, as in the AsyncAPI document."""
         return f"{self.message.type}_binary" if self.is_binary else self.message.type
 
     @property
     def payload(self) -> dict[str, Any] | str:
-        """As on the wire, but for what a client may leave out, and bytes in hexadecimal digits."""
+        """The message as it is sent. Fields that a client may leave out are left out; bytes are hexadecimal digits."""
         match self.message:
             case AudioBlock() | DryBlock() as block:
                 return block.serialize("f32").hex()
             case ListenerPose() as pose if self.is_binary:
                 return pose.serialize_binary().hex()
             case message:
-                said = message.model_dump(mode="json", exclude_unset=self.is_of_client)
-                return {"type": message.type, **said}
+                fields = message.model_dump(mode="json", exclude_unset=self.is_of_client)
+                return {"type": message.type, **fields}
 
 
 _STUDIO: Final = SceneDescription(
@@ -116,7 +116,7 @@ EXCHANGE: Final[tuple[Step, ...]] = (
         ),
     ),
     Step(
-        "has a recording play",
+        "adds an emitter that plays a clip",
         AddEmitter(
             id="talker",
             clip="woman-reading",
@@ -160,19 +160,17 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     ),
     Step("blocks 0 to 32 have arrived", Acknowledge(sequence=32)),
     Step("puts a microphone into the scene", AddEmitter(id="me", live=True, position=(2.0, 2.0, 1.5))),
-    Step("what it hears (here two frames)", DryBlock("me", 0, np.array([0.5, -0.5], np.float32))),
-    Step("it is carried about", MoveEmitter(id="me", position=(2.5, 2.0, 1.5), pose_id=3)),
+    Step("sends what the microphone hears (here two frames)", DryBlock("me", 0, np.array([0.5, -0.5], np.float32))),
+    Step("moves the microphone", MoveEmitter(id="me", position=(2.5, 2.0, 1.5), pose_id=3)),
     Step("turns it down", SetGain(id="me", gain_db=-12.0)),
+    Step("switches air absorption on, whatever the plan says", SetEffects(effects={"air_absorption": True})),
+    Step("chooses a cheaper quality level", SetLevel(level="fast")),
     Step(
-        "wants the air after all, and of reflections what the plan says", SetEffects(effects={"air_absorption": True})
-    ),
-    Step("takes a cheaper quality", SetLevel(level="fast")),
-    Step(
-        "it is heard from here on",
+        "says from when that level is heard",
         LevelChanged(level="fast", reason="chosen", ir_rate_hz=20.0, shared_tail=False, sample_clock=47_104),
     ),
     Step(
-        "tells how the stream does, once a second",
+        "reports statistics, once a second",
         Status(
             sample_clock=48_128,
             blocks_sent=188,
@@ -192,11 +190,11 @@ EXCHANGE: Final[tuple[Step, ...]] = (
             live=(LiveStatus(id="me", samples_queued=512, samples_dropped=0, samples_gated=0, underruns=0),),
         ),
     ),
-    Step("asks how long the way is", Ping(id=7)),
+    Step("measures the round-trip time", Ping(id=7)),
     Step("answers at once", Pong(id=7)),
     Step("leaves the room", ListenerPose(pose_id=4, position=(99.0, 2.0, 1.6), yaw=0.0)),
     Step(
-        "is refused; the stream goes on",
+        "refuses that; the stream goes on",
         Error(
             code="position_out_of_bounds",
             message="position (99, 2, 1.6) is outside [0.3, 0.3, 0.5] to [6.7, 3.7, 2.3] m of scene studio",

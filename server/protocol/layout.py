@@ -1,4 +1,4 @@
-"""Headers of binary messages: what packs and reads them is also what they are described by."""
+"""Headers of binary messages. One definition packs them, reads them and describes them in the documentation."""
 
 import struct
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ _TYPES: Final = {"B": "u8", "H": "u16", "I": "u32", "Q": "u64", "f": "f32", "x":
 
 
 class Field(NamedTuple):
-    """`length` numbers of `type`, such as u32, from byte `offset` on."""
+    """A header field of `length` numbers of `type`, such as u32, at byte `offset`."""
 
     name: str
     offset: int
@@ -22,9 +22,9 @@ class Field(NamedTuple):
 
 
 class Layout:
-    """A header, little endian and without gaps: every field by its name, its `struct` code (I, 3f) and its meaning.
+    """A header, little endian and without gaps. Each field has a name, a `struct` code (I, 3f) and a meaning.
 
-    `then` says what follows the header.
+    `then` describes the bytes after the header.
     """
 
     def __init__(self, *fields: tuple[str, str, str], then: str = "") -> None:
@@ -42,7 +42,7 @@ class Layout:
             offset += struct.calcsize(f"<{code}")
 
     def to_markdown(self) -> str:
-        """A table, and what follows."""
+        """A table of the fields, and a sentence about the bytes after the header."""
         rows = [f"| {each.offset} | {each.type_name} | `{each.name}` | {each.meaning} |" for each in self.fields]
         table = "\n".join(["| byte | type | field | meaning |", "| --- | --- | --- | --- |", *rows])
         return f"{table}\n\nThen, from byte {self.size} on, {self.then}." if self.then else table

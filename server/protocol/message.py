@@ -1,4 +1,4 @@
-"""What messages of a stream have in common, whichever way they go."""
+"""The base class and the common types of all messages of a stream."""
 
 from typing import Annotated, Any
 
@@ -10,14 +10,16 @@ def _read_whole(value: Any) -> Any:
 
 
 WHOLE = BeforeValidator(_read_whole)
-"""Takes 1.0 for the integer that JSON Schema says it is: encoders of Lua and C# write integers so. It has to come last,
-after what else is asked of a number, or the schema does not tell the rest."""
+"""Accepts 1.0 as an integer, as JSON Schema does; JSON encoders of Lua and C# write integers so. It has to come after
+the other annotations of a number, or the schema leaves those out."""
 Integer = Annotated[int, WHOLE]
 Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class Message(BaseModel):
-    # Unknown fields are refused: a misspelt "orientaton" would otherwise be heard as a head that never turns.
+    # Unknown fields are refused. With a misspelt "orientaton" the head would otherwise never turn.
+    # guard: numbers are not read from anything else
+    # guard: fields that are unknown are refused
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     def serialize(self) -> str:

@@ -1,4 +1,4 @@
-"""Messages from the server in a stream at /v1/stream (`server.protocol.client_messages`)."""
+"""Messages from the server in a stream at /v1/stream."""
 
 from typing import Annotated, Literal, Self
 
@@ -14,7 +14,7 @@ from server.scene.manifest import AcceptedLaw, Bounds, QualityLevel
 from server.scene.plan import Plan
 
 LevelReason = Literal["chosen", "load", "recovered"]
-"""Why a stream has another quality level: its client chose it, or the server's load rose or fell."""
+"""Why the quality level changed: the client chose it, the server's load rose, or the load fell again."""
 
 
 class Place(Message):
@@ -23,11 +23,11 @@ class Place(Message):
 
 
 class SceneDescription(Message):
-    """What a client needs to know of a scene; `corners` is the floor plan, counter-clockwise, or where no walls are
-    known the outline of the bounds. Of `channels` a scene has two ears or one microphone; a stream always has two.
+    """Description of a scene. `corners` is the floor plan, counter-clockwise, or the outline of the bounds if the walls
+    are unknown. `channels` are those of the scene's responses: two ears or one microphone.
 
-    `listener` and `emitter` are where to put a visitor and what he hears first. `accepted_laws` are those of
-    `nafir check` that the scene's fields break, with the reason why it is offered all the same.
+    `listener` and `emitter` are the places where a visit begins. `accepted_laws` are the laws of `nafir check` that the
+    scene's fields break, each with the reason why the scene is offered all the same.
     """
 
     id: str
@@ -50,9 +50,9 @@ class SceneDescription(Message):
 
 
 class Welcome(Message):
-    """Answer to a good hello. `window` is how many blocks may be unacknowledged before the server skips ahead. `level`
-    is the quality level heard at first. `max_emitters` is how many emitters the stream may have at once; servers up to
-    0.1 do not say."""
+    """The answer to a valid hello. `window` is how many blocks may be unacknowledged before the server skips blocks.
+    `level` is the first quality level. `max_emitters` is how many emitters the stream may have at once; servers up to
+    0.1 do not send it."""
 
     type: Literal["welcome"] = "welcome"
     protocol: Literal[2] = PROTOCOL
@@ -71,8 +71,8 @@ class Welcome(Message):
 
 
 class EmitterAdded(Message):
-    """The emitter's first IR is in effect: its clip begins at `sample_clock`, in the block that follows, and so does
-    what was sent live, once enough of it waits."""
+    """The emitter's first impulse response is in effect. Its clip begins at `sample_clock`, in the next block. A live
+    emitter begins then too, once enough of its samples wait."""
 
     type: Literal["emitter_added"] = "emitter_added"
     id: str
@@ -80,18 +80,19 @@ class EmitterAdded(Message):
 
 
 class EmitterRemoved(Message):
-    """The emitter is gone, and its id free."""
+    """The emitter was removed, and its id is free."""
 
     type: Literal["emitter_removed"] = "emitter_removed"
     id: str
 
 
 class LevelChanged(Message):
-    """From `sample_clock` on another quality is heard: impulse responses of `level`, at most `ir_rate_hz` a second for
-    each emitter or, where that is null, one with every pose; with `shared_tail` all emitters share one late tail.
+    """The quality changes at `sample_clock`. Impulse responses are of `level` from then on. Each emitter gets at most
+    `ir_rate_hz` of them a second or, if that is null, one for every pose. With `shared_tail` all emitters share one
+    late reverberation.
 
-    `reason` is chosen (by the client), load (there is too much to do for what was heard before) or recovered (there no
-    longer is).
+    `reason` is `chosen` (by the client), `load` (the server had too much to do for the better quality) or `recovered`
+    (it no longer has).
     """
 
     type: Literal["level_changed"] = "level_changed"
@@ -103,9 +104,9 @@ class LevelChanged(Message):
 
 
 class EffectDecision(Message):
-    """One effect on or off, of an emitter or, with null, of all that is heard. `change_jnd` is by how many
-    just-noticeable differences the `parameter` that changes most would change without it; `cost_us` per block and
-    `memory_bytes` are what it costs, or saves, null where that was not measured."""
+    """Whether one effect is on, for one emitter or, with null, for the whole stream. `change_jnd` is the predicted
+    change without the effect, in just-noticeable differences, of the `parameter` that would change most. `cost_us` per
+    block and `memory_bytes` are what the effect costs or saves; null if that was not measured."""
 
     name: str
     emitter: str | None
@@ -119,7 +120,7 @@ class EffectDecision(Message):
 
 
 class PlanChanged(Message):
-    """From `sample_clock` on these effects are heard, or their change is under way. Microseconds per block."""
+    """These effects are on from `sample_clock`, or are being faded in or out. Costs are microseconds per block."""
 
     type: Literal["plan_changed"] = "plan_changed"
     decisions: tuple[EffectDecision, ...]
@@ -129,7 +130,7 @@ class PlanChanged(Message):
 
     @classmethod
     def of(cls, plan: Plan, sample_clock: int) -> "PlanChanged":
-        # Not validated: a plan of many emitters is long, and this is made on the audio thread.
+        # Not validated: a plan of many emitters is long, and this runs on the audio thread.
         decisions = tuple(
             EffectDecision.model_construct(**{**vars(each), "change_jnd": round(each.change_jnd, 3)})
             for each in plan.decisions
@@ -140,7 +141,7 @@ class PlanChanged(Message):
 
 
 class Durations(Message):
-    """Milliseconds that a half, 99 % and 99.9 % did not exceed; null before the first."""
+    """Quantiles of durations in milliseconds: the median, 99 % and 99.9 %. Null before the first duration."""
 
     p50: float | None
     p99: float | None
@@ -156,8 +157,8 @@ class Durations(Message):
 
 
 class LiveStatus(Message):
-    """What became of a live emitter's samples: waiting, dropped because too many waited, silenced because they were no
-    audio; and how often there were too few."""
+    """Counts of a live emitter's samples: `samples_queued` wait, `samples_dropped` came while too many waited, and
+    `samples_gated` were not audio and became silence. `underruns` counts how often too few waited."""
 
     id: str
     samples_queued: int
@@ -167,14 +168,14 @@ class LiveStatus(Message):
 
 
 class Status(Message):
-    """How the stream does, once a second. Counts and durations run from the start of the stream.
+    """Statistics of the stream, sent once a second. Counts and durations run from the start of the stream.
 
-    `buffer_ms` is how far ahead of real time it is. `render_ms` is what a block costs; of blocks rendered together with
-    other streams', its share. `lateness_ms` is how long after it was due a block was ready to be sent: what it cost,
-    what was rendered with it, and how late the audio thread woke. `pose_ms` and `reverberation_ms` run from the arrival
-    of a pose to the first block, ready to be sent, whose direct sound and whose reverberation has it. `level` is the
-    quality level heard, and `ir_rate_hz` how many impulse responses an emitter gets per second at most.
-    `blocks_limited` would have been too loud, and were turned down.
+    `buffer_ms` is how far the stream is ahead of real time. `render_ms` is the time to render a block, or its share of
+    the time if several streams were rendered together. `lateness_ms` is the time from when a block was due until it
+    could be sent; it includes rendering and the late waking of the audio thread. `pose_ms` and `reverberation_ms` run
+    from the arrival of a pose until the first block could be sent whose direct sound, or reflected field, is of that
+    pose. `level` is the present quality level, and `ir_rate_hz` the most impulse responses an emitter gets per second.
+    `blocks_limited` counts blocks that would have been too loud and were turned down.
     """
 
     type: Literal["status"] = "status"
@@ -197,14 +198,14 @@ class Status(Message):
 
 
 class Pong(Message):
-    """Answer to the ping of this id."""
+    """The answer to the ping with this id."""
 
     type: Literal["pong"] = "pong"
     id: int
 
 
 class Error(Message):
-    """What was wrong with a message; the stream goes on unless it was the hello."""
+    """Says what was wrong with a message. The stream goes on, unless the message was the hello."""
 
     type: Literal["error"] = "error"
     code: str
@@ -221,14 +222,14 @@ _SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field
 
 
 class UnknownMessage(Message):
-    """What a newer server says, and a client of this version ignores."""
+    """A message type of a newer server, which a client of this version ignores."""
 
     type: str
 
 
 def parse_server_message(data: str) -> ServerMessage | UnknownMessage:
-    """A text message as a client receives it, which ignores fields that it does not know. Raises
-    pydantic.ValidationError for what no server says."""
+    """Read a text message as a client does: unknown fields are ignored. Raises pydantic.ValidationError for an invalid
+    message."""
     try:
         return _SERVER.validate_json(data, extra="ignore")
     except ValidationError as exc:

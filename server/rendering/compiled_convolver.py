@@ -3,15 +3,15 @@
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels import right_angle
+from server.kernels import odd_fft
 from server.kernels.cache_lines import zeros_on_lines
 from server.kernels.simd import LANES
 from server.rendering.convolver_kernel import process_block
 from server.rendering.convolver_records import CONVOLVER, PROGRESS, STAGE
 from server.rendering.fade import raised_cosine
+from server.rendering.multiply_accumulate import COLUMNS, GROUP, spectrum_stride
 from server.rendering.packed_filter import PackedFilter, address, pack
 from server.rendering.partitions import Partitioning, Stage
-from server.rendering.products import COLUMNS, GROUP, spectrum_stride
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -145,7 +145,7 @@ class _StageArrays:
     def __init__(self, stage: Stage, sources: int, channels: int) -> None:
         self.stage = stage
         self.sources = sources
-        self.tables = right_angle.tables(stage.size)
+        self.tables = odd_fft.tables(stage.size)
         self.fade_out = raised_cosine(stage.size)[::-1].copy()
         tiles, self.slots = stage.size // LANES, stage.partitions
         self.ring = zeros_on_lines(sources, self.slots, int(spectrum_stride(stage.size)))

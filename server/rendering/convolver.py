@@ -9,8 +9,8 @@ wrap around in time (a click) and comb. Only partitions that differ are computed
 begins with the next block; later stages exchange one source in TURNS per window, so later parts of the IR follow within
 TURNS + 1 partitions of their stage, and of several IRs that arrive meanwhile only the newest is heard there.
 
-Compiled where numba is installed (`server.rendering.convolver_kernel`), NumPy elsewhere
-(`server.rendering.numpy_convolver`): the same to -120 dB.
+Blocks of a power of two are convolved by compiled code (`server.rendering.convolver_kernel`), others by NumPy
+(`server.rendering.any_size_convolver`): the same to -120 dB.
 """
 
 from collections import deque
@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels.compiled import HAS_NUMBA
 from server.rendering.ingest import LOUDEST
 from server.rendering.partitions import TURNS, Partitioning
 
@@ -35,8 +34,8 @@ if TYPE_CHECKING:
 class PartitionedIr:
     """An impulse response made ready for convolvers of one layout; immutable, so threads may share it."""
 
-    layout: tuple[Partitioning, int, bool]
-    """Partitioning, channels, whether compiled."""
+    layout: tuple[Partitioning, int]
+    """Partitioning, channels."""
     filters: Any
     tail_energy: float
     """Sum of squares of the samples that a shared tail stands for, over both channels."""
@@ -84,10 +83,8 @@ class Convolver:
         ir_samples: int,
         shared_tail: bool = False,
         switches_tail: bool = False,
-        is_compiled: bool = HAS_NUMBA,
         any_size: bool = False,
     ) -> None:
-        is_compiled = is_compiled and not any_size
         if sources < 1 or channels not in {1, 2}:
             raise ValueError("a convolver has at least 1 source, and 1 or 2 channels")
         self._partitioning = Partitioning(block_size, ir_samples, any_size)
@@ -101,7 +98,7 @@ class Convolver:
         self.channels = channels
         self.block_size = block_size
         self.ir_samples = ir_samples
-        kind = _compiled_convolver() if is_compiled else _numpy_convolver()
+        kind = _any_size_convolver() if any_size else _compiled_convolver()
         self._engine: Any = kind(
             self._partitioning,
             sources,
@@ -111,7 +108,7 @@ class Convolver:
         )
         # What a stage that is not to be heard convolves with: no partition of it but in the head.
         self._silence = self._engine.prepare(np.zeros((channels, 1), np.float32)) if self._switches_tail else None
-        self._layout = self._partitioning, channels, is_compiled
+        self._layout = self._partitioning, channels
         self._irs: list[PartitionedIr | None] = [None] * sources
         self._tail_energy = np.zeros(sources)
         self._retired: deque[tuple[int, PartitionedIr]] = deque()
@@ -134,12 +131,14 @@ class Convolver:
         Raises ValueError for another shape, and for a sample that is not finite, or so large that a product might not
         be: either would spoil every output to come.
         """
+        # guard: a response has samples
         if ir.ndim != 2 or ir.shape[0] != self.channels or not 1 <= ir.shape[1] <= self.ir_samples:
             raise ValueError(f"expected an IR ({self.channels}, 1..{self.ir_samples}), got shape {ir.shape}")
         with np.errstate(over="ignore"):  # seen below
             samples = ir.astype(np.float32, copy=False)
         head_energy, tail_energy = _energy(samples[:, : self._tail_start]), _energy(samples[:, self._tail_start :])
         # Energy says it at once of nearly all; neither is true of what is no number.
+        # guard: a response is sound
         if not (head_energy + tail_energy <= LOUDEST or -LOUDEST <= ir.min() <= ir.max() <= LOUDEST):
             raise ValueError(f"impulse response has samples that are not finite, or beyond {LOUDEST:g}")
         if like is not None and like.layout != self._layout:
@@ -277,7 +276,7 @@ def _compiled_convolver() -> Any:
     return CompiledConvolver
 
 
-def _numpy_convolver() -> Any:
-    from server.rendering.numpy_convolver import NumpyConvolver
+def _any_size_convolver() -> Any:
+    from server.rendering.any_size_convolver import AnySizeConvolver
 
-    return NumpyConvolver
+    return AnySizeConvolver

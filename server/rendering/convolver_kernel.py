@@ -6,9 +6,9 @@ complex numbers as eight real parts then eight imaginary ones, and what is read 
 
     filter of a stage   near: (partition, tile, channel, part, 8), the first NEAR partitions;
                         far: (tile, partition, channel, part, 8), the others behind them
-    ring of a stage     (source, slot, tile, part, 8)          spectra of windows, `products.spectrum_stride`, the
-    newest first
-    mix of a stage      (tile, channel, column, part, 8)       columns as in `server.rendering.products`
+    ring of a stage     (source, slot, tile, part, 8)          spectra of windows, the newest first,
+                                                               `multiply_accumulate.spectrum_stride` apart
+    mix of a stage      (tile, channel, column, part, 8)       columns as in `server.rendering.multiply_accumulate`
 
 Memory is what limits it. So sources take turns, one in TURNS windows, and on its turn a source is multiplied for all
 of them, its filter read once: the window at work gets all partitions, the next one all but the first, whose input is
@@ -26,11 +26,20 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
-from server.kernels import right_angle
+from server.kernels import odd_fft
 from server.kernels.compiled import compiled
 from server.kernels.simd import add, broadcast, load, load_int, multiply_add, pointer, store
-from server.rendering import products
 from server.rendering.convolver_records import CONVOLVER, STAGE
+from server.rendering.multiply_accumulate import (
+    GROUP,
+    SURPLUS,
+    add_newest,
+    add_range,
+    add_turn,
+    enter_member,
+    mix_offset,
+    spectrum_stride,
+)
 from server.rendering.partitions import TURNS
 
 _CHUNK_NS = 2500
@@ -274,11 +283,11 @@ def _transform(convolver, stage, job) -> None:
     history = stage.history + 4 * source * span
     second = (stage.window * size) % span
     first = (second - size) % span
-    right_angle.forward(
+    odd_fft.forward(
         history + 4 * first,
         history + 4 * second,
         convolver.scratch,
-        _ring(stage, source) + 4 * products.spectrum_stride(size) * _newest(stage),
+        _ring(stage, source) + 4 * spectrum_stride(size) * _newest(stage),
         16,
         8,
         size,
@@ -293,7 +302,7 @@ def _group_end(stage, job) -> int:
     """The job after those that are multiplied together with this one: sources whose turn is in the same window."""
     job_source = _ints(stage.job_source, stage.sources)
     end = job + 1
-    while end < min(stage.jobs, job + products.GROUP) and (job_source[end] - job_source[job]) % TURNS == 0:
+    while end < min(stage.jobs, job + GROUP) and (job_source[end] - job_source[job]) % TURNS == 0:
         end += 1
     return end
 
@@ -307,11 +316,11 @@ def _multiply(convolver, stage, job, end, first, last) -> None:
     since, newest = _since_turn(stage, job_source[job]), _newest(stage)
     for member in range(job, end):
         filters, count = _partitions(stage, job_new[member])
-        products.enter_member(stage, member - job, filters, count, _ring(stage, job_source[member]))
+        enter_member(stage, member - job, filters, count, _ring(stage, job_source[member]))
     if since == 0:
-        products.add_turn(stage, channels, end - job, newest, first, last)
+        add_turn(stage, channels, end - job, newest, first, last)
     else:
-        products.add_newest(stage, channels, end - job, newest, TURNS - since, first, last)
+        add_newest(stage, channels, end - job, newest, TURNS - since, first, last)
     for member in range(job, end):
         if job_old[member] != 0 and job_new[member] != 0:
             _exchange(stage, channels, job_source[member], job_old[member], job_new[member], first, last)
@@ -325,19 +334,17 @@ def _exchange(stage, channels, source, old, new, first, last) -> None:
     begin, end = _changed(old, new, 3 * stage.number)
     for sign, header in ((np.float32(1), old), (np.float32(-1), new)):
         filters, count = _partitions(stage, header)
-        until, column = min(end, count), products.SURPLUS
-        products.add_range(stage, channels, filters, count, ring, newest, begin, until, 0, column, first, last, sign)
+        until, column = min(end, count), SURPLUS
+        add_range(stage, channels, filters, count, ring, newest, begin, until, 0, column, first, last, sign)
         for ahead in range(TURNS - since if since > 0 else 0):
             known, column = max(begin, ahead + 1), (stage.window + ahead) % TURNS
-            products.add_range(
-                stage, channels, filters, count, ring, newest, known, until, ahead, column, first, last, -sign
-            )
+            add_range(stage, channels, filters, count, ring, newest, known, until, ahead, column, first, last, -sign)
 
 
 @compiled
 def _ring(stage, source) -> int:
-    """The address of a source's ring of spectra (slot, tile, part, 8), which are `products.spectrum_stride`."""
-    return stage.ring + 4 * products.spectrum_stride(stage.size) * stage.slots * source
+    """The address of a source's ring of spectra (slot, tile, part, 8)."""
+    return stage.ring + 4 * spectrum_stride(stage.size) * stage.slots * source
 
 
 @compiled
@@ -374,7 +381,7 @@ def _synthesise(convolver, stage, channel, out) -> None:
     _invert_column(convolver, stage, channel, stage.window % TURNS, out)
     if stage.fades > 0:
         faded_from = convolver.scratch + 8 * stage.size
-        _invert_column(convolver, stage, channel, products.SURPLUS, faded_from)
+        _invert_column(convolver, stage, channel, SURPLUS, faded_from)
         for n in range(0, stage.size, 8):
             store(out, n, multiply_add(load(faded_from, n), load(stage.fade_out, n), load(out, n)))
 
@@ -382,9 +389,9 @@ def _synthesise(convolver, stage, channel, out) -> None:
 @compiled
 def _invert_column(convolver, stage, channel, column, out) -> None:
     """The samples (size,) of what is in a column of a channel's mix; zeros are left there, for a window to come."""
-    mix = stage.mix + 4 * products.mix_offset(convolver.channels, 0, channel, column)
-    step = products.mix_offset(convolver.channels, 1, 0, 0)
-    right_angle.inverse(mix, step, 8, convolver.scratch, out, stage.size, stage.twist, stage.passes, stage.lanes)
+    mix = stage.mix + 4 * mix_offset(convolver.channels, 0, channel, column)
+    step = mix_offset(convolver.channels, 1, 0, 0)
+    odd_fft.inverse(mix, step, 8, convolver.scratch, out, stage.size, stage.twist, stage.passes, stage.lanes)
     _clear_column(convolver, stage, channel, column)
 
 
@@ -392,6 +399,6 @@ def _invert_column(convolver, stage, channel, column, out) -> None:
 def _clear_column(convolver, stage, channel, column) -> None:
     zero = broadcast(np.float32(0))
     for tile in range(stage.size // 8):
-        at = products.mix_offset(convolver.channels, tile, channel, column)
+        at = mix_offset(convolver.channels, tile, channel, column)
         store(stage.mix, at, zero)
         store(stage.mix, at + 8, zero)

@@ -24,7 +24,7 @@ STAGE = np.dtype(
             "job_source",  # (source,) int64: those that sound in the window at work
             "job_old",  # (source,) int64: filter to fade from, 0 for none
             "job_new",  # (source,) int64
-            "group",  # (products.GROUP, 3) int64: filter, partitions and ring of those multiplied together
+            "group",  # (multiply_accumulate.GROUP, 3) int64: filter, partitions and ring of those multiplied together
             "jobs",
             "window",  # number of the window at work
             "cursor",

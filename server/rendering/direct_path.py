@@ -16,7 +16,6 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.kernels.cache_lines import zeros_on_lines
-from server.kernels.compiled import HAS_NUMBA
 from server.rendering.direct_path_kernel import TILE, ask, render_direct_paths, transform_tables
 from server.rendering.direct_path_records import SLOT, DirectPathState, FloatArray
 from server.rendering.fade import raised_cosine
@@ -182,7 +181,7 @@ def _state(
     records = np.zeros(slots, SLOT)
     records["silent"] = quiet = ring + again + 2 * bins + block_size
     return DirectPathState(
-        slots=records if HAS_NUMBA else records.view(np.recarray),
+        slots=records,
         to_head=doubles(3, 3),
         position=integers(1),
         line=floats(slots, ring + again),

@@ -1,4 +1,4 @@
-"""One block of the direct path of many emitters, in compiled code or, without a compiler, in Python and NumPy.
+"""One block of the direct path of many emitters, in compiled code.
 
 An emitter's block goes into its delay line. Each ear reads the line at a delay of its own, the way's plus the head's,
 and hears it through one minimum-phase filter: what the head, the air and the way do to magnitude, summed as cepstra.
@@ -13,7 +13,7 @@ moved, long before it could be heard, and crossfaded over the block: along a str
 blocks then join without a ripple at their rate, and along a raised cosine where they leap. A length that jumps further
 than anything moves is crossfaded too, from the old delay to the new.
 
-Filters work on the right-angle spectra of `server.kernels.right_angle`, all slots summed before the one way back: a
+Filters work on the spectra of `server.kernels.odd_fft`, all slots summed before the one way back: a
 spectrum per ear of what it hears, one per filter whenever that changes.
 
 Letters: s slots, e ears (2, or 1 without a head), n taps, f bins, b block size, w the same in whole tiles of the loops
@@ -26,15 +26,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels.compiled import HAS_NUMBA, compiled_in_place
-from server.rendering.direct_path_records import BANDS, DirectPathState, DoubleArray, FloatArray
+import server.rendering.path_loops as loops
+from server.kernels.compiled import compiled_in_place
+from server.rendering.direct_path_records import (
+    BANDS,
+    FILTERED,
+    MUTED,
+    NOT_STARTED,
+    UNFILTERED,
+    DirectPathState,
+    DoubleArray,
+    FloatArray,
+)
 from server.rendering.fractional_delay import BEFORE
 from server.rendering.sphere import find_triangle
-
-if HAS_NUMBA:
-    import server.rendering.path_loops as loops
-else:
-    import server.rendering.path_loops_numpy as loops  # type: ignore[no-redef]
 
 _LENGTH_TIME_S = 0.015
 _HEAD_TIME_S = 0.008
@@ -142,7 +147,7 @@ def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, 
     else:
         slot.silent = min(slot.silent + size, quiet)
         if slot.silent == quiet:
-            slot.started = False
+            slot.mode = NOT_STARTED
             return False
     loops.copy(block, line[position : position + size])
     again = ring + position
@@ -153,20 +158,18 @@ def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, 
 
 @compiled_in_place
 def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> None:
-    """Add a slot to the mixes."""
-    starts = not slot.started
-    appears = not (starts or slot.sounds)
-    slot.started = True
-    slot.sounds = not slot.muted
-    if slot.muted and (starts or appears):
-        slot.is_elsewhere = starts or slot.is_elsewhere or slot.asked
+    """Add a slot to the mixes. How it was heard before and is heard now decides what is done: nothing while it is not
+    heard, and between any two of the other ways, beginning and end included, a block that leads from one to the
+    other."""
+    before, ears = slot.mode, state.cepstra.shape[1]
+    if slot.muted and before <= MUTED:
+        slot.mode = MUTED
+        slot.is_elsewhere = before == NOT_STARTED or slot.is_elsewhere or slot.asked
         slot.jump = slot.asked = False
         return
     # What has not moved while it was muted goes on from where it was.
-    at_once = starts or (appears and slot.is_elsewhere)
+    at_once = before == NOT_STARTED or (before == MUTED and slot.is_elsewhere)
     slot.is_elsewhere = False
-    was_filtered = slot.filtered and not (starts or appears)
-    was_plain = not (slot.filtered or starts or appears)
     jumps = not at_once and _jumps(slot, size, state.sample_rate, state.speed_of_sound)
     if slot.asked:
         slot.since_asked = 0
@@ -178,12 +181,11 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
     gain_before = gain if at_once else slot.gain
     slot.gain = gain
     change = _change(slot, state.to_head, state.air_db_per_m)
-    ears = state.cepstra.shape[1]
-    slot.filtered = not slot.muted and (ears == 2 or _colours(slot))
-    is_plain = not (slot.filtered or slot.muted)
-    if jumps or slot.filtered != was_filtered:
+    now = MUTED if slot.muted else FILTERED if ears == 2 or _colours(slot) else UNFILTERED
+    slot.mode = now
+    if jumps or (now == FILTERED) != (before == FILTERED):
         change = _LEAP
-    if slot.filtered and (change != _NONE or starts):
+    if now == FILTERED and change != _NONE:
         _find_filters(state, slot)
 
     window = 2 * state.bins.shape[1]
@@ -191,34 +193,47 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
         _follow(slot.head[ear], slot.head_goal_s[ear], period_s, _HEAD_TIME_S, _REST_S, at_once or jumps)
         samples = state.heard[index, ear]
         newest = samples[window - size : window - size + state.first.size]
-        if was_filtered:
+        if before == FILTERED:
             loops.shift(samples, size, window - size)
-        elif starts:
+        elif before == NOT_STARTED:
             samples[:] = 0
-        elif slot.filtered:
-            # A filter has to know what came before.
-            past = _delay(state, slot, ear) if at_once else slot.delay[ear]
-            _read_still(state, state.line[index], past, window - size, samples[:window])
-            loops.multiply_by(samples[:window], gain_before)
+        elif now == FILTERED:
+            _read_past(state, slot, index, ear, window - size, at_once, gain_before)
         _read(state, slot, state.line[index], ear, size, at_once, jumps, gain_before, newest)
-        if was_filtered or slot.filtered:
-            loops.transform(samples, state.twist, state.passes, state.lanes, state.bins)
-            in_effect, after = state.spectra[index, ear], state.next_spectra[ear]
-            if not was_filtered:
-                in_effect[:] = 0
-            if not slot.filtered:
-                after[:] = 0
-            if starts:
-                loops.copy_spectrum(after, in_effect)
-            elif change != _NONE:
-                _open(state, change)
-                loops.accumulate_change(state.bins, in_effect, after, state.mix[change, ear])
-                loops.copy_spectrum(after, in_effect)
-            if slot.filtered:
-                _open(state, 0)
-                loops.accumulate(state.bins, in_effect, state.mix[0, ear])
-        if was_plain or is_plain:
-            _add_plain(state, newest[:size], was_plain or starts, is_plain)
+        if before == FILTERED or now == FILTERED:
+            _add_filtered(state, index, ear, before, now, change)
+        if before == UNFILTERED or now == UNFILTERED:
+            # What has just started has nothing to fade in from.
+            _add_plain(state, newest[:size], before in (UNFILTERED, NOT_STARTED), now == UNFILTERED)
+
+
+@compiled_in_place
+def _read_past(state: DirectPathState, slot: Any, index: int, ear: int, back: int, at_once: bool, gain: float) -> None:
+    """Find what an ear would have heard from `back` samples before this block on: a filter that begins has to know."""
+    past = _delay(state, slot, ear) if at_once else slot.delay[ear]
+    samples = state.heard[index, ear, : 2 * state.bins.shape[1]]
+    _read_still(state, state.line[index], past, back, samples)
+    loops.multiply_by(samples, gain)
+
+
+@compiled_in_place
+def _add_filtered(state: DirectPathState, index: int, ear: int, before: int, now: int, change: int) -> None:
+    """Add what an ear hears through its filter, fading from the one before where they are different."""
+    loops.transform(state.heard[index, ear], state.twist, state.passes, state.lanes, state.bins)
+    in_effect, after = state.spectra[index, ear], state.next_spectra[ear]
+    if before != FILTERED:
+        in_effect[:] = 0
+    if now != FILTERED:
+        after[:] = 0
+    if before == NOT_STARTED:
+        loops.copy_spectrum(after, in_effect)
+    elif change != _NONE:
+        _open(state, change)
+        loops.accumulate_change(state.bins, in_effect, after, state.mix[change, ear])
+        loops.copy_spectrum(after, in_effect)
+    if now == FILTERED:
+        _open(state, 0)
+        loops.accumulate(state.bins, in_effect, state.mix[0, ear])
 
 
 @compiled_in_place

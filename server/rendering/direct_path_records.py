@@ -11,6 +11,10 @@ IntArray = npt.NDArray[np.int64]
 
 BANDS = 7
 
+NOT_STARTED, MUTED, UNFILTERED, FILTERED = 0, 1, 2, 3
+"""How a slot was heard in the last block: not, as nothing was left to be heard of it; not, while its line went on; by
+its delays alone; by its delays and filters."""
+
 SLOT = np.dtype(
     [
         # What is asked for; written between blocks.
@@ -24,10 +28,8 @@ SLOT = np.dtype(
         ("arrival", np.float64, 3),  # world
         ("band_gain_db", np.float64, BANDS),
         # Where things are, at the end of the last block. A spring is where its anchor is, where it is, and its speed.
-        ("started", np.bool_),
-        ("sounds", np.bool_),  # not muted
+        ("mode", np.int64),  # NOT_STARTED, MUTED, UNFILTERED or FILTERED
         ("is_elsewhere", np.bool_),  # asked for since it was muted
-        ("filtered", np.bool_),
         ("was_unattenuated", np.bool_),
         ("silent", np.int64),  # samples
         ("since_asked", np.int64),  # samples

@@ -148,6 +148,7 @@ class HeadFilters:
             cepstra[part] = folded_cepstrum(np.log(magnitude))[..., :taps]
             delays_s[part] = excess_delays_samples(responses[part], hrtf.sample_rate) / hrtf.sample_rate
         common_s = delays_s.mean(axis=-1)
+        # guard: rings of a measured head are smoothed
         delays_s += (_smooth(hrtf.directions, common_s) - common_s)[:, None]
         directions, shares = fill_gaps(hrtf.directions)
         cepstra = np.concatenate([cepstra, np.einsum("gd,det->get", shares, cepstra)])

@@ -27,12 +27,17 @@ class DryAudio:
 
     def __init__(self, samples: npt.ArrayLike) -> None:
         with np.errstate(invalid="ignore", over="ignore"):  # signalling NaNs; doubles beyond the largest float
+            # guard: samples come in as floats
             given = np.asarray(samples, np.float32)
+            # guard: audio has one channel
             if given.ndim != 1:
                 raise ValueError(f"audio is mono, got shape {given.shape}")
             magnitude = np.abs(given)
             is_audio = magnitude <= LOUDEST
+            # guard: denormal samples are zero
+            # guard: what is no audio is silence
             self.samples: FloatArray = np.where(is_audio & (magnitude >= _TINY), given, np.float32(0))
+        # guard: what came in cannot be changed
         self.samples.flags.writeable = False
         self.silenced = given.size - int(np.count_nonzero(is_audio))
 
@@ -43,6 +48,7 @@ class DryAudio:
 
 def require_gain(gain: float) -> float:
     """Raises ValueError for a linear gain that is no number, or beyond `LOUDEST_GAIN` either way."""
+    # guard: a gain does not overflow
     if not abs(gain) <= LOUDEST_GAIN:
         raise ValueError(f"a gain is finite and at most {LOUDEST_GAIN:g}, got {gain:g}")
     return gain

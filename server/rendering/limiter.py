@@ -20,10 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels.compiled import HAS_NUMBA, compiled
-
-if HAS_NUMBA:
-    from server.kernels.by_reference import Reference
+from server.kernels.by_reference import Reference
+from server.kernels.compiled import compiled
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
@@ -90,24 +88,23 @@ class Limiter:
             keep=math.exp(-_STEP / (_RELEASE_S * sample_rate)),
             hold=round(_HOLD_S * sample_rate / _STEP),
         )
-        self._arrays = state
-        self.state: Any = Reference(state) if HAS_NUMBA else state
+        self.state: Any = Reference(state)
 
     def reset(self) -> None:
         """Forget what was heard before."""
-        for array in (self._arrays.signal, self._arrays.held, self._arrays.counts):
+        for array in (self.state.signal, self.state.held, self.state.counts):
             array.fill(0)
-        self._arrays.gain.fill(1)
+        self.state.gain.fill(1)
 
     @property
     def acted(self) -> bool:
         """Whether the block last processed was changed."""
-        return bool(self._arrays.counts[0])
+        return bool(self.state.counts[0])
 
     @property
     def samples_silenced(self) -> int:
         """Since the beginning, because they were not finite."""
-        return int(self._arrays.counts[1])
+        return int(self.state.counts[1])
 
     def process(self, block: FloatArray) -> None:
         """Limit a block in place."""
@@ -132,6 +129,7 @@ def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np
     is_loud = not _is_within(signal[:, :before], safe)
     if not _is_within(block, safe):
         is_loud = True
+        # guard: what is not finite never leaves
         silenced = _silence_what_is_not_finite(block)
     gain[0] = gain[-1]
     if is_loud:
@@ -150,50 +148,38 @@ def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np
         at = step * _STEP
         line = (gain[step] + (gain[step + 1] - gain[step]) * rise).astype(np.float32)
         if step == 0:
+            # guard: a peak at the beginning of a block is held
             line = np.minimum(line, ceiling / np.maximum(peak[:_STEP], ceiling))
         for channel in range(channels):
             block[channel, at : at + _STEP] *= line
     return True, silenced
 
 
-if HAS_NUMBA:
+@compiled
+def _is_within(samples: FloatArray, limit: np.float32) -> bool:
+    """Whether none is beyond; what is no number is."""
+    beyond = 0
+    for channel in range(samples.shape[0]):
+        for value in samples[channel]:
+            beyond += not abs(value) <= limit
+    return beyond == 0
 
-    @compiled
-    def _is_within(samples: FloatArray, limit: np.float32) -> bool:
-        """Whether none is beyond; what is no number is."""
-        beyond = 0
-        for channel in range(samples.shape[0]):
-            for value in samples[channel]:
-                beyond += not abs(value) <= limit
-        return beyond == 0
 
-    @compiled
-    def _interpolate(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
-        """out[i] = sum over k of taps[k] samples[i + k]"""
-        out[:] = 0
-        for k in range(taps.size):
-            tap, from_k = taps[k], samples[k:]
-            for i in range(out.size):
-                out[i] += tap * from_k[i]
+@compiled
+def _interpolate(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
+    """out[i] = sum over k of taps[k] samples[i + k]"""
+    out[:] = 0
+    for k in range(taps.size):
+        tap, from_k = taps[k], samples[k:]
+        for i in range(out.size):
+            out[i] += tap * from_k[i]
 
-    @compiled
-    def _raise_to(samples: FloatArray, peak: FloatArray) -> None:
-        """Have `peak` be no less than the magnitude of any sample."""
-        for i in range(peak.size):
-            peak[i] = max(peak[i], abs(samples[i]))
 
-else:
-
-    def _interpolate(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
-        out.fill(0)
-        for k, tap in enumerate(taps):
-            out += tap * samples[k : k + out.size]
-
-    def _raise_to(samples: FloatArray, peak: FloatArray) -> None:
-        np.maximum(peak, np.abs(samples), peak)
-
-    def _is_within(samples: FloatArray, limit: np.float32) -> bool:
-        return bool(np.all(np.abs(samples) <= limit))
+@compiled
+def _raise_to(samples: FloatArray, peak: FloatArray) -> None:
+    """Have `peak` be no less than the magnitude of any sample."""
+    for i in range(peak.size):
+        peak[i] = max(peak[i], abs(samples[i]))
 
 
 @compiled
@@ -243,5 +229,6 @@ def _follow(peak: FloatArray, ceiling: np.float32, keep: float, hold: int, gain:
         else:
             held[0] += 1
         gain[step + 1] = min(gain[step + 1], gain[step] if held[0] < hold else 1 - (1 - gain[step]) * keep)
+    # guard: a gain that recovers gets there
     if gain[steps] > 1 - _AT_REST:
         gain[steps] = 1

@@ -146,8 +146,10 @@ class MixerSet:
             mixer.stop(slot)
             self._ringing.append((mixer, slot))
         self._leaving.clear()
+        # guard: a slot is not taken while it rings out
         for mixer, slot in [each for each in self._ringing if each[0].is_quiet(each[1])]:
             self._ringing.remove((mixer, slot))
+            # guard: who has rung out makes room
             mixer.release(slot)
         for mixer, slot in [each for each in self._hushed if each[0].has_no_response(each[1])]:
             self._hushed.remove((mixer, slot))

@@ -1,5 +1,5 @@
 """One listener's sound in so many channels: gains, direct paths and convolution, mixed in compiled code
-(`server.rendering.mixing_kernel`) or, without a compiler, here.
+(`server.rendering.mixing_kernel`) or, in blocks of a size that it does not take, here.
 
 Slots are rows: what an emitter plays lies in `dry` (slot, block), is scaled by its gain for the direct path, and by its
 send besides for the convolver. Both reach what is wanted by the end of a block, along a raised cosine.
@@ -11,21 +11,18 @@ from typing import TypeGuard
 
 import numpy as np
 
-from server.kernels.compiled import HAS_NUMBA
+from server.kernels.by_reference import Reference
 from server.rendering.convolver import Convolver, FloatArray
 from server.rendering.direct_path import DirectPath
 from server.rendering.fade import raised_cosine
+from server.rendering.mixing_kernel import enter_convolver, record_of
 from server.rendering.partitions import is_power_of_two
 from server.rendering.sources import ClipPlayer, Source
-
-if HAS_NUMBA:
-    from server.kernels.by_reference import Reference
-    from server.rendering.mixing_kernel import enter_convolver, record_of
 
 
 def is_read_by_compiled_code(source: Source) -> TypeGuard[ClipPlayer]:
     """Of others, Python has to ask for each block."""
-    return HAS_NUMBA and isinstance(source, ClipPlayer)
+    return isinstance(source, ClipPlayer)
 
 
 class Mixer:
@@ -33,7 +30,7 @@ class Mixer:
     says whether compiled code mixes it, which convolves blocks of a power of two alone."""
 
     def __init__(self, *, channels: int, slots: int, block_size: int, direct: DirectPath | None) -> None:
-        self.is_compiled = HAS_NUMBA and is_power_of_two(block_size)
+        self.is_compiled = is_power_of_two(block_size)
         self.channels = channels
         self.slots = slots
         self.direct = direct
@@ -143,7 +140,7 @@ class Mixer:
 
 
 def mix(mixer: Mixer) -> None:
-    """The next block, in its `output`, without compiled code."""
+    """The next block of any size, in its `output`."""
     plays = mixer.plays.astype(bool)
     mixer.dry[~plays] = 0
     mixer.dry *= _ramp(mixer.gain, mixer.fade_in)

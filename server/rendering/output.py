@@ -9,13 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from server.kernels.compiled import HAS_NUMBA
 from server.rendering.convolver import FloatArray
 from server.rendering.limiter import Limiter
 from server.rendering.mixing import Mixer, mix
-
-if HAS_NUMBA:
-    from server.rendering.output_kernel import mixing_with, record_of
+from server.rendering.output_kernel import mixing_with, record_of
 
 
 class Output:
@@ -27,9 +24,8 @@ class Output:
         if ceiling is not None:
             self.limiter = Limiter(channels=channels, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
         self.sum = np.zeros((channels, block_size), np.float32)
-        if HAS_NUMBA:
-            self._record = record_of(self)
-            self.address = int(self._record.ctypes.data)
+        self._record = record_of(self)
+        self.address = int(self._record.ctypes.data)
 
 
 class Rendered(NamedTuple):
@@ -63,6 +59,7 @@ def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer], int]]) -> list[li
     like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
     limiter = next((output.limiter.state for output, _, _ in listeners if output.limiter is not None), None)
     kinds = (None if each is None else each.kind for each in (like, limiter))
+    # guard: a block is handed out as a copy
     frames, flags = np.empty(samples, np.float32), np.zeros((blocks, 2), np.int64)
     mixing_with(*kinds)(np.array(rows, np.int64), frames, flags, like, limiter)
     for mixer in mixers:

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels import right_angle
+from server.kernels import odd_fft
 from server.kernels.array_pool import ArrayPool
 from server.kernels.compiled import compiled
+from server.rendering.multiply_accumulate import filter_offset
 from server.rendering.partitions import Partitioning
-from server.rendering.products import filter_offset
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -19,7 +19,7 @@ IntArray = npt.NDArray[np.int64]
 _PER_STAGE = 3
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _SHIFT = np.uint64(32)
-_SPARES = ArrayPool(64 * 1024 * 1024)
+_POOL = ArrayPool(64 * 1024 * 1024)
 """A few dozen responses of a second: each that is exchanged leaves what the next one needs."""
 
 
@@ -67,7 +67,7 @@ def pack(
             digests.append(like.digests[number])
             continue
         count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
-        spectra.append(_SPARES.floats(2 * stage.size * count * channels))  # all of it is written below
+        spectra.append(_POOL.floats(2 * stage.size * count * channels))  # all of it is written below
         digests.append(all_digests[taken : taken + count])
         header[at : at + _PER_STAGE] = address(spectra[-1]), count, address(digests[-1])
         made, taken = number + 1, taken + count  # those that are taken over come last
@@ -77,10 +77,10 @@ def pack(
 
 
 @cache
-def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[right_angle.Tables, ...]]:
+def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[odd_fft.Tables, ...]]:
     """(stage, 5) where each begins, the size of its partitions, and the addresses of its transform's tables; and those
     tables, so that they last as long."""
-    all_tables = tuple(right_angle.tables(stage.size) for stage in partitioning.stages)
+    all_tables = tuple(odd_fft.tables(stage.size) for stage in partitioning.stages)
     rows = [
         (stage.start, stage.size, address(tables.twist), address(tables.passes), address(tables.lanes))
         for stage, tables in zip(partitioning.stages, all_tables, strict=True)
@@ -115,7 +115,7 @@ def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digest
                 at = filter_offset(channels, size // 8, count, 0, partition)
                 step = filter_offset(channels, size // 8, count, 1, partition) - at
                 to = spectra + 4 * (at + 16 * channel)
-                right_angle.forward(first, silence, bins, to, step, 8, size, twist, passes, lanes)
+                odd_fft.forward(first, silence, bins, to, step, 8, size, twist, passes, lanes)
             digests[done] = np.int64(digest)
             done += 1
 

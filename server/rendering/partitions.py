@@ -17,8 +17,8 @@ BLOCK_SIZES = f"a multiple of {BLOCK_STEP} from {SMALLEST_BLOCK} to {LARGEST_BLO
 """What a renderer takes. Of powers of two compiled code convolves; of others, 480 for one, NumPy does, which is slower
 and no path for what has to be in time."""
 TURNS = 4
-"""A source's filter is read once in so many windows, and multiplied for all of them (`server.rendering.products`);
-the source's number modulo TURNS says when."""
+"""A source's filter is read once in so many windows, and multiplied for all of them
+(`server.rendering.multiply_accumulate`); the source's number modulo TURNS says when."""
 NEAR = TURNS - 1
 """First partitions of a stage, which lie by themselves: they are multiplied in the windows between, too."""
 
@@ -87,4 +87,5 @@ class Partitioning:
     def quiet_blocks(self) -> int:
         """Blocks of silence after which no window of any stage holds anything else, turns included, and nothing is left
         to come out."""
+        # guard: a convolver hears on until its longest window is empty
         return max(self.history_blocks, *((stage.partitions + 2 * TURNS) * stage.ticks for stage in self.stages))

@@ -1,4 +1,4 @@
-"""The loops over samples of the direct path, compiled; `path_loops_numpy` has the same functions without a compiler.
+"""The loops over samples of the direct path, compiled.
 
 Outputs of `filter_block` are a multiple of `TILE` long: accumulators stay in registers that long.
 """
@@ -6,24 +6,29 @@ Outputs of `filter_block` are a multiple of `TILE` long: accumulators stay in re
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels import right_angle
+from server.kernels import odd_fft
 from server.kernels.compiled import compiled_in_place
 from server.kernels.simd import (
     broadcast,
+    lanes,
     load,
     load_broadcast,
     load_short_int,
+    multiply,
     multiply_add,
     multiply_subtract,
     prefetch,
     store,
     subtract,
+    sum_each,
 )
-from server.kernels.wide_simd import load_16, load_broadcast_16, multiply_16, multiply_add_16, sum_each
 from server.rendering.fractional_delay import PHASES, TAPS
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int32]
+
+_wide = lanes(16)
+_load_wide, _broadcast_wide = _wide.load, _wide.load_broadcast
 
 TILE = 64
 _ROW = 2 * TAPS
@@ -61,18 +66,18 @@ def filter_block(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None
 
 def transform_tables(size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What `transform` and `synthesise` of `size` bins take."""
-    tables = right_angle.tables(size)
+    tables = odd_fft.tables(size)
     return tables.twist, tables.passes, tables.lanes
 
 
 @compiled_in_place
 def transform(samples: FloatArray, twist: FloatArray, passes: FloatArray, lanes: FloatArray, bins: FloatArray) -> None:
-    """The right-angle spectrum (2, f) of the first 2 f samples."""
+    """The spectrum (2, f) of the first 2 f samples."""
     size = bins.shape[1]
     first = int(samples.ctypes.data)
     second, to = first + 4 * size, int(bins.ctypes.data)
     tables = int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data)
-    right_angle.forward(first, second, to, to, 8, size, size, *tables)
+    odd_fft.forward(first, second, to, to, 8, size, size, *tables)
 
 
 @compiled_in_place
@@ -82,7 +87,7 @@ def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: Fl
     bins = int(mix.ctypes.data)
     to = int(out.ctypes.data)
     tables = int(twist.ctypes.data), int(passes.ctypes.data), int(lanes.ctypes.data)
-    right_angle.inverse(bins, 8, size, bins, to, size, *tables)
+    odd_fft.inverse(bins, 8, size, bins, to, size, *tables)
 
 
 @compiled_in_place
@@ -135,11 +140,11 @@ def read_at(
 @compiled_in_place
 def _products(x: int, t: int, f: int, r: int, s: int, i: int):  # type: ignore[no-untyped-def]
     """What the sinc of one sample adds to, in sixteen lanes."""
-    at, row, share = load_short_int(f, i), load_short_int(r, i) * _ROW, load_broadcast_16(s, i)
-    total = multiply_16(multiply_add_16(share, load_16(t, row + TAPS), load_16(t, row)), load_16(x, at))
+    at, row, share = load_short_int(f, i), load_short_int(r, i) * _ROW, _broadcast_wide(s, i)
+    total = multiply(multiply_add(share, _load_wide(t, row + TAPS), _load_wide(t, row)), _load_wide(x, at))
     for k in range(16, TAPS, 16):
-        tap = multiply_add_16(share, load_16(t, row + TAPS + k), load_16(t, row + k))
-        total = multiply_add_16(tap, load_16(x, at + k), total)
+        tap = multiply_add(share, _load_wide(t, row + TAPS + k), _load_wide(t, row + k))
+        total = multiply_add(tap, _load_wide(x, at + k), total)
     return total
 
 

@@ -204,15 +204,19 @@ class Renderer:
         It is silent, its source waiting, until it has an IR, if it `awaits_ir`, and, where direct paths are heard, a
         path. Raises DuplicateEmitterError, RendererFullError, and ValueError for a gain that would overflow.
         """
+        # guard: a refused gain leaves no emitter behind
         require_gain(gain)
+        # guard: two emitters have not one id
         if emitter_id in self._emitters:
             raise DuplicateEmitterError(f"emitter {emitter_id!r} is present already")
+        # guard: a renderer has room for so many
         if len(self._emitters) >= self.max_emitters:
             raise RendererFullError(f"at most {self.max_emitters} emitters")
         slot = self._mixer.take_slot()
         if slot is None:
             raise RendererFullError("too many emitters removed just now still ring out")
         self._emitters[emitter_id] = _Emitter(self._mixer, slot, source, awaits_ir)
+        # guard: an emitter begins at its gain
         self._mixer.gain[:, slot] = gain
         self._mixer.send[:, slot] = 1.0
 
@@ -241,6 +245,7 @@ class Renderer:
             self._reach(emitter.mixer.send, emitter, gain)
 
     def _reach(self, gains: FloatArray, emitter: _Emitter, gain: float) -> None:
+        # guard: no gain is set that would overflow
         gains[1, emitter.slot] = require_gain(gain)
         if not emitter.has_played:
             gains[0, emitter.slot] = gain
@@ -324,6 +329,7 @@ class Renderer:
 
     def reset(self) -> None:
         """Drop every emitter and its reverberation, and start the clock again."""
+        # guard: a reset forgets what sounded
         self._mixers.clear()
         if self._output.limiter is not None:
             self._output.limiter.reset()

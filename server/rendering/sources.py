@@ -36,6 +36,7 @@ class ClipPlayer:
         audio = clip if isinstance(clip, DryAudio) else DryAudio(clip)
         if audio.size == 0:
             raise ValueError("a clip is mono and not empty, got no samples")
+        # guard: a caller's array goes through the door
         self.clip = audio.samples
         self.loop = loop
         self._position = 0
@@ -95,7 +96,9 @@ class LiveSource:
     def push(self, samples: FloatArray) -> None:
         """Take in what a client sent, (n,)."""
         audio = DryAudio(samples)
+        # guard: what a client sends goes through the door
         clean = audio.samples
+        # guard: gated samples are counted
         self.samples_gated += audio.silenced
         capacity = self._ring.size
         self._drop(self.queued + clean.size - capacity)
@@ -135,6 +138,7 @@ class LiveSource:
     def _run_dry(self, out: FloatArray) -> None:
         rest = out[: self.queued]
         self._take(rest)
+        # guard: an underrun fades out
         rest[-FADE_SAMPLES:] *= 1 - self._fade_in
         out[rest.size :] = 0
         self._is_playing = False

@@ -1,4 +1,4 @@
-"""Impulse responses of paths at rest, in compiled code or, without a compiler, in Python and NumPy.
+"""Impulse responses of paths at rest, in compiled code.
 
 The same steps as in one block of a direct path: delays and minimum-phase filters of head, air and surfaces, and the
 windowed sinc. Letters: n taps, e ears.
@@ -9,14 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.kernels.compiled import HAS_NUMBA, compiled
+import server.rendering.path_loops as loops
+from server.kernels.compiled import compiled
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.sphere import find_triangle
-
-if HAS_NUMBA:
-    import server.rendering.path_loops as loops
-else:
-    import server.rendering.path_loops_numpy as loops  # type: ignore[no-redef]
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]

@@ -1,7 +1,7 @@
-"""The orderly end of a server that was told to stop: it takes nothing new, tells its streams, finishes what is in
-flight, and has ended within a stated time.
+"""Orderly shutdown. The server accepts nothing new, tells its streams, finishes the requests in flight, and ends within
+a stated time.
 
-A `Drain` belongs to the event loop. Seconds are counted from its beginning.
+A `Drain` belongs to the event loop. Its times count from the beginning of the shutdown.
 """
 
 import asyncio
@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Iterator
 
 _FOR_REQUESTS = 0.7
-"""Share of the time after which requests that are not answered yet are answered 503."""
+"""Share of the drain time after which open requests are answered with 503."""
 _FOR_ANSWERS = 0.85
-"""And after which nobody waits any longer for those answers to be read."""
+"""Share of the drain time after which the server stops waiting for clients to read those answers."""
 
 
 class Drain:
-    """Ends within `drain_s` of its beginning."""
+    """A shutdown that takes at most `drain_s` seconds."""
 
     def __init__(self, drain_s: float, *, time_s: Callable[[], float] = time.monotonic) -> None:
         self.drain_s = drain_s
@@ -35,27 +35,27 @@ class Drain:
 
     @property
     def retry_after_s(self) -> int:
-        """In how many whole seconds a server that takes this one's place can be expected at the earliest."""
+        """Whole seconds, at least 1, until this server has ended and another can take its place."""
         passed_s = 0.0 if self._began_s is None else self._time_s() - self._began_s
         return max(1, math.ceil(self.drain_s - passed_s))
 
     def begin(self) -> None:
-        """From now on nothing new is taken. A second call changes nothing."""
+        """Accept nothing new from now on. A second call changes nothing."""
         if self._began_s is None:
             self._began_s = self._time_s()
             self._has_begun.set()
 
     async def begun(self) -> None:
-        """Return once it has begun."""
+        """Return once the shutdown has begun."""
         await self._has_begun.wait()
 
     async def out_of_time(self) -> None:
-        """Return once requests have had all the time that there is for them."""
+        """Return once the time for open requests is over."""
         await self._is_out_of_time.wait()
 
     @contextlib.contextmanager
     def in_flight(self) -> Iterator[None]:
-        """A request, or a stream, which the drain waits for."""
+        """Context of a request or stream that the shutdown waits for."""
         self._in_flight += 1
         self._is_idle.clear()
         try:
@@ -66,7 +66,7 @@ class Drain:
                 self._is_idle.set()
 
     async def settle(self) -> None:
-        """Begin, and return as soon as nothing is in flight any more, or when there is no time left to wait."""
+        """Begin the shutdown. Return when nothing is in flight any more or the time is over."""
         self.begin()
         await self._wait_until_idle(_FOR_REQUESTS)
         self._is_out_of_time.set()

@@ -1,14 +1,13 @@
-"""How memory comes from the system and goes back to it, for a process that runs for weeks.
+"""Settings of the allocator and the garbage collector for a process that runs for weeks.
 
-Streams come and go, each with megabytes of filters and spectra, on several threads. By default glibc keeps what they
-leave in a heap per thread, between blocks that live longer, and raises by itself the size from which an array has
-pages of its own; so a server for hostile clients (`nafir soak`) held four times what it used.
+Streams come and go on several threads, each with megabytes of filters and spectra. By default glibc keeps the memory
+they free in one heap per thread, between blocks that live longer, and raises by itself the size from which an array
+gets its own pages. Without these settings a server under `nafir soak` held four times the memory it used.
 
-Pages of its own are fresh ones, which take time: `server.kernels.array_pool` are for what comes and goes many times a
-second.
+Fresh pages take time. Arrays that are allocated many times a second come from `server.kernels.array_pool` instead.
 
-What refers to itself is freed by the interpreter's collector alone. While that looks, no thread renders that has to
-take in a pose or to pass a block on; so on a server it looks seldom, and never at what has been there from the start.
+Only the garbage collector frees reference cycles. While it runs, no thread can take in a pose or pass a block on. So a
+server runs it seldom, and it never looks at objects that have existed since the start.
 """
 
 import ctypes
@@ -17,17 +16,18 @@ import platform
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h
 _LARGE_BYTES = 96 * 1024
-"""Less than an impulse response, or a stage of one; more than what a field's graph says of one."""
+"""Arrays of this size get their own pages. It is less than an impulse response or one stage of it, and more than the
+output of a field's graph."""
 _HEAPS = 2
 _USUAL_COLLECTIONS = gc.get_threshold()
 _RARE_COLLECTIONS = (20_000, 20, 20)
-"""As `gc.set_threshold`; the first is of objects made and not freed. With the usual 700, sixteen emitters of fourteen
-listeners had it look at all that has come since the start every half minute, for 6 to 56 ms."""
+"""Arguments of `gc.set_threshold`. With the default, 700 objects, a server with 14 listeners of 16 emitters each paused
+for 6 to 56 ms every half minute."""
 
 
 def give_back_large_arrays() -> bool:
-    """Have arrays from 96 KiB on be pages of their own, which go back to the system with them; whether this system's
-    allocator can be told so. From now on, for the whole process."""
+    """Give arrays of 96 KiB or more their own pages, which return to the system when the array is freed. This holds for
+    the whole process. False if the system's allocator has no such setting."""
     if platform.libc_ver()[0] != "glibc":
         return False
     libc = ctypes.CDLL(None)
@@ -37,7 +37,7 @@ def give_back_large_arrays() -> bool:
 
 
 def collect_rarely() -> None:
-    """Free what can be freed, and have the collector leave what remains alone and look less often at what comes."""
+    """Collect once, exempt all objects that remain, and collect new ones less often."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(*_RARE_COLLECTIONS)

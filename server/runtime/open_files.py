@@ -1,20 +1,20 @@
-"""How many files, sockets among them, the process may have open."""
+"""The limit on open files, which include sockets."""
 
 import sys
 
 from server.core.errors import NafirError
 
 _OTHERS = 256
-"""Beside connections: bundles, libraries, pipes, static files that are being sent."""
+"""Open files other than connections: bundles, libraries, pipes, static files being sent."""
 
 
 def allow_connections(connections: int) -> None:
-    """Raise the process's own limit where it is lower than what so many connections take.
+    """Raise the process's limit on open files if it is too low for that many connections.
 
-    Raises NafirError where the system allows fewer.
+    Raises NafirError if the system does not allow it.
     """
     if sys.platform == "win32":
-        return  # sockets are no files there
+        return  # sockets are not files on Windows
     import resource
 
     needed = connections + _OTHERS

@@ -1,4 +1,4 @@
-"""Long work on a thread of its own, which keeps no process from ending."""
+"""Long work on a daemon thread of its own."""
 
 import asyncio
 import contextlib
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 async def run_in_own_thread(work: Callable[[], T], name: str) -> T:
-    """What `work` returns or raises. Cancelled, nobody waits for it any longer, and it goes on."""
+    """Return or raise what `work` returns or raises. Cancelling this coroutine does not stop the work."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
 
@@ -26,9 +26,9 @@ async def run_in_own_thread(work: Callable[[], T], name: str) -> T:
         result, failure = None, None
         try:
             result = work()
-        except BaseException as exc:  # noqa: BLE001  whoever waits for the result has it raised
+        except BaseException as exc:  # noqa: BLE001  raised where the result is awaited
             failure = exc if isinstance(exc, Exception) else RuntimeError(f"thread {name} was ended: {exc!r}")
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(settle, result, failure)
 
     threading.Thread(target=run, name=name, daemon=True).start()

@@ -1,9 +1,9 @@
-"""Long work that goes on behind what is more urgent, and ends when nobody wants its result any more.
+"""Pacing of long work: it makes way for urgent work, and it stops when its result is no longer wanted.
 
-A low priority is not enough: a thread that is put aside while it holds the interpreter's lock keeps those waiting that
-come before it. So work is done in short stretches, and between two of them the thread sleeps for as long as something
-urgent is under way; but for no more than `1 / least_share - 1` times what the stretch took, so that it comes to its
-end on a busy server, too.
+A low priority is not enough. A thread that the system suspends while it holds the interpreter's lock blocks more
+important threads. So long work runs in short stretches. Between two of them the thread sleeps while something urgent is
+under way, but for at most `1 / least_share - 1` times the length of the stretch, so that it also finishes on a busy
+server.
 """
 
 import time
@@ -11,18 +11,18 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError
 
 Checkpoint = Callable[[], None]
-"""To be called often by long work. Raises CancelledError where nobody wants the result."""
+"""Long work calls its checkpoint often. It raises CancelledError if the result is no longer wanted."""
 
 _LOOK_S = 0.004
 _STRETCH_S = 0.002
 
 
 def no_checkpoint() -> None:
-    """For work that somebody waits for at a command line."""
+    """The checkpoint of work at a command line, which runs without pauses to its end."""
 
 
 class Pace:
-    """The checkpoint of one piece of work, of the thread that does it."""
+    """The checkpoint of one piece of work; only the thread that does the work calls it."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Pace:
             raise CancelledError
 
     def rest(self) -> None:
-        """Let urgent work go first, if the stretch since the last rest was long enough."""
+        """Sleep while urgent work is under way, if enough work was done since the last rest."""
         worked_s = self._thread_time_s() - self._since_s
         if worked_s < _STRETCH_S:
             return

@@ -1,7 +1,8 @@
-"""Who goes first on a busy machine: threads that render sound before all others, next the one that passes it on,
-threads that prepare it last, and what nobody waits for now and then.
+"""Thread priorities on a busy machine. Threads that render sound come first, then the event loop that sends it, then
+the workers that compute responses. Work without a deadline gets a limited share of the time (`DutyCycle`).
 
-Priorities belong to the calling thread; where the system has none per thread, or allows none, nothing changes.
+Each function changes the priority of the calling thread. If the system has no priorities per thread, or does not allow
+them, nothing changes.
 """
 
 import contextlib
@@ -16,20 +17,20 @@ from concurrent.futures import CancelledError
 from typing import ClassVar
 
 _REAL_TIME = 20
-"""Above every ordinary thread, below what keeps the machine itself alive (1 to 99)."""
+"""Real-time priority, from 1 to 99: above every ordinary thread, below the threads of the kernel."""
 _NICENESS = 5
 _PROMPT_NICENESS = -10
 _PROMPT_SLICE_NS = 100_000
-"""The shortest slice of time that Linux has. Who has a shorter one than the thread at work need not wait for that one's
-to end: of the usual 3 ms on a core that audio fills to nine tenths, that is 30."""
+"""The shortest time slice that Linux has. A thread with a shorter slice than the running thread need not wait until
+that thread's slice ends. The usual slice is 3 ms, and takes 30 ms on a core that audio fills to nine tenths."""
 _ORDINARY, _RESET_ON_FORK = 0, 1
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 def become_real_time() -> str | None:
-    """Have the calling thread scheduled before ordinary ones; why not, where it stays as it is.
+    """Schedule the calling thread before ordinary ones. Returns the reason if the system refuses, or else None.
 
-    Round-robin, so that two such threads on one core share it. Threads that it starts are ordinary.
+    The policy is round-robin, so two such threads share one core. Threads started by this thread are ordinary.
     """
     if sys.platform != "linux":
         return "this system has no real-time priority for single threads"
@@ -41,7 +42,7 @@ def become_real_time() -> str | None:
 
 
 class _Attributes(ctypes.Structure):
-    """Linux's `struct sched_attr`; for ordinary threads, `runtime_ns` is their slice."""
+    """Linux's `struct sched_attr`. For ordinary threads `runtime_ns` is the time slice."""
 
     _fields_: ClassVar = [
         ("size", ctypes.c_uint32),
@@ -56,9 +57,9 @@ class _Attributes(ctypes.Structure):
 
 
 def become_prompt() -> bool:
-    """Have the calling thread go before other ordinary ones as soon as it has something to do, for as short as that
-    takes; whether the system allows it. Not real-time: ordinary threads that starve get their share of Linux at one go,
-    50 ms in which no audio thread renders. Threads that it starts are as they would have been."""
+    """Run the calling thread before other ordinary ones as soon as it has work, for short stretches. Returns whether
+    the system allows it. The thread does not become real-time: Linux gives starved ordinary threads their share in one
+    stretch of 50 ms, in which no audio thread renders. Threads started by this thread are ordinary."""
     number = _SCHED_SETATTR.get(platform.machine())
     if sys.platform != "linux" or number is None:
         return False
@@ -70,17 +71,17 @@ def become_prompt() -> bool:
 
 
 def become_background(niceness: int = _NICENESS) -> None:
-    """Have the calling thread yield to ordinary ones, and to those of less `niceness`."""
+    """Let the calling thread yield to ordinary threads and to those of lower `niceness`."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, niceness)  # 0 is the calling thread here, the process elsewhere
 
 
 class DutyCycle:
-    """Long work of one thread, of which it does at most a `share` of the time, about `stretch_s` at once.
+    """Limits long work of one thread to a `share` of the time, in stretches of about `stretch_s`.
 
-    A priority is not enough: on a core that streams fill, work at the lowest takes what impulse responses need, and,
-    put aside while it holds the interpreter's lock, keeps those waiting that come before it.
+    A low priority is not enough. On a core that streams fill, such work still takes time that impulse responses need,
+    and a thread that is suspended while it holds the interpreter's lock blocks more important ones.
     """
 
     def __init__(
@@ -93,7 +94,8 @@ class DutyCycle:
         self._is_over = threading.Event()
 
     def rest(self) -> None:
-        """To be called often, by the thread that works; raises CancelledError once it was called off."""
+        """Sleep if enough work was done since the last rest. The working thread calls this often. Raises CancelledError
+        after `call_off`."""
         now_s = self._thread_time_s()
         if self._since_s is None:
             self._since_s = now_s
@@ -104,5 +106,5 @@ class DutyCycle:
         self._since_s = self._thread_time_s()
 
     def call_off(self) -> None:
-        """Have the work end with its next break, which may be the one it has now; on any thread."""
+        """End the work at its next or current rest. Any thread may call this."""
         self._is_over.set()

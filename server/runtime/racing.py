@@ -1,4 +1,4 @@
-"""Work on the event loop that ends early when something else happens first."""
+"""Work on the event loop that is cancelled if another event comes first."""
 
 import asyncio
 from collections.abc import Coroutine
@@ -8,12 +8,12 @@ T = TypeVar("T")
 
 
 class StoppedError(Exception):
-    """The work was cancelled, because what it was raced against ended first."""
+    """The work was cancelled because `stop` ended first."""
 
 
 async def run_until(work: Coroutine[Any, Any, T], stop: Coroutine[Any, Any, object]) -> T:
-    """The result of `work`, or what it raises. Raises StoppedError where `stop` ends first: `work` is then cancelled,
-    and has cleaned up after itself. Neither goes on after this returns."""
+    """Return or raise what `work` returns or raises. If `stop` ends first, `work` is cancelled, and StoppedError is
+    raised once it has cleaned up. Neither goes on after this returns."""
     working, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop)
     try:
         await asyncio.wait({working, stopping}, return_when=asyncio.FIRST_COMPLETED)
@@ -26,6 +26,6 @@ async def run_until(work: Coroutine[Any, Any, T], stop: Coroutine[Any, Any, obje
         await asyncio.wait({working, stopping})
         for task in (working, stopping):
             if not task.cancelled():
-                task.exception()  # looked at, or asyncio logs that nobody did
-        # What is raised holds this frame, and with the tasks in it all would wait for the collector.
+                task.exception()  # retrieved, or asyncio logs that it never was
+        # The exception refers to this frame. With the tasks in it there would be a cycle for the garbage collector.
         del task, working, stopping

@@ -1,4 +1,4 @@
-"""Whether a server should get streams and requests, and if not, why."""
+"""Whether the server is ready for streams and requests, and the reason if it is not."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -7,12 +7,12 @@ from server.runtime.drain import Drain
 from server.runtime.thread_watch import ThreadWatch
 
 _SOON_S = 1
-"""After which it is worth asking again, where nobody knows better."""
+"""Retry-After of an unready server that cannot tell when it will be ready."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Why the server is not ready: `code` for programs, `message` for people, and when to ask again."""
+    """The reason why the server is not ready: `code` is for programs, `message` for people."""
 
     code: str
     message: str
@@ -21,7 +21,7 @@ class Obstacle:
 
 @dataclass
 class Readiness:
-    """Ready once warmed up, unless threads fail or the server drains. Belongs to the event loop."""
+    """The server is ready once it is warmed up, unless threads fail or it shuts down. Belongs to the event loop."""
 
     drain: Drain
     watch: ThreadWatch = field(default_factory=lambda: ThreadWatch(()))
@@ -29,7 +29,7 @@ class Readiness:
 
     @property
     def obstacle(self) -> Obstacle | None:
-        """None where it is ready."""
+        """Why the server is not ready; None if it is."""
         if self.drain.has_begun:
             return Obstacle("server_draining", "the server is shutting down", self.drain.retry_after_s)
         if self.warm_up == "failed":

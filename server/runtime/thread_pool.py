@@ -1,7 +1,6 @@
-"""Threads that do what they are given, in the order in which it came. They are watched (`server.runtime.thread_watch`),
-and keep no process from ending.
+"""A pool of daemon threads that run jobs in the order of submission. `server.runtime.thread_watch` watches them.
 
-`concurrent.futures` has a pool that breaks for good when one thread cannot start, and keeps silent of one that died.
+The pool of `concurrent.futures` breaks for good if one thread cannot start, and does not report a thread that died.
 """
 
 import logging
@@ -14,13 +13,13 @@ from queue import SimpleQueue
 from server.runtime.thread_watch import Watched
 
 Job = Callable[[], None]
-"""Raises nothing: what becomes of the work is the job's own business."""
+"""A job raises nothing. It reports the outcome of its work itself."""
 
 _logger = logging.getLogger(__name__)
 
 
 class PoolThread:
-    """One thread of a pool, which takes the jobs that `numbers` names out of `jobs`."""
+    """One thread of a pool. It takes a number from the queue `numbers` and runs the job of that number in `jobs`."""
 
     def __init__(
         self,
@@ -47,7 +46,7 @@ class PoolThread:
         return self._number
 
     def join(self, timeout_s: float) -> bool:
-        """Whether it has ended within that time."""
+        """Wait for the thread to end. Returns whether it did within the time."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
@@ -55,7 +54,7 @@ class PoolThread:
         if self._initializer is not None:
             try:
                 self._initializer()
-            except Exception:  # it sets a priority, say: without it, work is still done
+            except Exception:  # without a priority, say, the thread still works
                 _logger.exception("thread %s goes on though it could not be set up", self.name)
         while (number := self._numbers.get()) is not None:
             if (job := self._jobs.pop(number, None)) is not None:
@@ -66,8 +65,8 @@ class PoolThread:
 
 
 class ThreadPool:
-    """So many threads, named `name` and a number, each of which calls `initializer` first. A job that takes longer than
-    `patience_s` is stuck."""
+    """A pool of `threads` threads, named `name` and a number. Each calls `initializer` first. A job that takes longer
+    than `patience_s` counts as stuck."""
 
     def __init__(
         self, threads: int, name: str, *, initializer: Callable[[], object] | None = None, patience_s: float
@@ -76,7 +75,7 @@ class ThreadPool:
         self._count = count()
         self._numbers: SimpleQueue[int | None] = SimpleQueue()
         self._jobs: dict[int, Job] = {}
-        """Those that no thread has taken yet."""
+        """By number, the jobs that no thread has taken yet."""
         self._initializer = initializer
         self._threads = [self._new(f"{name}-{number}") for number in range(threads)]
 
@@ -85,23 +84,23 @@ class ThreadPool:
         return self._threads
 
     def submit(self, job: Job) -> None:
-        """Waits for nothing; on any thread."""
+        """Queue a job. Never blocks; any thread may call this."""
         number = next(self._count)
         self._jobs[number] = job
         self._numbers.put(number)
 
     def replace(self, dead: Watched) -> None:
-        # A thread that dies while it waits takes a number with it. Of two with the same number, one finds no job.
+        # A thread that dies while it waits may have taken a number, so all numbers are queued again. A thread that
+        # takes a number for the second time finds no job.
         for number in tuple(self._jobs):
             self._numbers.put(number)
         self._threads = [self._new(each.name) if each is dead else each for each in self._threads]
 
     def give_up(self, stuck: Watched) -> None:
-        """Others go on; who waits for this one's work waits until it comes."""
+        """Does nothing. The other threads go on, and callers keep waiting for the job of the stuck one."""
 
     def stop(self, timeout_s: float) -> bool:
-        """Have the threads end with what they were given before, and wait for that at most so long; whether they
-        did."""
+        """Let the threads finish all jobs already submitted and end. Returns whether they did within the time."""
         for _ in self._threads:
             self._numbers.put(None)
         until_s = time.monotonic() + timeout_s

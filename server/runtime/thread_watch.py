@@ -1,8 +1,8 @@
-"""A watch over the threads that do a server's work: one that is dead is replaced, one that is stuck is told of.
+"""Supervision of the server's threads. A dead thread is replaced, a stuck one is reported.
 
-A thread is *stuck* while it is at one piece of work for longer than such work ever takes. Python has no way to end it,
-so a stuck thread keeps the server from being ready until it goes on. Time is counted in looks at the threads, not in
-seconds, so that a machine that was suspended has no stuck threads when it wakes.
+A thread is *stuck* while one piece of work takes longer than such work ever should. Python cannot end a thread, so the
+server is not ready until the stuck thread goes on. Time is counted in looks at the threads, not in seconds, so that no
+thread counts as stuck after the machine was suspended.
 """
 
 import asyncio
@@ -14,7 +14,7 @@ from typing import Literal, Protocol
 
 PERIOD_S = 0.1
 _GIVE_UP_AFTER = 3
-"""A stuck thread is given up for good after so many times its patience."""
+"""A stuck thread is given up after this many times its patience."""
 _MOST_DEATHS = 3
 _DEATHS_WITHIN_S = 60.0
 
@@ -24,18 +24,18 @@ _logger = logging.getLogger(__name__)
 
 
 class Watched(Protocol):
-    """A thread, as far as it is watched. Both may be asked from any thread."""
+    """A thread as the watch sees it. Any thread may read these properties."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def is_dead(self) -> bool:
-        """Whether it was started and has ended, though nobody told it to."""
+        """Whether the thread has ended without being told to."""
 
     @property
     def work_number(self) -> int | None:
-        """Which piece of work it is at; None while it waits for one."""
+        """Number of the piece of work it is doing; None while it waits for work."""
 
 
 class Group(Protocol):
@@ -46,34 +46,34 @@ class Group(Protocol):
 
     @property
     def patience_s(self) -> float:
-        """How long one piece of work may take."""
+        """How long one piece of work may take before the thread counts as stuck."""
 
     def replace(self, dead: Watched) -> None:
-        """Put a new thread of the same name in its place."""
+        """Replace a dead thread by a new one of the same name."""
 
     def give_up(self, stuck: Watched) -> None:
-        """Tell those who wait for a thread that has been stuck for long."""
+        """Tell the waiting callers that this thread has been stuck for too long."""
 
 
 class ThreadWatch:
-    """Looks at the threads of `groups` every `PERIOD_S`; belongs to the event loop."""
+    """Checks the threads of `groups` every `PERIOD_S`. Belongs to the event loop."""
 
     def __init__(self, groups: Sequence[Group]) -> None:
         self._groups = groups
         self._at: dict[str, tuple[int, int]] = {}
-        """By thread: the piece of work it is at, and how many looks have found it there."""
+        """By thread name, the number of its current piece of work and how many looks have seen that number."""
         self._looks = 0
         self._deaths: deque[int] = deque(maxlen=_MOST_DEATHS)
-        """With which look each was found."""
+        """Numbers of the looks that found a dead thread, most recent last."""
         self.restarts: Counter[str] = Counter()
-        """Threads that died and were replaced, by name."""
+        """How often each thread, by name, was replaced."""
         self.stuck: tuple[str, ...] = ()
-        """Names of threads that are stuck now."""
+        """Names of the threads that are stuck now."""
         self._has_failed = False
 
     @property
     def problem(self) -> str | None:
-        """What keeps the server from doing its work, if anything does."""
+        """Why the server cannot do its work; None if it can."""
         if self._has_failed:
             return "the watch over the server's threads has failed; the log says why"
         if self.stuck:
@@ -84,7 +84,7 @@ class ThreadWatch:
 
     @property
     def states(self) -> dict[str, State]:
-        """By name of thread."""
+        """State of each thread, by name."""
         return {
             thread.name: "dead" if thread.is_dead else "stuck" if thread.name in self.stuck else "working"
             for group in self._groups
@@ -92,7 +92,7 @@ class ThreadWatch:
         }
 
     def look(self) -> None:
-        """Look once at every thread."""
+        """Check every thread once."""
         self._looks += 1
         stuck = []
         for group in self._groups:
@@ -111,7 +111,7 @@ class ThreadWatch:
         self.stuck = tuple(stuck)
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Check the threads again and again until cancelled."""
         try:
             while True:
                 await asyncio.sleep(PERIOD_S)

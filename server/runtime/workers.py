@@ -1,5 +1,5 @@
-"""Threads that compute what audio threads wait for: what is urgent first, then one of each kind in turns, each kind in
-the order in which it was asked for. A kind that many ask for keeps no other waiting."""
+"""Worker threads, which compute impulse responses and plans for the audio threads. Urgent work comes first. After that
+the kinds of work take turns, so that no kind delays another; within a kind the oldest request comes first."""
 
 import threading
 from collections import deque
@@ -12,22 +12,22 @@ from server.runtime.thread_pool import ThreadPool
 
 T = TypeVar("T")
 Kind = Literal["response", "plan"]
-"""Impulse responses, and plans of effects with their checks."""
+"""Impulse responses, or plans of effects with their audits."""
 
 
 _PATIENCE_S = 10.0
-"""Impulse responses and plans take milliseconds, checks of plans up to a second."""
+"""Impulse responses and plans take milliseconds, audits of plans up to a second."""
 _STOP_S = 1.0
 
 
 class Workers:
-    """So many threads; leaving the context waits until everything is done, for a second at the most."""
+    """A pool of `threads` workers. Leaving the context waits at most a second for work to finish."""
 
     def __init__(self, threads: int, name: str = "worker", *, initializer: Callable[[], None] | None = None) -> None:
         self.threads = threads
         self.pool = ThreadPool(threads, name, initializer=initializer, patience_s=_PATIENCE_S)
         self._unfinished: deque[None] = deque()
-        """As many as there are pieces of work that are not done."""
+        """One entry for each unfinished piece of work."""
         self._urgent: deque[Callable[[], None]] = deque()
         self._usual: dict[Kind, deque[Callable[[], None]]] = {kind: deque() for kind in get_args(Kind)}
         self._turns = deque(self._usual)
@@ -41,12 +41,12 @@ class Workers:
 
     @property
     def are_busy(self) -> bool:
-        """Whether anything is being done or waits; may be asked from any thread."""
+        """Whether any work is being done or waits. Any thread may ask."""
         return bool(self._unfinished)
 
     def submit(self, work: Callable[..., T], /, *args: Any, kind: Kind, is_urgent: bool = False) -> Future[T]:
-        """What `work` returns or raises. Waits for no thread that chooses what comes next: one of low priority may take
-        long for that."""
+        """Queue `work(*args)`; the future has its result. Takes no lock that a worker holds, since a worker of low
+        priority may hold a lock for long."""
         future: Future[T] = Future()
         run = partial(_settle, future, work, args)
         self._unfinished.append(None)
@@ -56,7 +56,7 @@ class Workers:
 
     def _run_next(self) -> None:
         try:
-            self._next()()  # in no variable: a traceback of what fails would hold it
+            self._next()()  # not in a variable, which the traceback of a failure would keep alive
         finally:
             self._unfinished.pop()
 
@@ -76,9 +76,9 @@ def _settle(future: Future[T], work: Callable[..., T], args: tuple[Any, ...]) ->
         return
     try:
         result = work(*args)
-    except BaseException as exc:  # noqa: BLE001  whoever asks for the result has it raised
+    except BaseException as exc:  # noqa: BLE001  raised where the result is read
         future.set_exception(exc)
-        # The traceback holds this frame: with the future in it, all three would wait for the collector.
+        # The traceback refers to this frame. With the future in it there would be a cycle for the garbage collector.
         del future
     else:
         future.set_result(result)

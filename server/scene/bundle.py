@@ -1,8 +1,8 @@
-"""Scene bundles: the folder training writes and the server loads.
+"""Scene bundles: folders that training writes and the server loads.
 
-`scene.json` describes the scene and lists a SHA-256 for every other file; `*.onnx` are the fields; `arrays.npz` holds
-`frozen_noise` (2, sample), the white signal behind every late reverberation of the scene. Nothing half-loads: a bundle
-that exists as an object was read and checked whole.
+`scene.json` describes the scene and lists the SHA-256 of every other file. `*.onnx` are the fields. `arrays.npz` holds
+`frozen_noise` (2, sample), the white signal behind the late reverberation of the scene. A `Bundle` object exists only
+after the whole folder was read and checked.
 """
 
 import hashlib
@@ -30,21 +30,23 @@ MANIFEST_FILE = "scene.json"
 BUNDLED = Path(__file__).parent / "bundles"
 
 MOST_MANIFEST_BYTES = 4 * 2**20
-"""The bundled apartment, with its whole frontier, takes 31 kB."""
+"""Largest `scene.json`. That of the bundled apartment, with its whole frontier, has 31 kB."""
 MOST_FILE_BYTES = 2**31 - 1
-"""What an ONNX file may have: protobuf knows no larger message. All listed files together may have as much."""
+"""Largest size of all listed files together. A single ONNX file cannot be larger, since protobuf has no larger
+messages."""
 _CHUNK_BYTES = 2**20
 _NOISE_MEMBER = "frozen_noise.npy"
 _WIDEST_SAMPLE_BYTES = 8
 _ARCHIVE_OVERHEAD_BYTES = 2**16
-# What `zipfile` raises for bytes that are no archive, or a damaged one; NotImplementedError is a RuntimeError.
+# Exceptions of `zipfile` for invalid or damaged archives. NotImplementedError is a RuntimeError.
+# guard: an archive that is none is refused by file and field
 _ARCHIVE_ERRORS = (OSError, EOFError, KeyError, ValueError, RuntimeError, zlib.error, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """A checked scene bundle. `models` holds the bytes of each ONNX file by name, as hashed; `frozen_noise` is empty
-    where there are none."""
+    """A checked scene bundle. `models` holds the bytes of the ONNX files by name. `frozen_noise` (2, sample) is empty
+    if the scene has no fields."""
 
     folder: Path
     manifest: Manifest
@@ -54,12 +56,14 @@ class Bundle:
 
     @classmethod
     def load(cls, folder: Path) -> "Bundle":
-        """Raises BundleError naming file and field for anything missing, damaged or out of bounds."""
+        """Read and check a bundle. Raises BundleError, which names the file and the field, for anything missing,
+        damaged or out of bounds."""
         path = folder / MANIFEST_FILE
         text = _read(folder, MANIFEST_FILE, MOST_MANIFEST_BYTES)
         try:
             manifest = Manifest.model_validate_json(text)
         except ValidationError as exc:
+            # guard: a manifest that is none is refused by file and field
             first = exc.errors()[0]
             field = ".".join(str(part) for part in first["loc"]) or "document"
             raise BundleError(path, field, first["msg"]) from exc
@@ -87,6 +91,7 @@ class Bundle:
         inside a wall."""
         bounds = self.manifest.bounds
         sides = zip(bounds.minimum, position, bounds.maximum, strict=True)
+        # guard: a place is within the bounds
         in_box = all(least <= at <= most for least, at, most in sides)
         if in_box and self.floor_plan.holds(position):
             return
@@ -96,7 +101,7 @@ class Bundle:
 
 
 def write_bundle(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> Bundle:
-    """Writes the files, then the manifest with their hashes in place of any it had, and loads the result back."""
+    """Write the files and the manifest with their hashes, and load the result back."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         (folder / name).write_bytes(data)
@@ -107,12 +112,12 @@ def write_bundle(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> B
 
 
 def find_bundle(scene: str) -> Path:
-    """The folder of a bundled scene by id, or of any scene by path. Raises RequestError `unknown_scene`."""
+    """The folder of a bundled scene by its id, or of any scene by its path. Raises RequestError `unknown_scene`."""
     for folder in (BUNDLED / scene, Path(scene)):
         try:
             if (folder / MANIFEST_FILE).is_file():
                 return folder
-        except (OSError, ValueError):  # no name that a file could have
+        except (OSError, ValueError):  # not a possible name of a file
             continue
     known = ", ".join(folder.name for folder in bundled_scenes())
     raise RequestError(
@@ -126,8 +131,8 @@ def bundled_scenes() -> list[Path]:
 
 
 def _read_listed(folder: Path, manifest: Manifest) -> dict[str, bytes]:
-    """The files that the manifest lists, by name. No more is read of any than it may have, nor kept of one that is
-    not the one that was hashed."""
+    """Contents of the files that the manifest lists, by name. Raises BundleError for a file that is too long or has
+    another hash."""
     contents = {}
     left = MOST_FILE_BYTES
     for name, expected in manifest.files.items():
@@ -144,13 +149,14 @@ def _noise_bytes(samples: int) -> int:
 
 
 def _read(folder: Path, name: str, most_bytes: int, *, sha256: str | None = None) -> bytes:
-    """The file `name` of a bundle. Raises BundleError for one that is missing, no regular file, outside the folder,
-    longer than `most_bytes`, or of another hash; nothing is kept before that is known."""
+    """Content of the file `name` of a bundle. Raises BundleError if it is missing, not a regular file, outside the
+    folder, longer than `most_bytes`, or has another hash. These checks come before the content is held in memory."""
     path = folder / name
     try:
+        # guard: a bundle is what lies in its folder
         if not path.resolve().is_relative_to(folder.resolve()):
             raise BundleError(path, "file", f"is a link to {path.resolve()}, outside of the bundle; copy the file here")
-        # Before opening, which would wait for whoever writes to a pipe.
+        # Before opening, which would block on a pipe.
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise BundleError(path, "file", "cannot be read: not a regular file")
@@ -163,7 +169,7 @@ def _read(folder: Path, name: str, most_bytes: int, *, sha256: str | None = None
             return stream.read(status.st_size)
     except OSError as exc:
         raise BundleError(path, "file", f"cannot be read: {exc.strerror}") from exc
-    except RuntimeError as exc:  # links that lead round in a circle
+    except RuntimeError as exc:  # a circle of links
         raise BundleError(path, "file", f"cannot be read: {exc}") from exc
 
 
@@ -178,8 +184,8 @@ def _hash_of(stream: IO[bytes], most_bytes: int) -> str:
 
 
 def _frozen_noise(path: Path, data: bytes, samples: int) -> npt.NDArray[np.float32]:
-    """(2, samples) of the archive. What its directory and the array's header claim is compared with what the manifest
-    expects before any of it is unpacked."""
+    """(2, samples) noise from the archive. The archive's directory and the array's header are compared with the
+    manifest before anything is unpacked."""
     try:
         with (
             zipfile.ZipFile(io.BytesIO(data)) as archive,
@@ -187,28 +193,31 @@ def _frozen_noise(path: Path, data: bytes, samples: int) -> npt.NDArray[np.float
         ):
             header = NpyHeader.read(member)
             _require_noise(path, header, samples)
-            # One byte more, so that `zipfile` sees the end, and compares its checksum.
+            # One byte more, so that `zipfile` sees the end and compares the checksum.
             stored = header.array(member.read(header.data_bytes + 1))
     except (NpyError, *_ARCHIVE_ERRORS) as exc:
         raise BundleError(path, "frozen_noise", f"cannot be read: {exc}") from exc
-    with np.errstate(over="ignore"):  # seen below
+    with np.errstate(over="ignore"):  # checked below
         noise = stored.astype(np.float32)
+    # guard: the frozen noise is finite
     if not np.isfinite(noise).all():
         raise BundleError(path, "frozen_noise", "holds non-finite samples")
     return noise
 
 
 def _noise_member(path: Path, archive: zipfile.ZipFile, samples: int) -> zipfile.ZipInfo:
-    """The one member of the archive. Raises BundleError for another, for two, and for one that unpacks to more than the
-    manifest allows."""
+    """The archive's only member. Raises BundleError if it has another name, if there are several, or if it unpacks to
+    more than the manifest allows."""
     members = archive.infolist()
     names = [member.filename for member in members]
     if _NOISE_MEMBER not in names:
         raise BundleError(path, "frozen_noise", "cannot be read: there is no such array in the archive")
+    # guard: an archive of arrays has one member
     if len(names) > 1:
         others = [name for name in names if name != _NOISE_MEMBER]
         problem = f"there are others beside it, {others[0]!r} for one" if others else "it is there twice"
         raise BundleError(path, "frozen_noise", problem)
+    # guard: an archive unpacks to no more than the manifest allows
     if members[0].file_size > _noise_bytes(samples):
         raise BundleError(
             path,

@@ -1,4 +1,4 @@
-"""What a scene is made of: walls, openings and materials, as written in scene files and bundles."""
+"""Geometry of a scene in scene files and bundles: walls, openings and materials."""
 
 from typing import Annotated
 
@@ -11,23 +11,25 @@ from server.scene.outline import faults_of
 Share = Annotated[float, Field(ge=0, le=1)]
 PerBand = Annotated[tuple[Share, ...], Field(min_length=len(OCTAVE_BANDS_HZ), max_length=len(OCTAVE_BANDS_HZ))]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+# guard: a coordinate of a scene is a place
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 PlanPoint = tuple[Coordinate, Coordinate]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
 MOST_CORNERS = 256
-"""Whoever looks for ways round corners compares all of them with each other."""
+"""Most corners of a floor plan. The search for paths round corners compares each corner with every other."""
 
 
 class Strict(BaseModel):
-    """Unknown keys are mistakes, and nothing changes after it was read."""
+    """Base of models that refuse unknown keys and cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Material(Strict):
-    """Energy shares per octave band, 125 Hz to 8 kHz: absorbed, and scattered of what is reflected. Sound goes through
-    a wall as its mass lets it; without one stated, not at all."""
+    """Properties of a surface per octave band, 125 Hz to 8 kHz. `absorption` is the share of energy absorbed,
+    `scattering` the share of the reflected energy that is scattered. The surface mass decides the transmission loss;
+    without one, no sound goes through the wall."""
 
     absorption: PerBand
     scattering: PerBand
@@ -41,7 +43,7 @@ class Materials(Strict):
 
 
 class Opening(Strict):
-    """A passage between rooms, as the line in plan that one steps over."""
+    """A passage between rooms, given by the line on the floor that one steps over."""
 
     name: str
     start: PlanPoint
@@ -73,11 +75,11 @@ class Geometry(Strict):
         return FloorPlan(self.corners, self.height_m)
 
     def without_scattering(self) -> "Geometry":
-        """All that is reflected is mirrored."""
+        """The same geometry with specular reflections only."""
         return self.with_scattering(0.0)
 
     def with_scattering(self, share: float) -> "Geometry":
-        """Every surface scatters this share of what it reflects, in all octave bands."""
+        """The same geometry with this scattering coefficient at every surface and in all octave bands."""
         scattering = {"scattering": (share,) * len(OCTAVE_BANDS_HZ)}
         names = type(self.materials).model_fields
         materials = Materials(**{name: getattr(self.materials, name).model_copy(update=scattering) for name in names})

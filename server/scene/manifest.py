@@ -1,10 +1,10 @@
-"""`scene.json`: what a scene bundle says of itself.
+"""`scene.json`, the manifest of a scene bundle.
 
-Since format 2 the responses of a bundle's fields hold what follows the direct sound and not the direct sound itself,
-which the server computes from geometry. With `image_order` 1 it computes the first reflections too, and the fields hold
-what follows those. Where responses were measured nobody can take the direct sound out of them: `direct_sound` says that
-the fields hold all of it, through one microphone or two ears. Of such a place often no walls are known either; then
-there is no `geometry`, and the place is what lies within `bounds`.
+Since format 2 the fields of a bundle hold the reflected field only, and the server computes the direct sound from
+geometry. With `image_order` 1 the server also computes the early reflections, and the fields hold only the late
+reverberation. Measured responses cannot be separated like that: with `direct_sound` "field" the fields hold everything,
+for one microphone or two ears. If the walls of such a place are unknown, there is no `geometry`, and the place is the
+box of `bounds`.
 """
 
 from collections.abc import Mapping
@@ -25,14 +25,14 @@ from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ,
 
 ARRAYS_FILE = "arrays.npz"
 NO_FIELD = "none"
-"""What the level of a scene without fields is of."""
+"""Name of the field in the only level of a scene without fields."""
 FORMAT_VERSION: Literal[2] = 2
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
 
 class Bounds(Strict):
-    """The box of positions the field was trained for, metres."""
+    """The box of positions that the fields were trained for, in metres."""
 
     minimum: Point
     maximum: Point
@@ -45,7 +45,7 @@ class Bounds(Strict):
 
 
 class Start(Strict):
-    """Where a visitor finds listener and emitter."""
+    """Poses of listener and emitter at the beginning of a visit."""
 
     listener: Point
     listener_yaw_deg: Finite = 0.0
@@ -53,26 +53,26 @@ class Start(Strict):
 
 
 class Air(Strict):
-    """How much sound the air absorbs on the way; the speed of sound is stated on its own."""
+    """Temperature and humidity of the air, which decide its absorption. The speed of sound is a separate value."""
 
     temperature_c: Annotated[float, Field(ge=-20, le=50)] = 20.0
     relative_humidity: Annotated[float, Field(ge=0.05, le=1)] = 0.5
 
     @property
     def absorption_db_per_m(self) -> npt.NDArray[np.float64]:
-        """(band,) at OCTAVE_BANDS_HZ."""
+        """(band,) absorption at OCTAVE_BANDS_HZ."""
         return absorption_db_per_m(
             OCTAVE_BANDS_HZ, temperature_c=self.temperature_c, relative_humidity=self.relative_humidity
         )
 
 
 class CodecParameters(Strict):
-    """How the field's spectrograms are to be read.
+    """Parameters of a field's spectrograms.
 
-    `samples` is the length of a response after alignment: sample `lead_samples` is the moment sound can first arrive.
-    `known_frames` is the number of frames whose phase the field predicts. Where there are `frame_cells`, each column of
-    log-magnitude and coherence stands for so many frames in place of one: it is what their centre has, and values
-    between two centres go linearly from one to the other.
+    `samples` is the length of a response after alignment: at sample `lead_samples` sound can first arrive.
+    `known_frames` is the number of frames whose phase the field predicts. `frame_cells` gives the number of frames that
+    each column of log-magnitude and coherence stands for. A column is the value at the centre of its frames; between
+    centres values are interpolated linearly. Without `frame_cells` every frame has its own column.
     """
 
     sample_rate: Annotated[int, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
@@ -104,12 +104,12 @@ class CodecParameters(Strict):
 
     @property
     def frame_axis(self) -> Axis | None:
-        """Of the cells of frames; None where every frame is told."""
+        """The cells of frames; None if every frame has its own column."""
         return None if self.frame_cells is None else Axis(np.cumsum([0, *self.frame_cells]))
 
     @property
     def columns(self) -> int:
-        """That log-magnitude has: frames, or cells of them."""
+        """Number of columns of log-magnitude: frames, or cells of frames."""
         return self.codec.frames if self.frame_cells is None else len(self.frame_cells)
 
     @property
@@ -118,8 +118,8 @@ class CodecParameters(Strict):
 
 
 class FieldFile(Strict):
-    """One trained network: an ONNX file, the rank of its output basis where it has one, and its own `codec` where that
-    differs from the bundle's."""
+    """One trained network: its ONNX file, the rank of its output basis if it has one, and its `codec` if that differs
+    from the bundle's."""
 
     file: FileName
     architecture: str
@@ -128,11 +128,11 @@ class FieldFile(Strict):
 
 
 class Phase(Strict):
-    """Where the phase comes from that a field does not know.
+    """The source of the phase that a field does not predict.
 
-    frozen: noise that stands still, one per scene, mixed to the predicted interaural coherence. integrated: the
-    predicted instantaneous frequency, summed up over all frames it was predicted for. griffin_lim: `iterations` of
-    Griffin and Lim's, from zero phase or, `warm`, from the phase last found near the pose.
+    frozen: one noise signal per scene, mixed to the predicted interaural coherence. integrated: the predicted
+    instantaneous frequency, summed over all frames that have one. griffin_lim: `iterations` of the Griffin-Lim
+    algorithm, from zero phase or, if `warm`, from the phase last found near the pose.
     """
 
     kind: Literal["frozen", "integrated", "griffin_lim"] = "frozen"
@@ -149,9 +149,8 @@ class Phase(Strict):
 
 
 class Accuracy(Strict):
-    """Mean errors over `pairs` held-out pairs, each heard at `yaws` head orientations, by metric, and the
-    repeatability floor. `steps` are the largest changes seen between poses a centimetre apart, by metric, in
-    just-noticeable differences."""
+    """Mean errors by metric over `pairs` held-out pairs, each at `yaws` head orientations, and the repeatability floor.
+    `steps` are the largest changes between poses a centimetre apart, by metric, in just-noticeable differences."""
 
     pairs: int
     yaws: int
@@ -164,11 +163,11 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Cost(Strict):
-    """What a pose takes on one core of `host` until its binaural response is ready to be convolved.
+    """Time on one core of `host` from a pose until its binaural response is ready to be convolved.
 
-    `ms_p50`, `ms_p99` and `ms_mean` are over the poses of a walk; `ms_miss` is the median of those that found nothing
-    kept to reuse, which is what a deadline has to bear. The last two are the median where they were not measured.
-    `storage_mb` is that of the field's file, `memory_mb` what serving it adds to a process.
+    `ms_p50`, `ms_p99` and `ms_mean` are over the poses of a walk. `ms_miss` is the median over poses for which no kept
+    response could be reused; deadlines have to allow for it. If `ms_mean` or `ms_miss` was not measured, it equals
+    `ms_p50`. `storage_mb` is the size of the field's file, `memory_mb` the memory that serving it adds to a process.
     """
 
     ms_p50: Positive
@@ -188,11 +187,12 @@ class Cost(Strict):
 
 
 class Reuse(Strict):
-    """Responses are computed for the nodes of a lattice alone and kept: poses near a node have its response.
+    """Reuse of responses. They are computed only at the nodes of a lattice and kept; a pose gets the response of its
+    nearest node.
 
-    Nodes are `spacing_m` apart at most along each axis, for listener and emitter alike, and headings at most
-    `turn_deg`. The first reflections that geometry computes are those of the `pose` itself, or, kept with all else,
-    those of its `node`. The direct sound is always the pose's own.
+    Nodes are at most `spacing_m` apart along each axis, for listener and emitter alike, and headings at most
+    `turn_deg`. Early reflections computed from geometry are those of the `pose` itself, or those of its `node` and kept
+    with the response. The direct sound is always that of the pose itself.
     """
 
     spacing_m: Positive
@@ -201,11 +201,11 @@ class Reuse(Strict):
 
 
 class QualityLevel(Strict):
-    """A point on the accuracy-cost frontier; `accuracy` and `cost` are absent until they were measured.
+    """A point on the accuracy-cost frontier. `accuracy` and `cost` are absent until they are measured.
 
-    Of the response all is computed, or only the first `frames`, and the rest is silent; an emitter gets `ir_rate_hz`
-    responses per second at most, or one with every pose; with `shared_tail` all emitters of a listener share one late
-    tail; with `reuse` poses near each other share responses.
+    With `frames` only that many frames of a response are computed, and the rest is silent. An emitter gets at most
+    `ir_rate_hz` responses per second or, without that, one for every pose. With `shared_tail` all emitters of a
+    listener share one late reverberation. With `reuse` poses near each other share responses.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
@@ -220,7 +220,7 @@ class QualityLevel(Strict):
 
 
 class FrontierPoint(Strict):
-    """A level that was measured and is not offered; what it would take of `architecture` and `rank` need not be in the
+    """A level that was measured but is not offered. Its field, of this `architecture` and `rank`, need not be in the
     bundle."""
 
     level: QualityLevel
@@ -229,11 +229,11 @@ class FrontierPoint(Strict):
 
 
 class DataReference(Strict):
-    """What the responses that a scene's fields were trained on do themselves, as `nafir check` measures fields: where a
-    room's own responses rise, or are louder than a diffuse field could be, so may its fields.
+    """Measurements of the responses that a scene's fields were trained on, made as `nafir check` measures fields. If
+    these responses rise, or are louder than a diffuse field could be, the fields may do the same.
 
-    `rises_db` are the greatest rises that end in each window of `window_s`, of all responses measured;
-    `energy_excess_db` is the most energy that any has, re what the walls let remain.
+    `rises_db` are the greatest rises, over all responses, that end in each window of `window_s`. `energy_excess_db` is
+    the greatest energy of any response, relative to the energy that the walls' absorption allows.
     """
 
     responses: Annotated[int, Field(ge=1)]
@@ -243,55 +243,56 @@ class DataReference(Strict):
 
 
 class AcceptedLaw(Strict):
-    """A law of health that the fields break, and why whoever exported them offers them all the same."""
+    """A law of `nafir check` that the fields break, and the reason why the scene is offered all the same."""
 
     law: str
     reason: Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class Manifest(Strict):
-    """All of `scene.json`; `files` maps every other file of the bundle to its SHA-256."""
+    """The content of `scene.json`."""
 
     format_version: Literal[2] = FORMAT_VERSION
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
-    """What clients ask for the scene by."""
+    """Identifier by which clients ask for the scene."""
     name: str
-    """What the page calls it."""
+    """Name shown on the page."""
     description: str = ""
     geometry: Geometry | None = None
-    """Walls, openings and materials; absent where they are not known, as of measured places."""
+    """Walls, openings and materials; absent if they are unknown, as of measured places."""
     bounds: Bounds
     speed_of_sound: Annotated[float, Field(gt=100, lt=1000)]
     """Metres per second."""
     air: Air = Air()
-    """What the absorption by air is computed from."""
+    """Temperature and humidity, from which the absorption by air is computed."""
     image_order: Literal[0, 1] = 0
-    """The server computes reflections from so many surfaces from geometry, and the fields do not hold them."""
+    """Order of the reflections that the server computes from geometry and the fields do not hold: none, or those from
+    one surface."""
     transmission: bool = False
-    """Whether the server lets sound go straight through walls, as far as their mass lets it; else they are solid."""
+    """Whether the server renders sound through walls, by their surface mass. Otherwise no sound goes through them."""
     start: Start
-    """Where a visitor begins."""
+    """Poses at the beginning of a visit."""
     direct_sound: Literal["geometry", "field"] = "geometry"
     """Whether the direct sound is computed from geometry or held by the fields' responses."""
     reference_level_db: Finite = 0.0
-    """Level of the direct sound one metre from an emitter, in the unit of the fields' responses. Sound is heard, and
-    maps are drawn, as if it were 0."""
+    """Level of the direct sound one metre from an emitter, in the unit of the fields' responses. Sound and maps are
+    rendered as if it were 0."""
     channels: tuple[Literal["left"], Literal["right"]] | tuple[Literal["mono"]] = ("left", "right")
     """Channels of the fields' responses: two ears or one microphone."""
     codec: CodecParameters
-    """How the fields' spectrograms are read, unless a field has a codec of its own."""
+    """Parameters of the fields' spectrograms, unless a field has its own."""
     fields: dict[str, FieldFile]
-    """The trained networks by name; empty where nothing reverberates, as in the open."""
+    """The trained networks by name; empty if there is no reverberation, as outdoors."""
     levels: Annotated[tuple[QualityLevel, ...], Field(min_length=1)]
     """The quality levels on offer, the default first."""
     frontier: tuple[FrontierPoint, ...] = ()
-    """Levels that are worth their time, but so near one of `levels` that they are not offered."""
+    """Measured levels on the frontier that are not offered because they are too near one of `levels`."""
     effects: Mapping[EffectName, bool] = Field(default_factory=dict)
-    """Effects that are on or off whatever the planner would decide; the planner decides about all others."""
+    """Effects that are always on or always off. The planner decides about all others."""
     reference: DataReference | None = None
-    """What the responses are like that the fields were trained on; absent where that is not known."""
+    """Measurements of the responses that the fields were trained on; absent if there are none."""
     accepted: tuple[AcceptedLaw, ...] = ()
-    """Laws of health that the scene breaks with a stated reason."""
+    """Laws of `nafir check` that the scene breaks for a stated reason."""
     files: dict[FileName, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
     """SHA-256 of every other file of the bundle."""
 
@@ -339,12 +340,14 @@ class Manifest(Strict):
         if self.direct_sound == "field" and any(level.reuse is not None for level in self.levels):
             raise ValueError("levels: responses that hold the direct sound cannot be those of another place (reuse)")
         if len(self.channels) == 1 and self.direct_sound == "geometry":
-            raise ValueError("direct_sound: what one microphone heard holds it; it is computed for two ears only")
+            raise ValueError(
+                "direct_sound: responses of one microphone have to hold it; it is computed for two ears only"
+            )
         return self
 
     @property
     def floor_plan(self) -> FloorPlan:
-        """Where sound travels: that of the geometry, or the box of the bounds, in which all see each other."""
+        """The floor plan of the geometry or, without one, the empty box of the bounds."""
         if self.geometry is not None:
             return self.geometry.floor_plan
         (west, south, low), (east, north, high) = self.bounds.minimum, self.bounds.maximum

@@ -1,6 +1,6 @@
-"""Whether the corners of a floor plan make one simple polygon, and where they do not.
+"""Check that the corners of a floor plan form a simple polygon.
 
-Edge i runs from corner i to corner i + 1, and the last one back to corner 0. Metres.
+Edge i runs from corner i to corner i + 1, and the last one back to corner 0. Units are metres.
 """
 
 import math
@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import shapely
 
 SHORTEST_WALL_M = 0.001
-"""Of a wall, and between two walls. Shorter ones are a corner written twice; geometry divides by the length of a
-wall."""
+"""Least length of a wall, and least distance between two walls that do not meet. Anything shorter is a corner written
+twice, and geometry divides by the length of a wall."""
 
 _MOST_FAULTS_TOLD = 3
 
@@ -18,26 +18,28 @@ _Corner = tuple[float, float]
 
 
 def faults_of(corners: Sequence[_Corner]) -> list[str]:
-    """What keeps three corners or more from being a simple polygon that runs counter-clockwise, the first few of it;
-    nothing of one that is."""
+    """The first few reasons why three or more corners are not a simple, counter-clockwise polygon; empty if they
+    are."""
     for index, corner in enumerate(corners):
+        # guard: a wall has a length
         if math.dist(corner, corners[index - 1]) < SHORTEST_WALL_M:
             closes = ": leave the last one out, a floor plan closes by itself" if index == 0 else ""
             return [f"corner {index} is where corner {(index - 1) % len(corners)} is, at {_place(corner)}{closes}"]
     meetings = _meetings(corners)
     if meetings:
         return [*meetings[:_MOST_FAULTS_TOLD], "edge 0 runs from corner 0 to corner 1"]
+    # guard: a room has an inside
     if not shapely.LinearRing(corners).is_ccw:
         return ["corners must run counter-clockwise: these run clockwise, so write them in the opposite order"]
     return []
 
 
 def _meetings(corners: Sequence[_Corner]) -> list[str]:
-    """Of edges anywhere but in the corner between two neighbours."""
+    """Messages about edges that meet anywhere but in the corner between two neighbours."""
     count = len(corners)
     edges = [shapely.LineString([corners[index], corners[(index + 1) % count]]) for index in range(count)]
     near = shapely.STRtree(edges).query(edges, predicate="dwithin", distance=SHORTEST_WALL_M)
-    told = []
+    faults = []
     for first, second in sorted((int(a), int(b)) for a, b in near.T if a < b):
         if second - first == 1 or (first == 0 and second == count - 1):
             shared = corners[second] if second - first == 1 else corners[0]
@@ -45,12 +47,12 @@ def _meetings(corners: Sequence[_Corner]) -> list[str]:
         else:
             fault = _meeting(edges[first], edges[second])
         if fault:
-            told.append(f"edges {first} and {second} {fault}")
-    return told
+            faults.append(f"edges {first} and {second} {fault}")
+    return faults
 
 
 def _meeting(edge: shapely.LineString, other: shapely.LineString) -> str:
-    """Of two edges that are not neighbours."""
+    """How two edges meet that are not neighbours."""
     common = edge.intersection(other)
     if common.is_empty:
         return f"touch at {_place(shapely.shortest_line(edge, other).coords[0])}"
@@ -61,7 +63,7 @@ def _meeting(edge: shapely.LineString, other: shapely.LineString) -> str:
 
 
 def _fold(edge: shapely.LineString, other: shapely.LineString, shared: _Corner) -> str:
-    """Of neighbours, where the second runs back over the first; empty where it does not."""
+    """How a neighbouring edge runs back over the other; empty if it does not."""
     shorter, longer = sorted((edge, other), key=lambda each: each.length)
     free = max(shorter.coords, key=lambda end: math.dist(end, shared))
     if longer.distance(shapely.Point(free)) >= SHORTEST_WALL_M:

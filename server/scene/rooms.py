@@ -1,4 +1,4 @@
-"""The rooms that openings part a floor plan into."""
+"""Division of a floor plan into rooms at its openings."""
 
 import math
 from collections.abc import Sequence
@@ -10,21 +10,21 @@ import numpy as np
 from server.acoustics.geometry import FloorPlan
 from server.scene.geometry import Geometry, PlanPoint
 
-# An opening that ends nearer to a wall than this ends on it.
+# An opening whose end is nearer to a wall than this ends on the wall.
 ON_WALL_M = 0.001
 _LEAST_M2 = 0.001
 
 
 @dataclass(frozen=True)
 class Room:
-    """`plan` is closed across its openings, which are `passage_m` wide together."""
+    """One room. `plan` runs straight across the room's openings, whose total width is `passage_m`."""
 
     plan: FloorPlan
     passage_m: float
 
 
 def rooms_of(geometry: Geometry) -> list[Room]:
-    """One or more. Openings that do not lead from wall to wall part nothing."""
+    """The rooms of a floor plan, at least one. An opening divides a room only if it runs from wall to wall."""
     parts, passages = [list(geometry.corners)], set()
     for opening in geometry.openings:
         for index, corners in enumerate(parts):
@@ -50,7 +50,7 @@ def rooms_of(geometry: Geometry) -> list[Room]:
 
 
 def _wall_at(corners: Sequence[PlanPoint], point: PlanPoint) -> int | None:
-    """The nearest wall, if it is touched."""
+    """Index of the wall that the point lies on; None if it lies on none."""
     starts = np.array(corners)
     along = np.roll(starts, -1, axis=0) - starts
     share = np.clip(np.sum((point - starts) * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
@@ -60,6 +60,6 @@ def _wall_at(corners: Sequence[PlanPoint], point: PlanPoint) -> int | None:
 
 
 def _between(corners: Sequence[PlanPoint], first: int, last: int) -> list[PlanPoint]:
-    """Corners after wall `first` up to where wall `last` begins, on along the walls."""
+    """Corners from the end of wall `first` to the beginning of wall `last`."""
     count = (last - first) % len(corners)
     return [corners[(first + 1 + step) % len(corners)] for step in range(count)]

@@ -9,15 +9,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 def soak(
     scene: Annotated[str, typer.Argument(help="Id of a bundled scene.")] = "apartment",
-    minutes: Annotated[float, typer.Option(min=0.1, help="How long; memory is judged from 12 on.")] = 30.0,
+    minutes: Annotated[
+        float, typer.Option(min=0.1, help="Length of the run; memory is judged from 12 minutes on.")
+    ] = 30.0,
     clients: Annotated[int, typer.Option(min=1, max=32, help="Hostile clients at any time.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Of all that they do.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the clients' actions.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
-    """Stream for a long time to clients that do what they should not, from a server of its own, and see what it does.
+    """Run a server for a long time with clients that misbehave, and check that it keeps working.
 
-    Beside them a listener at rest compares every sample with an offline render in double precision. Exit code 1 where
-    something that has to hold does not, with the reason on standard error.
+    Meanwhile a listener at rest compares every sample with an offline render in double precision. The exit code is 1 if
+    any requirement is not met; standard error says which and why.
     """
     from server.bench.report import Judgement, end_with, missed, print_json, print_judgements, print_measures
     from server.soak.run import Plan

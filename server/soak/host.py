@@ -1,4 +1,4 @@
-"""`nafir serve` in a process of its own, watched: what it keeps in memory, what it counts, and what it complains of."""
+"""`nafir serve` in a process of its own, with access to its memory use, its metrics and the errors in its log."""
 
 import contextlib
 import re
@@ -17,7 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from server.core.errors import NafirError
 
 _READY_S = 300.0
-"""Machine code may have to be made first."""
+"""Limit for becoming ready. Kernels may have to be compiled first."""
 _PATIENCE_S = 20.0
 _NEXT_LINE = re.compile(r"\n(?:DEBUG|INFO|WARNING|ERROR|CRITICAL)")
 _TRACE_CHARACTERS = 800
@@ -25,7 +25,7 @@ _SERVE = "from server.cli.main import main; main()"
 
 
 class Host:
-    """A server that runs."""
+    """A running server process."""
 
     def __init__(self, process: subprocess.Popen[bytes], port: int, log: Path) -> None:
         self._process = process
@@ -37,18 +37,18 @@ class Host:
         return self._process.poll() is None
 
     def get(self, path: str) -> bytes:
-        """Raises OSError where there is no answer, and urllib.error.HTTPError where it is an error."""
+        """Body of a GET request. Raises OSError if there is no answer, and urllib.error.HTTPError if it is an error."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=_PATIENCE_S) as answer:
             body: bytes = answer.read()
         return body
 
     def metrics(self) -> dict[str, float]:
-        """Samples without labels by name, of /metrics."""
+        """Values of /metrics by name, of the metrics without labels."""
         families = text_string_to_metric_families(self.get("/metrics").decode())
         return {sample.name: sample.value for family in families for sample in family.samples if not sample.labels}
 
     def tracebacks(self) -> list[str]:
-        """Exceptions that nobody caught, as far as the log tells: the last lines of each."""
+        """Last lines of every traceback in the log."""
         _, *tracebacks = self._log.read_text(errors="replace").split("Traceback (most recent call last):\n")
         return [_NEXT_LINE.split(text)[0][-_TRACE_CHARACTERS:] for text in tracebacks]
 
@@ -58,7 +58,7 @@ class Host:
 
 @contextlib.contextmanager
 def serve(bundle: Path) -> Iterator[Host]:
-    """Until the context ends. Raises NafirError where it does not become ready."""
+    """Run a server until the context ends. Raises NafirError if it does not become ready."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

@@ -1,9 +1,9 @@
-"""Clients that do everything a client should not, and much that it may.
+"""Hostile clients for `nafir soak`.
 
-What is sent is drawn at random, from a seed. What a server may take is meant to be hard for it: teleports, emitters on
-top of the listener, levels and effects switched in mid-air, denormal sound. What it has to refuse, a *fault*, has to be
-answered by an error, after which the stream goes on as if nothing had been sent. Some connections are broken off in
-mid-stream, some stop reading.
+Their messages are drawn at random from a seed. Valid messages are hard for the server: teleports, emitters on top of
+the listener, changes of level and effects at any time, denormal samples. Invalid messages, called *faults*, have to be
+answered by an error, after which the stream goes on as if they had not been sent. Some connections break off in the
+middle of a stream, and some clients stop reading.
 """
 
 import asyncio
@@ -50,7 +50,7 @@ _DRY_FRAMES = 512
 
 
 class Hostile:
-    """One client after another, until it is told to stop. All counts are of all its lives."""
+    """Runs one hostile connection after another. Counts are sums over all of them."""
 
     def __init__(self, url: str, seed: int) -> None:
         self.actions: Counter[str] = Counter()
@@ -58,7 +58,7 @@ class Hostile:
         self.endings: Counter[str] = Counter()
         self.blocks = self.blocks_late = self.samples_not_finite = self.faults_unanswered = 0
         self.complaints: list[str] = []
-        """What should not have happened: streams that the server ended, or that never answered."""
+        """Failures: streams that the server ended, or that never answered."""
         self._url = url
         self._rng = np.random.default_rng(seed)
 
@@ -109,10 +109,10 @@ class Hostile:
 
 
 class _Life:
-    """From one welcome to the end of that connection."""
+    """One hostile connection, from its welcome to its end."""
 
     def __init__(self, hostile: Hostile, socket: ClientConnection, welcome: Welcome, rng: np.random.Generator) -> None:
-        self._told = hostile
+        self._client = hostile
         self._socket = socket
         self._welcome = welcome
         self._rng = rng
@@ -121,22 +121,22 @@ class _Life:
         )
         self._position = np.array(welcome.scene.listener.position)
         self._emitters: dict[str, bool] = {}
-        """By id, whether it is live."""
+        """Emitters by id, with whether each is live."""
         self._serial = self._pose_id = self._dry_sequence = 0
         self._errors = self._faults = 0
         self._newest = 0
         self._pong = asyncio.Event()
 
     async def listen(self) -> None:
-        told = self._told
+        client = self._client
         async for message in self._socket:
             if isinstance(message, bytes):
                 block = AudioBlock.parse(message, self._welcome.encoding)
-                told.blocks += 1
-                told.blocks_late += block.is_late
-                told.samples_not_finite += block.samples.size - int(np.count_nonzero(np.isfinite(block.samples)))
+                client.blocks += 1
+                client.blocks_late += block.is_late
+                client.samples_not_finite += block.samples.size - int(np.count_nonzero(np.isfinite(block.samples)))
                 self._newest = block.sequence
-                if told.blocks % 4 == 0:
+                if client.blocks % 4 == 0:
                     await self._socket.send(Acknowledge(sequence=block.sequence).serialize())
                 continue
             event = parse_server_message(message)
@@ -153,22 +153,22 @@ class _Life:
             name = str(self._rng.choice(names, p=weights / weights.sum()))
             for message in tricks[name](self):
                 await self._socket.send(message)
-            self._told.actions[name] += 1
+            self._client.actions[name] += 1
             if name in _FAULTS:
                 self._faults += 1
-                self._told.faults[name] += 1
+                self._client.faults[name] += 1
             await asyncio.sleep(self._rng.exponential(1 / _ACTIONS_PER_S))
 
     async def settle(self) -> None:
-        """Until everything sent so far has been answered; then nothing may be missing. What the audio thread refuses
-        may be told of after the answer to a ping, which it never sees."""
+        """Wait until everything sent so far has been answered, and count faults without an error. Errors from the audio
+        thread may come after the answer to a ping, since a ping does not pass through that thread."""
         await self._socket.send(Ping(id=1).serialize())
         await asyncio.wait_for(self._pong.wait(), _PATIENCE_S)
         if self._errors < self._faults:
             await asyncio.sleep(_REFUSAL_S)
-        self._told.faults_unanswered += max(0, self._faults - self._errors)
+        self._client.faults_unanswered += max(0, self._faults - self._errors)
 
-    # What a client may do, each the messages to send.
+    # Valid actions. Each returns the messages to send.
 
     def teleport(self) -> list[str | bytes]:
         return [self._stand(self._rng.uniform(self._low, self._high))]
@@ -245,7 +245,7 @@ class _Life:
     def acknowledge_again(self) -> list[str | bytes]:
         return [Acknowledge(sequence=self._newest).serialize()]
 
-    # Faults.
+    # Faults. Each returns the messages to send.
 
     def position_not_finite(self) -> list[str | bytes]:
         number = self._rng.choice((np.nan, np.inf, -np.inf))
@@ -277,8 +277,8 @@ class _Life:
     def too_loud(self) -> list[str | bytes]:
         return ['{"type": "set_gain", "id": "e1", "gain_db": 1e30}']
 
-    def nobody(self) -> list[str | bytes]:
-        return [RemoveEmitter(id="nobody").serialize()]
+    def unknown_emitter(self) -> list[str | bytes]:
+        return [RemoveEmitter(id="unheard").serialize()]
 
     def unknown_level(self) -> list[str | bytes]:
         return [SetLevel(level="perfect").serialize()]
@@ -296,7 +296,7 @@ class _Life:
         return [Hello(protocol=PROTOCOL, scene=self._welcome.scene.id).serialize()]
 
     def _stand(self, position: _Floats) -> bytes:
-        # In doubles a corner of the bounds is inside them; as float32 it may be a hair outside.
+        # A corner of the bounds may be slightly outside of them after rounding to float32.
         self._position = np.clip(position, self._low + 1e-4, self._high - 1e-4)
         turn = self._rng.normal(size=4)
         return _BINARY_POSE.pack(2, 0, 0, self._next_pose(), *self._position, *(turn / np.linalg.norm(turn)))
@@ -353,7 +353,7 @@ _FAULTS: Mapping[str, _Trick] = {
         _Life.misspelt_field,
         _Life.random_bytes,
         _Life.too_loud,
-        _Life.nobody,
+        _Life.unknown_emitter,
         _Life.unknown_level,
         _Life.unknown_effect,
         _Life.unknown_clip,

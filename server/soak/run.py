@@ -1,14 +1,12 @@
-"""Hours of streaming in minutes of malice: a server of its own, hostile clients, and a witness who hears whether any of
-it shows.
+"""The soak test: a server, hostile clients, and a witness that checks whether they affect other streams.
 
-- `samples_not_finite`: in what any client received, and, as the server counts, in what it rendered.
-- `crashes`: the server's end before its time, exceptions that nobody caught, and answers of 5xx but for 503, which says
-  that there is too much to do.
-- `faults_unanswered`: messages that had to be refused and were not.
-- `memory_growth`: of the server's resident memory once its caches have filled, after six minutes: the median of
-  the last fifth of the time after that over the median of the first. A run of less than twelve minutes leaves it out.
-- `drift_db`: see `server.soak.witness`. `silence_to_sound`: see `server.soak.silence`, measured when all else is over.
-- `blocks_late` are told, not judged: they say how busy the host was.
+- `samples_not_finite`: number of such samples that clients received or that the server rendered.
+- `crashes`: early ends of the server, uncaught exceptions, and 5xx answers except 503, which means that it is busy.
+- `faults_unanswered`: invalid messages that were not refused.
+- `memory_growth`: growth of the server's resident memory after six minutes, when its caches are full. It compares the
+  medians of the last and the first fifth of the remaining time. Runs of less than twelve minutes leave it out.
+- `drift_db`: see `server.soak.witness`. `silence_to_sound`: see `server.soak.silence`; it is measured at the end.
+- `blocks_late` is reported but not judged, since it depends on how busy the host is.
 """
 
 import asyncio
@@ -42,12 +40,12 @@ _ACKNOWLEDGE_EVERY = 4
 _WATCH_S = 2.0
 _FIFTH = 5
 _ODDS = 0.8, *5 * (0.04,)
-"""Of a coordinate that is right, and of others."""
+"""Probability of a valid coordinate, and of each invalid one."""
 
 _FILLING_S = 360.0
-"""How long caches fill: it takes them four to six minutes with three clients."""
+"""Time until the caches are full; with three clients it takes four to six minutes."""
 _LEAST_S = 2 * _FILLING_S
-"""That memory is judged for."""
+"""Shortest run for which memory is judged."""
 
 _NOT_FINITE = Goal("samples not finite", 0, is_at_most=True)
 _CRASHES = Goal("crashes", 0, is_at_most=True)
@@ -58,7 +56,7 @@ _DRIFT = Goal("drift of the witness, dB", 1.0, is_at_most=True)
 _SILENCE = Goal("a block in silence over one in sound", 1.0, is_at_most=True)
 
 Advance = Callable[[float], None]
-"""Told every now and then what share of the time is over."""
+"""Progress callback; it gets the share of the time that is over."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +64,12 @@ class Plan:
     scene: str = "apartment"
     duration_s: float = 1_800.0
     clients: int = 3
-    """Hostile ones, at any time."""
+    """Number of hostile clients at any time."""
     seed: int = 0
 
 
 def soak(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
-    """Raises NafirError where the server does not start or ends before the first sound."""
+    """Run the soak test. Raises NafirError if the server does not start or ends before the first sound."""
     folder = find_bundle(plan.scene)
     levels = FieldsByLevel.load(Bundle.load(folder))
     with serve(folder) as host:
@@ -82,17 +80,18 @@ def soak(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
 
 
 def judge(measured: dict[str, Any]) -> list[Judgement]:
-    """Beside what has to hold. What nobody tried does not hold: without a block heard, or a fault sent."""
+    """Judge the measurements against the requirements. A requirement that was not tested, because no block was received
+    or no fault was sent, counts as not met."""
     silent = None if measured["blocks"] else "no hostile client heard a block"
     harmless = None if measured["faults"] else "no client did anything that had to be refused"
-    unheard = None if measured["witness"]["seconds"] else "the witness heard nothing"
+    unmeasured = None if measured["witness"]["seconds"] else "the witness heard nothing"
     return [
         _NOT_FINITE.judge(measured["samples_not_finite"], failure=silent),
         _CRASHES.judge(measured["crashes"]),
         _UNANSWERED.judge(measured["faults_unanswered"], failure=harmless),
         _judge_growth(measured),
-        _ERROR.judge(measured["witness"]["worst_error_db"], failure=unheard),
-        _DRIFT.judge(measured["witness"]["drift_db"], failure=unheard),
+        _ERROR.judge(measured["witness"]["worst_error_db"], failure=unmeasured),
+        _DRIFT.judge(measured["witness"]["drift_db"], failure=unmeasured),
         _SILENCE.judge(measured["silence_to_sound"]),
     ]
 
@@ -114,7 +113,7 @@ class _Soak:
         self._url = f"ws://127.0.0.1:{host.port}/v1/stream"
         self._clients = [Hostile(self._url, plan.seed + number) for number in range(plan.clients)]
         self._memory: list[tuple[float, float]] = []
-        """Seconds since the beginning, and bytes."""
+        """Pairs of seconds since the beginning and resident bytes."""
         self._metrics: dict[str, float] = {}
         self._answers: Counter[int] = Counter()
         self._complaints: list[str] = []
@@ -151,7 +150,7 @@ class _Soak:
         over.set()
 
     async def _listen(self, over: asyncio.Event) -> None:
-        """The witness's stream, which nothing may break."""
+        """Run the witness's stream, which must not break."""
         witness = self._witness
         try:
             async with connect(self._url, compression=None) as socket:
@@ -168,7 +167,7 @@ class _Soak:
                             witness.begin(event.sample_clock)
                         continue
                     block = AudioBlock.parse(message, welcome.encoding)
-                    witness.hear(block)
+                    witness.compare(block)
                     self._blocks += 1
                     self._blocks_late += block.is_late
                     self._not_finite += block.samples.size - int(np.count_nonzero(np.isfinite(block.samples)))
@@ -178,7 +177,7 @@ class _Soak:
             self._complaints.append(f"witness: {type(exc).__name__}: {exc}")
 
     async def _visit(self, over: asyncio.Event) -> None:
-        """Requests over HTTP, good and bad."""
+        """Send valid and invalid HTTP requests."""
         rng = np.random.default_rng(self._plan.seed)
         path = f"/v1/scenes/{self._plan.scene}/impulse-response"
         start = self._witness.emitter.position
@@ -238,7 +237,7 @@ class _Soak:
 
 
 def _growth(samples: list[float]) -> float | None:
-    """None where there are too few samples to tell."""
+    """Relative growth of the memory samples; None if there are too few."""
     fifth = len(samples) // _FIFTH
     if fifth == 0:
         return None

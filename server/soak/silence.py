@@ -1,6 +1,6 @@
-"""What a block costs while there is sound, and in the silence after it.
+"""Time to render a block during sound and in the silence after it.
 
-Filters that ring out end in numbers so small that some processors take a hundred times as long over them.
+Decaying filters end in denormal numbers, for which some processors take a hundred times as long.
 """
 
 import statistics
@@ -13,9 +13,10 @@ from server.field.field import AcousticField
 from server.rendering.ingest import DryAudio
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
+from server.responses.emitter_state import EmitterState
 from server.responses.full_response import kemar
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import StreamedEmitter
 
 _BLOCK_SIZE = 256
 _SOUND_S = 2.0
@@ -24,13 +25,13 @@ _ROUNDS = 5
 
 
 def silence_to_sound(field: AcousticField) -> float:
-    """The median time of a block in silence over that in sound; the median of several rounds of both."""
+    """Median time of a block in silence divided by that in sound; the median of several rounds."""
     manifest = field.bundle.manifest
     rate = field.sample_rate
     direct = DirectSound.of(field.bundle, kemar(rate))
     start = manifest.start
     listener = Pose(start.listener)
-    emitter = Emitter(serial=0, pose=Pose(start.emitter))
+    emitter = StreamedEmitter(0, EmitterState(Pose(start.emitter)))
     ir = field.impulse_responses([start.listener], [start.emitter], [0.0])[0]
     loud = np.random.default_rng(0).uniform(-1, 1, round(_SOUND_S * rate)).astype(np.float32)
     ratios = []

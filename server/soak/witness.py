@@ -1,8 +1,8 @@
-"""A listener at rest, who knows to the last sample what he should hear.
+"""The witness: a listener at rest whose expected samples are known exactly.
 
-One emitter loops a clip. Once the response is full, every block is a stretch of the clip's circular convolution with
-the whole impulse response, which is known in double precision (`server.health.double_precision`); whatever the server
-goes through meanwhile, and however long, that does not change.
+One emitter loops a clip. Once the reverberation has built up, every block is part of the circular convolution of the
+clip with the full impulse response, which is known in double precision (`server.health.double_precision`). Nothing that
+happens on the server may change that.
 """
 
 import math
@@ -22,18 +22,18 @@ from server.scene.effects import EffectName
 
 _CLIP = "man-reading"
 _GAIN_DB = -12.0
-"""Below where the limiter would have something to do."""
+"""Low enough that the limiter never acts."""
 _STRETCH_S = 1.0
 
 
 @dataclass
 class Errors:
-    """Of stretches of a second, in dB of the whole expected sound's mean power."""
+    """Errors of one-second stretches, in dB relative to the mean power of the expected sound."""
 
     db: list[float] = field(default_factory=list)
 
     def drift_db(self) -> float:
-        """By how much the worst of the last tenth is worse than the worst of the first."""
+        """Worst error of the last tenth minus that of the first tenth."""
         tenth = max(1, len(self.db) // 10)
         return _worst(self.db[-tenth:]) - _worst(self.db[:tenth])
 
@@ -43,7 +43,7 @@ class Errors:
 
 
 class Witness:
-    """Of one level of a scene, with every effect on."""
+    """The witness of a scene's default level, with every effect on."""
 
     def __init__(self, levels: FieldsByLevel) -> None:
         manifest = levels.bundle.manifest
@@ -69,33 +69,32 @@ class Witness:
         self._expected = _circular(clip, response.astype(np.float64))
         self._power = float(np.mean(self._expected**2))
         self._error_power = 0.0
-        self._heard = 0
+        self._compared = 0
 
     def begin(self, sample_clock: int) -> None:
-        """The clip's first sample is this one."""
+        """Set the clock of the clip's first sample."""
         self._begins = sample_clock
 
-    def hear(self, block: AudioBlock) -> None:
+    def compare(self, block: AudioBlock) -> None:
         if self._begins is None or block.sample_clock - self._begins < self._ir_samples:
             return
         frames = block.samples.shape[1]
         at = (block.sample_clock - self._begins + np.arange(frames)) % self._expected.shape[1]
         difference: npt.NDArray[np.float64] = block.samples - self._expected[:, at]
         self._error_power += float(np.sum(difference**2))
-        self._heard += difference.size
-        if self._heard >= 2 * self._stretch_samples:
-            self.errors.db.append(float(power_to_db(self._error_power / self._heard / self._power)))
-            self._error_power, self._heard = 0.0, 0
+        self._compared += difference.size
+        if self._compared >= 2 * self._stretch_samples:
+            self.errors.db.append(float(power_to_db(self._error_power / self._compared / self._power)))
+            self._error_power, self._compared = 0.0, 0
 
 
 def _worst(errors_db: list[float]) -> float:
-    """Not a number where one of them is none, or there are none."""
+    """The greatest error; NaN if there are none or one is NaN."""
     return float(np.max(errors_db)) if errors_db else math.nan
 
 
 def _circular(clip: npt.NDArray[np.float64], response: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(ear, sample of the clip): what is heard of a clip (n,) that has been looping for longer than `response`
-    (ear, m) lasts."""
+    """(ear, n) one period of a clip (n,) that loops through `response` (ear, m), in the steady state."""
     folded = np.zeros((len(response), clip.size))
     for start in range(0, response.shape[1], clip.size):
         part = response[:, start : start + clip.size]

@@ -32,6 +32,7 @@ class StreamClock:
     def slip(self, block: int, now_s: float) -> None:
         """Move the origin by whole blocks so that `block` is due next: after a stall, sound resumes instead of arriving
         in a burst, and other streams' blocks still fall due between this one's."""
+        # guard: a stall moves a clock by whole blocks
         self._origin_s += math.ceil((now_s - self.due_s(block)) / self._block_s) * self._block_s
 
 
@@ -63,6 +64,8 @@ class SendWindow:
 
     def acknowledge(self, sequence: int) -> None:
         """Blocks up to and including `sequence` arrived. Raises RequestError for one that was never sent."""
+        # guard: what was not sent cannot have arrived
         if sequence >= self.sent:
             raise RequestError("unknown_sequence", f"block {sequence} has not been sent yet", field="sequence")
+        # guard: who acknowledges late takes nothing back
         self._acknowledged = max(self._acknowledged, sequence + 1)

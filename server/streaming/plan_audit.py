@@ -19,9 +19,9 @@ from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import PARTS, EmitterEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs
 from server.scene.effects import EffectName
-from server.streaming.emitters import Emitter
 
 FIRST_S = 2.0
 PERIOD_S = 10.0
@@ -58,7 +58,7 @@ class PlanAudit:
 
     level: str
     listener: Pose
-    emitter: Emitter
+    emitter: EmitterState
     whole: EmitterEffects
     channels: int
     whole_channels: int
@@ -101,7 +101,7 @@ class PlanAudit:
         self, field: AcousticField, reference: npt.NDArray[np.float32], effects: EmitterEffects, channels: int
     ) -> dict[str, float]:
         heard = self._heard(field, effects, channels)
-        onset_s = float(field.onset_s([self.listener.position], [self.emitter.pose.position])[0])
+        onset_s = float(field.onset_s([self.listener.position], [self.emitter.position])[0])
         return audible_difference(reference, heard, field.sample_rate, onset_s=onset_s)
 
     def _heard(self, field: AcousticField, effects: EmitterEffects, channels: int) -> npt.NDArray[np.float32]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from server.core.errors import RequestError
+from server.field.kinds.catalogue import kind_of
 from server.protocol.client_messages import AUTO
 from server.scene.manifest import QualityLevel
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
@@ -49,11 +50,11 @@ class Offer:
             return (*self._slower(level), self._step(level, least_hz))
         fitting = [level for level in self.levels if self.ms_here[level.name] <= 1000 * block_s] or self.levels[:1]
         # The most expensive is the best, but what shares a tail comes last.
-        own_tails = [level for level in reversed(fitting) if not level.shared_tail]
-        best, *cheaper = (*own_tails, *(level for level in reversed(fitting) if level.shared_tail))
+        best_first = reversed(fitting)
+        best, *cheaper = sorted(best_first, key=lambda level: kind_of(level).shares_tail)
         # What reuses responses has fewer to compute, however often it is asked.
         often_hz, *_, seldom_hz = self.thresholds.ir_rates_hz
-        down = [self._step(level, seldom_hz if level.reuse is None else often_hz) for level in cheaper]
+        down = [self._step(level, often_hz if kind_of(level).reuses_responses else seldom_hz) for level in cheaper]
         return (*self._slower(best), *down, self._step((best, *cheaper)[-1], least_hz))
 
     def _slower(self, level: QualityLevel) -> tuple[QualityStep, ...]:

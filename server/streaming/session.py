@@ -10,7 +10,6 @@ Blocks are rendered in three steps, so that many sessions' can be rendered in on
 A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -49,16 +48,26 @@ from server.scene.effects import read_overrides, require_effect
 from server.scene.plan import Plan
 from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter, LiveInput
+from server.streaming.emitters import LiveInput, Stage, StreamedEmitter
 from server.streaming.pacing import SendWindow
 from server.streaming.plan_audit import PlanAudit, Regret
 from server.streaming.quality_steps import QualityStep
-from server.streaming.response_scheduler import ResponseScheduler
+from server.streaming.response_scheduler import ResponseScheduler, Scope
 
 
 def _start_pose(bundle: Bundle) -> Pose:
     start = bundle.manifest.start
     return Pose.from_yaw(start.listener, math.radians(start.listener_yaw_deg))
+
+
+def _require_served(hello: Hello, sample_rate: int) -> None:
+    """Raises RequestError for another protocol or sample rate than a session has."""
+    if hello.protocol != PROTOCOL:
+        problem = f"this server speaks protocol {PROTOCOL}, not {hello.protocol}"
+        raise RequestError("unsupported_protocol", problem, field="protocol")
+    if hello.sample_rate not in {None, sample_rate}:
+        problem = f"scene {hello.scene!r} is rendered at {sample_rate} Hz: ask for that, or leave sample_rate out"
+        raise RequestError("unsupported_sample_rate", problem, field="sample_rate")
 
 
 class Session:
@@ -85,18 +94,7 @@ class Session:
         costs: Callable[[], Costs] = dict,
     ) -> None:
         field = levels.default
-        if hello.protocol != PROTOCOL:
-            raise RequestError(
-                "unsupported_protocol",
-                f"this server speaks protocol {PROTOCOL}, not {hello.protocol}",
-                field="protocol",
-            )
-        if hello.sample_rate not in {None, field.sample_rate}:
-            raise RequestError(
-                "unsupported_sample_rate",
-                f"scene {hello.scene!r} is rendered at {field.sample_rate} Hz: ask for that, or leave sample_rate out",
-                field="sample_rate",
-            )
+        _require_served(hello, field.sample_rate)
         self.window = SendWindow(window)
         self.ir_exchanges = 0
         self.blocks_dropped = 0
@@ -117,7 +115,7 @@ class Session:
             sample_rate=field.sample_rate,
             max_emitters=max_emitters,
             shared_tail=shared_tail,
-            switches_tail=planned is not None or any(level.level.shared_tail for level in levels.values()),
+            switches_tail=planned is not None or any(field.kind.shares_tail for field in levels.values()),
             outputs=1 if hello.output == "mono" else 2,
             has_head=planned is None or planned.shared.head,
         )
@@ -128,7 +126,7 @@ class Session:
             has_early=self._direct_sound.early_reflections is not None,
             has_late=bool(self._bundle.manifest.fields),
         )
-        self._emitters: dict[str, Emitter] = {}
+        self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(self._direct_sound, self.renderer, self._emitters)
         self._responses = ResponseScheduler(
             self.renderer,
@@ -182,7 +180,7 @@ class Session:
                 case AddEmitter():
                     self._add_emitter(message)
                 case SetGain():
-                    self._require_emitter(message.id).gain_db = message.gain_db
+                    self._require_emitter(message.id).set_gain(message.gain_db)
                     self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)))
                 case DryBlock():
                     self._push(message)
@@ -203,10 +201,10 @@ class Session:
         """Whether there was something to ask for when `take_request` looked last, and it is time to."""
         return self._responses.are_wanted
 
-    def take_request(self, *, only_first: bool = False) -> IrRequest | None:
+    def take_request(self, scope: Scope = Scope.ALL) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
-        `only_first` ones may be asked for and none is the first of an emitter."""
-        return self._responses.take_request(self._listener, only_first=only_first)
+        none is in `scope`."""
+        return self._responses.take_request(self._listener, scope)
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""
@@ -221,7 +219,8 @@ class Session:
         planned = self._effects.planned
         if planned is None:
             return None
-        return planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+        states = {name: emitter.state for name, emitter in self._emitters.items()}
+        return planned.take_request(self._listener, states, self._effects.clock_s)
 
     def adopt(self, plan: Plan) -> list[ServerMessage]:
         """Put the plan asked for last into effect, with the block that follows."""
@@ -245,7 +244,7 @@ class Session:
         check = PlanAudit(
             self.quality.level,
             self._listener,
-            dataclasses.replace(emitter),
+            emitter.state,
             whole,
             self.renderer.channels,
             2 if head else self.renderer.channels,
@@ -264,7 +263,7 @@ class Session:
         assert planned is not None
         planned.give_up()
         for emitter in self._emitters.values():
-            emitter.is_decided = True
+            emitter.decide()
         self._responses.retry()
         return [Error(code="plan_failure", message="no plan of effects could be made")]
 
@@ -292,6 +291,7 @@ class Session:
             self.blocks_limited += is_limited
             if number < len(sequences):
                 place = sequences[number], clocks[number]
+                # guard: a block says that it was turned down
                 blocks.append(AudioBlock(*place, *pose_ids, samples, is_exchange=is_exchange, is_limited=is_limited))
         return blocks
 
@@ -309,9 +309,9 @@ class Session:
         refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
 
-    def _follow(self, identifier: str, emitter: Emitter) -> None:
+    def _follow(self, identifier: str, emitter: StreamedEmitter) -> None:
         if self._effects.planned is not None:
-            self._effects.planned.follow_emitter(identifier, emitter.pose, self._effects.clock_s)
+            self._effects.planned.follow_emitter(identifier, emitter.state.pose, self._effects.clock_s)
 
     def _wish(self, message: SetEffects) -> None:
         if self._effects.planned is not None:
@@ -320,6 +320,7 @@ class Session:
 
     def _move_listener(self, message: ListenerPose) -> None:
         pose = message.pose
+        # guard: a listener stays inside
         self._bundle.require_inside(pose.position, "position")
         self._responses.advance(message.pose_id)
         moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
@@ -336,11 +337,11 @@ class Session:
         emitter = self._require_emitter(message.id)
         self._bundle.require_inside(message.position, "position")
         self._responses.advance(message.pose_id)
-        before = emitter.pose.orientation
+        before = emitter.state.pose.orientation
         emitter.move(message)
         # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
-        is_mirrored = self._direct_sound.early_reflections is not None and emitter.directivity != OMNIDIRECTIONAL
-        emitter.is_outdated |= is_mirrored and emitter.pose.orientation != before
+        is_mirrored = self._direct_sound.early_reflections is not None and emitter.state.directivity != OMNIDIRECTIONAL
+        emitter.is_outdated |= is_mirrored and emitter.state.pose.orientation != before
         self._effects.unbake(message.id, emitter)
         self._follow(message.id, emitter)
 
@@ -356,10 +357,10 @@ class Session:
             raise RequestError("duplicate_emitter", f"emitter {message.id!r} is already there", field="id") from exc
         except RendererFullError as exc:
             raise RequestError("too_many_emitters", str(exc)) from exc
-        emitter = Emitter.added_by(message, self._next_serial, live)
-        emitter.is_decided = self._effects.planned is None
-        if emitter.directivity != OMNIDIRECTIONAL:
-            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.directivity))
+        stage = Stage.DECIDED if self._effects.planned is None else Stage.UNDECIDED
+        emitter = StreamedEmitter.added_by(message, self._next_serial, live, stage)
+        if emitter.state.directivity != OMNIDIRECTIONAL:
+            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.state.directivity))
         self._emitters[message.id] = emitter
         self._follow(message.id, emitter)
         self._next_serial += 1
@@ -386,7 +387,7 @@ class Session:
         self._responses.retry()
         return [EmitterRemoved(id=message.id), *self._responses.change_quality_unheard()]
 
-    def _require_emitter(self, identifier: str) -> Emitter:
+    def _require_emitter(self, identifier: str) -> StreamedEmitter:
         if identifier not in self._emitters:
             raise RequestError("unknown_emitter", f"there is no emitter {identifier!r}", field="id", status=404)
         return self._emitters[identifier]

@@ -1,14 +1,14 @@
-// Which effects are rendered now, why, and what each costs or saves; each can be switched, to hear the difference.
+// The panel of effects: which are on, why, and what each costs or saves. Each can be switched to hear the difference.
 //
-// The server decides effect by effect, for each source or for all that is heard; a row sums up what it said of one effect.
+// The server decides each effect for each source or for the whole stream. A row sums up its decisions about one effect.
 
-const SHOWN_JND = 10; // the bar's full length; whatever changes more changes everything
+const SHOWN_JND = 10; // change at the bar's full length
 const TITLES = {
   hrtf: "head",
   per_source_tail: "own late tails",
 };
 const titleOf = (name) => TITLES[name] ?? name.replaceAll("_", " ");
-const unbroken = (text) => text.replace(/(?<=\d) (?=\S)/g, "\u00a0"); // a number stays with its unit
+const unbroken = (text) => text.replace(/(?<=\d) (?=\S)/g, "\u00a0"); // no line break between a number and its unit
 const microseconds = (value) => `${value < 10 ? value.toPrecision(2) : Math.round(value)} µs`;
 
 function element(tag, className, text) {
@@ -18,7 +18,7 @@ function element(tag, className, text) {
   return node;
 }
 
-/** One entry per effect of a plan's decisions: on where it is on for any source, with what is most audible of them. */
+/** One entry for each effect in a plan's decisions. It is on if it is on for any source, and has the most audible decision's values. */
 export function summarise(decisions) {
   const effects = new Map();
   for (const decision of decisions) {
@@ -45,7 +45,7 @@ export class Effects extends EventTarget {
   #rows = new Map();
   #wishes = {};
 
-  /** `root` is the section; emits "wished" with {effects, output} of what was changed: on, off, or null for as planned. */
+  /** `root` is the section. Emits "wished" with the changed {effects, output}: on, off, or null to follow the plan. */
   constructor(root) {
     super();
     const find = (id) => root.querySelector(`#${id}`);
@@ -57,12 +57,12 @@ export class Effects extends EventTarget {
     this.rest();
   }
 
-  /** What to say in a hello: only what was switched by hand. */
+  /** Effects for a hello: only those that the user switched. */
   get wishes() {
     return { effects: { ...this.#wishes }, output: this.#output.value };
   }
 
-  /** A plan as the server sends it. */
+  /** Shows a plan from the server. */
   show({ decisions, cost_us: cost, saved_us: saved }) {
     const effects = summarise(decisions);
     const on = effects.filter((effect) => effect.called_for).length;
@@ -71,7 +71,7 @@ export class Effects extends EventTarget {
     for (const effect of effects) this.#row(effect.name).show(effect);
   }
 
-  /** Nothing is rendered. */
+  /** Shows that no stream is open. */
   rest() {
     this.#total.textContent = "–";
     this.#note.textContent = "once playing";

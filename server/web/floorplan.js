@@ -1,5 +1,5 @@
-// The moving part of the floor plan, an SVG over the paper: the listener with a handle for the heading, and the emitters. Each can
-// be dragged by mouse, pen or finger, and focused and moved by keyboard.
+// The interactive part of the floor plan, an SVG over the canvas: the listener with a handle for the heading, and the emitters. Each
+// can be dragged by mouse, pen or finger, and focused and moved by keyboard.
 // Events: "dropped" (detail: emitter id, after it came to rest), "lifted" (an emitter started to move), "hover" (detail: [x, y] in
 // metres or null).
 
@@ -46,7 +46,7 @@ export class FloorPlan extends EventTarget {
     svg.addEventListener("pointerup", (event) => this.#drop(event));
     svg.addEventListener("pointercancel", (event) => this.#drop(event));
     svg.addEventListener("pointerleave", () => this.#emit("hover", null));
-    // Scrolling would take the pointer away in the middle of a drag.
+    // Scrolling would end a drag.
     const grabbed = (event) => event.target.closest("[data-drag]") && event.preventDefault();
     svg.addEventListener("touchstart", grabbed, { passive: false });
     world.addEventListener("listener", () => this.#placeListener());
@@ -60,7 +60,7 @@ export class FloorPlan extends EventTarget {
     return document.activeElement?.closest?.("[data-emitter]")?.dataset.emitter ?? null;
   }
 
-  /** Lights the ears of the listener; levels run from 0 to 1. */
+  /** Shows the levels at the listener's ears, from 0 to 1. */
   glow(left, right) {
     this.#ears[0].style.setProperty("--level", left.toFixed(2));
     this.#ears[1].style.setProperty("--level", right.toFixed(2));
@@ -187,7 +187,7 @@ export class FloorPlan extends EventTarget {
     this.#drag = { kind, id, pointerId: event.pointerId, offset: [position[0] - at[0], position[1] - at[1]], moved: false };
     this.#svg.setPointerCapture(event.pointerId);
     this.#svg.classList.add("dragging");
-    // Keys walk after any drag: only Tab gives them to an emitter.
+    // After any drag the keys move the listener. Only Tab gives the keyboard to an emitter.
     this.#listener.focus({ preventScroll: true, focusVisible: false });
     event.preventDefault();
   }

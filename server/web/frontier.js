@@ -1,12 +1,12 @@
-// What accuracy costs in time: one mark per quality level, on a logarithmic scale of milliseconds, small ones for those that were
-// measured and are not offered, and what the server says of the one that is heard.
+// The plot of accuracy against time: one mark for each quality level on a logarithmic scale of milliseconds, small ones for levels that
+// were measured but are not offered, and the server's messages about the present level.
 //
-// Errors are in just-noticeable differences (JND), the mean over the metrics that have one; smaller is better.
+// Errors are means over the metrics in just-noticeable differences (JND); smaller is better.
 
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT] = [296, 132];
 const MARGIN = { left: 26, right: 38, top: 12, bottom: 22 };
-const KEPT = 3; // changes told
+const KEPT = 3; // messages about changes that stay visible
 const REASONS = {
   chosen: "as you chose",
   load: "the server has too much to do",
@@ -15,7 +15,7 @@ const REASONS = {
 
 const milliseconds = (value) => `${value < 0.1 ? value.toPrecision(1) : value < 1 ? value.toFixed(2) : value.toPrecision(2)} ms`;
 const costOf = (level) => level.ms_mean ?? level.ms_here;
-// What was measured here is a response that nobody asked for before; most poses of a walk need none where levels reuse them.
+// The time measured here is for a new response. With levels that reuse responses, most poses of a walk need none.
 const hereOf = (level) => (level.ms_mean === null || level.ms_here === null ? level.ms_here : (level.ms_here * level.ms_mean) / level.ms_miss);
 const isPlaced = (level) => level.audible !== null && costOf(level) !== null;
 
@@ -35,9 +35,9 @@ export class Frontier extends EventTarget {
   #changes;
   #levels = [];
   #heard = null;
-  #told = []; // {at, level, text}, newest first
+  #changes = []; // {at, level, text}, newest first
 
-  /** `root` is the section; emits "chosen" with a level's name, or "auto". */
+  /** `root` is the section. Emits "chosen" with a level's name or "auto". */
   constructor(root) {
     super();
     const find = (id) => root.querySelector(`#${id}`);
@@ -49,7 +49,7 @@ export class Frontier extends EventTarget {
     this.#choice.addEventListener("change", () => this.#choose());
   }
 
-  /** Name of the level asked for, or "auto". */
+  /** Name of the chosen level, or "auto". */
   get chosen() {
     return this.#choice.value || "auto";
   }
@@ -69,25 +69,25 @@ export class Frontier extends EventTarget {
     this.#draw();
   }
 
-  /** There is nothing to show yet, and why. */
+  /** Shows the reason why there is nothing to show yet. */
   fail(reason) {
     if (this.#levels.length === 0) this.#note.textContent = `not available: ${reason}`;
   }
 
-  /** The level heard from now on; null while there is no stream. */
+  /** Sets the present level; null while no stream is open. */
   set heard(name) {
     this.#heard = name;
     this.#draw();
   }
 
-  /** What the server says when it changes what is heard. */
+  /** Shows a message from the server about a change of level. */
   changed({ level, reason, ir_rate_hz: rateHz }) {
     const pace = rateHz === null ? "" : `, at most ${+rateHz.toFixed(1)} responses a second`;
     const title = this.#levels.find(({ name }) => name === level)?.title ?? level;
-    this.#told.unshift({ at: new Date(), level, text: `${title}${pace}: ${REASONS[reason] ?? reason}` });
-    this.#told.length = Math.min(this.#told.length, KEPT);
+    this.#changes.unshift({ at: new Date(), level, text: `${title}${pace}: ${REASONS[reason] ?? reason}` });
+    this.#changes.length = Math.min(this.#changes.length, KEPT);
     this.#changes.replaceChildren(
-      ...this.#told.map(({ at, level: name, text }) => {
+      ...this.#changes.map(({ at, level: name, text }) => {
         const item = document.createElement("li");
         item.title = name;
         const time = document.createElement("time");
@@ -125,7 +125,7 @@ export class Frontier extends EventTarget {
 
   #axes(placed) {
     const costs = placed.flatMap((level) => [level.ms_mean, hereOf(level)]).filter((cost) => cost !== null);
-    // Half a decade on either side, so that there is a power of ten to read.
+    // Half a decade on either side, so that the axis has at least one power of ten.
     const low = Math.log10(Math.min(...costs)) - 0.5;
     const high = Math.log10(Math.max(...costs)) + 0.5;
     const worst = Math.max(...placed.map(({ audible, audible_floor: floor }) => Math.max(audible, floor ?? 0)));
@@ -149,7 +149,7 @@ export class Frontier extends EventTarget {
 
   #floor(at) {
     draw("path", { class: "floor", d: `M${MARGIN.left} ${at.toFixed(1)}H${WIDTH - MARGIN.right}` }, this.#chart);
-    // Beside the plot, where it covers no point.
+    // Beside the plot, so that it covers no point.
     draw("text", { x: WIDTH - MARGIN.right + 6, y: at + 3.5, class: "tick start floor-label" }, this.#chart, "floor");
   }
 

@@ -37,8 +37,8 @@ function nearestOnEdge([a, b], point) {
   return [a[0] + clamped * along[0], a[1] + clamped * along[1]];
 }
 
-/** Where a person or a source may stand: inside the walls by `clearance` metres and inside the field's bounds. With a clearance of
-    null there are no walls. */
+/** Places where the listener or a source may stand: inside the walls by `clearance` metres and inside the field's bounds. A clearance of
+    null means that there are no walls. */
 export class Floor {
   constructor({ corners, minimum, maximum, clearance = 0.15 }) {
     this.corners = corners;
@@ -58,10 +58,10 @@ export class Floor {
     return inBounds && contains(this.corners, point) && edges(this.corners).every(clear);
   }
 
-  /** The nearest allowed point found by pushing `point` off the walls; null where the plan is too tight for that. */
+  /** An allowed point near `point`, found by pushing it off the walls; null if the plan is too narrow. */
   nearest(point) {
     let candidate = this.#clamp(point);
-    // Each pass settles one wall, so a corner takes two; a few more for the ends of inner walls.
+    // Each pass handles one wall, so a corner takes two. The ends of inner walls take a few more.
     for (let pass = 0; pass < 8; pass++) {
       if (this.allows(candidate)) return candidate;
       candidate = this.#clamp(this.#pushed(candidate));
@@ -91,7 +91,7 @@ export class Floor {
     return contains(this.corners, left) ? left : [nearest[0] - reach * normal[0], nearest[1] - reach * normal[1]];
   }
 
-  /** Follows a drag or a step from `from` towards `to`, sliding along walls; stays put when there is no room. */
+  /** The end of a drag or a step from `from` towards `to`. It slides along walls and stays at `from` if there is no room. */
   slide(from, to) {
     return this.nearest(to) ?? from;
   }

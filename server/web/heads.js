@@ -1,4 +1,4 @@
-// Heads to hear through, as the server serves them. Emits "chosen" with a head's name.
+// The menu of the heads that the server offers. Emits "chosen" with a head's name.
 
 const TITLES = { kemar: "KEMAR" };
 const titleOf = (name) => TITLES[name] ?? name;
@@ -15,12 +15,12 @@ export class Heads extends EventTarget {
     choice.addEventListener("change", () => this.dispatchEvent(new CustomEvent("chosen", { detail: choice.value })));
   }
 
-  /** Name of the head asked for; undefined where that is left to the server. */
+  /** Name of the chosen head; undefined if the server chooses. */
   get chosen() {
     return this.#isKnown ? this.#choice.value : undefined;
   }
 
-  /** Offers these heads; one that was chosen before stays so while it is among them. */
+  /** Offers these heads. The present choice stays if it is among them. */
   show({ default: usual, hrtfs }) {
     const before = this.chosen;
     const options = hrtfs.map((name) => {
@@ -34,7 +34,7 @@ export class Heads extends EventTarget {
     this.#enable();
   }
 
-  /** Whether what is listened with has two ears. */
+  /** Whether the output is headphones, which need a head. */
   set used(isUsed) {
     this.#isUsed = isUsed;
     this.#enable();

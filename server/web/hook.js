@@ -1,4 +1,4 @@
-// window.nafir: what a test or a curious person may do with the page from outside.
+// window.nafir: an interface to the page for tests and for the browser's console.
 //
 //   await nafir.ready                         the scene is on the page and play can be pressed
 //   nafir.state()                             {connection, playing, level, head, effects, listener, emitters, latency, reverberationLatency, poses}

@@ -1,27 +1,27 @@
-// Adaptive playout buffer between a bursty network and the sound card. Plain arithmetic without I/O, so the worklet drives it
-// and tests can too. Positions count samples since the first one pushed; both ears share every index.
+// An adaptive playout buffer between a bursty network and the sound card. It does no I/O, so that the worklet and tests can drive it.
+// Positions count samples since the first one pushed, the same for both ears.
 //
-// Samples are played bit for bit. Clock drift and changing jitter are absorbed by splices: one quantum crossfades to the same
-// signal a few milliseconds later (to shorten the buffer) or earlier (to lengthen it), at the lag where the two match best.
+// Samples are played bit for bit. Splices compensate clock drift and changing jitter: one quantum crossfades to the same signal a few
+// milliseconds later (to shorten the buffer) or earlier (to lengthen it), at the lag where the two match best.
 
-const QUANTUM = 128; // of the Web Audio API
-const RESERVE = 64; // kept back so that a buffer running dry ends in a fade and not in a click
-const WINDOW_S = 1; // over which the lowest fill is taken
-const MEMORY_S = 15; // without a dip before the buffer is shortened a little: jitter that comes rarely still comes
-const SOON_S = 2; // before it is shortened of much more than that, as of what came in a burst after a dropout
+const QUANTUM = 128; // samples that the Web Audio API processes at once
+const RESERVE = 64; // samples held back so that an empty buffer ends in a fade and not in a click
+const WINDOW_S = 1; // the lowest fill is measured in windows of this length
+const MEMORY_S = 15; // the buffer is shortened a little only after so long without a dip, since jitter may be rare
+const SOON_S = 2; // a much too long buffer, as after a burst that follows a dropout, is shortened after this time
 const MUCH_S = 0.025;
-const AGAIN_S = 0.2; // after a splice that did not suffice
-const JUMP_S = 0.15; // above the headroom, as after a burst: half of it is skipped at once
-const HEADROOM_S = 0.05; // lowest fill aimed for on a quiet network
-const START_S = 0.05; // more than that at first: page, server and sound card are busiest while they start
-const STARTING = 3; // windows for which that is
-const RIPPLE_S = 0.015; // of the fill between the arrival of one block and the next
+const AGAIN_S = 0.2; // time from a splice that did not suffice to the next one
+const JUMP_S = 0.15; // if the fill is this far above the headroom, as after a burst, half of it is skipped at once
+const HEADROOM_S = 0.05; // target of the lowest fill on a quiet network
+const START_S = 0.05; // additional headroom at first, while page, server and sound card are busy with starting
+const STARTING = 3; // windows with the additional headroom
+const RIPPLE_S = 0.015; // variation of the fill between the arrival of one block and the next
 const MAX_HEADROOM_S = 0.25;
-const SLACK_S = 0.012; // above the headroom before the buffer is shortened
-const GROWTH_S = 0.015; // more headroom after each dropout
+const SLACK_S = 0.012; // the buffer is shortened only if the fill is this far above the headroom
+const GROWTH_S = 0.015; // each dropout increases the headroom by this much
 const SHORTEST_LAG = 48;
 const LONGEST_LAG = 288;
-const INAUDIBLE = 1e-4; // sum of squares over a quantum's ears: 60 dB below full scale
+const INAUDIBLE = 1e-4; // sum of squares over a quantum of both ears, 60 dB below full scale
 
 const raisedCosine = (length) => Float32Array.from({ length }, (_, i) => 0.5 - 0.5 * Math.cos((Math.PI * (i + 0.5)) / length));
 const CROSSFADE = raisedCosine(QUANTUM);
@@ -37,7 +37,7 @@ export class JitterBuffer {
     this.reset();
   }
 
-  /** Forgets the audio and starts filling again; counters stay. */
+  /** Drops the audio and starts filling again. Counters are kept. */
   reset() {
     this.ending = this.playing && this.fill >= RESERVE ? this.#faded() : null;
     this.read = 0;
@@ -55,7 +55,7 @@ export class JitterBuffer {
     this.#openWindow();
   }
 
-  /** What comes next, on its way out: a stream that ends while it is heard would end in a click. */
+  /** The next samples with a fade-out, so that a stream that ends does not end in a click. */
   #faded() {
     const ears = [new Float32Array(RESERVE), new Float32Array(RESERVE)];
     this.#copy(...ears, RESERVE);
@@ -74,7 +74,7 @@ export class JitterBuffer {
     return this.written - this.read;
   }
 
-  /** Fill aimed for on the whole, in samples, and with which playing starts: headroom and what rises and falls above it. */
+  /** Target of the fill in samples, at which playing starts: the headroom and the ripple above it. */
   get target() {
     return Math.round((this.headroomS + RIPPLE_S) * this.sampleRate);
   }
@@ -86,7 +86,7 @@ export class JitterBuffer {
     const joined = this.nextClock === null || sampleClock === this.nextClock;
     this.nextClock = sampleClock + frames;
     if (this.fill + frames > this.capacity / 2) {
-      // The sound card stopped taking samples (a sleeping tab); what is oldest is worth least.
+      // The sound card has stopped taking samples (a sleeping tab). The oldest samples are dropped.
       this.counters.overflows += 1;
       this.read = this.written + frames - this.target;
     }
@@ -112,7 +112,7 @@ export class JitterBuffer {
   }
 
   /**
-   * Fills both outputs (QUANTUM samples each) and returns the poses that became audible in them, as
+   * Fills both outputs (QUANTUM samples each). Returns the poses that become audible in them, as
    * [{poseId, reverberationPoseId, offset, fill}] with `offset` in samples from the start of the outputs.
    */
   pull(left, right) {
@@ -120,7 +120,7 @@ export class JitterBuffer {
     if (!this.playing && this.fill >= this.target) {
       this.playing = true;
       this.started = true;
-      this.read = this.written - this.target; // what came in one burst with it would only be delay
+      this.read = this.written - this.target; // older samples of the same burst would only add delay
       this.dips = [];
       this.#openWindow();
       this.#copy(left, right, frames);
@@ -175,12 +175,12 @@ export class JitterBuffer {
     return this.#heard(rest);
   }
 
-  /** Samples to skip (positive) or repeat (negative) now that a window has ended; 0 leaves the buffer alone. */
+  /** Samples to skip (positive) or to repeat (negative) at the end of a window; 0 changes nothing. */
   #correction() {
     const { lowest } = this;
     this.#remember();
     this.#openWindow();
-    // Headroom won by a dropout is given back slowly, that of the start at once.
+    // Headroom added by a dropout shrinks slowly; that of the start ends at once.
     if (this.starting > 0 && --this.starting === 0) this.headroomS -= START_S;
     this.headroomS = Math.max(HEADROOM_S, this.headroomS - 0.0002);
     const headroom = this.headroomS * this.sampleRate;
@@ -201,7 +201,7 @@ export class JitterBuffer {
     return this.dips.reduce((sum, { seconds }) => sum + seconds, 0);
   }
 
-  /** Lowest fill of the last seconds, in samples; -Infinity before so many have been played. */
+  /** The lowest fill of the last seconds, in samples; -Infinity until so much has been played. */
   #lowestOf(seconds) {
     let lowest = Infinity;
     let covered = 0;
@@ -212,7 +212,7 @@ export class JitterBuffer {
     return covered < seconds - 1e-6 ? -Infinity : lowest;
   }
 
-  /** The longest lag of those at which the signal matches best. */
+  /** The lag at which the signal matches best; the longest if several do. */
   #bestLag(sign, limit) {
     const differences = [];
     for (let lag = SHORTEST_LAG; lag <= Math.min(LONGEST_LAG, limit); lag++) {

@@ -1,5 +1,5 @@
-// Pose-to-sound latency: from the moment a pose is set on the page until the first sample rendered with it, or with a newer one,
-// leaves the sound card. The direct sound has one and the reverberation another. All times are epoch milliseconds.
+// Pose-to-sound latency: the time from setting a pose on the page until the first sample rendered with it, or with a newer one, leaves
+// the sound card. It is measured separately for the direct sound and for the reflected field. All times are epoch milliseconds.
 
 const WINDOW_MS = 4000;
 const MOST_PENDING = 2000;
@@ -29,7 +29,7 @@ export class PoseLedger {
     this.newestHeard = -1;
   }
 
-  /** `steady` is false while the buffer is still filling, when the wait is the start-up's and not the pose's. */
+  /** `steady` is false while the buffer is still filling, since the latency is then that of the start-up. */
   heard({ poseId, at, bufferedS, outputS }, steady) {
     this.newestHeard = Math.max(this.newestHeard, poseId);
     while (this.#pending.length > 0 && this.#pending[0].poseId <= poseId) {
@@ -40,7 +40,7 @@ export class PoseLedger {
     while (this.#samples.length > 0 && this.#samples[0].heardAt < at - WINDOW_MS) this.#samples.shift();
   }
 
-  /** Medians over the last seconds, in milliseconds: {totalMs, worstMs, serverMs, bufferMs, outputMs}; null before the first. */
+  /** Medians over the last seconds, in milliseconds: {totalMs, worstMs, serverMs, bufferMs, outputMs}; null if there are none yet. */
   summary() {
     if (this.#samples.length === 0) return null;
     const median = (key) => quantile(this.#samples.map((sample) => sample[key]), 0.5);

@@ -1,4 +1,4 @@
-// Legend of the loudness map: one swatch per band, labels in decibels, and a needle at the level where the listener (or the mouse) is.
+// The legend of the loudness map: one swatch per band, labels in decibels, and a needle at the level of the listener or the mouse.
 
 import { loudnessRamp } from "./palette.js";
 
@@ -46,12 +46,12 @@ export class Legend {
     }
   }
 
-  /** Says what the map shows, or why there is none. */
+  /** Sets the caption: what the map shows, or why there is none. */
   set note(text) {
     this.#note.textContent = text;
   }
 
-  /** Points at `level` in decibels; `where` says whose level it is. */
+  /** Moves the needle to `level` in decibels; `where` names the place it belongs to. */
   point(level, where) {
     this.#needle.hidden = !this.#scale || !Number.isFinite(level);
     if (this.#needle.hidden) return;

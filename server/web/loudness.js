@@ -1,27 +1,27 @@
-// Loudness maps as a person reads them: levels on a grid become filled bands of a few decibels, like depths on a chart.
-// A grid is {levels (rows of numbers, NaN outside), origin [x, y], spacingM}, row 0 being the southernmost.
+// Loudness maps: levels on a grid are drawn as filled bands of a few decibels, like depths on a chart.
+// A grid is {levels (rows of numbers, NaN outside), origin [x, y], spacingM}. Row 0 is the southernmost.
 
 import { contains, crosses, edges } from "./geometry.js";
 
 const BAND_WIDTHS_DB = [1, 2, 3, 5];
 const MOST_BANDS = 10;
 const WIDTH = 1.25;
-const REACH = 1.5 * WIDTH; // of the spline, in grid steps
+const REACH = 1.5 * WIDTH; // half-width of the spline, in grid steps
 const RIDGE = 1e-3;
 const FINEST_M = 0.05;
-const FINE_STEPS = 5; // of the fine grid to one of the coarse, where that is not finer still
+const FINE_STEPS = 5; // steps of the fine grid in one step of the coarse grid, unless FINEST_M limits it
 const NEARBY = [[0, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]];
 
 export function parseGrid({ levels_db: rows, origin, spacing_m: spacingM }) {
   return { levels: rows.map((row) => row.map((level) => level ?? NaN)), origin, spacingM };
 }
 
-/** The grid of an emitter that is `gainDb` louder. */
+/** The grid with all levels raised by `gainDb`. */
 export function raised(grid, gainDb) {
   return { ...grid, levels: grid.levels.map((levels) => levels.map((level) => level + gainDb)) };
 }
 
-/** Energy sum of several emitters' grids over the same points. */
+/** The energetic sum of several emitters' grids over the same points. */
 export function combine(grids) {
   const [first, ...rest] = grids;
   const power = (grid, row, column) => 10 ** (grid.levels[row][column] / 10);
@@ -31,8 +31,8 @@ export function combine(grids) {
 }
 
 /**
- * Scale that fits a grid, {bottom, top, band} in decibels. The loudest few points may saturate, since a level near a source has no
- * bound, and so may the quietest where the range would not fit the widest bands.
+ * A scale {bottom, top, band} in decibels that fits a grid. The loudest few points may lie above it, since the level near a source has
+ * no limit. The quietest may lie below it if the range is too large even for the widest bands.
  */
 export function scaleOf(grid) {
   const levels = grid.levels.flat().filter(Number.isFinite).sort((a, b) => a - b);
@@ -46,14 +46,14 @@ export function scaleOf(grid) {
 
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 
-/** Quadratic B-spline, a little wider than the grid: smooth enough for contours, narrow enough to keep the shadow of a wall. */
+/** A quadratic B-spline a little wider than the grid. Contours are smooth, and the shadow behind a wall stays visible. */
 function spline(t) {
   const x = Math.abs(t) / WIDTH;
   if (x < 0.5) return 0.75 - x * x;
   return x < 1.5 ? 0.5 * (1.5 - x) ** 2 : 0;
 }
 
-/** Weighted least squares of a plane, evaluated where x = y = 0. A plain mean would bend contours along every wall. */
+/** A weighted least-squares fit of a plane, evaluated at x = y = 0. A weighted mean would bend contours along every wall. */
 class PlaneFit {
   #s = new Float64Array(9); // w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz
 
@@ -63,7 +63,7 @@ class PlaneFit {
     });
   }
 
-  /** NaN without any point near. The ridge keeps the plane level in a direction that the points say nothing about. */
+  /** The plane's value; NaN if no point is near. The ridge keeps the plane level in a direction in which the points do not vary. */
   value() {
     const [w, x, y, xx0, xy, yy0, z, xz, yz] = this.#s;
     if (w < 1e-4) return NaN;
@@ -73,7 +73,7 @@ class PlaneFit {
   }
 }
 
-/** Levels of a grid at any point of a floor plan. Points see only grid points that no wall hides from them. */
+/** Levels at any point of a floor plan, interpolated from those grid points that no wall hides from it. */
 export class LoudnessField {
   constructor(grid, corners) {
     this.grid = grid;
@@ -92,7 +92,7 @@ export class LoudnessField {
         this.fine[row * this.columns + column] = this.#weighted(point);
       }
     }
-    // Points within walls and close to them, where no grid point reaches, continue their neighbours.
+    // Points inside walls and close to them, which no grid point reaches, get the mean of their neighbours.
     for (let pass = 0; pass < 12; pass++) this.#spread();
   }
 
@@ -102,7 +102,7 @@ export class LoudnessField {
     const { levels, origin, spacingM } = this.grid;
     const x = (point[0] - origin[0]) / spacingM;
     const y = (point[1] - origin[1]) / spacingM;
-    // The grid ends short of the walls: continue its slope for a cell and then stay level.
+    // The grid ends before the walls. Its slope continues for one cell, and the level is constant beyond.
     const [u, v] = [clamp(x, 0, levels[0].length - 1), clamp(y, 0, levels.length - 1)];
     const [atX, atY] = [clamp(x, u - 1, u + 1), clamp(y, v - 1, v + 1)];
     const fit = new PlaneFit();
@@ -118,7 +118,7 @@ export class LoudnessField {
     return fit.value();
   }
 
-  /** The point, or one a step away where it lies on a wall; null within a wall. */
+  /** The point itself, or one a step away if it lies on a wall; null inside a wall. */
   #stepInside([x, y]) {
     for (const [dx, dy] of NEARBY) {
       const eye = [x + 0.3 * this.fineM * dx, y + 0.3 * this.fineM * dy];
@@ -146,7 +146,7 @@ export class LoudnessField {
     }
   }
 
-  /** Level in dB at [x, y]; NaN outside the floor. */
+  /** The level in dB at [x, y]; NaN outside the floor. */
   at([x, y]) {
     const u = Math.min(this.columns - 1.001, Math.max(0, (x - this.minimum[0]) / this.fineM));
     const v = Math.min(this.rows - 1.001, Math.max(0, (y - this.minimum[1]) / this.fineM));
@@ -158,7 +158,7 @@ export class LoudnessField {
     return below * (1 - t) + above * t;
   }
 
-  /** The map as a canvas of `pixelsPerMetre`, row 0 north; `ramp(fraction)` gives [r, g, b] for 0 (quiet) to 1 (loud). */
+  /** The map as a canvas of `pixelsPerMetre` with row 0 in the north; `ramp(fraction)` gives [r, g, b] for 0 (quiet) to 1 (loud). */
   paint({ bottom, top, band: width }, ramp, pixelsPerMetre) {
     const columns = Math.round((this.columns - 1) * this.fineM * pixelsPerMetre);
     const rows = Math.round((this.rows - 1) * this.fineM * pixelsPerMetre);

@@ -1,4 +1,5 @@
-// Joins the parts: scene and loudness over HTTP, poses and audio through the stream worker, the plan, the panel and the keyboard.
+// Connects the parts of the page: scene and loudness over HTTP, poses and audio through the stream worker, the floor plan, the panels
+// and the keyboard.
 
 import { FloorPlan } from "./floorplan.js";
 import { Effects } from "./effects.js";
@@ -35,7 +36,7 @@ class Page {
     this.effects = new Effects(find("rendered"));
     this.heads = new Heads(find("head"));
     this.rendered = null; // the server's plan of effects; null while there is no stream
-    this.level = this.head = null; // what is heard, and through whose ears; null while there is no stream
+    this.level = this.head = null; // the present level and head; null while there is no stream
     this.player = new Player();
     this.ledger = new PoseLedger();
     this.reverberationLedger = new PoseLedger();
@@ -44,10 +45,10 @@ class Page {
     this.playing = false;
     this.steady = false;
     this.grids = new Map(); // emitter id -> {key, grid}
-    this.mapping = null; // AbortController of the map under way
+    this.mapping = null; // AbortController of the request for the next map
     this.field = null;
     this.scale = null;
-    this.scaled = 0; // number of emitters the scale was made for
+    this.scaled = 0; // number of emitters that the scale was made for
     this.hovered = null;
   }
 
@@ -61,7 +62,7 @@ class Page {
       return;
     }
     if (wanted && chosen.id !== wanted) this.notices.show("scene", `There is no scene called “${wanted}”; this is ${chosen.name}.`);
-    this.#offer(scenes, chosen); // the way out, whatever becomes of this scene
+    this.#offer(scenes, chosen); // first, so that another scene can be chosen even if this one fails
     const scene = await this.#untilAnswered(() => fetchScene(chosen.id));
     this.#describe(scene);
     const clips = (await fetchClips().catch(() => null)) ?? [];
@@ -72,7 +73,7 @@ class Page {
     this.#setConnection("idle", "Ready");
   }
 
-  /** Fills a part of the page that the rest can do without, and tries again later where that fails. */
+  /** Fills a part of the page that the rest does not need, and tries again later if that fails. */
   async #fill(part, ask, show) {
     for (let wait = RETRY_MS; ; wait = Math.min(2 * wait, LONGEST_RETRY_MS)) {
       try {
@@ -198,7 +199,7 @@ class Page {
       },
       refused: ({ code, message }) => {
         this.notices.show(code, message);
-        // A server that was started anew may offer other things than the page knows of.
+        // A restarted server may offer other scenes, clips and heads.
         if (code === "unknown_hrtf") fetchHeads().then((heads) => this.heads.show(heads), () => {});
         if (code === "unknown_level") fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
       },
@@ -226,7 +227,7 @@ class Page {
 
   #setVolume(percent) {
     find("volume").style.setProperty("--value", `${percent}%`);
-    this.player.volume = (percent / 100) ** 2; // closer to how loudness is heard than a straight line
+    this.player.volume = (percent / 100) ** 2; // closer to perceived loudness than a linear control
   }
 
   #listenerNow() {
@@ -278,7 +279,7 @@ class Page {
     this.#setConnection("idle", "Paused");
   }
 
-  /** No figure stays that is no longer so. */
+  /** Clears the figures of a stream that has ended. */
   #blank() {
     this.panel.rest();
     this.frontier.heard = this.level = this.head = null;
@@ -313,7 +314,7 @@ class Page {
       this.frontier.heard = this.level = welcome.level;
       this.head = welcome.hrtf;
       this.world.mostEmitters = welcome.max_emitters;
-      // A page opened while the server warmed up does not know yet what levels cost there.
+      // If the page was opened while the server warmed up, it does not have the levels' costs yet.
       fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
       this.notices.clear("connection");
     } else if (state === "waiting") {
@@ -330,7 +331,7 @@ class Page {
     }
   }
 
-  /** Fetches the maps that no longer fit their emitters and shows the sum of all. */
+  /** Fetches the maps of emitters that have moved, and shows the sum of all maps. */
   async map() {
     this.mapping?.abort();
     const emitters = [...this.world.emitters.values()];
@@ -345,7 +346,7 @@ class Page {
       if (mapping.signal.aborted) return;
       const grid = combine(grids);
       this.field = new LoudnessField(grid, this.scene.corners);
-      // One scale as long as no source comes or goes, so that two maps can be compared by eye.
+      // The scale is kept as long as no source is added or removed, so that maps can be compared by eye.
       if (this.scaled !== emitters.length) [this.scale, this.scaled] = [scaleOf(grid), emitters.length];
       this.paper.show(this.field, this.scale);
       this.legend.show(this.scale);

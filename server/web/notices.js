@@ -1,4 +1,4 @@
-// Short messages that never stand in the way: each kind shows once, leaves by itself and can be sent away.
+// Short messages. At most one of each kind is visible; it disappears by itself and can be dismissed.
 
 const SHOWN_MS = 7000;
 

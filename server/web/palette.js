@@ -1,4 +1,4 @@
-// Colours that canvases need, read from the style sheet so that light and dark live in one place.
+// Colours for canvases, read from the style sheet, so that both themes are defined in one place.
 
 const STOPS = ["--map-0", "--map-1", "--map-2", "--map-3", "--map-4", "--map-5"];
 
@@ -9,7 +9,7 @@ function parse(hex) {
 
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-/** Loudness ramp of the current theme: fraction 0 (quiet) to 1 (loud) -> [r, g, b]. */
+/** The loudness ramp of the current theme: fraction 0 (quiet) to 1 (loud) -> [r, g, b]. */
 export function loudnessRamp() {
   const stops = STOPS.map((name) => parse(colour(name)));
   return (fraction) => {
@@ -26,7 +26,7 @@ export function onThemeChange(changed) {
 
 const SOURCES = 8; // colours of the style sheet, --source-1 and on
 
-/** CSS colour of the source with this place in the alphabet of ids: neighbours differ. */
+/** CSS colour of a source by its id. Successive ids differ in colour. */
 export const sourceColour = (id) => {
   const ordinal = [...id].reduce((sum, letter) => 26 * sum + letter.charCodeAt(0) - 64, 0);
   return `var(--source-${((ordinal - 1) % SOURCES) + 1})`;

@@ -1,9 +1,9 @@
-// The measurements beside the plan: ear levels, pose-to-sound latency and its parts, buffer health, and what the server says.
+// The panel of measurements: ear levels, pose-to-sound latency and its parts, the playout buffer, and the server's statistics.
 
 import { Sparkline } from "./sparkline.js";
 
 const FLOOR_DB = -60;
-const DRAW_MS = 100; // figures and the strip chart; the meters run with every report
+const DRAW_MS = 100; // interval of figures and strip chart; the meters are drawn with every report
 const decibels = (amplitude) => (amplitude > 0 ? 20 * Math.log10(amplitude) : -Infinity);
 const fraction = (level) => Math.min(1, Math.max(0, 1 - level / FLOOR_DB));
 const milliseconds = (value) => `${Math.round(value)} ms`;
@@ -12,7 +12,7 @@ class Meter {
   #bar;
   #peak;
   #output;
-  #held = FLOOR_DB;
+  #peakHold = FLOOR_DB;
   #shown = FLOOR_DB;
 
   constructor(root) {
@@ -21,13 +21,13 @@ class Meter {
     this.#output = root.querySelector("output");
   }
 
-  /** Rises at once and falls gently, as a programme meter does; returns the bar's length, 0 to 1. */
+  /** Rises at once and falls slowly, like a programme meter. Returns the bar's length, 0 to 1. */
   show(rms, peak) {
     const level = Math.max(FLOOR_DB, decibels(rms));
     this.#shown = Math.max(level, this.#shown - 1.2);
-    this.#held = Math.max(Math.max(FLOOR_DB, decibels(peak)), this.#held - 0.5);
+    this.#peakHold = Math.max(Math.max(FLOOR_DB, decibels(peak)), this.#peakHold - 0.5);
     this.#bar.style.transform = `scaleX(${fraction(this.#shown).toFixed(4)})`;
-    this.#peak.style.left = `${(100 * fraction(this.#held)).toFixed(2)}%`;
+    this.#peak.style.left = `${(100 * fraction(this.#peakHold)).toFixed(2)}%`;
     return fraction(this.#shown);
   }
 
@@ -36,7 +36,7 @@ class Meter {
   }
 
   rest() {
-    this.#held = this.#shown = FLOOR_DB;
+    this.#peakHold = this.#shown = FLOOR_DB;
     this.show(0, 0);
     this.print();
   }
@@ -64,7 +64,7 @@ export class Panel {
     this.#spark.draw();
   }
 
-  /** Takes a worklet report and the latencies of both parts; returns the meters' lengths for both ears. */
+  /** Shows a worklet report and the latencies of direct sound and reflected field. Returns the meters' lengths for both ears. */
   report(report, latency, reverberation) {
     const at = performance.now();
     const fillMs = 1000 * report.fillS;
@@ -108,7 +108,7 @@ export class Panel {
     }
   }
 
-  /** Takes the server's once-a-second status message. */
+  /** Shows the server's status message, which comes once a second. */
   status({ blocks_late: late, blocks_dropped: dropped, ir_ms: ir }) {
     this.#server = { late, dropped };
     if (ir?.p50 != null) this.#find("field-cost").textContent = `${ir.p50.toFixed(1)} ms`;

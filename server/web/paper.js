@@ -1,15 +1,15 @@
-// The still part of the floor plan, drawn on a canvas: walls, or the bounds where no walls are known, the loudness map on the floor,
-// and measures along the edges.
+// The static part of the floor plan, drawn on a canvas: walls (or the bounds if the walls are unknown), the loudness map on the floor,
+// and scales along the edges.
 
 import { colour, loudnessRamp } from "./palette.js";
 
 const WALL_M = 0.2;
-const STEPS_M = [1, 2, 5, 10, 20, 50, 100]; // between measures
+const STEPS_M = [1, 2, 5, 10, 20, 50, 100]; // possible distances between the marks of a scale
 const LEAST_STEP = 30; // pixels
 const FADE_MS = 260;
 const FINEST_MAP = 200; // pixels per metre
 
-/** Placement of a plan in a box: world [x, y] in metres to CSS pixels and back. */
+/** The mapping between world [x, y] in metres and CSS pixels. */
 export class View {
   constructor({ corners, walled, width }) {
     const xs = corners.map(([x]) => x);
@@ -23,7 +23,7 @@ export class View {
     this.width = width;
     const [left, right, above, below] = [this.margin, this.wall + 3, this.wall + 3, this.margin];
     this.scale = (width - left - right) / (this.east - this.west);
-    // Inner walls are gaps in the polygon, closed by the strokes along both their sides.
+    // Inner walls are gaps between edges of the polygon. The strokes along both sides fill them.
     if (walled) this.wall = Math.max(this.wall, 0.5 * WALL_M * this.scale + 1);
     this.left = left;
     this.top = above;
@@ -67,7 +67,7 @@ export class Paper {
     this.draw();
   }
 
-  /** Shows a LoudnessField on `scale` {bottom, top, band}, fading over from the one before. */
+  /** Shows a LoudnessField on `scale` {bottom, top, band}, with a crossfade from the previous one. */
   show(field, scale) {
     this.#before = this.#map;
     this.#field = field;
@@ -78,7 +78,7 @@ export class Paper {
     this.#fade();
   }
 
-  /** Pales the map while it no longer fits what is heard. */
+  /** Whether the map is out of date; it is then drawn paler. */
   set stale(stale) {
     if (stale === this.#stale) return;
     this.#stale = stale;
@@ -93,7 +93,7 @@ export class Paper {
 
   #repaintMap() {
     if (!this.#field || !this.#view) return;
-    // Twice the size it is shown at: scaling it down smooths the edges of the bands.
+    // Twice the size on the screen, since scaling down smooths the edges of the bands.
     const pixelsPerMetre = Math.min(FINEST_MAP, 2 * this.#view.scale);
     this.#map = this.#field.paint(this.#scale, loudnessRamp(), pixelsPerMetre);
   }

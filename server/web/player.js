@@ -1,6 +1,6 @@
-// The sound card end: an AudioContext at the stream's sample rate, the worklet and a volume control.
-// Events: "report" and "heard" as sent by the worklet; "heard" gains `at`, the epoch millisecond when it leaves the sound card,
-// and `outputS`, how long that takes from the worklet; "interrupted" when the system takes the sound away (a call, another tab).
+// Audio output: an AudioContext at the stream's sample rate, the worklet and a volume control.
+// Events: "report" and "heard" from the worklet, and "interrupted" when the system stops the sound (a call, another tab). "heard" has in
+// addition `at`, the epoch millisecond when it leaves the sound card, and `outputS`, the time from the worklet until then.
 
 export class Player extends EventTarget {
   #context = null;
@@ -11,9 +11,9 @@ export class Player extends EventTarget {
   #nextCapture = 0;
   #ready = null;
   #started = false;
-  #wanted = false; // whether sound should be running, so that a pause overtaken by a start does nothing
+  #wanted = false; // whether sound should be running, so that a pause followed by a start does nothing
 
-  /** Call from a user gesture: browsers start audio only then. Resolves with a port that takes audio blocks. */
+  /** Starts audio. Browsers allow that only in a user gesture. Resolves with a port that takes audio blocks. */
   async start(sampleRate) {
     if (!this.#context) {
       this.#context = new AudioContext({ sampleRate, latencyHint: "interactive" });
@@ -84,7 +84,7 @@ export class Player extends EventTarget {
     if (this.#gain && this.#context.state === "running") this.#fade(value);
   }
 
-  /** The last `seconds` that were played, before the volume control: {sampleRate, left, right}. */
+  /** The last `seconds` that were played, taken before the volume control: {sampleRate, left, right}. */
   capture(seconds) {
     if (!this.#node) return Promise.reject(new Error("nothing has been played yet"));
     const id = this.#nextCapture++;

@@ -1,4 +1,4 @@
-// HTTP side of the server: scenes, clips, heads and loudness maps. Problem bodies become RequestError.
+// Requests to the server over HTTP: scenes, clips, heads and loudness maps. Problem documents become RequestError.
 
 const endpoint = (path) => new URL(`v1/${path}`, document.baseURI);
 

@@ -1,5 +1,4 @@
-// The list of emitters beside the plan: what each one plays and how loud, where it is as seen from the listener, and how to add or
-// remove one.
+// The list of emitters beside the floor plan: clip, gain and direction from the listener of each, with controls to add and remove one.
 
 import { isVisible } from "./geometry.js";
 import { sourceColour } from "./palette.js";
@@ -15,7 +14,7 @@ function describe({ distanceM, bearing }, visible) {
   return `${distanceM.toFixed(1)} m, ${direction}${visible ? "" : ", out of sight"}`;
 }
 
-/** Not by `disabled`, which takes the keyboard away and lets no one ask why. */
+/** Disables a control but leaves it focusable, so that a user can find out why. The attribute `disabled` would not. */
 const disable = (button, isDisabled) => button.setAttribute("aria-disabled", isDisabled);
 
 export class Sources {
@@ -26,7 +25,7 @@ export class Sources {
   #limit;
   #rows = new Map(); // id -> {row, select, remove, gain, place}
 
-  /** `limit` says why none can be added. */
+  /** `limit` is the element that says why no source can be added. */
   constructor({ world, clips, list, add, limit }) {
     this.#world = world;
     this.#clips = clips;
@@ -52,20 +51,20 @@ export class Sources {
     this.#sync();
   }
 
-  /** The first clip that nobody plays yet. */
+  /** The first clip that no emitter plays yet. */
   nextClip() {
     const played = new Set([...this.#world.emitters.values()].map(({ clip }) => clip));
     return (this.#clips.find(({ name }) => !played.has(name)) ?? this.#clips[0]).name;
   }
 
-  /** Why no source can be added; empty where one can. */
+  /** The reason why no source can be added; empty if one can. */
   #why() {
     if (this.#clips.length === 0) return "The server has no clip to play.";
     const { isFull, mostEmitters: most } = this.#world;
     return isFull ? `This server plays at most ${most === 1 ? "one source" : `${most} sources`} at once.` : "";
   }
 
-  /** Removes a source, and leaves the keyboard at the one that takes its place. */
+  /** Removes a source and moves the focus to the one that takes its place in the list. */
   #remove(id) {
     const at = [...this.#rows.keys()].indexOf(id);
     this.#world.removeEmitter(id);
@@ -89,7 +88,7 @@ export class Sources {
     select.addEventListener("keydown", () => (byPointer = false));
     select.addEventListener("change", () => {
       this.#world.setClip(emitter.id, select.value);
-      if (byPointer) select.blur(); // gives the keys back to walking
+      if (byPointer) select.blur(); // so that the keys move the listener again
     });
     const remove = document.createElement("button");
     remove.type = "button";

@@ -1,4 +1,4 @@
-// A strip chart of the last seconds of the playout buffer: fill as an area, the target as a line, dropouts as marks.
+// A strip chart of the playout buffer over the last seconds. The fill is an area, the target a line, and dropouts are marks.
 
 import { colour } from "./palette.js";
 

@@ -1,14 +1,14 @@
-// A live stream that keeps itself connected: it holds what the listener should hear (poses, emitters) and brings the server to it,
-// at first and again after every reconnect. Runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
+// A live stream that reconnects by itself. It keeps the wanted state (poses, emitters) and sends it to the server at first and after
+// every reconnect. It runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
 
 import { FLAG_LATE, isBlock, message, parseBlock, serializePose } from "./wire.js";
 
-const POSE_INTERVAL_MS = 12; // at most about 80 poses a second, the newest wins
+const POSE_INTERVAL_MS = 12; // at most about 80 poses a second; only the newest is sent
 const ACKNOWLEDGE_EVERY = 4; // blocks
 const RETRY_MS = [250, 500, 1000, 2000, 4000];
-const REST_MS = 1000; // a listener at rest is sent again this often, which keeps the measured latency current
-const SILENCE_MS = 4000; // a server that paces audio is never silent for this long
-const REFUSED = 1008; // bad hello: asking again would not help
+const REST_MS = 1000; // the pose of a listener at rest is sent again this often, so that the measured latency stays current
+const SILENCE_MS = 4000; // a server that sends audio is never silent for this long
+const REFUSED = 1008; // the hello was refused, so a new connection would not help
 
 export const now = () => performance.timeOrigin + performance.now();
 
@@ -77,7 +77,7 @@ export class Stream {
     if (this.#welcomed) this.#send(message.setLevel(level));
   }
 
-  /** `effects` are on, off, or null for as planned; `output` null where it stays. */
+  /** Each of `effects` is on, off, or null to follow the plan; `output` is null to keep the present one. */
   setEffects({ effects, output }) {
     const wished = { ...this.#hello.effects, ...effects };
     for (const [name, isOn] of Object.entries(wished)) if (isOn === null) delete wished[name];
@@ -85,7 +85,7 @@ export class Stream {
     if (this.#welcomed) this.#send(message.setEffects({ effects, output }));
   }
 
-  /** Another head takes a new stream: the hello alone names it. */
+  /** Changes the head. That takes a new stream, since only a hello names the head. */
   setHead(head) {
     this.#hello = { ...this.#hello, head };
     clearTimeout(this.#retry);
@@ -163,7 +163,7 @@ export class Stream {
     this.#dirty.clear();
     this.#listeners.state({ state: "live", welcome });
     for (const emitter of this.#emitters.values()) this.#send(message.addEmitter(emitter));
-    // Whatever moved while the hello was under way is in here.
+    // Everything that moved between hello and welcome is in here.
     this.setListener({ ...this.#listener, at: now() });
     clearInterval(this.#heartbeat);
     this.#heartbeat = setInterval(() => {
@@ -173,7 +173,7 @@ export class Stream {
 
   #receiveBlock(buffer) {
     this.#heardAt = now();
-    if (!isBlock(buffer)) return; // a newer server may say more
+    if (!isBlock(buffer)) return; // a newer server may send other kinds
     const block = parseBlock(buffer);
     if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence));
     this.#listeners.block({ ...block, late: (block.flags & FLAG_LATE) !== 0 });

@@ -1,4 +1,4 @@
-// Worker entry: carries commands from the page to a Stream, its events back, and audio blocks straight to the worklet's port.
+// The worker of the stream. It passes commands from the page to a Stream, events back to the page, and audio blocks to the worklet.
 
 import { Stream } from "./stream.js";
 

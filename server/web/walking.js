@@ -4,8 +4,8 @@
 const WALK_M_S = 1.3;
 const SOURCE_M_S = 1.3;
 const TURN_RAD_S = 1.9;
-const HURRY = 2.2; // with shift
-const STRIDE_S = 0.02; // so that no wall is stepped over, however rarely the page is drawn
+const HURRY = 2.2; // factor of the speed with shift
+const STRIDE_S = 0.02; // longest step in time, so that no step crosses a wall even if the page is drawn rarely
 
 const KEYS = {
   KeyW: "forward", ArrowUp: "forward", KeyS: "back", ArrowDown: "back", KeyA: "left", KeyD: "right",
@@ -16,13 +16,13 @@ export class Walking {
   #world;
   #focusedEmitter;
   #dropped;
-  #held = new Map(); // code -> action
+  #pressed = new Map(); // code -> action
   #hurry = false;
   #last = 0;
   #frame = 0;
   #movedEmitter = null;
 
-  /** `focusedEmitter()` names the emitter with the keyboard focus or null; `dropped(id)` tells that one came to rest. */
+  /** `focusedEmitter()` returns the id of the emitter with the keyboard focus, or null. `dropped(id)` is called when it comes to rest. */
   constructor(world, { focusedEmitter, dropped }) {
     this.#world = world;
     this.#focusedEmitter = focusedEmitter;
@@ -37,7 +37,7 @@ export class Walking {
     const action = KEYS[event.code];
     if (!action || event.ctrlKey || event.altKey || event.metaKey || takesKey(event)) return;
     event.preventDefault();
-    this.#held.set(event.code, action);
+    this.#pressed.set(event.code, action);
     if (!this.#frame) {
       this.#last = performance.now();
       this.#frame = requestAnimationFrame((time) => this.#step(time));
@@ -46,17 +46,17 @@ export class Walking {
 
   #up(event) {
     this.#hurry = event.shiftKey;
-    this.#held.delete(event.code);
+    this.#pressed.delete(event.code);
   }
 
   #release() {
-    this.#held.clear();
+    this.#pressed.clear();
   }
 
   #step(time) {
     const seconds = Math.min(0.1, Math.max(0, (time - this.#last) / 1000));
     this.#last = time;
-    const active = new Set(this.#held.values());
+    const active = new Set(this.#pressed.values());
     const axis = (plus, minus) => (active.has(plus) ? 1 : 0) - (active.has(minus) ? 1 : 0);
     const emitter = this.#focusedEmitter();
     for (let left = active.size > 0 ? seconds : 0; left > 0; left -= STRIDE_S) {
@@ -64,7 +64,7 @@ export class Walking {
       if (emitter) this.#moveEmitter(emitter, axis, pace);
       else this.#walk(axis, pace);
     }
-    if (this.#held.size > 0) {
+    if (this.#pressed.size > 0) {
       this.#frame = requestAnimationFrame((next) => this.#step(next));
     } else {
       this.#frame = 0;
@@ -92,7 +92,7 @@ export class Walking {
   }
 }
 
-/** Whether the focused control has a use of its own for this key. */
+/** Whether the focused control uses this key itself. */
 function takesKey({ target, code }) {
   if (!(target instanceof Element)) return false;
   if (target.closest("select, textarea, [contenteditable]")) return true;

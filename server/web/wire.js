@@ -10,7 +10,7 @@ const POSE_BYTES = 36;
 
 export const FLAG_LATE = 2;
 
-/** Compact listener pose; `position` is [x, y, z] and `yaw` turns counter-clockwise from +x. */
+/** A listener pose as a binary message. `position` is [x, y, z], and `yaw` turns counter-clockwise from +x. */
 export function serializePose({ poseId, position, yaw }) {
   const buffer = new ArrayBuffer(POSE_BYTES);
   const view = new DataView(buffer);
@@ -21,12 +21,12 @@ export function serializePose({ poseId, position, yaw }) {
   return buffer;
 }
 
-/** Whether a binary message is an audio block, and no kind that this version does not know. */
+/** Whether a binary message is an audio block; a newer server may send other kinds. */
 export const isBlock = (buffer) => buffer.byteLength > 0 && new DataView(buffer).getUint8(0) === AUDIO_BLOCK;
 
 /**
- * Audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, left, right}; the ears are
- * Float32Array(frames), alike where there is one channel, the newest poses those of the direct sound and of what follows it.
+ * An audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, left, right}. `left` and `right` are
+ * Float32Array(frames), equal if there is one channel. The poses are the newest of the direct sound and of the reflected field.
  */
 export function parseBlock(buffer) {
   const view = new DataView(buffer);

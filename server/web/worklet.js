@@ -1,5 +1,5 @@
-// AudioWorklet: plays what the stream worker delivers and reports how it went. Both ports carry messages, never shared memory, so
-// the page needs no cross-origin isolation.
+// The AudioWorklet. It plays the blocks from the stream worker and reports levels and buffer statistics. It uses messages and no shared
+// memory, so that the page needs no cross-origin isolation.
 
 import { JitterBuffer } from "./jitterbuffer.js";
 

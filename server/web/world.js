@@ -1,6 +1,6 @@
-// What is in the scene: one listener and a few emitters, always in places where they may stand.
-// Events: "listener", "emitter" (detail: the emitter), "gain" (likewise), "emitters" (one came or went) and "limit" (another number
-// of them may be there).
+// The contents of the scene: one listener and a few emitters, always in places where they may stand.
+// Events: "listener", "emitter" (detail: the emitter), "gain" (likewise), "emitters" (one was added or removed) and "limit" (the largest
+// number of emitters has changed).
 
 import { Floor, distance, wrapAngle } from "./geometry.js";
 
@@ -11,14 +11,14 @@ const IDS = [...LETTERS, ...LETTERS.flatMap((first) => LETTERS.map((second) => f
 export class World extends EventTarget {
   #mostEmitters;
 
-  /** `mostEmitters` is how many the server takes. */
+  /** `mostEmitters` is the largest number that the server takes. */
   constructor(scene, { mostEmitters }) {
     super();
     this.scene = scene;
     this.#mostEmitters = mostEmitters;
     const { minimum, maximum } = scene.bounds;
     const clearance = scene.walls_known ? undefined : null;
-    // Poses travel in single precision, which rounds what lies on the bounds to either side of them.
+    // Poses are sent in single precision, which may round a place on the bounds to outside of them.
     const [west, south, east, north] = [minimum[0] + INSIDE_M, minimum[1] + INSIDE_M, maximum[0] - INSIDE_M, maximum[1] - INSIDE_M];
     this.floor = new Floor({ corners: scene.corners, minimum: [west, south], maximum: [east, north], clearance });
     this.listener = { position: [...scene.listener.position], yaw: scene.listener.yaw ?? 0 };
@@ -29,7 +29,7 @@ export class World extends EventTarget {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
-  /** Moves and turns the listener; `point` is [x, y] or [x, y, z], either argument may be left out. */
+  /** Moves and turns the listener. `point` is [x, y] or [x, y, z]; either argument may be left out. */
   moveListener(point, yaw) {
     const { position } = this.listener;
     if (point) this.#place(position, point);
@@ -55,7 +55,7 @@ export class World extends EventTarget {
     this.#emit("emitter", emitter);
   }
 
-  /** Decibels beside the clip as it was recorded. */
+  /** Sets an emitter's gain in decibels relative to the clip as recorded. */
   setGain(id, gainDb) {
     const emitter = this.emitters.get(id);
     emitter.gainDb = gainDb;
@@ -77,7 +77,7 @@ export class World extends EventTarget {
     return this.emitters.size >= this.#mostEmitters;
   }
 
-  /** Adds an emitter named by the first free letter, at `position` or else where there is most room. */
+  /** Adds an emitter named by the first free letter, at `position` or where there is most room. */
   addEmitter({ clip, position }) {
     const id = IDS.find((each) => !this.emitters.has(each));
     const height = this.scene.emitter.position[2];
@@ -106,7 +106,7 @@ export class World extends EventTarget {
     return best ?? [this.listener.position[0], this.listener.position[1]];
   }
 
-  /** Emitter as heard: distance in metres and bearing in radians, positive to the left of the nose. */
+  /** An emitter relative to the listener: distance in metres and bearing in radians, positive to the left. */
   bearing({ position }) {
     const [x, y] = this.listener.position;
     const angle = Math.atan2(position[1] - y, position[0] - x) - this.listener.yaw;

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.acoustics import reflections
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.reflections import FirstEcho, ReflectionFinder, mirror_gain_db
+from tests.oracles.reflections import NumpyReflectionFinder
 
 SCENE = Path(__file__).resolve().parents[2] / "training" / "scenes" / "apartment.toml"
 GEOMETRY = tomllib.loads(SCENE.read_text())["geometry"]
@@ -190,22 +190,21 @@ def assert_same(a, b):
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=30)
-def test_in_any_room_the_same_is_found_with_a_compiler_and_without(seed):
+def test_in_any_room_the_same_is_found_by_compiled_code_and_numpy(seed):
     plan = star(seed)
     finder = ReflectionFinder(plan, GAINS_DB)
     listener, *emitters = points_inside(plan, 9, seed)
     together = finder.find(listener, np.array(emitters))
-    assert_same(together, finder.find_with_numpy(listener, np.array(emitters)))
+    assert_same(together, NumpyReflectionFinder(plan, GAINS_DB).find(listener, np.array(emitters)))
     alone = [one(finder, listener, emitter).length_m for emitter in emitters]
     np.testing.assert_array_equal(together.length_m, np.concatenate(alone))
 
 
-def test_without_numba_numpy_answers(monkeypatch):
-    emitters = points_inside(APARTMENT, 16, 14)
-    expected = FINDERS["apartment"].find((1.0, 1.0, 1.5), emitters)
-    monkeypatch.setattr(reflections, "HAS_NUMBA", False)
-    monkeypatch.setattr(reflections, "find_reflections", None)
-    assert_same(ReflectionFinder(APARTMENT, GAINS_DB).find((1.0, 1.0, 1.5), emitters), expected)
+@pytest.mark.parametrize("name", PLANS)
+def test_compiled_and_numpy_reflections_are_the_same(name):
+    emitters, oracle = points_inside(PLANS[name], 16, 14), NumpyReflectionFinder(PLANS[name], GAINS_DB)
+    for listener in points_inside(PLANS[name], 20, 15):
+        assert_same(FINDERS[name].find(listener, emitters), oracle.find(listener, emitters))
 
 
 @pytest.mark.parametrize("name", PLANS)

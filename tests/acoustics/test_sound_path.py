@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 from scipy.sparse.csgraph import dijkstra
 
-from server.acoustics import sound_path
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
+from tests.oracles.sound_path import NumpySoundPathFinder, diffraction_gain_db
 
 Floats = npt.NDArray[np.float64]
 
@@ -48,6 +47,7 @@ BOX = FloorPlan(((0, 0), (5, 0), (5, 4), (0, 4)), 2.5)
 PLANS = {"apartment": APARTMENT, "serpentine": SERPENTINE, "star": star(33), "box": BOX}
 FINDERS = {name: SoundPathFinder(plan, SPEED_OF_SOUND) for name, plan in PLANS.items()}
 FINDER = FINDERS["apartment"]
+ORACLES = {name: NumpySoundPathFinder(plan, SPEED_OF_SOUND) for name, plan in PLANS.items()}
 
 
 def points_inside(plan: FloorPlan, count: int, seed: int, *, clearance_m: float = 0.0) -> Floats:
@@ -287,7 +287,7 @@ def test_any_straight_walk_in_the_open_is_without_jumps(name: str) -> None:
 def test_every_number_is_finite_wherever_the_points_are(
     listener: tuple[float, ...], emitter: tuple[float, ...]
 ) -> None:
-    for find in (FINDER.find, FINDER.find_with_numpy):
+    for find in (FINDER.find, ORACLES["apartment"].find):
         paths = find(np.array(listener), np.array([emitter]))
         assert all(np.isfinite(values).all() for values in numbers(paths).values())
         np.testing.assert_allclose(np.linalg.norm(paths.arrival, axis=-1), 1, atol=1e-12)
@@ -304,7 +304,7 @@ def test_standing_on_a_corner_one_hears_round_the_next() -> None:
 
 
 def test_no_emitters_no_paths() -> None:
-    for find in (FINDER.find, FINDER.find_with_numpy, FINDERS["box"].find_with_numpy):
+    for find in (FINDER.find, ORACLES["apartment"].find, ORACLES["box"].find):
         paths = find(np.array((1.0, 1.0, 1.5)), np.zeros((0, 3)))
         assert paths.length_m.shape == (0,)
         assert paths.screen_db.shape == (0, len(OCTAVE_BANDS_HZ))
@@ -324,19 +324,10 @@ def assert_same(ours: SoundPaths, theirs: SoundPaths) -> None:
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_compiled_and_numpy_paths_are_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sound_path, "HAS_NUMBA", True)
+def test_compiled_and_numpy_paths_are_the_same(name: str) -> None:
     emitters = points_inside(PLANS[name], 16, 12)
     for listener in points_inside(PLANS[name], 60, 13):
-        assert_same(FINDERS[name].find(listener, emitters), FINDERS[name].find_with_numpy(listener, emitters))
-
-
-def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    emitters = points_inside(APARTMENT, 16, 14)
-    with_numba = FINDER.find((1.0, 1.0, 1.5), emitters)
-    monkeypatch.setattr(sound_path, "HAS_NUMBA", False)
-    monkeypatch.setattr(sound_path, "find_sound_paths", None)
-    assert_same(SoundPathFinder(APARTMENT, SPEED_OF_SOUND).find((1.0, 1.0, 1.5), emitters), with_numba)
+        assert_same(FINDERS[name].find(listener, emitters), ORACLES[name].find(listener, emitters))
 
 
 @given(st.integers(0, 10_000))
@@ -347,4 +338,4 @@ def test_in_any_room_the_shortest_path_is_found_whichever_way_it_is_computed(see
     listener, *emitters = points_inside(plan, 9, seed)
     paths = finder.find(listener, np.array(emitters))
     np.testing.assert_allclose(paths.length_m, plan.path_length_m(listener, np.array(emitters)), rtol=1e-12)
-    assert_same(paths, finder.find_with_numpy(listener, np.array(emitters)))
+    assert_same(paths, NumpySoundPathFinder(plan, SPEED_OF_SOUND).find(listener, np.array(emitters)))

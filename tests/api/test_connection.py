@@ -136,7 +136,7 @@ def test_blocks_that_go_the_short_way_and_the_long_one_stay_in_order(field, hrtf
 
         async with hosting(field, hrtfs) as host:
             way = FastPath(write=write, listen=lambda _: None)
-            connection = Connection(socket, host, way=way, time_s=lambda: time.monotonic() + 1.0)
+            connection = Connection(socket, host, fast_path=way, time_s=lambda: time.monotonic() + 1.0)
             running = asyncio.create_task(connection.run())
             socket.say(HELLO)
             await listen_for_a_second(socket)
@@ -158,7 +158,7 @@ def test_what_is_heard_at_once_waits_for_a_clip_that_is_being_read(field, hrtfs)
         socket, listening = Socket(), asyncio.get_running_loop().create_future()
         way = FastPath(write=lambda _: False, listen=listening.set_result)
         async with hosting(field, hrtfs) as host:
-            running = asyncio.create_task(Connection(socket, host, way=way).run())
+            running = asyncio.create_task(Connection(socket, host, fast_path=way).run())
             socket.say(HELLO)
             hear = await asyncio.wait_for(listening, 5)
             assert not hear(AddEmitter(id="a", clip="trumpet", position=(1.0, 2.0, 1.0)).serialize())

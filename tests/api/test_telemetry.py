@@ -81,7 +81,7 @@ def test_streams_are_counted_together_and_stay_counted_when_they_end(host, field
         stream.session.receive(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
         for _ in range(5):
             stream.session.render_block()
-        stream.render_times.add(0.001)
+        stream.times.render.add(0.001)
         stream.blocks_late += 1
     streams[0].ladder = replace(streams[0].ladder, at=1)
     told = samples(host)
@@ -101,7 +101,7 @@ def test_durations_are_buckets_that_contain_each_other(host, field, filters):
     times_s = [1e-4, 2e-4, 2e-4, 0.03, 100.0]
     stream = open_stream(host, field, filters)
     for time_s in times_s:
-        stream.render_times.add(time_s)
+        stream.times.render.add(time_s)
     told = samples(host)
     counts = sorted(
         (float(dict(labels)["le"]), value)

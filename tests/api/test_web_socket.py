@@ -14,7 +14,7 @@ from websockets.frames import Frame, Opcode
 from websockets.uri import parse_uri
 
 from server.api.inflow import Allowance
-from server.api.web_socket import FastPath, direct_way, watched
+from server.api.web_socket import FastPath, fast_path, watched
 from server.protocol.client_messages import ListenerPose
 
 PROTOCOL = "server.api.web_socket:WebSocketProtocol"
@@ -44,7 +44,7 @@ async def serving(application, ws=PROTOCOL, **more):
 
 def test_what_is_written_arrives_in_order_among_what_is_sent():
     async def speak(scope, _receive, send):
-        write = direct_way(scope).write
+        write = fast_path(scope).write
         for number in range(50):
             if number % 3:
                 assert write([bytes([number]) * 1000])
@@ -65,7 +65,7 @@ def test_a_client_that_does_not_read_is_not_written_to():
     written = []
 
     async def speak(scope, receive, send):
-        write = direct_way(scope).write
+        write = fast_path(scope).write
         while write([len(written).to_bytes(4, "little") * 2_000]):
             written.append(len(written))
             await asyncio.sleep(0)
@@ -92,7 +92,7 @@ def test_nothing_is_written_to_a_connection_that_closes():
 
     async def speak(scope, _receive, send):
         await send({"type": "websocket.close"})
-        outcome.append(direct_way(scope).write([b"too late"]))
+        outcome.append(fast_path(scope).write([b"too late"]))
 
     async def listen():
         async with serving(speak) as address, connect(address, compression=None) as client:
@@ -102,12 +102,12 @@ def test_nothing_is_written_to_a_connection_that_closes():
     assert outcome == [False]
 
 
-def test_another_server_has_no_short_way():
+def test_another_server_has_no_fast_path():
     found = []
 
     async def speak(scope, _receive, send):
-        found.append(direct_way(scope))
-        assert watched(scope, sent=found.append, heard=found.append) is scope
+        found.append(fast_path(scope))
+        assert watched(scope, sent=found.append, received=found.append) is scope
         await send({"type": "websocket.close"})
 
     async def listen():
@@ -118,7 +118,7 @@ def test_another_server_has_no_short_way():
     assert found == [None]
 
 
-def test_who_watches_is_told_of_what_went_the_direct_way():
+def test_a_watched_scope_reports_what_went_by_the_fast_path():
     sent, heard, taken, listeners = [], [], [], []
 
     def take(message):
@@ -126,8 +126,8 @@ def test_who_watches_is_told_of_what_went_the_direct_way():
         return message not in (b"not now", [b"not now"])
 
     way = FastPath(write=take, listen=listeners.append)
-    scope = {"extensions": {"nafir.direct": {"way": way}, "other": {}}}
-    watched_way = direct_way(watched(scope, sent=sent.append, heard=heard.append))
+    scope = {"extensions": {"nafir.direct": {"path": way}, "other": {}}}
+    watched_way = fast_path(watched(scope, sent=sent.append, received=heard.append))
     assert [watched_way.write([b"one", b"two"]), watched_way.write([b"not now"])] == [True, False]
     watched_way.listen(take)
     (listener,) = listeners
@@ -146,7 +146,7 @@ def test_what_is_heard_at_once_and_what_waits_stay_in_order():
         return True
 
     async def listen(scope, receive, send):
-        direct_way(scope).listen(hear)
+        fast_path(scope).listen(hear)
         is_open.set()
         while len(heard) < 8:
             message = await receive()
@@ -174,7 +174,7 @@ def test_text_that_is_none_closes_the_connection():
     """As it does without anybody who listens."""
 
     async def listen(scope, receive, _send):
-        direct_way(scope).listen(lambda _: True)
+        fast_path(scope).listen(lambda _: True)
         while (await receive())["type"] != "websocket.disconnect":
             pass
 
@@ -215,7 +215,7 @@ def test_a_message_that_is_too_long_closes_the_connection(hears):
     heard = []
 
     async def listen(scope, receive, _send):
-        direct_way(scope).listen(lambda message: hears and not heard.append(len(message)))
+        fast_path(scope).listen(lambda message: hears and not heard.append(len(message)))
         while (await receive())["type"] != "websocket.disconnect":
             pass
 
@@ -236,7 +236,7 @@ def test_what_comes_after_a_breach_of_the_protocol_is_not_heard():
     heard, events = [], []
 
     async def listen(scope, receive, _send):
-        direct_way(scope).listen(lambda message: not heard.append(message))
+        fast_path(scope).listen(lambda message: not heard.append(message))
         await asyncio.sleep(0.5)
         queue = receive.__self__.queue
         events.extend(queue.get_nowait()["type"] for _ in range(queue.qsize()))
@@ -263,7 +263,7 @@ def test_a_client_that_is_still_sending_learns_why_the_connection_closes(breach,
 
     async def listen(scope, receive, send):
         if hears:
-            direct_way(scope).listen(lambda message: not heard.append(message))
+            fast_path(scope).listen(lambda message: not heard.append(message))
         while (event := await receive())["type"] != "websocket.disconnect":
             heard.append(event)
         await send({"type": "websocket.send", "bytes": b"too late"})
@@ -316,7 +316,7 @@ def hear_all(*messages, until, **options):
                 is_over.set()
             return True
 
-        direct_way(scope).listen(hear)
+        fast_path(scope).listen(hear)
         is_open.set()
         await is_over.wait()
         await send({"type": "websocket.close"})
@@ -364,7 +364,7 @@ def test_the_last_that_waits_is_heard_before_what_comes_behind_it():
         return True
 
     async def listen(scope, receive, send):
-        direct_way(scope).listen(hear)
+        fast_path(scope).listen(hear)
         is_open.set()
         while len(heard) < 100:
             with contextlib.suppress(TimeoutError):
@@ -389,7 +389,7 @@ def test_between_a_few_messages_others_have_their_turn():
     heard, turns, is_open = [], [], asyncio.Event()
 
     async def listen(scope, _receive, send):
-        direct_way(scope).listen(lambda message: not heard.append(message))
+        fast_path(scope).listen(lambda message: not heard.append(message))
         is_open.set()
         while len(heard) < 1_000:
             turns.append(len(heard))
@@ -411,7 +411,7 @@ def test_who_has_spent_its_budget_is_read_no_more_for_a_while_and_loses_nothing(
     allowance = Allowance(messages_per_s=400, bytes_per_s=1e6)
 
     async def listen(scope, _receive, send):
-        way = direct_way(scope)
+        way = fast_path(scope)
         way.allow(allowance)
         way.listen(lambda message: not heard.append((time.monotonic(), message)))
         is_open.set()

@@ -41,12 +41,12 @@ def _sent_as(first, data):
 @given(st.lists(FRAMES, max_size=6), st.lists(st.integers(0, 200_000), max_size=8))
 def test_all_that_came_goes_on_in_order(frames, borders):
     """Wherever it was cut on the way, and but for what waits for its end."""
-    data, cutter = sent(frames), FrameSplitter(1 << 20)
+    data, splitter = sent(frames), FrameSplitter(1 << 20)
     borders = sorted(border % (len(data) + 1) for border in borders)
     pieces = [data[start:end] for start, end in zip([0, *borders], [*borders, len(data)], strict=True)]
-    cuts = [cut for piece in pieces for cut in cutter.cut(piece)]
-    assert b"".join(cut.raw for cut in cuts) == data
-    found = [(cut.message, cut.is_text) for cut in cuts if cut.message is not None]
+    received = [each for piece in pieces for each in splitter.split(piece)]
+    assert b"".join(each.raw for each in received) == data
+    found = [(each.message, each.is_text) for each in received if each.message is not None]
     expected = [(frame.data, frame.opcode is Opcode.TEXT) for frame in whole_messages(frames)]
     at = 0
     for message in found:  # long ones are whole only where they came in one piece
@@ -63,35 +63,35 @@ def test_messages_are_those_of_the_librarys_parser(messages):
     parser = Protocol(Side.SERVER)
     parser.receive_data(sent(frames))
     parsed = [(bytes(frame.data), frame.opcode is Opcode.TEXT) for frame in parser.events_received()]
-    assert [(cut.message, cut.is_text) for cut in FrameSplitter(1 << 20).cut(sent(frames))] == parsed
+    assert [(each.message, each.is_text) for each in FrameSplitter(1 << 20).split(sent(frames))] == parsed
 
 
 def test_a_message_of_one_byte_at_a_time_is_whole():
-    cutter = FrameSplitter(1 << 20)
+    splitter = FrameSplitter(1 << 20)
     data = Frame(Opcode.TEXT, b"bit by bit").serialize(mask=True)
-    cuts = [cut for at in range(len(data)) for cut in cutter.cut(data[at : at + 1])]
-    assert [(cut.raw, cut.message) for cut in cuts] == [(data, b"bit by bit")]
+    received = [each for at in range(len(data)) for each in splitter.split(data[at : at + 1])]
+    assert [(each.raw, each.message) for each in received] == [(data, b"bit by bit")]
 
 
 @pytest.mark.parametrize("length", [126, 65_535, 65_536])
 def test_nothing_of_a_long_message_is_kept_back(length):
     """It would be memory, of which a client could claim as much as it says that its message has."""
     data = Frame(Opcode.BINARY, bytes(length)).serialize(mask=True)[:-1]
-    cutter = FrameSplitter(1 << 20)
-    assert [cut.raw for cut in cutter.cut(data)] == [data]
-    assert [(cut.raw, cut.message) for cut in cutter.cut(b"!")] == [(b"!", None)]
+    splitter = FrameSplitter(1 << 20)
+    assert [each.raw for each in splitter.split(data)] == [data]
+    assert [(each.raw, each.message) for each in splitter.split(b"!")] == [(b"!", None)]
 
 
 def test_what_is_longer_than_allowed_is_left_to_the_parser():
     """Which closes the connection."""
     allowed, longer = (Frame(Opcode.BINARY, bytes(length)).serialize(mask=True) for length in (100, 101))
-    assert [cut.message for cut in FrameSplitter(100).cut(allowed + longer)] == [bytes(100), None]
+    assert [each.message for each in FrameSplitter(100).split(allowed + longer)] == [bytes(100), None]
 
 
 def test_what_is_not_masked_is_no_message():
     """It breaks the protocol, and the parser is to say so."""
     data = Frame(Opcode.BINARY, b"plain").serialize(mask=False)
-    assert [(cut.raw, cut.message) for cut in FrameSplitter(1 << 20).cut(data)] == [(data, None)]
+    assert [(each.raw, each.message) for each in FrameSplitter(1 << 20).split(data)] == [(data, None)]
 
 
 @pytest.mark.parametrize("length", [0, 1, 125, 126, 2_080, 65_535, 65_536])
@@ -103,14 +103,14 @@ def test_headers_are_those_of_the_library(length):
 @given(st.lists(FRAMES, max_size=6), st.integers(1, 4))
 def test_few_frames_at_a_time_are_the_same_frames(frames, most):
     data, at_once, by_parts = sent(frames), FrameSplitter(1 << 20), FrameSplitter(1 << 20)
-    whole = at_once.cut(data)
-    parts = [by_parts.cut(data, most=most)]
+    whole = at_once.split(data)
+    parts = [by_parts.split(data, most=most)]
     while by_parts.has_more:
-        parts.append(by_parts.cut(most=most))
-    cuts = [cut for part in parts for cut in part]
-    assert b"".join(cut.raw for cut in cuts) == data
-    assert [cut.message for cut in cuts if cut.message is not None] == [
-        cut.message for cut in whole if cut.message is not None
+        parts.append(by_parts.split(most=most))
+    received = [each for part in parts for each in part]
+    assert b"".join(each.raw for each in received) == data
+    assert [each.message for each in received if each.message is not None] == [
+        each.message for each in whole if each.message is not None
     ]
-    assert all(sum(cut.frames for cut in part) <= most for part in parts)
-    assert sum(cut.frames for cut in cuts) == sum(cut.frames for cut in whole) == len(frames)
+    assert all(sum(each.frames for each in part) <= most for part in parts)
+    assert sum(each.frames for each in received) == sum(each.frames for each in whole) == len(frames)

@@ -7,12 +7,13 @@ from onnx import TensorProto, helper, numpy_helper
 
 from server.acoustics.phase import FrozenNoise
 from server.core.errors import BundleError
-from server.field.decoder import Decoder
+from server.field.decoder import Decoder, is_compiled_size
 from server.field.field import AcousticField, frozen_noise
 from server.field.fields_by_level import FieldsByLevel
 from server.field.graph import OUTPUTS, Spectrograms
 from server.scene.bundle import write_bundle
 from server.scene.manifest import FieldFile, Phase, QualityLevel
+from tests.oracles.decoder import NumpyDecoder
 
 WIDTHS = (1,) * 11 + (2,) * 5 + (4,) * 3 + (8,) * 3 + (9,)
 POSE = [(2.0, 2.5, 1.5)], [(5.0, 4.0, 1.5)], [0.4]
@@ -117,10 +118,7 @@ def test_spectrograms_and_energy_are_of_frames(fields):
 def test_numpy_decodes_cells_as_compiled_code_does(fields, codec):
     field, _ = fields("frozen")
     noise = frozen_noise(field.bundle, field.graph)
-    compiled, plain = (
-        Decoder(codec, noise, ir_samples=codec.samples, phase=Phase(), is_compiled=is_compiled)
-        for is_compiled in (True, False)
-    )
+    compiled, plain = (kind(codec, noise, ir_samples=codec.samples, phase=Phase()) for kind in (Decoder, NumpyDecoder))
     predicted, at = field.graph.predictions(*POSE), np.array([130.4])
     assert difference_db(compiled.decode(predicted, at), plain.decode(predicted, at)) < -90
 
@@ -137,11 +135,10 @@ def test_few_cells_are_decoded_as_numpy_does(codec, count):
         rng.uniform(-0.7, 0.7, shape).astype(np.float32),
     )
     noise = FrozenNoise.from_signal(codec.codec, rng.standard_normal((2, codec.samples)))
+    assert is_compiled_size(few) == (count >= 3)
     found, expected = (
-        Decoder(few, noise, ir_samples=codec.samples, phase=Phase(), is_compiled=is_compiled).decode(
-            told, np.array([100.3])
-        )
-        for is_compiled in (True, False)
+        kind(few, noise, ir_samples=codec.samples, phase=Phase()).decode(told, np.array([100.3]))
+        for kind in (Decoder, NumpyDecoder)
     )
     assert difference_db(found, expected) < -90
 

@@ -8,9 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from server.acoustics.codec import Codec
 from server.acoustics.phase import FrozenNoise, griffin_lim
-from server.field.decoder import Decoder
+from server.field.decoder import Decoder, is_compiled_size
 from server.field.graph import Spectrograms
 from server.scene.manifest import CodecParameters, Phase
+from tests.oracles.decoder import NumpyDecoder
 
 SAMPLES = 3_000
 FROZEN, INTEGRATED = Phase(), Phase(kind="integrated")
@@ -32,9 +33,9 @@ def _iterations(count, *, warm=False):
     return Phase(kind="griffin_lim", iterations=count, warm=warm)
 
 
-def _decoder(parameters, phase=FROZEN, **options):
+def _decoder(parameters, phase=FROZEN, *, kind=Decoder, **options):
     noise = np.random.default_rng(9).standard_normal((2, parameters.samples))
-    return Decoder(
+    return kind(
         parameters,
         FrozenNoise.from_signal(parameters.codec, noise),
         **{"ir_samples": SAMPLES, **options},
@@ -99,10 +100,12 @@ ALIGNED = np.array([0.0, 100.0, 431.37, -40.0, -17.6, 32.5, SAMPLES - 90.2, 1e5]
 @pytest.mark.parametrize("name", CASES)
 def test_compiled_and_numpy_agree(name):
     case = CASES[name]
-    decoder = _decoder(case.parameters, case.phase, frames=case.frames)
+    assert is_compiled_size(case.parameters)
     predicted = _predicted(case.parameters, len(ALIGNED))
-    compiled = decoder.decode(predicted, ALIGNED)
-    reference = decoder.decode_with_numpy(predicted, ALIGNED, [None] * len(ALIGNED))
+    compiled, reference = (
+        _decoder(case.parameters, case.phase, frames=case.frames, kind=kind).decode(predicted, ALIGNED)
+        for kind in (Decoder, NumpyDecoder)
+    )
     assert np.abs(reference[:-1]).max(axis=(1, 2)).min() > 1e-3
     assert not compiled[-1].any()
     difference = np.linalg.norm(compiled - reference, axis=(1, 2))
@@ -112,9 +115,9 @@ def test_compiled_and_numpy_agree(name):
 def test_a_window_that_is_no_power_of_two_is_decoded_all_the_same():
     parameters = _parameters(192)
     predicted = _predicted(parameters)
-    decoder = _decoder(parameters)
-    expected = decoder.decode_with_numpy(predicted, np.array([50.5]), [None])
-    assert_array_equal(decoder.decode(predicted, np.array([50.5])), expected)
+    assert not is_compiled_size(parameters)
+    expected = _decoder(parameters, kind=NumpyDecoder).decode(predicted, np.array([50.5]))
+    assert_array_equal(_decoder(parameters).decode(predicted, np.array([50.5])), expected)
     assert np.abs(expected).max() > 1e-3
 
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from server.field.gate import MOST_GIVEN, Gate
-from server.kernels.compiled import HAS_NUMBA
+from server.health.double_precision import DoubleGate
 from server.scene.manifest import CodecParameters
 
 RATE, N_FFT, SAMPLES = 24_000, 256, 2_000
@@ -15,8 +15,12 @@ PARAMETERS = CodecParameters(
 ONSETS = np.array([-100, -3, 0, 700, 700, 700, SAMPLES - 30, SAMPLES, 2**40])
 ECHOES = np.array([-90, 4, 0, 690, 704, 900, SAMPLES - 20, 12, 2**40])
 
-COMPILED = pytest.mark.skipif(not HAS_NUMBA, reason="nothing is compiled")
-EITHER = pytest.mark.parametrize("is_compiled", [pytest.param(True, marks=COMPILED), False])
+EITHER = pytest.mark.parametrize("is_compiled", [pytest.param(True, id="compiled"), pytest.param(False, id="numpy")])
+
+
+def _gate(*, is_compiled=True, **options):
+    gate = Gate(PARAMETERS, **options)
+    return gate if is_compiled else DoubleGate(gate)
 
 
 def _noise(count=1, channels=2, seed=0):
@@ -27,14 +31,13 @@ def _energy(responses):
     return np.sum(responses.astype(np.float64) ** 2, axis=-1)
 
 
-@COMPILED
 @pytest.mark.parametrize("gives_back", [False, True])
 @pytest.mark.parametrize("channels", [1, 2])
 def test_compiled_and_numpy_agree(channels, gives_back):
     compiled = _noise(len(ONSETS), channels)
     reference = compiled.copy()
     for responses, is_compiled in ((compiled, True), (reference, False)):
-        gate = Gate(PARAMETERS, rise_s=0.004, gives_back=gives_back, is_compiled=is_compiled)
+        gate = _gate(rise_s=0.004, gives_back=gives_back, is_compiled=is_compiled)
         gate.open(responses, ONSETS, ECHOES)
     assert_allclose(compiled, reference, rtol=1e-5)
     assert np.all(_energy(compiled)[:-2] > 0.1)
@@ -44,7 +47,7 @@ def test_compiled_and_numpy_agree(channels, gives_back):
 def test_it_is_silent_until_sound_arrives_and_open_after_its_rise(is_compiled):
     responses = _noise(3)
     expected = responses.copy()
-    Gate(PARAMETERS, rise_s=0.004, is_compiled=is_compiled).open(responses, np.array([-200, 300, 700]))
+    _gate(rise_s=0.004, is_compiled=is_compiled).open(responses, np.array([-200, 300, 700]))
     assert_array_equal(responses[0], expected[0])
     for response, whole, onset in zip(responses[1:], expected[1:], (300, 700), strict=True):
         assert not response[:, :onset].any()
@@ -62,7 +65,7 @@ def test_it_is_silent_until_sound_arrives_and_open_after_its_rise(is_compiled):
 def test_it_is_silent_until_a_surface_has_answered(is_compiled):
     responses = _noise()
     expected = responses.copy()
-    Gate(PARAMETERS, is_compiled=is_compiled).open(responses, np.array([300]), np.array([400]))
+    _gate(is_compiled=is_compiled).open(responses, np.array([300]), np.array([400]))
     assert not responses[..., : 400 - 7].any()
     assert responses[..., 400 - 7 : 400].all()
     assert_array_equal(responses[..., 400:], expected[..., 400:])
@@ -102,13 +105,13 @@ def test_what_little_there_is_is_not_made_up_of_what_was_taken():
 def test_of_silence_nothing_is_given_back(is_compiled):
     responses = _noise()
     responses[..., 300:] = 0
-    Gate(PARAMETERS, gives_back=True, is_compiled=is_compiled).open(responses, np.array([300]))
+    _gate(gives_back=True, is_compiled=is_compiled).open(responses, np.array([300]))
     assert not responses.any()
 
 
 @EITHER
 def test_as_many_responses_as_there_are_onsets(is_compiled):
-    gate = Gate(PARAMETERS, is_compiled=is_compiled)
+    gate = _gate(is_compiled=is_compiled)
     with pytest.raises(ValueError, match="3 onsets and 3 echoes of 1 responses"):
         gate.open(_noise(), np.array([1, 2, 3]))
     with pytest.raises(ValueError, match="1 onsets and 2 echoes"):

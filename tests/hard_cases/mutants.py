@@ -1,24 +1,30 @@
 """Whether the tests would notice: each guard of `guards/` is removed from a copy of the tree of its own, and the tests
 that are said to watch it are run there. `python tests/hard_cases/mutants.py [NAME ...] [--jobs N] [--after NAME]`.
 
-A guard is found by its exact text, which has to be in its file once. It is caught where every test that is named for it
+A guard is the statement below a comment `# guard: NAME` in the code, and a list says what stands there without it:
+another statement (`replace`), the same with another `condition`, or with one piece of its text changed for another
+(`swap`); of a statement with a body, only what stands before it. It is caught where every test that is named for it
 fails, in one of its cases at least; all of them have passed before with every guard in place. Each copy begins with the
 code that is compiled already, and is run in a process of its own that begins with the libraries in place.
 """
 
 import argparse
+import ast
 import io
 import multiprocessing
 import os
+import re
 import shutil
 import sys
 import tempfile
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
+from functools import cache
+from itertools import accumulate
 from pathlib import Path
 
 import pytest
@@ -29,16 +35,76 @@ COPIED = ("server", "training", "tests", "client_examples", "pyproject.toml", "R
 LIBRARIES = ["numba", "onnxruntime", "pydantic", "scipy.signal", "scipy.spatial", "scipy.stats", "torch"]
 
 
+MARK = re.compile(r"^ *# guard: (.+)$", re.MULTILINE)
+MARKED = ("server", "training", "tests/hard_cases")
+
+
 @dataclass(frozen=True)
 class Guard:
-    """`find` in `file`, and what stands there without the guard; `tests` are functions, `path::name`, each of which
-    fails then."""
+    """What takes the place of the statement marked with `name`: one of `replace`, `condition` and `swap`. `tests` are
+    functions, `path::name`, each of which fails then."""
 
     name: str
-    file: str
-    find: str
-    replace: str
     tests: tuple[str, ...]
+    replace: str | None = None
+    condition: str | None = None
+    swap: tuple[str, str] | None = None
+
+    def removed_from(self, source: str) -> str:
+        """The source without this guard. Raises ValueError where its mark stands there not once, where no such
+        statement stands below it, and where a swap finds its text not once."""
+        marks = [mark for mark in MARK.finditer(source) if mark[1] == self.name]
+        if len(marks) != 1:
+            raise ValueError(f"{self.name}: marked {len(marks)} times, not once")
+        text = source.encode()  # columns of syntax trees are bytes
+        line = source[: marks[0].end()].count("\n") + 1
+        statement = _statement_below(ast.parse(text), line)
+        start, end = self._replaced(text, statement)
+        old = text[start:end].decode()
+        if self.swap is not None:
+            if old.count(self.swap[0]) != 1:
+                raise ValueError(f"{self.name}: {self.swap[0]!r} stands {old.count(self.swap[0])} times in {old!r}")
+            new = old.replace(*self.swap)
+        else:
+            new = self.condition if self.replace is None else self.replace
+            assert new is not None, f"{self.name}: a guard has replace, condition or swap"
+        return (text[:start] + new.encode() + text[end:]).decode()
+
+    def _replaced(self, text: bytes, statement: ast.stmt) -> tuple[int, int]:
+        if self.condition is not None:
+            if not isinstance(statement, ast.If | ast.While | ast.Assert):
+                raise ValueError(f"{self.name}: {type(statement).__name__} has no condition")
+            return _span(text, statement.test)
+        start, end = _span(text, statement)
+        body = getattr(statement, "body", None)
+        if self.swap is not None and body:
+            end = _span(text, body[0])[0]
+        return start, end
+
+
+def _statement_below(tree: ast.Module, line: int) -> ast.stmt:
+    below = [node for node in ast.walk(tree) if isinstance(node, ast.stmt) and node.lineno > line]
+    if not below:
+        raise ValueError(f"nothing stands below line {line}")
+    return min(below, key=lambda node: (node.lineno, node.col_offset))
+
+
+def _span(text: bytes, node: ast.stmt | ast.expr) -> tuple[int, int]:
+    lines = list(accumulate((len(line) for line in text.splitlines(keepends=True)), initial=0))
+    assert node.end_lineno is not None
+    assert node.end_col_offset is not None
+    return lines[node.lineno - 1] + node.col_offset, lines[node.end_lineno - 1] + node.end_col_offset
+
+
+@cache
+def marked_files() -> Mapping[str, tuple[str, ...]]:
+    """By the name of each mark, the files that it stands in, as often as it does."""
+    found: dict[str, tuple[str, ...]] = {}
+    for folder in MARKED:
+        for path in sorted((REPOSITORY / folder).rglob("*.py")):
+            for name in MARK.findall(path.read_text()):
+                found[name] = (*found.get(name, ()), str(path.relative_to(REPOSITORY)))
+    return found
 
 
 @dataclass(frozen=True)
@@ -70,7 +136,7 @@ def _name(test: str) -> str:
 
 def read_guards() -> list[Guard]:
     entries = [entry for path in sorted(LISTS.glob("*.toml")) for entry in tomllib.loads(path.read_text())["guard"]]
-    return [Guard(**(entry | {"tests": tuple(entry["tests"])})) for entry in entries]
+    return [Guard(**{key: tuple(it) if isinstance(it, list) else it for key, it in entry.items()}) for entry in entries]
 
 
 @dataclass(eq=False)  # pytest keeps its plugins in a set
@@ -95,11 +161,8 @@ def copied_tree(without: Guard | None) -> Iterator[Path]:
             else:
                 shutil.copy2(source, tree / name)
         if without is not None:
-            path = tree / without.file
-            text = path.read_text()
-            if (times := text.count(without.find)) != 1:
-                raise ValueError(f"{without.name}: {without.file} has it {times} times, not once")
-            path.write_text(text.replace(without.find, without.replace))
+            path = tree / marked_files()[without.name][0]
+            path.write_text(without.removed_from(path.read_text()))
         yield tree
 
 

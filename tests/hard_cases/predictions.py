@@ -1,4 +1,4 @@
-"""What a network may say, and who decodes it: compiled, in NumPy and in double precision."""
+"""What a network may say, and what decodes it: compiled code, NumPy and double precision."""
 
 from dataclasses import replace
 from functools import cache
@@ -9,9 +9,11 @@ import pytest
 
 from server.acoustics.phase import FrozenNoise
 from server.field.decoder import Decoder
+from server.field.gate import Gate
 from server.field.graph import Spectrograms
-from server.health.double_precision import DoubleDecoder
+from server.health.double_precision import DoubleDecoder, DoubleGate
 from server.scene.manifest import CodecParameters, Phase, QualityLevel
+from tests.oracles.decoder import NumpyDecoder
 from training.models.frozen_noise import even_noise
 
 SAMPLES = 6_000
@@ -45,7 +47,13 @@ def noise_of(parameters):
 
 def decoder_of(parameters, phase=FROZEN, *, is_compiled=True, **options):
     noise = FrozenNoise.from_signal(parameters.codec, noise_of(parameters))
-    return Decoder(parameters, noise, ir_samples=parameters.samples, phase=phase, is_compiled=is_compiled, **options)
+    kind = Decoder if is_compiled else NumpyDecoder
+    return kind(parameters, noise, ir_samples=parameters.samples, phase=phase, **options)
+
+
+def gate_of(parameters, *, is_compiled=True, **options):
+    gate = Gate(parameters, **options)
+    return gate if is_compiled else DoubleGate(gate)
 
 
 def exact_of(parameters, phase=FROZEN, frames=None):

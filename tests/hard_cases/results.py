@@ -24,6 +24,7 @@ class Measurement:
     @property
     def holds(self) -> bool:
         # An infinite value within an infinite bound would say nothing.
+        # guard: a bound without end is no bound
         return math.isfinite(self.bound) and (self.value >= self.bound if self.at_least else self.value <= self.bound)
 
     @property
@@ -47,8 +48,10 @@ class Measurements:
     def __call__(self, what: str, value: float, bound: float, unit: str = "", *, at_least: bool = False) -> None:
         """Raises AssertionError unless the value is at most the bound, or with `at_least` no less than that."""
         found = Measurement(what, float(value), float(bound), unit, at_least)
+        # guard: what is measured again is kept at its worst
         if what not in self.worst or not found.margin >= self.worst[what].margin:
             self.worst[what] = found
+        # guard: a law that does not hold fails its case
         if not found.holds:
             raise AssertionError(f"{what}: {found.value:.6g} {unit} is not {found.law}")
 
@@ -67,6 +70,7 @@ def markdown(found: dict[str, list[Measurement]]) -> str:
         lines += [f"### {subject.capitalize()}", "", "| case | what | bound | worst | margin |"]
         lines.append("| --- | --- | --- | --- | --- |")
         for (case, what), measurements in cases.items():
+            # guard: cases that share a row show the worst
             worst = min(measurements, key=lambda measurement: measurement.margin / (abs(measurement.bound) or 1.0))
             times = f" ({len(measurements)})" if len(measurements) > 1 else ""
             unit = f" {worst.unit}" if worst.unit else ""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.field.gate import MOST_GIVEN, Gate
+from server.field.gate import MOST_GIVEN
 from tests.hard_cases.predictions import (
     AT,
     COLD,
@@ -22,6 +22,7 @@ from tests.hard_cases.predictions import (
     energy,
     exact_of,
     flat,
+    gate_of,
     parameters,
     predicted,
     predicted_energy,
@@ -184,7 +185,7 @@ def test_a_response_that_begins_anywhere_is_finite_and_silent_before(phase, at, 
     some = parameters()
     response = decoder_of(some, phase, is_compiled=is_compiled).decode(predicted(some), np.array([at]))
     onset = np.array([np.floor(at)], dtype=np.int64)
-    Gate(some, gives_back=True, is_compiled=is_compiled).open(response, onset)
+    gate_of(some, gives_back=True, is_compiled=is_compiled).open(response, onset)
     assert np.isfinite(response).all()
     silent = int(np.clip(np.floor(at), 0, SAMPLES))
     assert not np.any(response[..., :silent])
@@ -200,7 +201,7 @@ def test_what_a_gate_gives_back_makes_nothing_much_louder(before, after, is_comp
     response = np.full((1, 2, SAMPLES), after, np.float32)
     response[..., :onset] = before
     expected = response.copy()
-    Gate(some, gives_back=True, is_compiled=is_compiled).open(response, np.array([onset]))
+    gate_of(some, gives_back=True, is_compiled=is_compiled).open(response, np.array([onset]))
     assert not response[..., :onset].any()
     assert np.isfinite(response).all()
     assert np.all(response[..., onset:] <= 1.0001 * np.sqrt(1 + MOST_GIVEN) * expected[..., onset:])

@@ -1,9 +1,10 @@
 """From pose to samples: what is streamed and written, single precision in compiled code, beside two oracles in double.
 
-One is the package itself without a compiler, in a process in which single precision does not exist: NumPy's `float32`
-is `float64` there, and `complex64` is `complex128`. It follows poses, Doppler and exchanges of responses as the
-original does. The other is a convolution with responses from `server.health.double_precision`, which shares little code
-with the original, for listeners at rest. Both read the network's outputs as the graph gives them, in single precision.
+One is the package itself with nothing compiled (`tests.oracles.interpreted`), in a process in which single precision
+does not exist: NumPy's `float32` is `float64` there, and `complex64` is `complex128`. It follows poses, Doppler and
+exchanges of responses as the original does. The other is a convolution with responses from
+`server.health.double_precision`, which shares little code with the original, for listeners at rest. Both read the
+network's outputs as the graph gives them, in single precision.
 """
 
 import subprocess
@@ -34,26 +35,19 @@ SECONDS = 0.7
 RENDER = """
 import json, sys
 if sys.argv[1] == "double":
-    sys.modules["numba"] = None
-    import numpy
-    numpy.float32, numpy.complex64 = numpy.float64, numpy.complex128
+    sys.path.insert(0, "tests/oracles")
+    import interpreted
+    interpreted.install(in_double_precision=True)
 import numpy as np
-from server.field import graph
-if sys.argv[1] == "double":
-    single = np.dtype("f4")
-    feed = graph._feed
-    graph._feed = lambda *pose: {name: value.astype(single) for name, value in feed(*pose).items()}
-    run = graph.FieldGraph.run
-    graph.FieldGraph.run = lambda *given: [output.astype(np.float64) for output in run(*given)]
 from server.acoustics.geometry import Pose
-from server.kernels.compiled import HAS_NUMBA
+from server.rendering import direct_path_kernel
 from server.responses.direct_sound import DirectSound
 from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, render
 from server.scene.bundle import Bundle, find_bundle
 from server.responses.full_response import kemar
 
-assert HAS_NUMBA == (sys.argv[1] == "single")
+assert hasattr(direct_path_kernel.ask, "py_func") == (sys.argv[1] == "single")
 scene, out, seconds = sys.argv[2], sys.argv[3], float(sys.argv[4])
 levels = FieldsByLevel.load(Bundle.load(find_bundle(scene)))
 bundle = levels.bundle

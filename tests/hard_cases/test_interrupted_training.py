@@ -101,7 +101,7 @@ def test_an_error_on_what_is_held_back_that_explodes_is_never_kept(responses, tm
         return {name: part * (1e9 if len(rounds) > 1 else 1) for name, part in parts.items()}
 
     monkeypatch.setattr(FactorisedLearner, "losses", growing)
-    with pytest.raises(DivergedError, match="held back is"):
+    with pytest.raises(DivergedError, match="validation error is"):
         trained(responses, tmp_path, FACTORISED)
     kept = load_checkpoint(tmp_path, torch.device("cpu"))
     assert kept["rounds"] == 1

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from server.acoustics import diffraction
 from server.acoustics.air import absorption_db_per_m
-from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, HYPERCARDIOID, OMNIDIRECTIONAL, Cardioid
 from server.acoustics.geometry import FARTHEST_M, FloorPlan, Pose
 from server.acoustics.reflections import ReflectionFinder
@@ -21,6 +21,8 @@ from server.rendering.still_paths import StillPaths
 from server.responses.radiation import reverberation_gain
 from server.scene.bundle import BUNDLED, Bundle
 from tests.hard_cases.listening import AHEAD, FLAT, Listening, hear, not_finite, play, renderer
+from tests.oracles.reflections import NumpyReflectionFinder
+from tests.oracles.sound_path import NumpySoundPathFinder
 from tests.signals import noise
 
 # A room with one reflex corner, and a flat of two rooms with a doorway.
@@ -40,14 +42,14 @@ SPECIAL = {
     "outside": (20.0, 1.0, 1.0),
     "a million metres away": (1e6, -1e6, 1e6),
 }
+diffraction_gain_db = np.vectorize(diffraction.diffraction_gain_db, otypes=[float])
 LISTENER = (1.0, 5.0, 1.5)
 
 
 def paths(plan, listener, emitter):
     """By compiled code and by NumPy."""
-    finder = SoundPathFinder(plan, 343.0)
     listener, emitters = np.asarray(listener, float), np.asarray([emitter], float)
-    return finder.find(listener, emitters), finder.find_with_numpy(listener, emitters)
+    return tuple(kind(plan, 343.0).find(listener, emitters) for kind in (SoundPathFinder, NumpySoundPathFinder))
 
 
 @pytest.mark.parametrize("place", SPECIAL.values(), ids=SPECIAL)
@@ -219,8 +221,7 @@ def test_compiled_and_plain_reflections_agree_anywhere(measured, plan, shares):
     a, b = (np.array([*(low + np.array(part[:2]) * (high - low)), 2.5 * part[2]]) for part in (shares[:3], shares[3:]))
     if not (plan.contains(a) and plan.contains(b)):
         return
-    finder = _mirrors_of(plan)
-    one, other = finder.find(a, b[None]), finder.find_with_numpy(a, b[None])
+    one, other = _mirrors_of(plan).find(a, b[None]), NumpyReflectionFinder(plan, _MIRRORS_DB).find(a, b[None])
     lengths = [np.sort(found.length_m) for found in (one, other)]
     # At the very end of a wall one may see a path that the other does not; every other is there twice.
     if len(lengths[0]) == len(lengths[1]):
@@ -229,11 +230,12 @@ def test_compiled_and_plain_reflections_agree_anywhere(measured, plan, shares):
 
 
 _FINDERS = {}
+_MIRRORS_DB = np.full((3, 7), -1.0)
 
 
 def _mirrors_of(plan):
     if plan.corners not in _FINDERS:
-        _FINDERS[plan.corners] = ReflectionFinder(plan, np.full((3, 7), -1.0))
+        _FINDERS[plan.corners] = ReflectionFinder(plan, _MIRRORS_DB)
     return _FINDERS[plan.corners]
 
 
@@ -242,6 +244,16 @@ def test_a_screen_never_amplifies_and_is_always_finite(measured, number):
     gain = float(diffraction_gain_db(number))
     assert math.isfinite(gain)
     measured("gain", gain, 0.0, "dB")
+
+
+@pytest.mark.parametrize("number", [0.0, -0.0, 5e-324, -5e-324, 1e-300, -1e-300, 1e-9, -1e-9])
+def test_a_screen_that_the_line_grazes_takes_five_decibels(measured, number):
+    measured("difference", abs(float(diffraction_gain_db(number)) + 5), 1e-6, "dB")
+
+
+@pytest.mark.parametrize("number", [-0.1915871349, -0.25, -1.0, -2.0, -7.3, -1e6, -1e300])
+def test_a_screen_far_from_the_line_takes_nothing(measured, number):
+    measured("taken", abs(float(diffraction_gain_db(number))), 0.0, "dB")
 
 
 def test_a_screen_grows_without_steps_as_one_walks_behind_it(measured):

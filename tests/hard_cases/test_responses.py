@@ -197,8 +197,8 @@ def test_a_shared_tail_of_silent_responses_is_silent(measured):
 def test_compiled_and_plain_convolution_agree_at_any_level(measured, amplitude):
     clip, ir = amplitude * noise(1, 1, 40 * SIZE), room(2)
     outputs = []
-    for is_compiled in (True, False):
-        convolver = Convolver(sources=1, channels=2, block_size=SIZE, ir_samples=IR_SAMPLES, is_compiled=is_compiled)
+    for any_size in (False, True):
+        convolver = Convolver(sources=1, channels=2, block_size=SIZE, ir_samples=IR_SAMPLES, any_size=any_size)
         convolver.set_ir(0, ir)
         blocks = [convolver.process(clip[:, at : at + SIZE].copy()) for at in range(0, clip.shape[1], SIZE)]
         outputs.append(np.concatenate(blocks, axis=1).astype(np.float64))

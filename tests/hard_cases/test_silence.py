@@ -6,7 +6,6 @@ import time
 import numpy as np
 import pytest
 
-from server.kernels.compiled import HAS_NUMBA
 from tests.hard_cases.listening import IR_SAMPLES, SIZE, ahead, hear, not_finite, play, renderer, room
 from tests.signals import noise
 
@@ -49,7 +48,6 @@ def test_a_block_of_silence_after_loud_sound_costs_no_more_than_one_of_sound(mea
     measured("cost beside sound", float(np.median(ratios)), 0.7)
 
 
-@pytest.mark.skipif(not HAS_NUMBA, reason="NumPy has no say in how its loops treat denormal numbers")
 @pytest.mark.parametrize("amplitude", [1e-36, 1e-37, 1.2e-38])
 def test_a_block_at_the_edge_of_denormal_numbers_costs_no_more_than_any(measured, filters, amplitude):
     loud, faint = renderer(filters), renderer(filters)
@@ -75,8 +73,7 @@ def test_products_of_the_faintest_numbers_are_zero_and_only_in_there(measured):
     thread.start()
     thread.join()
     (largest, outside) = seen[0]
-    if HAS_NUMBA:
-        measured("largest product inside", largest, 0.0)
+    measured("largest product inside", largest, 0.0)
     measured("product outside", float(outside), 9e-40, at_least=True)
 
 

@@ -9,6 +9,7 @@ from scipy.signal import fftconvolve
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
 from server.field.fields_by_level import FieldsByLevel
+from server.field.kinds.catalogue import kind_of
 from server.offline.render import PathError, PathPoint, RenderedEmitter, read_path, render
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose
 from server.rendering.fade import raised_cosine
@@ -31,6 +32,7 @@ class NoiseField:
     ir_samples = 1_500
     sample_rate = SAMPLE_RATE
     level = QualityLevel(name="noise", field="noise")
+    kind = kind_of(level)
 
     def impulse_responses(self, listeners, emitters, yaws):
         return np.stack([self.one(*poses) for poses in zip(listeners, emitters, yaws, strict=True)])
@@ -179,6 +181,7 @@ class OtherField(NoiseField):
 
     ir_samples = 1_100
     level = QualityLevel(name="other", field="noise", shared_tail=True)
+    kind = kind_of(level)
 
     def one(self, listener, emitter, yaw):
         return super().one(listener, emitter, yaw + 10)

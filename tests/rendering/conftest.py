@@ -3,17 +3,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from server.kernels.compiled import HAS_NUMBA
 from server.rendering.direct_path import DirectPath
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 from server.rendering.sphere import triangulate
 
 SPEED_OF_SOUND = 343.0
-
-
-@pytest.fixture
-def numba_is_there(is_compiled):
-    assert HAS_NUMBA or not is_compiled, "the tests measure the compiled convolver: install numba"
 
 
 @pytest.fixture(scope="session")

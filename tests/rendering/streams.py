@@ -9,11 +9,10 @@ from tests.signals import noise
 SAMPLE_RATE = 24_000
 BLOCK_SIZES = (64, 128, 256)
 
-BOTH_KINDS = [
-    pytest.mark.parametrize("is_compiled", [pytest.param(True, id="compiled"), pytest.param(False, id="numpy")]),
-    pytest.mark.usefixtures("numba_is_there"),
-]
-"""Of convolver: a test takes `is_compiled`."""
+BOTH_KINDS = pytest.mark.parametrize(
+    "any_size", [pytest.param(False, id="compiled"), pytest.param(True, id="any size")]
+)
+"""Of convolver: a test takes `any_size`."""
 
 
 def decaying_ir(seed, samples, channels=2, t60_s=0.4):

@@ -54,22 +54,22 @@ def expected_with_exchanges(dry, schedule, partitioning):
     seed=st.integers(0, 2**32 - 1),
     changes=st.lists(st.tuples(st.integers(0, 90), st.integers(0, 1)), max_size=12),
 )
-def test_any_sequence_of_exchanges_is_a_sequence_of_crossfades(is_compiled, seed, changes):
+def test_any_sequence_of_exchanges_is_a_sequence_of_crossfades(any_size, seed, changes):
     size, blocks, ir_samples = 64, 96, 2_900
     dry = noise(seed, 2, blocks * size)
     irs = [decaying_ir(seed + index, ir_samples) for index in range(len(changes) + 2)]
     schedule = [[(0, irs[0])], [(0, irs[1])]]
     for index, (block, source) in enumerate(sorted(changes, key=lambda change: change[0])):
         schedule[source].append((block, irs[index + 2]))
-    convolver = Convolver(sources=2, channels=2, block_size=size, ir_samples=ir_samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=2, channels=2, block_size=size, ir_samples=ir_samples, any_size=any_size)
     # Before its first block a source takes an IR at once: several at block 0 are no exchange.
     flat = [(block, source, ir) for source, entries in enumerate(schedule) for block, ir in entries]
     wet = stream(convolver, dry, flat)
     assert error_db(wet, expected_with_exchanges(dry, schedule, Partitioning(size, ir_samples))) < -115
 
 
-def test_newest_ir_wins_and_flags_tell_which_block_exchanged(is_compiled):
-    convolver = Convolver(sources=2, channels=2, block_size=64, ir_samples=100, is_compiled=is_compiled)
+def test_newest_ir_wins_and_flags_tell_which_block_exchanged(any_size):
+    convolver = Convolver(sources=2, channels=2, block_size=64, ir_samples=100, any_size=any_size)
     dry = noise(13, 2, 64)
     for source in (0, 1):
         convolver.set_ir(source, decaying_ir(14, 100))
@@ -96,23 +96,23 @@ def splatter_db(wet, above_hz, sample_rate):
 
 @pytest.mark.parametrize("block_size", [128, 256, 512])
 @pytest.mark.parametrize("blocks_between", [1, 5])
-def test_exchange_does_not_splatter(is_compiled, block_size, blocks_between):
+def test_exchange_does_not_splatter(any_size, block_size, blocks_between):
     """Energy above 4 kHz of a 997 Hz tone, while every exchange is to an entirely unrelated room: the worst case."""
     ir_samples = 12_000
     blocks = 2 * SAMPLE_RATE // block_size
     tone = np.sin(2 * np.pi * 997 * np.arange(blocks * block_size) / SAMPLE_RATE).astype(np.float32)[np.newaxis]
-    convolver = Convolver(sources=1, channels=1, block_size=block_size, ir_samples=ir_samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=1, channels=1, block_size=block_size, ir_samples=ir_samples, any_size=any_size)
     rooms = [decaying_ir(seed, ir_samples, 1) for seed in range(20)]
     changes = [(block, 0, rooms[block % 20]) for block in range(0, blocks, blocks_between)]
     wet = stream(convolver, tone, changes)[0, ir_samples + block_size :].astype(float)
     assert splatter_db(wet, 4_000, SAMPLE_RATE) < -95
 
 
-def test_exchanges_at_90_hz_of_second_long_rooms_do_not_splatter(is_compiled):
+def test_exchanges_at_90_hz_of_second_long_rooms_do_not_splatter(any_size):
     sample_rate, ir_samples, size = 48_000, 48_000, 256
     blocks = 3 * sample_rate // size
     tone = np.sin(2 * np.pi * 997 * np.arange(blocks * size) / sample_rate).astype(np.float32)[np.newaxis]
-    convolver = Convolver(sources=1, channels=1, block_size=size, ir_samples=ir_samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=1, channels=1, block_size=size, ir_samples=ir_samples, any_size=any_size)
     rooms = [convolver.prepare(decaying_ir(seed, ir_samples, 1)) for seed in range(12)]
     changes = [(int(number / 90 * sample_rate / size), 0, rooms[number % 12]) for number in range(3 * 90)]
     wet = stream(convolver, tone, changes)[0, ir_samples + size :].astype(float)
@@ -120,16 +120,16 @@ def test_exchanges_at_90_hz_of_second_long_rooms_do_not_splatter(is_compiled):
 
 
 @pytest.mark.parametrize("fresh_copies", [True, False])
-def test_exchange_to_an_equal_ir_is_inaudible(is_compiled, fresh_copies):
+def test_exchange_to_an_equal_ir_is_inaudible(any_size, fresh_copies):
     dry = noise(16, 1, 120 * 64)
     ir = decaying_ir(17, 3_000)
-    convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=3_000, is_compiled=is_compiled)
+    convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=3_000, any_size=any_size)
     prepared = convolver.prepare(ir)
     wet = stream(convolver, dry, [(b, 0, convolver.prepare(ir) if fresh_copies else prepared) for b in range(120)])
     assert error_db(wet, convolve(dry[0], ir)) < -120
 
 
-def test_an_exchange_of_some_partitions_leaves_the_others_bit_for_bit(is_compiled):
+def test_an_exchange_of_some_partitions_leaves_the_others_bit_for_bit(any_size):
     """An IR that changes only in its head: what later stages say must not change at all."""
     dry = np.zeros((1, 80 * 64), np.float32)
     dry[:, : 10 * 64] = noise(38, 1, 10 * 64)
@@ -138,7 +138,7 @@ def test_an_exchange_of_some_partitions_leaves_the_others_bit_for_bit(is_compile
     after[:, :64] = decaying_ir(40, 64)
 
     def wet(changes):
-        convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=2_900, is_compiled=is_compiled)
+        convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=2_900, any_size=any_size)
         return stream(convolver, dry, changes)
 
     with_exchange, without = wet([(0, 0, before), (20, 0, after)]), wet([(0, 0, before)])
@@ -147,12 +147,12 @@ def test_an_exchange_of_some_partitions_leaves_the_others_bit_for_bit(is_compile
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), change=st.integers(1, 80))
-def test_energy_of_an_exchange_is_bounded(is_compiled, seed, change):
+def test_energy_of_an_exchange_is_bounded(any_size, seed, change):
     """A crossfade is a convex mix at every instant: never above the larger of the two, stage by stage."""
     size, samples = 64, 500  # one stage: the bound holds sample by sample
     dry = noise(seed, 1, 90 * size)
     old, new = decaying_ir(seed, samples), decaying_ir(seed + 1, samples)
-    convolver = Convolver(sources=1, channels=2, block_size=size, ir_samples=samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=1, channels=2, block_size=size, ir_samples=samples, any_size=any_size)
     wet = stream(convolver, dry, [(0, 0, old), (change, 0, new)])
     bound = np.maximum(np.abs(convolve(dry[0], old)), np.abs(convolve(dry[0], new)))
     assert np.all(np.abs(wet) <= bound + 1e-4)

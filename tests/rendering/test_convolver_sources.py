@@ -13,7 +13,7 @@ from tests.signals import error_db, noise
 pytestmark = BOTH_KINDS
 
 
-def test_others_are_bit_equal_after_a_source_has_come_and_gone(is_compiled):
+def test_others_are_bit_equal_after_a_source_has_come_and_gone(any_size):
     size, blocks, samples = 64, 240, 3_000
     dry = noise(18, 3, blocks * size)
     dry[1, 40 * size :] = 0
@@ -21,7 +21,7 @@ def test_others_are_bit_equal_after_a_source_has_come_and_gone(is_compiled):
     gone_at = 40 + Partitioning(size, samples).quiet_blocks
 
     def wet(guest):
-        convolver = Convolver(sources=3, channels=2, block_size=size, ir_samples=samples, is_compiled=is_compiled)
+        convolver = Convolver(sources=3, channels=2, block_size=size, ir_samples=samples, any_size=any_size)
         convolver.set_ir(0, irs[0])
         convolver.set_ir(2, irs[2])
         output = []
@@ -44,20 +44,20 @@ def test_others_are_bit_equal_after_a_source_has_come_and_gone(is_compiled):
 
 
 @pytest.mark.parametrize("pause", [1, 2, 5, 14, 15, 16, 17, 31, 33, 48, 63, 64, 79, 80, 81, 96, 111, 130])
-def test_a_source_that_rang_out_and_sounds_again_remembers_nothing(is_compiled, pause):
+def test_a_source_that_rang_out_and_sounds_again_remembers_nothing(any_size, pause):
     """Guards the shortcut for silence: no stale spectrum may be heard when the source is fed again, however late."""
     size, samples = 64, 3_000
     ir = decaying_ir(22, samples)
     dry = noise(23, 1, 250 * size)
     dry[:, 20 * size : (20 + pause) * size] = 0
-    convolver = Convolver(sources=1, channels=2, block_size=size, ir_samples=samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=1, channels=2, block_size=size, ir_samples=samples, any_size=any_size)
     convolver.set_ir(0, ir)
     assert error_db(stream(convolver, dry), convolve(dry[0], ir)) < -120
 
 
-def test_quiet_means_exactly_nothing_more(is_compiled):
+def test_quiet_means_exactly_nothing_more(any_size):
     size, samples = 64, 3_000
-    convolver = Convolver(sources=1, channels=2, block_size=size, ir_samples=samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=1, channels=2, block_size=size, ir_samples=samples, any_size=any_size)
     assert convolver.is_quiet(0)
     convolver.set_ir(0, decaying_ir(24, samples))
     convolver.process(noise(25, 1, size))
@@ -76,11 +76,11 @@ def test_quiet_means_exactly_nothing_more(is_compiled):
 
 
 @pytest.mark.parametrize("joins_at", [1, 12, 16, 21, 47])
-def test_a_source_starts_from_silence_with_its_first_ir(is_compiled, joins_at):
+def test_a_source_starts_from_silence_with_its_first_ir(any_size, joins_at):
     """What was fed before the first IR is not heard, and joining late is the same as being new."""
     dry = noise(27, 1, 120 * 64)
     ir = decaying_ir(28, 2_900)
-    convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=2_900, is_compiled=is_compiled)
+    convolver = Convolver(sources=1, channels=2, block_size=64, ir_samples=2_900, any_size=any_size)
     wet = stream(convolver, dry, [(joins_at, 0, ir)])
     assert not wet[:, : joins_at * 64].any()
     assert error_db(wet[:, joins_at * 64 :], convolve(dry[0, joins_at * 64 :], ir)) < -120
@@ -88,12 +88,12 @@ def test_a_source_starts_from_silence_with_its_first_ir(is_compiled, joins_at):
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_sources_join_and_leave_without_touching_the_others(is_compiled, seed):
+def test_sources_join_and_leave_without_touching_the_others(any_size, seed):
     """Random comings and goings in three slots; each stay is a convolution of its own."""
     size, samples, blocks = 64, 1_500, 260
     rng = np.random.default_rng(seed)
     quiet = Partitioning(size, samples).quiet_blocks
-    convolver = Convolver(sources=3, channels=2, block_size=size, ir_samples=samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=3, channels=2, block_size=size, ir_samples=samples, any_size=any_size)
     dry = np.zeros((3, blocks * size), np.float32)
     expected = np.zeros((2, blocks * size))
     joins, leaves = {}, {}
@@ -121,12 +121,12 @@ def test_sources_join_and_leave_without_touching_the_others(is_compiled, seed):
 
 
 @pytest.mark.parametrize("cleared_at", range(64, 80))
-def test_a_source_cleared_while_it_fades_touches_no_other(is_compiled, cleared_at):
+def test_a_source_cleared_while_it_fades_touches_no_other(any_size, cleared_at):
     """At every block of a window of the last stage in which its IR is being exchanged, and with it what that costs."""
     size, samples = 64, 12_000
     dry = noise(70, 2, 320 * size)
     irs = [decaying_ir(seed, samples) for seed in (71, 72, 73)]
-    convolver = Convolver(sources=2, channels=2, block_size=size, ir_samples=samples, is_compiled=is_compiled)
+    convolver = Convolver(sources=2, channels=2, block_size=size, ir_samples=samples, any_size=any_size)
     convolver.set_ir(0, irs[0])
     convolver.set_ir(1, irs[1])
     wet = []
@@ -143,19 +143,19 @@ def test_a_source_cleared_while_it_fades_touches_no_other(is_compiled, cleared_a
     assert error_db(np.concatenate(wet, axis=1)[:, gone:], expected[:, gone:]) < -115
 
 
-def test_reset_is_as_good_as_new(is_compiled):
+def test_reset_is_as_good_as_new(any_size):
     dry = noise(29, 2, 70 * 64)
     ir = decaying_ir(30, 2_900)
-    used = Convolver(sources=2, channels=2, block_size=64, ir_samples=2_900, is_compiled=is_compiled)
+    used = Convolver(sources=2, channels=2, block_size=64, ir_samples=2_900, any_size=any_size)
     stream(used, dry, [(0, 0, ir), (3, 1, ir), (19, 1, decaying_ir(41, 2_900)), (60, 1, ir)])
     used.set_ir(0, ir)
     used.reset()
-    fresh = Convolver(sources=2, channels=2, block_size=64, ir_samples=2_900, is_compiled=is_compiled)
+    fresh = Convolver(sources=2, channels=2, block_size=64, ir_samples=2_900, any_size=any_size)
     changes = [(0, 1, decaying_ir(31, 400)), (5, 1, ir), (7, 0, ir)]
     np.testing.assert_array_equal(stream(used, dry, changes), stream(fresh, dry, changes))
 
 
-def test_a_shared_tail_is_each_sources_own_at_its_level(is_compiled):
+def test_a_shared_tail_is_each_sources_own_at_its_level(any_size):
     """Rooms that share their late part but for a gain: the shared tail is then exact, at a tail's cost for one."""
     size, samples = 64, 3_000
     tail_start = Partitioning(size, samples).stages[-1].start
@@ -169,7 +169,7 @@ def test_a_shared_tail_is_each_sources_own_at_its_level(is_compiled):
         irs.append(ir + np.float32(gain) * late)
     dry = noise(46, 3, 120 * size)
     convolver = Convolver(
-        sources=3, channels=2, block_size=size, ir_samples=samples, shared_tail=True, is_compiled=is_compiled
+        sources=3, channels=2, block_size=size, ir_samples=samples, shared_tail=True, any_size=any_size
     )
     for source, ir in enumerate(irs):
         convolver.set_ir(source, ir)
@@ -177,7 +177,7 @@ def test_a_shared_tail_is_each_sources_own_at_its_level(is_compiled):
     assert error_db(stream(convolver, dry), expected) < -115
 
 
-def test_a_shared_tail_of_unlike_rooms_keeps_each_level(is_compiled):
+def test_a_shared_tail_of_unlike_rooms_keeps_each_level(any_size):
     """Two unrelated tails, one source at a time: what is heard late has the energy of its own tail."""
     size, samples = 64, 6_000
     tail_start = Partitioning(size, samples).stages[-1].start
@@ -186,7 +186,7 @@ def test_a_shared_tail_of_unlike_rooms_keeps_each_level(is_compiled):
         dry = np.zeros((2, 160 * size), np.float32)
         dry[sounding, 0] = 1
         convolver = Convolver(
-            sources=2, channels=2, block_size=size, ir_samples=samples, shared_tail=True, is_compiled=is_compiled
+            sources=2, channels=2, block_size=size, ir_samples=samples, shared_tail=True, any_size=any_size
         )
         for source, ir in enumerate(irs):
             convolver.set_ir(source, ir)
@@ -196,7 +196,7 @@ def test_a_shared_tail_of_unlike_rooms_keeps_each_level(is_compiled):
         assert 10 * np.log10(heard / own) == pytest.approx(0, abs=0.05)
 
 
-def test_both_kinds_are_equal_through_everything(is_compiled):
+def test_both_kinds_are_equal_through_everything(any_size):
     """The same calls, random, to both: exchanges, comings, goings, silence and a shared tail."""
     size, samples, sources = 64, 2_900, 4
     for shared_tail in (False, True):
@@ -208,9 +208,9 @@ def test_both_kinds_are_equal_through_everything(is_compiled):
                 block_size=size,
                 ir_samples=samples,
                 shared_tail=shared_tail,
-                is_compiled=kind,
+                any_size=kind,
             )
-            for kind in (is_compiled, False)
+            for kind in (any_size, True)
         ]
         outputs = [[], []]
         for block in range(300):

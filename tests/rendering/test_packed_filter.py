@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from server.kernels.compiled import HAS_NUMBA
-from server.rendering.partitions import Partitioning
-
-if not HAS_NUMBA:
-    pytest.skip("no numba", allow_module_level=True)
-
 from server.rendering.packed_filter import pack
+from server.rendering.partitions import Partitioning
 
 SAMPLES = 6000
 PARTITIONING = Partitioning(64, 8000)

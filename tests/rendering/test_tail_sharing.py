@@ -3,24 +3,20 @@
 import numpy as np
 import pytest
 
-from server.kernels.compiled import HAS_NUMBA
 from server.rendering.convolver import Convolver
 from server.rendering.partitions import Partitioning
+from tests.rendering.streams import BOTH_KINDS
 from tests.signals import error_db
 
 SIZE, SAMPLES, SOURCES = 64, 4_000, 3
 SETTLED = SAMPLES + 4 * 16 * SIZE
 
 
-@pytest.fixture(params=[True, False], ids=["compiled", "numpy"])
-def is_compiled(request):
-    if request.param and not HAS_NUMBA:
-        pytest.skip("numba is not installed")
-    return request.param
+pytestmark = BOTH_KINDS
 
 
-def make(is_compiled, **kind):
-    return Convolver(sources=SOURCES, channels=2, block_size=SIZE, ir_samples=SAMPLES, is_compiled=is_compiled, **kind)
+def make(any_size, **kind):
+    return Convolver(sources=SOURCES, channels=2, block_size=SIZE, ir_samples=SAMPLES, any_size=any_size, **kind)
 
 
 def rooms(seed):
@@ -41,12 +37,12 @@ def stream(convolver, dry, switches=(), irs=()):
     return np.concatenate(output, axis=1).astype(float)
 
 
-def test_before_and_after_a_switch_it_is_as_if_it_had_always_been_so(is_compiled):
+def test_before_and_after_a_switch_it_is_as_if_it_had_always_been_so(any_size):
     dry = np.random.default_rng(1).standard_normal((SOURCES, 400 * SIZE)).astype(np.float32)
     own, shared, switched = (
-        make(is_compiled),
-        make(is_compiled, shared_tail=True),
-        make(is_compiled, switches_tail=True),
+        make(any_size),
+        make(any_size, shared_tail=True),
+        make(any_size, switches_tail=True),
     )
     for convolver in (own, shared, switched):
         for source, ir in enumerate(rooms(2)):
@@ -61,9 +57,9 @@ def test_before_and_after_a_switch_it_is_as_if_it_had_always_been_so(is_compiled
     assert error_db(heard[:, second], alone[:, second]) > -60  # or there would be nothing to switch
 
 
-def test_both_kinds_switch_alike_while_irs_change(is_compiled):
+def test_both_kinds_switch_alike_while_irs_change(any_size):
     rng = np.random.default_rng(3)
-    pair = [make(kind, switches_tail=True) for kind in (is_compiled, False)]
+    pair = [make(kind, switches_tail=True) for kind in (any_size, True)]
     outputs = [[], []]
     for block in range(400):
         dry = rng.standard_normal((SOURCES, SIZE)).astype(np.float32)
@@ -78,11 +74,11 @@ def test_both_kinds_switch_alike_while_irs_change(is_compiled):
     assert error_db(np.concatenate(outputs[0], axis=1), np.concatenate(outputs[1], axis=1)) < -115
 
 
-def test_switching_does_not_splatter(is_compiled):
+def test_switching_does_not_splatter(any_size):
     sample_rate = 24_000
     time_s = np.arange(500 * SIZE) / sample_rate
     dry = np.tile(np.sin(2 * np.pi * 500 * time_s), (SOURCES, 1)).astype(np.float32)
-    convolver = make(is_compiled, switches_tail=True)
+    convolver = make(any_size, switches_tail=True)
     for source, ir in enumerate(rooms(4)):
         convolver.set_ir(source, ir)
     wet = stream(convolver, dry, [(block, block % 80 == 0) for block in range(120, 480, 40)])
@@ -92,12 +88,10 @@ def test_switching_does_not_splatter(is_compiled):
     assert 10 * np.log10(spectrum[:, frequency > 4_000].sum() / spectrum.sum()) < -90
 
 
-def test_responses_without_a_tail_have_none_to_share(is_compiled):
+def test_responses_without_a_tail_have_none_to_share(any_size):
     short = Partitioning(SIZE, 400)
     assert len(short.stages) == 1
-    convolver = Convolver(
-        sources=1, channels=2, block_size=SIZE, ir_samples=400, switches_tail=True, is_compiled=is_compiled
-    )
+    convolver = Convolver(sources=1, channels=2, block_size=SIZE, ir_samples=400, switches_tail=True, any_size=any_size)
     convolver.set_ir(0, rooms(5)[0][:, :400])
     convolver.share_tail(True)
     dry = np.zeros((1, 20 * SIZE), np.float32)
@@ -106,11 +100,11 @@ def test_responses_without_a_tail_have_none_to_share(is_compiled):
 
 
 @pytest.mark.parametrize("kind", [{"switches_tail": True}, {"shared_tail": True}, {}], ids=str)
-def test_what_is_replaced_before_a_block_leaves_no_trace(is_compiled, kind):
+def test_what_is_replaced_before_a_block_leaves_no_trace(any_size, kind):
     """One convolver is told everything, the other only what stands when a block is made. Some responses have no
     tail."""
     rng = np.random.default_rng(7)
-    told_all, told_last = make(is_compiled, **kind), make(is_compiled, **kind)
+    told_all, told_last = make(any_size, **kind), make(any_size, **kind)
     known = [ir[:, :length] for seed in range(4) for ir, length in zip(rooms(seed), (SAMPLES, 300, 300), strict=True)]
     outputs = [[], []]
     for _ in range(400):

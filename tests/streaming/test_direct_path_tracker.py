@@ -12,8 +12,9 @@ from server.acoustics.geometry import FloorPlan, Pose
 from server.rendering.hrtf import NoHead
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import ALL_ON
+from server.responses.emitter_state import EmitterState
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import StreamedEmitter
 
 CORNER = FloorPlan(((0.0, 0.0), (8.0, 0.0), (8.0, 4.0), (4.0, 4.0), (4.0, 8.0), (0.0, 8.0)), 3.0)
 PLACES = [(1.0, 1.0, 1.5), (7.0, 3.0, 1.2), (2.0, 7.5, 1.0), (3.5, 3.5, 2.0), (1.0, 1.0, 2.5)]
@@ -38,7 +39,7 @@ def sound():
 
 
 def emitters_at(*places):
-    return {str(number): Emitter(number, Pose(place)) for number, place in enumerate(places)}
+    return {str(number): StreamedEmitter(number, EmitterState(Pose(place))) for number, place in enumerate(places)}
 
 
 ACTIONS = st.sampled_from(["listener", "emitter", "turn", "effects", "remove", "add", "nothing"])
@@ -47,7 +48,7 @@ ACTIONS = st.sampled_from(["listener", "emitter", "turn", "effects", "remove", "
 @given(st.lists(st.tuples(ACTIONS, st.integers(0, 4), st.booleans()), max_size=20))
 def test_paths_are_those_found_anew(sound, actions):
     emitters, paths = emitters_at(*PLACES[:3]), Paths()
-    emitters["0"].pattern = CARDIOID
+    emitters["0"].state = replace(emitters["0"].state, pattern=CARDIOID)
     aim, listener, serial = DirectPathTracker(sound, paths, emitters), Pose(PLACES[0]), 3
     for action, number, is_block in [("nothing", 0, True), *actions, ("nothing", 0, True)]:
         place, chosen = PLACES[number], list(emitters.values())[number % max(1, len(emitters)) :][:1]
@@ -59,23 +60,28 @@ def test_paths_are_those_found_anew(sound, actions):
                 paths.newest.pop(name, None)
             case "add":
                 # Ids are free again once who had them is gone.
-                emitters[str(number if str(number) not in emitters else serial)] = Emitter(serial, Pose(place))
+                emitters[str(number if str(number) not in emitters else serial)] = StreamedEmitter(
+                    serial, EmitterState(Pose(place))
+                )
                 serial += 1
         for emitter in chosen:
             match action:
                 case "emitter":
-                    emitter.pose = Pose(place)
+                    emitter.state = replace(emitter.state, pose=Pose(place))
                 case "turn":
-                    emitter.pose = Pose.from_yaw(emitter.position, float(number))
+                    turned = Pose.from_yaw(emitter.state.position, float(number))
+                    emitter.state = replace(emitter.state, pose=turned)
                 case "effects":
                     bent = number % 3 > 0
-                    emitter.effects = replace(ALL_ON, occlusion=number % 2 > 0, diffraction=bent, directivity=not bent)
+                    emitter.set_effects(
+                        replace(ALL_ON, occlusion=number % 2 > 0, diffraction=bent, directivity=not bent)
+                    )
             emitter.is_displaced |= action in {"emitter", "turn", "effects"}
         if not is_block:
             continue
         aim.follow(listener)
         anew = Paths()
-        for ways in sound.ways_from(emitters.items()):
+        for ways in sound.ways_from((name, emitter.state) for name, emitter in emitters.items()):
             anew.set_paths(ways.keys, *ways.find(listener))
         assert paths.newest == anew.newest
 

@@ -100,7 +100,7 @@ class Stage:
 
     @property
     def is_folded(self):
-        return [emitter.is_folded for emitter in self.session._emitters.values()]
+        return [emitter.heard.bakes_direct for emitter in self.session._emitters.values()]
 
 
 @pytest.fixture

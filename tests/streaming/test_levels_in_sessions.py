@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from server.field.fields_by_level import FieldsByLevel
+from server.field.kinds.catalogue import kind_of
 from server.planning.places import place_of_field
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, RemoveEmitter, SetEffects
 from server.protocol.server_messages import EmitterAdded, LevelChanged
@@ -27,6 +28,7 @@ class Room:
 
     def __init__(self, field, name, ir, **level):
         self.bundle, self.level, self._ir = field.bundle, QualityLevel(name=name, field="arithmetic", **level), ir
+        self.kind = kind_of(self.level)
 
     @property
     def ir_samples(self):

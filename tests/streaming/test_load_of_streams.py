@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from server.field.fields_by_level import FieldsByLevel
+from server.field.kinds.catalogue import kind_of
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, SetLevel
 from server.protocol.server_messages import Error, LevelChanged, Status
 from server.scene.manifest import QualityLevel
@@ -25,6 +26,7 @@ class Room:
 
     def __init__(self, field, name):
         self.bundle, self.level = field.bundle, QualityLevel(name=name, field="arithmetic")
+        self.kind = kind_of(self.level)
 
     def impulse_responses(self, listeners, *_, **__):
         return np.zeros((len(listeners), 2, self.ir_samples), np.float32)

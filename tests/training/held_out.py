@@ -56,7 +56,7 @@ def make_held_out(tmp_path) -> Callable[..., HeldOut]:
             repeats=None if repeat is None else Takes(repeat),
             delays_s=listeners[:, 0] / 343.0,
             yaws=2 * np.pi * np.arange(yaws) / yaws,
-            heard=np.arange(yaws),
+            yaw_indices=np.arange(yaws),
             visible=np.ones(len(held_out), bool) if visible is None else np.array(visible),
             simulated=None,
         )

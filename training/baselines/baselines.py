@@ -1,6 +1,6 @@
-"""Baselines that a field has to beat: the nearest training pair, and linear interpolation between training pairs.
+"""Simple baselines for a field: the nearest training pair, and linear interpolation between training pairs.
 
-Axes: one pair's impulse responses are `(yaw, channel, sample)`; every baseline answers with the yaws of the training
+Axes: the responses of one pair are `(yaw, channel, sample)`. Every baseline gives responses at yaws of the training
 data, so none has to interpolate orientation.
 """
 
@@ -17,28 +17,28 @@ from scipy.spatial import Delaunay
 
 _Floats = npt.NDArray[np.float64]
 _Responses = npt.NDArray[np.float32]
-Turns = npt.NDArray[np.integer] | slice
-"""Which of a pair's yaws are asked for."""
-ALL_TURNS = slice(None)
+YawIndices = npt.NDArray[np.integer] | slice
+"""Indices of the wanted yaws of a pair."""
+ALL_YAWS = slice(None)
 
 _KERNEL_REACH = 32  # samples on either side
 _KERNEL_BETA = 8.0
 _WEIGHT_TOLERANCE = 1e-9
-_REMEMBERED = 32  # pairs: the neighbours of one are asked for by several methods
+_CACHED_PAIRS = 32  # several methods use the same neighbours of a pair
 
 
 class PairResponses(Protocol):
-    """An array or an open HDF5 dataset: indexed by pair it gives `(yaw, channel, sample)`."""
+    """An array or an open HDF5 dataset. Indexed by pair, it gives `(yaw, channel, sample)`."""
 
     def __getitem__(self, pair: int, /) -> npt.NDArray[np.floating]: ...
 
 
 @dataclass(frozen=True)
 class TrainingPairs:
-    """The pairs of a dataset and which of them a baseline may look at.
+    """The pairs of a dataset, and which of them a baseline may use.
 
-    pair_listener, pair_emitter: (pair,) probe of each; listener_positions, emitter_positions: (probe, 3), metres;
-    training: (pair,), False where held out.
+    pair_listener, pair_emitter: (pair,) numbers of positions; listener_positions, emitter_positions: (position, 3),
+    metres; training: (pair,), False for held-out pairs.
     """
 
     responses: PairResponses
@@ -55,7 +55,7 @@ class TrainingPairs:
             raise ValueError("no pair is left for training")
 
     def response(self, pair: int) -> _Responses:
-        """Not to be written to: the last few are kept."""
+        """The result is cached and must not be changed."""
         with self._lock:
             if pair in self._read:
                 self._read.move_to_end(pair)
@@ -63,17 +63,20 @@ class TrainingPairs:
         response = np.asarray(self.responses[pair], dtype=np.float32)
         with self._lock:
             self._read[pair] = response
-            while len(self._read) > _REMEMBERED:
+            while len(self._read) > _CACHED_PAIRS:
                 self._read.popitem(last=False)
         return response
 
-    def weighted(self, pairs: Sequence[int], weights: Sequence[float], turns: Turns) -> _Responses:
-        parts = (np.float32(weight) * self.response(pair)[turns] for pair, weight in zip(pairs, weights, strict=True))
+    def weighted(self, pairs: Sequence[int], weights: Sequence[float], yaw_indices: YawIndices) -> _Responses:
+        parts = (
+            np.float32(weight) * self.response(pair)[yaw_indices] for pair, weight in zip(pairs, weights, strict=True)
+        )
         return np.asarray(sum(parts), dtype=np.float32)
 
 
 def nearest_pair(pairs: TrainingPairs, pair: int) -> int:
-    """The training pair closest to `pair` in (listener, emitter) space, six coordinates in metres; first of equals."""
+    """The training pair closest to `pair` in the space of listener and emitter, six coordinates in metres; the first of
+    several equal ones."""
     candidates = np.flatnonzero(pairs.training)
     squared = _squared_distances(pairs.listener_positions, pairs.pair_listener, candidates, pair)
     squared += _squared_distances(pairs.emitter_positions, pairs.pair_emitter, candidates, pair)
@@ -81,10 +84,10 @@ def nearest_pair(pairs: TrainingPairs, pair: int) -> int:
 
 
 def linear_weights(pairs: TrainingPairs, pair: int) -> tuple[list[int], list[float]]:
-    """Training pairs of the emitter of `pair` whose listeners surround its listener, and their weights, which sum to 1.
+    """Training pairs of the same emitter whose listeners surround that of `pair`, and their weights, which add up to 1.
 
-    Barycentric in the Delaunay triangulation of those listeners in plan (they stand in one layer, at various heights).
-    Outside their hull: the nearest of them. Where the emitter has no training pair: the nearest pair.
+    Weights are barycentric in the Delaunay triangulation of the listeners in plan (they stand in one layer, at various
+    heights). Outside the hull, it is the nearest listener. If the emitter has no training pair, it is the nearest pair.
     """
     candidates = np.flatnonzero(pairs.training & (pairs.pair_emitter == pairs.pair_emitter[pair]))
     if len(candidates) == 0:
@@ -98,13 +101,14 @@ def linear_weights(pairs: TrainingPairs, pair: int) -> tuple[list[int], list[flo
     return [int(candidates[corner]) for corner in corners], [float(weight) for weight in weights]
 
 
-def nearest(pairs: TrainingPairs, pair: int, turns: Turns = ALL_TURNS) -> _Responses:
-    return pairs.response(nearest_pair(pairs, pair))[turns]
+def nearest(pairs: TrainingPairs, pair: int, yaw_indices: YawIndices = ALL_YAWS) -> _Responses:
+    return pairs.response(nearest_pair(pairs, pair))[yaw_indices]
 
 
-def linear(pairs: TrainingPairs, pair: int, turns: Turns = ALL_TURNS) -> _Responses:
-    """Weighted sum of the waveforms, as in Luo et al. (NeurIPS 2022): early sound combs, levels sag between probes."""
-    return pairs.weighted(*linear_weights(pairs, pair), turns)
+def linear(pairs: TrainingPairs, pair: int, yaw_indices: YawIndices = ALL_YAWS) -> _Responses:
+    """The weighted sum of the waveforms, as in Luo et al. (NeurIPS 2022). Early sound has comb filtering, and levels
+    are too low between probes."""
+    return pairs.weighted(*linear_weights(pairs, pair), yaw_indices)
 
 
 def linear_aligned(
@@ -112,27 +116,28 @@ def linear_aligned(
     pair: int,
     delays_s: npt.NDArray[np.floating],
     sample_rate: float,
-    turns: Turns = ALL_TURNS,
+    yaw_indices: YawIndices = ALL_YAWS,
 ) -> _Responses:
-    """Linear interpolation of waveforms whose direct sounds are moved on top of each other first.
+    """Linear interpolation of waveforms after aligning their direct sounds.
 
-    delays_s: (pair,), propagation delay of every pair, the target included (known from geometry). Stronger than
-    `linear` near the direct sound.
+    delays_s: (pair,), propagation delay of every pair, the target included, from geometry. It is better than `linear`
+    near the direct sound.
     """
     neighbours, weights = linear_weights(pairs, pair)
     shifts = [(float(delays_s[pair]) - float(delays_s[neighbour])) * sample_rate for neighbour in neighbours]
     total: _Responses | None = None
     for neighbour, weight, shift in zip(neighbours, weights, shifts, strict=True):
-        part = np.float32(weight) * _shifted(pairs.response(neighbour)[turns], shift)
+        part = np.float32(weight) * _delay(pairs.response(neighbour)[yaw_indices], shift)
         total = part if total is None else total + part
     assert total is not None  # weights are never empty
     return total
 
 
-def _shifted(responses: _Responses, shift_samples: float) -> _Responses:
-    """Later by a fraction of samples; what leaves the response on either side is lost.
+def _delay(responses: _Responses, shift_samples: float) -> _Responses:
+    """Delayed by a fractional number of samples; samples that leave the response are lost.
 
-    The windowed sinc is short: an unwindowed one would ring at -90 dB all over the response and end its decay.
+    The windowed sinc is short. An unwindowed one would ring at -90 dB throughout the response, and hide the end of its
+    decay.
     """
     samples = responses.shape[-1]
     whole = round(shift_samples)
@@ -155,7 +160,7 @@ def _squared_distances(
 
 
 def barycentric(points: _Floats, target: _Floats) -> tuple[npt.NDArray[np.integer], _Floats] | None:
-    """Corners (indices into points) of the simplex that holds `target`, and weights; None outside the hull.
+    """Corners (indices into points) of the simplex that contains `target`, and their weights; None outside the hull.
 
     points: (point, 2 or 3); target: (2 or 3,).
     """
@@ -170,12 +175,12 @@ def barycentric(points: _Floats, target: _Floats) -> tuple[npt.NDArray[np.intege
         return _between(flat[:, 0], float(at[0]))
     simplices = Delaunay(flat).simplices
     corners = flat[simplices]  # (simplex, corner, axis)
-    # Ratios of volumes: Delaunay.find_simplex calls LAPACK for every simplex, hundreds of times slower on busy cores.
+    # Weights are ratios of volumes. Delaunay.find_simplex would call LAPACK per simplex, hundreds of times slower.
     volumes = _volumes(corners)
     replaced = np.repeat(corners[np.newaxis], corners.shape[1], axis=0)
     for corner in range(corners.shape[1]):
         replaced[corner, :, corner] = at
-    with np.errstate(divide="ignore", invalid="ignore"):  # slivers of no volume hold nothing
+    with np.errstate(divide="ignore", invalid="ignore"):  # a simplex without volume contains nothing
         weights = np.where(volumes != 0.0, _volumes(replaced) / volumes, -np.inf)
     holding = int(np.argmax(weights.min(axis=0)))
     held = weights[:, holding] > _WEIGHT_TOLERANCE
@@ -185,7 +190,7 @@ def barycentric(points: _Floats, target: _Floats) -> tuple[npt.NDArray[np.intege
 
 
 def _volumes(corners: _Floats) -> _Floats:
-    """Signed areas of triangles `(..., 3, 2)` or volumes of tetrahedra `(..., 4, 3)`, times a constant."""
+    """Signed areas of triangles `(..., 3, 2)` or volumes of tetrahedra `(..., 4, 3)`, up to a constant factor."""
     edges = corners[..., 1:, :] - corners[..., :1, :]
     if edges.shape[-1] == 2:
         return np.asarray(edges[..., 0, 0] * edges[..., 1, 1] - edges[..., 0, 1] * edges[..., 1, 0])

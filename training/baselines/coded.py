@@ -1,11 +1,11 @@
 """Training responses coded by audio codecs, as Luo et al. (NeurIPS 2022) stored them for their baselines: AAC at 24 and
-Opus at 12 kbit/s a stream.
+Opus at 12 kbit/s per stream.
 
-Responses are coded one behind the other with silence in between, a hundred or so to a file, which costs less than a
-file each. What a codec adds in front is taken away by its container's own note of it. Files are made when somebody asks
-for what is in them, and kept beside the dataset.
+About a hundred responses, with silence between them, are coded into one file, which is faster than one file per
+response. The delay that a codec adds at the start is removed by the decoder, as the container specifies. Files are made
+when a response in them is needed, and are stored beside the dataset.
 
-Axes: one pair's responses are `(yaw, channel, sample)`.
+Axes: the responses of one pair are `(yaw, channel, sample)`.
 """
 
 import hashlib
@@ -36,8 +36,8 @@ Track = Callable[[range, str], Iterable[int]]
 
 @dataclass(frozen=True)
 class AudioCodec:
-    """encode and decode: command lines, in which `{source}`, `{target}` and `{rate}` stand for files and the sample
-    rate of what is coded. Both end in a WAV file of floats."""
+    """encode and decode are command lines, in which `{source}`, `{target}` and `{rate}` stand for the files and the
+    sample rate. The source of the first and the target of the second are WAV files of floats."""
 
     name: str
     suffix: str
@@ -73,16 +73,16 @@ _OPUS_OF_FFMPEG = AudioCodec("opus", ".opus", (*_FFMPEG, "-c:a", "libopus", "-b:
 
 
 def opus() -> AudioCodec:
-    """opus-tools where they are installed, else what ffmpeg has of the same encoder."""
+    """opus-tools if they are installed, otherwise ffmpeg with the same encoder."""
     return _OPUS_OF_FFMPEG if not OPUS.is_installed and _OPUS_OF_FFMPEG.is_installed else OPUS
 
 
 class CodedResponses:
-    """The training pairs of a dataset after coding; indexed by pair. Thread-safe."""
+    """The training pairs of a dataset after coding and decoding, by pair. Several threads may use one."""
 
     def __init__(self, codec: AudioCodec, held_out: HeldOut, *, track: Track = lambda files, _: files) -> None:
-        """Codes a few files, spread evenly over all. Raises EvaluationError if the codec's program is missing or fails,
-        as asking for a pair does."""
+        """Codes a few files, evenly spread over all. Raises EvaluationError if the codec's program is missing or fails,
+        as reading a pair does, too."""
         self._codec = codec
         self._held_out = held_out
         self._slot = held_out.samples + round(_GAP_S * held_out.sample_rate)
@@ -99,11 +99,12 @@ class CodedResponses:
         sampled = np.linspace(0, len(self._pairs) - 1, min(_SAMPLED_FILES, len(self._pairs))).round().astype(int)
         self._sampled = [int(number) for number in sampled]
         for index in track(range(len(self._sampled)), f"coding ({codec.name})"):
-            self._make(self._sampled[index])
+            self._ensure_coded(self._sampled[index])
 
     @property
     def storage_bytes(self) -> int:
-        """What the few files coded first take, as much for every response there is, and its gain of four bytes."""
+        """The estimated size of all coded responses, from the files that were coded first, with four bytes per response
+        for its gain."""
         sampled = sum(self._path(number).stat().st_size for number in self._sampled)
         of_sampled, of_all = (
             sum(len(self._pairs[number]) for number in numbers) for numbers in (self._sampled, range(len(self._pairs)))
@@ -111,7 +112,7 @@ class CodedResponses:
         return round(sampled * of_all / of_sampled) + of_all * len(self._held_out.yaws) * 4
 
     def decoding_ms(self) -> float:
-        """Per response, measured now on a whole file of them."""
+        """Milliseconds per response, measured now on a whole file."""
         start = time.perf_counter()
         self._read(0)
         return 1e3 * (time.perf_counter() - start) / (len(self._pairs[0]) * len(self._held_out.yaws))
@@ -123,7 +124,7 @@ class CodedResponses:
             with self._lock:
                 decoded = self._decoded.get(file)
             if decoded is None:
-                self._make(file)
+                self._ensure_coded(file)
                 decoded = self._read(file)
             with self._lock:
                 self._decoded[file] = decoded
@@ -144,9 +145,9 @@ class CodedResponses:
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:04d}{self._codec.suffix}"
 
-    def _make(self, number: int) -> None:
-        """If it is not there. Under their own names only when whole, the gains first: an interrupted run is gone on
-        with."""
+    def _ensure_coded(self, number: int) -> None:
+        """Codes a file unless it exists. The file gets its final name when it is whole, and after its gains, so that an
+        interrupted run can be resumed."""
         if self._path(number).exists():
             return
         held_out = self._held_out

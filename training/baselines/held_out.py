@@ -1,6 +1,7 @@
-"""The held-out pairs of a dataset, simulated or measured: what every method is asked for and may look at.
+"""The held-out pairs of a dataset, simulated or measured: what each method must estimate, and the pairs that it may
+use.
 
-Axes: one pair's impulse responses are `(yaw, channel, sample)`, whole, the direct sound included. Metres, radians.
+Axes: the responses of one pair are `(yaw, channel, sample)`, whole, with the direct sound. Metres, radians.
 """
 
 from collections.abc import Iterator
@@ -26,16 +27,17 @@ _Integers = npt.NDArray[np.integer]
 
 
 class EvaluationError(NafirError):
-    """What was asked to be evaluated cannot be."""
+    """An evaluation that is not possible."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
     """Held-out pairs by index, counted from 0.
 
-    pairs: all pairs of the dataset, and which a method may look at; held_out: (index,) their numbers among those;
-    repeats: a second independent take of each pair, if there is one; delays_s: (pair,) when sound can first arrive;
-    yaws: (yaw,) of all responses, and heard: (n,) those that are measured, indices into yaws; visible: (index,).
+    pairs: all pairs of the dataset, and which of them a method may use. held_out: (index,) numbers of the held-out
+    pairs among those. repeats: a second independent take of each pair, if there is one. delays_s: (pair,) seconds until
+    the first sound can arrive. yaws: (yaw,) of all responses. yaw_indices: (n,) indices of the yaws that are evaluated.
+    visible: (index,) whether the ends see each other.
     """
 
     folder: Path
@@ -48,11 +50,11 @@ class HeldOut:
     repeats: PairResponses | None
     delays_s: _Floats
     yaws: _Floats
-    heard: _Integers
+    yaw_indices: _Integers
     visible: npt.NDArray[np.bool_]
     simulated: Dataset | None
     left_out: int = 0
-    """Pairs that could not be used: without a response at every orientation that the others have."""
+    """Number of pairs that are not used because they lack a response at one of the orientations."""
 
     def __post_init__(self) -> None:
         if not len(self.held_out):
@@ -72,25 +74,25 @@ class HeldOut:
         return np.asarray(self.pairs.listener_positions[self.pairs.pair_listener[self.held_out]])
 
     def reference(self, index: int) -> Responses:
-        """At the orientations that are heard."""
-        return self.pairs.response(int(self.held_out[index]))[self.heard]
+        """The responses at the orientations that are evaluated."""
+        return self.pairs.response(int(self.held_out[index]))[self.yaw_indices]
 
     def sample(self, *, pairs: int | None, yaws: int | None, seed: int) -> "HeldOut":
-        """A random subset of as many pairs, and as many orientations spread evenly, or all where there are no more."""
+        """A random subset of `pairs` pairs, and `yaws` evenly spaced orientations; all of them if there are fewer."""
         chosen = np.arange(len(self))
         if pairs is not None and pairs < len(self):
             chosen = np.sort(np.random.default_rng([seed, 11]).choice(len(self), pairs, replace=False))
-        heard = self.heard
-        if yaws is not None and yaws < len(heard):
-            heard = heard[np.linspace(0, len(heard), yaws, endpoint=False).astype(int)]
-        return replace(self, held_out=self.held_out[chosen], heard=heard, visible=self.visible[chosen])
+        yaw_indices = self.yaw_indices
+        if yaws is not None and yaws < len(yaw_indices):
+            yaw_indices = yaw_indices[np.linspace(0, len(yaw_indices), yaws, endpoint=False).astype(int)]
+        return replace(self, held_out=self.held_out[chosen], yaw_indices=yaw_indices, visible=self.visible[chosen])
 
 
 @contextmanager
 def open_held_out(folder: Path) -> Iterator[HeldOut]:
-    """The held-out pairs of a dataset folder of either kind, its responses read from disk as they are asked for.
+    """The held-out pairs of a simulated or measured dataset folder. Responses are read from disk when they are needed.
 
-    Raises DatasetError or ResponsesError if the folder holds no dataset, EvaluationError if none of it is held out.
+    Raises DatasetError or ResponsesError if the folder holds no dataset, and EvaluationError if no pair is held out.
     """
     responses = open_responses(folder)
     if isinstance(responses, SimulatedResponses):
@@ -101,7 +103,7 @@ def open_held_out(folder: Path) -> Iterator[HeldOut]:
 
 
 def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
-    """Raises DatasetError if the dataset is of another scene than the bundle."""
+    """Raises DatasetError if dataset and bundle are of different scenes."""
     codec = bundle.manifest.codec.codec
     of_bundle = bundle.manifest.geometry, codec.sample_rate, codec.samples
     if of_bundle != (dataset.scene.geometry, dataset.sample_rate, dataset.samples):
@@ -124,7 +126,7 @@ def _of_simulation(dataset: Dataset, file: h5py.File) -> HeldOut:
         repeats=References(dataset, file, "repeats"),
         delays_s=dataset.onset_s.ravel(),
         yaws=dataset.yaws,
-        heard=np.arange(len(dataset.yaws)),
+        yaw_indices=np.arange(len(dataset.yaws)),
         visible=dataset.plan.is_visible(probes[emitter[held_out]], probes[listener[held_out]]),
         simulated=dataset,
     )
@@ -132,7 +134,7 @@ def _of_simulation(dataset: Dataset, file: h5py.File) -> HeldOut:
 
 @dataclass(frozen=True)
 class _MeasuredResponses:
-    """rows: (pair, yaw) rows of the dataset."""
+    """The responses of pairs; `rows` are (pair, yaw) rows of the dataset."""
 
     dataset: ImportedDataset
     rows: _Integers
@@ -143,8 +145,8 @@ class _MeasuredResponses:
 
 @dataclass(frozen=True)
 class MeasuredPairs:
-    """A measurement by pairs: those with a response at every one of the `yaws` (yaw,), which all others lack
-    (`left_out` of them). delays_s: (pair,) along the straight line, for of a measurement no walls are known."""
+    """The pairs of a measurement that have a response at each of the `yaws` (yaw,). `left_out` counts the other pairs.
+    delays_s: (pair,) along the straight line, because the walls are unknown."""
 
     pairs: TrainingPairs
     delays_s: _Floats
@@ -153,11 +155,11 @@ class MeasuredPairs:
 
 
 def measured_pairs(dataset: ImportedDataset) -> MeasuredPairs:
-    """Raises EvaluationError where no pair was measured at all orientations."""
+    """Raises EvaluationError if no pair was measured at all orientations."""
     whole_turn = np.round(2 * np.pi, 6)
-    yaws, turn = np.unique(np.round(dataset.yaw % (2 * np.pi), 6) % whole_turn, return_inverse=True)
+    yaws, yaw_index = np.unique(np.round(dataset.yaw % (2 * np.pi), 6) % whole_turn, return_inverse=True)
     rows = np.full((int(dataset.pair.max()) + 1, len(yaws)), -1)
-    rows[dataset.pair, turn.reshape(-1)] = np.arange(len(dataset.pair))
+    rows[dataset.pair, yaw_index.reshape(-1)] = np.arange(len(dataset.pair))
     complete = (rows >= 0).all(axis=1)
     rows = rows[complete]
     if not len(rows):
@@ -170,7 +172,7 @@ def measured_pairs(dataset: ImportedDataset) -> MeasuredPairs:
 
 
 def _of_measurement(dataset: ImportedDataset) -> HeldOut:
-    """Every pair counts as in sight."""
+    """The walls are unknown, so every pair counts as in sight."""
     measured = measured_pairs(dataset)
     held_out = np.flatnonzero(~measured.pairs.training)
     return HeldOut(
@@ -184,7 +186,7 @@ def _of_measurement(dataset: ImportedDataset) -> HeldOut:
         repeats=None,
         delays_s=measured.delays_s,
         yaws=measured.yaws,
-        heard=np.arange(len(measured.yaws)),
+        yaw_indices=np.arange(len(measured.yaws)),
         visible=np.ones(len(held_out), dtype=bool),
         simulated=None,
         left_out=measured.left_out,

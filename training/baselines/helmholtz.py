@@ -1,9 +1,9 @@
-"""Interpolation of sound fields by kernel ridge regression with a kernel that solves the Helmholtz equation (Ueno,
-Koyama and Saruwatari, "Kernel ridge regression with constraint of Helmholtz equation for sound field interpolation",
-IWAENC 2018): at wave number k, sin(k d) / (k d) of the distance d between two listeners.
+"""Interpolates sound fields by kernel ridge regression with a kernel that solves the Helmholtz equation (Ueno, Koyama
+and Saruwatari, "Kernel ridge regression with constraint of Helmholtz equation for sound field interpolation", IWAENC
+2018): at wave number k, sin(k d) / (k d) of the distance d between two listeners.
 
-It interpolates between listeners of one emitter. A head that keeps its orientation hears a sum of plane waves, each by
-a factor of its own, which solves the same equation: so every ear at every yaw is interpolated by itself.
+It interpolates between the listeners of one emitter. At a fixed orientation, a head hears a sum of plane waves, each
+with a factor of its own, which solves the same equation. So every ear at every yaw is interpolated separately.
 
 Axes: responses (yaw, channel, sample); spectra (listener, yaw, channel, frequency). Metres, hertz.
 """
@@ -12,14 +12,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
-from training.baselines.baselines import ALL_TURNS, TrainingPairs, Turns
+from training.baselines.baselines import ALL_YAWS, TrainingPairs, YawIndices
 from training.data.dataset import SPEED_OF_SOUND
 
 _Floats = npt.NDArray[np.float64]
 _Responses = npt.NDArray[np.float32]
 
 REGULARISATIONS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-# A filter of the kernel reaches as far to both sides as sound travels between the listeners farthest apart.
+# The kernel's filter extends to both sides by the travel time between the most distant listeners.
 _PADDING_S = 0.1
 _CHUNK = 512  # frequencies
 _CHOOSING_EMITTERS = 3
@@ -27,24 +27,24 @@ _CHOOSING_STEP = 16  # every so many frequencies
 
 
 class HelmholtzInterpolation:
-    """Below `cutoff_hz`, where given, and silent above: wider than half a wavelength, the spaces between listeners
-    leave nothing to interpolate from."""
+    """Interpolates below `cutoff_hz` and is silent above, if a cut-off is given. Interpolation fails where the distance
+    between listeners exceeds half a wavelength."""
 
     def __init__(self, pairs: TrainingPairs, sample_rate: int, cutoff_hz: float | None = None) -> None:
-        """`regularisations` (octave,) are those of least error when listeners that were trained on are left out, one by
-        one, of the first emitters that have enough."""
+        """Chooses `regularisations` (octave,): those with the least leave-one-out error over the training listeners of
+        the first emitters that have enough of them."""
         self._pairs = pairs
         self._sample_rate = sample_rate
         self._cutoff_hz = cutoff_hz
         self.regularisations = self._choose()
 
-    def response(self, pair: int, turns: Turns = ALL_TURNS) -> _Responses | None:
-        """None where the pair's emitter was never trained on."""
+    def response(self, pair: int, yaw_indices: YawIndices = ALL_YAWS) -> _Responses | None:
+        """None if training has no pair of this emitter."""
         pairs = self._pairs
         known = self._known(int(pairs.pair_emitter[pair]))
         if not len(known):
             return None
-        responses = np.stack([pairs.response(int(number))[turns] for number in known])
+        responses = np.stack([pairs.response(int(number))[yaw_indices] for number in known])
         samples = responses.shape[-1]
         size = self._size(samples)
         frequency = rfftfreq(size, 1 / self._sample_rate)
@@ -71,7 +71,7 @@ class HelmholtzInterpolation:
         return next_fast_len(samples + round(_PADDING_S * self._sample_rate), real=True)
 
     def _passed(self, frequency: _Floats) -> _Floats:
-        """Gain: one up to the cut-off, a raised cosine over half an octave, none above."""
+        """Gain of the low-pass filter: one up to the cut-off, then a raised cosine over half an octave, then zero."""
         if self._cutoff_hz is None:
             return np.ones(len(frequency))
         octaves = np.log2(np.maximum(frequency, 1e-3) / self._cutoff_hz)
@@ -97,12 +97,12 @@ class HelmholtzInterpolation:
 
 
 def octaves(frequency: _Floats) -> npt.NDArray[np.int64]:
-    """(frequency,) which octave each is in, the lowest being everything below 125 Hz."""
+    """(frequency,) the number of the octave of each frequency; the lowest octave is everything below 125 Hz."""
     return np.maximum(np.floor(np.log2(np.maximum(frequency, 1.0) / 62.5)), 0).astype(np.int64)
 
 
 def kernel(frequency: _Floats, distance_m: _Floats) -> _Floats:
-    """(frequency, ...) of distances (...)."""
+    """(frequency, ...) kernel values for distances (...)."""
     wavelengths = frequency.reshape(-1, *(1,) * np.ndim(distance_m)) * distance_m / SPEED_OF_SOUND
     return np.asarray(np.sinc(2 * wavelengths))
 
@@ -110,9 +110,9 @@ def kernel(frequency: _Floats, distance_m: _Floats) -> _Floats:
 def left_out_errors(
     matrix: _Floats, values: npt.NDArray[np.complexfloating], regularisation: float
 ) -> npt.NDArray[np.complexfloating]:
-    """(frequency, listener, ...) what each of `values` differs by from its estimate by all others, of (frequency,
-    listener, listener) kernels: in closed form, without leaving any out (Rasmussen and Williams, Gaussian Processes for
-    Machine Learning, 2006, 5.4.2)."""
+    """(frequency, listener, ...) differences of `values` from their estimates by all other listeners, for kernels
+    (frequency, listener, listener). The closed form leaves no listener out explicitly (Rasmussen and Williams, Gaussian
+    Processes for Machine Learning, 2006, 5.4.2)."""
     inverse = np.linalg.inv(matrix + regularisation * np.eye(matrix.shape[-1]))
     flat = values.reshape(*values.shape[:2], -1)
     errors = (inverse @ flat) / np.diagonal(inverse, axis1=-2, axis2=-1)[..., None]

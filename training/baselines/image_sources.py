@@ -1,11 +1,11 @@
-"""Signal processing in place of learning: image sources of the known geometry, a tail of shaped noise by reverberation
-theory, and the head that everything is heard through. No training data are looked at.
+"""A baseline without learning: image sources of the known geometry, a tail of shaped noise by reverberation theory, and
+the head. It uses no training data.
 
-The tail is that of a diffuse field. In a room of volume V, images fill space evenly, so that from a unit emitter
-4 pi c / V of energy arrives per second and decays by Eyring's absorption exponent and that of the air (Kuttruff, Room
-Acoustics, ch. 4 and 5). The images of low order are there already: n reflections in the time t are Poisson about the
-mean free path 4 V / S, weighted by what they reflect, and the tail takes what the mirrored ones leave over. Rooms that
-are coupled through a door have no one diffuse field; that is this method's error, not a fault of it.
+The tail is that of a diffuse field. In a room of volume V, images fill space evenly. So an emitter of unit pressure
+sends 4 pi c / V of energy per second, which decays by Eyring's absorption exponent and that of the air (Kuttruff, Room
+Acoustics, ch. 4 and 5). The images of low order contain a part of that energy: the number of reflections up to time t
+has a Poisson distribution for the mean free path 4 V / S, weighted by what they reflect. The tail has the rest. Rooms
+that are coupled by a door do not have one diffuse field, which is an error of this method.
 
 Axes: bands are `OCTAVE_BANDS_HZ`; responses (yaw, ear, sample). Metres, seconds.
 """
@@ -33,7 +33,7 @@ _SEED = 20
 
 @dataclass(frozen=True)
 class DiffuseField:
-    """What reverberation theory says of a room."""
+    """Predictions of reverberation theory for a room."""
 
     geometry: Geometry
     air: Air
@@ -44,19 +44,19 @@ class DiffuseField:
 
     @cached_property
     def areas_m2(self) -> _Floats:
-        """(surface,) walls, floor and ceiling."""
+        """(surface,) areas of walls, floor and ceiling."""
         plan = self.geometry.floor_plan
         perimeter_m = float(np.sum(np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1)))
         return np.array([perimeter_m * self.geometry.height_m, plan.area_m2, plan.area_m2])
 
     @cached_property
     def reflected(self) -> _Floats:
-        """(band,) mean share of energy that a surface reflects."""
+        """(band,) mean share of the energy that surfaces reflect."""
         return np.asarray(self.areas_m2 @ surface_shares(self.geometry)[0] / self.areas_m2.sum())
 
     @cached_property
     def mirrored(self) -> _Floats:
-        """(band,) mean share that it reflects without scattering it, of what it reflects."""
+        """(band,) mean share of the reflected energy that is not scattered."""
         reflected, scattered = surface_shares(self.geometry)
         return np.asarray(self.areas_m2 @ (reflected * (1 - scattered)) / np.maximum(self.areas_m2 @ reflected, 1e-12))
 
@@ -66,7 +66,7 @@ class DiffuseField:
 
     @cached_property
     def decay_per_s(self) -> _Floats:
-        """(band,) exponent of the energy: Eyring's and the air's."""
+        """(band,) exponent of the decay of energy: Eyring's plus that of the air."""
         of_surfaces = -np.log(np.maximum(self.reflected, 1e-12)) * self.reflections_per_s
         of_air = self.air.absorption_db_per_m * np.log(10) / 10 * SPEED_OF_SOUND
         return np.asarray(of_surfaces + of_air)
@@ -77,18 +77,19 @@ class DiffuseField:
         return np.asarray(6 * np.log(10) / self.decay_per_s)
 
     def energy_per_s(self, time_s: _Floats) -> _Floats:
-        """(band, time) squared pressure of everything that arrives, at unit pressure one metre from the emitter."""
+        """(band, time) squared pressure per second of everything that arrives, for unit pressure one metre from the
+        emitter."""
         return np.asarray(4 * np.pi * SPEED_OF_SOUND / self.volume_m3 * np.exp(-self.decay_per_s[:, None] * time_s))
 
     def share_beyond(self, order: int, time_s: _Floats) -> _Floats:
-        """(band, time) of that energy, the share that mirrored reflections of up to `order` do not bring."""
+        """(band, time) the share of this energy that does not come from specular reflections of up to `order`."""
         expected = self.reflections_per_s * time_s * self.reflected[:, None]
         brought = [poisson.pmf(count, expected) * self.mirrored[:, None] ** count for count in range(order + 1)]
         return np.asarray(1 - np.sum(brought, axis=0))
 
 
 class ImageSources:
-    """Whole responses of a simulated dataset's scene from its geometry alone. Thread-safe."""
+    """Whole responses of a simulated dataset's scene from geometry alone. Several threads may use one."""
 
     def __init__(self, dataset: Dataset) -> None:
         settings = dataset.scene.simulation
@@ -104,9 +105,9 @@ class ImageSources:
         self._lock = threading.Lock()
 
     def response(
-        self, emitter: _Floats, listener: _Floats, turns: npt.NDArray[np.integer], number: int
+        self, emitter: _Floats, listener: _Floats, yaw_indices: npt.NDArray[np.integer], number: int
     ) -> npt.NDArray[np.float32]:
-        """(turn, ear, sample) at those of the dataset's yaws; `number` draws the noise of the tail."""
+        """(yaw, ear, sample) at the dataset's yaws with these indices; `number` seeds the noise of the tail."""
         dataset = self._dataset
         settings = dataset.scene.simulation
         tracer = RoomTracer(
@@ -117,7 +118,7 @@ class ImageSources:
             image_order=settings.image_order,
             arrival_directions=self._directions,
         )
-        synthesis = self._synthesis(turns)
+        synthesis = self._synthesis(yaw_indices)
         onset_s = float(dataset.plan.path_length_m(emitter, listener)) / SPEED_OF_SOUND
         arrivals = Arrivals(*tracer.images(emitter)[0], self._tail)
         response = synthesis.render(arrivals, listener, onset_s, np.random.default_rng([_SEED, number]))
@@ -125,12 +126,15 @@ class ImageSources:
             response = response + synthesis.direct(emitter, listener, dataset.scene.air)
         return response.astype(np.float32)
 
-    def _synthesis(self, turns: npt.NDArray[np.integer]) -> BinauralSynthesis:
-        """What does not depend on the pair is computed once for the orientations asked for."""
-        key = tuple(int(turn) for turn in turns)
+    def _synthesis(self, yaw_indices: npt.NDArray[np.integer]) -> BinauralSynthesis:
+        """The synthesis for these orientations, which is computed once for all pairs."""
+        key = tuple(int(yaw_index) for yaw_index in yaw_indices)
         with self._lock:
             if key not in self._syntheses:
                 self._syntheses[key] = BinauralSynthesis(
-                    kemar(self._dataset.sample_rate), self._directions, self._dataset.yaws[turns], self._dataset.samples
+                    kemar(self._dataset.sample_rate),
+                    self._directions,
+                    self._dataset.yaws[yaw_indices],
+                    self._dataset.samples,
                 )
             return self._syntheses[key]

@@ -1,12 +1,13 @@
-"""Gaussian process regression over pairs of places: what measurements between known places say of one between others.
+"""Gaussian process regression over pairs of places: estimates values at other pairs from measured ones.
 
 Axes: pairs (row, 3) emitters and (row, 3) listeners, metres; values (row, target).
 
-The covariance of two pairs adds up what they have in common: being near each other at both ends; the same listener,
-whoever speaks (a microphone's gain, what stands beside it); the same emitter heard at places near each other (its
-directivity); the same listener and emitters near each other. Lengths and shares are those most likely a posteriori
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 5.2 and 5.4.1), common to all targets up to
-their scale; what is known of them before, to a factor of e, decides where there are only a dozen pairs.
+The covariance of two pairs is a sum over what they have in common: both ends are near each other; they have the same
+listener, with any emitter (a microphone's gain, objects near it); they have the same emitter, and listeners near each
+other (the emitter's directivity); they have the same listener, and emitters near each other. Lengths and shares
+maximise the posterior probability (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 5.2 and
+5.4.1). They are common to all targets up to their scale. The prior allows a factor of e, and matters when there are
+only a dozen pairs.
 """
 
 from dataclasses import dataclass
@@ -20,12 +21,13 @@ from scipy.spatial.distance import cdist
 _Floats = npt.NDArray[np.float64]
 
 SAME_M = 1e-3
-"""Nearer than this two points are one."""
+"""Points nearer to each other than this count as one."""
 _FITTED_ROWS = 250
 _FITTED_COMPONENTS = 30
 _ITERATIONS = 25
-# Logarithms of: near at both ends (share, length at the emitter, at the listener), same listener (share), same emitter
-# (share, length), same listener (share, length at the emitter), noise (share). Lengths count in spreads of that end.
+# Logarithms of: both ends near (share, length at the emitter, length at the listener), same listener (share), same
+# emitter (share, length at the listener), same listener (share, length at the emitter), noise (share). The unit of
+# lengths is the spread of positions at that end.
 _START = np.log([1.0, 0.7, 0.7, 0.3, 0.5, 0.15, 0.3, 0.7, 0.1])
 _PRIOR_SPREAD = 1.0
 _BOUNDS = np.log(
@@ -35,17 +37,18 @@ _BOUNDS = np.log(
 
 @dataclass(frozen=True)
 class Ends:
-    """(row, 3) each."""
+    """The emitters and listeners of pairs, (row, 3) each."""
 
     emitter: _Floats
     listener: _Floats
 
 
 class PairRegression:
-    """Of the pairs given, to all others.
+    """A regression that is fitted to the given pairs.
 
-    What it says is `mean` (target,) and covariances with `known` pairs times `weights` (row, target); `spread` is the
-    unit of distances at the emitter's end and the listener's, and `parameters` the logarithms that were found.
+    The estimate for a pair is `mean` (target,) plus its covariances with the `known` pairs times `weights` (row,
+    target). `spread` has the units of distance at the emitter's and the listener's end; `parameters` are the logarithms
+    of the fitted shares and lengths.
     """
 
     def __init__(self, emitter: _Floats, listener: _Floats, values: _Floats, *, seed: int = 0) -> None:
@@ -57,7 +60,7 @@ class PairRegression:
         self.weights = cho_solve(cho_factor(self._of_known(self.known)), values - self.mean)
 
     def __call__(self, emitter: _Floats, listener: _Floats) -> _Floats:
-        """(row, target) expected at other pairs."""
+        """(row, target) estimates at other pairs."""
         return np.asarray(self.mean + self._covariance(Ends(emitter, listener), self.known) @ self.weights)
 
     def _fitted(self, ends: Ends, centred: _Floats) -> _Floats:
@@ -68,7 +71,7 @@ class PairRegression:
             return _START
 
         def cost(parameters: _Floats) -> float:
-            """Negative logarithm of the likelihood, the common scale at its best, and of the prior."""
+            """Negative log posterior: that of the likelihood at the best common scale, and that of the prior."""
             self.parameters = parameters
             try:
                 lower, _ = cho_factor(self._of_known(ends), lower=True)

@@ -1,5 +1,5 @@
-"""Fields to a scene bundle: trained ones, and measured responses themselves. Every graph is checked against torch
-before anything is written."""
+"""Writes fields to a scene bundle: trained fields, and measured responses themselves. Every graph is checked against
+torch before anything is written."""
 
 import io
 import tempfile
@@ -48,28 +48,39 @@ MODEL_FILE = "factorised.onnx"
 DEFAULT_LEVEL = "standard"
 SHAPED_NEAREST = "shaped-nearest"
 EFFORT = Effort()
-"""Of the health check that a bundle has to pass."""
+"""The effort of the health check that a bundle must pass."""
 
 _CHECK_POSES = {"factorised": 64, "naf": 2, SHAPED_NEAREST: 8}
 _INT8_LEAST_WEIGHTS = 100_000
 _TRUNCATION_POSES = 3000
-# Rounded weights are the only difference; phases of uncertain bins may turn, so frequency is compared where it matters.
-# Largest differences for float32 (float16 weights), root mean squares for int8.
+# Rounding of weights is the only difference. Phases of uncertain bins may change, so frequency is compared where phase
+# is certain. Tolerances are for the largest difference in float32 (float16 weights), and the root mean square in int8.
 _TOLERANCES: dict[Precision, dict[str, float]] = {
     "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, RESPONSE: 1e-3},
     "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, RESPONSE: 0.05},
 }
 _PHASE_TOLERANCE: dict[Precision, float] = {"float32": 0.05, "int8": 0.2}
 TABLED_TOLERANCE = 1e-4
-"""Largest difference in log-magnitude between the plain graph of a `naf` and the tabled one."""
+"""Largest difference in log-magnitude between the plain and the tabled graph of a `naf`."""
 
 
 class ExportError(NafirError):
-    """A field that fits into no bundle, or an exported graph that does not compute what the trained field computes."""
+    """A field that does not fit into the bundle, or an exported graph whose results differ from the trained field's."""
+
+
+@dataclass(frozen=True)
+class _Variants:
+    """The forms in which each run is written: `ranks` for factorised fields, `exact_tables` for a `naf`."""
+
+    precisions: Sequence[Precision]
+    ranks: Sequence[int]
+    exact_tables: bool
 
 
 @dataclass(frozen=True)
 class _Exported:
+    """A checked graph and what the manifest says about it."""
+
     name: str
     model: onnx.ModelProto
     architecture: str
@@ -88,49 +99,86 @@ def export(
     accepted: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Bundle:
-    """Writes finished runs on one scene as the fields of one bundle, each in every precision; the first field is the
-    default. Factorised fields are also written at every lower one of `ranks`, with the least loss. With `exact_tables`
-    a `naf` is also written with less arithmetic for the same numbers. The folder of measured responses in place of a
-    run stands for the field that needs no training, `ShapedNearest`, in one precision.
+    """Writes finished runs on one scene as the fields of one bundle, each in every precision. The first field is the
+    default. Factorised fields are also written at each lower one of `ranks`, with the least loss. With `exact_tables`,
+    a `naf` is also written with less arithmetic for the same numbers. In place of a run, the folder of measured
+    responses stands for the field that needs no training, `ShapedNearest`, in one precision.
 
-    Fields of a simulated scene leave the direct sound to the server; those of measured responses hold it, and so does
-    `naf-whole`. The frozen noise of a simulated scene whose first field is factorised is chosen
-    (`training.bundling.noise`), all others' is drawn.
+    Fields of a simulated scene leave direct sound and first reflections to the server. Fields of measured responses
+    include them, and so does `naf-whole`. If the first field of a simulated scene is factorised, the best of several
+    draws of frozen noise is chosen (`training.bundling.noise`); otherwise the noise is the first draw.
 
-    Factorised fields of another width than the first one's have it in their names.
+    The name of a factorised field includes its width if that differs from the first one's.
 
-    What fields do beside what their data do (`training.bundling.data_reference`) is checked before the noise is chosen.
-    `accepted` are reasons, by name of a law, to offer the scene although its fields break it; of those that they do
-    break the manifest keeps a record.
+    The fields are checked against the laws of `nafir check`, some of them relative to the data
+    (`training.bundling.data_reference`), before the noise is chosen. `accepted` gives reasons, by name of a law, to
+    offer the scene although its fields break the law. The manifest records those that they do break.
 
-    Raises RunError for an unfinished run, ExportError for a graph that disagrees, for a dataset folder that is not of
-    `responses` or not measured, for fields of which only some hold the direct sound, for ranks, tables or precisions
-    that none of the fields has, and for a law that does not exist or that nobody may accept, and HealthError for
-    fields that break a law of `nafir check`: nothing is written.
+    Nothing is written if this raises RunError for an unfinished run; ExportError for a graph that differs from torch,
+    a dataset folder that is not that of `responses` or not measured, fields of which only some include the direct
+    sound, ranks, tables or precisions that apply to none of the fields, or a law that does not exist or cannot be
+    accepted; or HealthError for fields that break a law of `nafir check`.
     """
     accepting = _accepting(accepted or {})
+    variants = _Variants(precisions, ranks, exact_tables)
+    # Making a graph takes a while, so everything that could be wrong with a field or an option is checked first.
+    fields = [_opened(responses, place) for place in runs]
+    _require_different(
+        [_name_of(field, place, _usual_width(fields)) for field, place in zip(fields, runs, strict=True)]
+    )
+    whole = _hold_direct_sound(fields)
+    _require_used(fields, variants)
+    exported = _graphs(fields, runs, variants)
+    seed = 0 if exported[0].architecture == SHAPED_NEAREST else Configuration.read(runs[0]).seed
+    files, described = _contents(exported, precisions[0], seed)
+    if isinstance(responses, SimulatedResponses):
+        manifest = simulated_manifest(responses, described, whole=whole)
+    else:
+        assert isinstance(responses, ImportedDataset)
+        manifest = measured_manifest(responses, described)
+    manifest = manifest.model_copy(update={"reference": reference_of(responses, manifest), "accepted": accepting})
+    with tempfile.TemporaryDirectory() as trial:
+        bundle = write_bundle(Path(trial), manifest, files)
+        found = check_fields(bundle, EFFORT)
+        # guard: ill bundles are not exported
+        found.health.require()
+        if isinstance(responses, SimulatedResponses) and exported[0].architecture == "factorised":
+            files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
+            bundle = write_bundle(Path(trial), manifest, files)
+        health = check(bundle, EFFORT, fields=found)
+        health.require()
+    return write_bundle(folder, manifest.model_copy(update={"accepted": _needed(accepting, health)}), files)
+
+
+def _graphs(
+    fields: Sequence[Learner | ImportedDataset], places: Sequence[Path], variants: _Variants
+) -> list[_Exported]:
+    """All graphs of the fields. Raises ExportError for a graph that differs from torch, or two of the same name."""
     exported: list[_Exported] = []
-    # All are opened, and told apart, before the first graph is made, which takes a while.
-    opened = [(_opened(responses, place), place) for place in runs]
-    usual_width = next((field.field.width for field, _ in opened if isinstance(field, FactorisedLearner)), 0)
-    _require_different([_name_of(field, place, usual_width) for field, place in opened])
-    whole = _hold_direct_sound([field for field, _ in opened])
-    _require_used([field for field, _ in opened], precisions, ranks, exact_tables=exact_tables)
-    for field, place in opened:
+    for field, place in zip(fields, places, strict=True):
         if isinstance(field, ImportedDataset):
             exported.append(_shaped(field))
         elif isinstance(field, FactorisedLearner):
-            exported += _factorised(field, Configuration.read(place), precisions, ranks, usual_width=usual_width)
+            exported += _factorised(field, Configuration.read(place), variants, _usual_width(fields))
         elif isinstance(field, NafLearner):
-            exported += _naf(field, Configuration.read(place), precisions, exact_tables=exact_tables)
+            exported += _naf(field, Configuration.read(place), variants)
         else:
             raise TypeError(f"{type(field)} has no graph")
-    names = [each.name for each in exported]
-    _require_different(names)  # of lower ranks, too
-    codec = exported[0].codec
-    seed = 0 if exported[0].architecture == SHAPED_NEAREST else Configuration.read(runs[0]).seed
-    # The default field is called by its kind alone, whatever its rank, unless it is less than exact.
-    titles = [exported[0].architecture if precisions[0] == "float32" else names[0], *names[1:]]
+    _require_different([each.name for each in exported])  # with lower ranks
+    return exported
+
+
+def _usual_width(fields: Sequence[Learner | ImportedDataset]) -> int:
+    """The width of the first factorised field, which names leave out; 0 if there is none."""
+    return next((field.field.width for field in fields if isinstance(field, FactorisedLearner)), 0)
+
+
+def _contents(exported: Sequence[_Exported], precision: Precision, seed: int) -> tuple[dict[str, bytes], Fields]:
+    """The bundle's files but the manifest, and what the manifest says about them. `precision` is that of the first
+    field; the frozen noise is a draw of this `seed`."""
+    codec, names = exported[0].codec, [each.name for each in exported]
+    # The default field is named by its kind alone, whatever its rank, unless it is quantised.
+    titles = [exported[0].architecture if precision == "float32" else names[0], *names[1:]]
     files = {f"{title}.onnx": each.model.SerializeToString() for title, each in zip(titles, exported, strict=True)}
     fields = {
         title: FieldFile(
@@ -145,23 +193,7 @@ def export(
         QualityLevel(name=title if number else DEFAULT_LEVEL, field=title) for number, title in enumerate(titles)
     )
     files[ARRAYS_FILE] = _arrays(even_noise(codec.codec, np.random.default_rng([seed, 6])))
-    described = Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
-    if isinstance(responses, SimulatedResponses):
-        manifest = simulated_manifest(responses, described, whole=whole)
-    else:
-        assert isinstance(responses, ImportedDataset)
-        manifest = measured_manifest(responses, described)
-    manifest = manifest.model_copy(update={"reference": reference_of(responses, manifest), "accepted": accepting})
-    with tempfile.TemporaryDirectory() as trial:
-        bundle = write_bundle(Path(trial), manifest, files)
-        found = check_fields(bundle, EFFORT)
-        found.health.require()
-        if isinstance(responses, SimulatedResponses) and exported[0].architecture == "factorised":
-            files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
-            bundle = write_bundle(Path(trial), manifest, files)
-        health = check(bundle, EFFORT, fields=found)
-        health.require()
-    return write_bundle(folder, manifest.model_copy(update={"accepted": _needed(accepting, health)}), files)
+    return files, Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
 
 
 def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
@@ -169,7 +201,7 @@ def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
     for name, reason in reasons.items():
         if name not in known:
             raise ExportError(
-                f"accept: {name}: is no law that may be broken for a reason; those are {', '.join(known)}"
+                f"accept: {name}: is not a law that may be broken for a reason; those are {', '.join(known)}"
             )
         if not reason.strip():
             raise ExportError(f"accept: {name}: needs a reason, which the bundle keeps")
@@ -177,13 +209,13 @@ def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
 
 
 def _needed(accepting: tuple[AcceptedLaw, ...], health: Health) -> tuple[AcceptedLaw, ...]:
-    """Of the laws that are accepted those that are broken."""
+    """Those of the accepted laws that are broken."""
     broken = {finding.law.name for finding in health.accepted}
     return tuple(entry for entry in accepting if entry.law in broken)
 
 
 def _arrays(noise: npt.NDArray[np.float32]) -> bytes:
-    """The bundle's file of arrays."""
+    """The content of the bundle's file of arrays."""
     arrays = io.BytesIO()
     np.savez(arrays, frozen_noise=noise)
     return arrays.getvalue()
@@ -208,51 +240,41 @@ def _name_of(field: Learner | ImportedDataset, place: Path, usual_width: int) ->
 
 
 def _factorised_name(rank: int, width: int, usual_width: int) -> str:
-    """With the width, where it is another than that of the bundle's first factorised field."""
+    """The name of a factorised field. It includes the width if that differs from the width of the bundle's first
+    factorised field."""
     return f"factorised-r{rank}" if width == usual_width else f"factorised-w{width}-r{rank}"
 
 
 def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
-    """Whether these fields of a simulated scene do. Raises ExportError where only some of them do."""
+    """Whether these fields of a simulated scene include the direct sound. Raises ExportError if only some do."""
     holding = [isinstance(field, NafLearner) and field.recipe.whole for field in fields]
     if any(holding) and not all(holding):
         raise ExportError("naf-whole holds the direct sound, other fields leave it out: export it to its own bundle")
     return all(holding)
 
 
-def _require_used(
-    fields: Sequence[Learner | ImportedDataset],
-    precisions: Sequence[Precision],
-    ranks: Sequence[int],
-    *,
-    exact_tables: bool,
-) -> None:
-    """Raises ExportError for what is asked for and none of the fields has."""
-    if ranks and not any(isinstance(field, FactorisedLearner) for field in fields):
-        raise ExportError("ranks: none of the runs is a factorised field, which alone has them; leave it out")
-    if exact_tables and not any(isinstance(field, NafLearner) for field in fields):
-        raise ExportError("exact-tables: none of the runs is a naf, which alone has them; leave it out")
-    if list(precisions) != ["float32"] and all(isinstance(field, ImportedDataset) for field in fields):
-        raise ExportError("precision: measured responses themselves are kept in float32 alone; leave it out")
+def _require_used(fields: Sequence[Learner | ImportedDataset], variants: _Variants) -> None:
+    """Raises ExportError for options that apply to none of the fields."""
+    if variants.ranks and not any(isinstance(field, FactorisedLearner) for field in fields):
+        raise ExportError("ranks: none of the runs is a factorised field, and other fields have none; leave it out")
+    if variants.exact_tables and not any(isinstance(field, NafLearner) for field in fields):
+        raise ExportError("exact-tables: none of the runs is a naf, and other fields have none; leave it out")
+    if list(variants.precisions) != ["float32"] and all(isinstance(field, ImportedDataset) for field in fields):
+        raise ExportError("precision: measured responses themselves are stored in float32 only; leave it out")
 
 
 def _require_different(names: list[str]) -> None:
-    if doubled := {name for name in names if names.count(name) > 1}:
-        raise ExportError(f"{', '.join(sorted(doubled))}: more than one run makes a field of that name")
+    if duplicates := {name for name in names if names.count(name) > 1}:
+        raise ExportError(f"{', '.join(sorted(duplicates))}: more than one run makes a field of that name")
 
 
 def _factorised(
-    learner: FactorisedLearner,
-    configuration: Configuration,
-    precisions: Sequence[Precision],
-    ranks: Sequence[int],
-    *,
-    usual_width: int,
+    learner: FactorisedLearner, configuration: Configuration, variants: _Variants, usual_width: int
 ) -> list[_Exported]:
-    """All graphs of a run, each checked."""
+    """All graphs of a factorised field's run, each checked."""
     cells, whole = learner.cells, learner.field
     trained_at = _tensors(_poses(learner.responses, _TRUNCATION_POSES, configuration.seed), _TRUNCATION_POSES)
-    lower = sorted({rank for rank in ranks if rank < len(whole.basis)}, reverse=True)
+    lower = sorted({rank for rank in variants.ranks if rank < len(whole.basis)}, reverse=True)
     poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
     codec = _codec_parameters(cells.codec, cells.known_frames, cells.all_frames)
     outputs = _outputs(learner)
@@ -262,7 +284,7 @@ def _factorised(
         rank = len(field.basis)
         module = ExportedField(field, cells).eval()
         graph = traced if field is whole else with_weights(traced, module)
-        for precision in precisions:
+        for precision in variants.precisions:
             least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
             small = to_int8(graph, least_weights=least_weights, exact=GEOMETRY) if precision == "int8" else graph
             model = halve_weights(small, exact=GEOMETRY)
@@ -272,26 +294,24 @@ def _factorised(
     return exported
 
 
-def _naf(
-    learner: NafLearner, configuration: Configuration, precisions: Sequence[Precision], *, exact_tables: bool
-) -> list[_Exported]:
-    """All graphs of a run, each checked."""
+def _naf(learner: NafLearner, configuration: Configuration, variants: _Variants) -> list[_Exported]:
+    """All graphs of a naf's run, each checked."""
     field = learner.field
     time_domain = field.shape.domain == "time"
     outputs = (RESPONSE,) if time_domain else _outputs(learner)
     codec = _codec_parameters(learner.codec, 0 if time_domain else learner.codec.frames)
     poses = _poses(learner.responses, _CHECK_POSES["naf"], configuration.seed)
     exported = []
-    for tabled in (False, True)[: 1 + exact_tables]:
+    for tabled in (False, True)[: 1 + variants.exact_tables]:
         module = NafGraph(field, learner.codec, tabled=tabled).eval()
         graph = to_onnx(module, _tensors(poses, 1), outputs, free_batch=False)
-        for precision in precisions:
+        for precision in variants.precisions:
             small = to_int8(graph, least_weights=field.shape.width**2) if precision == "int8" else graph
             model = pose_by_pose(small)
             _check(model, module, poses, outputs, precision)
             name = f"{configuration.name}{'-tables' if tabled else ''}{_suffix(precision)}"
             exported.append(_Exported(name, model, configuration.name, None, codec))
-    if exact_tables:
+    if variants.exact_tables:
         _check_tables(learner, poses)
     return exported
 
@@ -311,7 +331,7 @@ def _suffix(precision: Precision) -> str:
 
 
 def _outputs(learner: FactorisedLearner | NafLearner) -> tuple[str, ...]:
-    """Of one channel there is no coherence between ears."""
+    """The outputs of a field. For one channel there is no coherence between ears."""
     return OUTPUTS[: 2 + learner.responses.channels]
 
 
@@ -329,7 +349,7 @@ def _codec_parameters(codec: Codec, known_frames: int, frames: Axis | None = Non
 
 
 def _poses(responses: ResponseSet, count: int, seed: int) -> tuple[npt.NDArray[np.float32], ...]:
-    """Random listener, emitter and yaw in the neighbourhoods of those measured."""
+    """Random listeners, emitters and yaws near the measured ones."""
     rng = np.random.default_rng(seed)
     listener, emitter = (
         end[rng.integers(0, len(end), count)] + rng.uniform(-0.05, 0.05, (count, 3))
@@ -353,7 +373,7 @@ def _check(
     session = open_session(model.SerializeToString())
     found = dict(zip(outputs, session.run(list(outputs), dict(zip(INPUTS, poses, strict=True))), strict=True))
     with torch.no_grad():
-        # One at a time: a batch of `naf` would not fit into memory.
+        # One pose at a time, because a batch of `naf` would not fit into memory.
         rows = [module(*(torch.from_numpy(part[row : row + 1]) for part in poses)) for row in range(len(poses[0]))]
     expected = {name: np.concatenate([row[number] for row in rows]) for number, name in enumerate(outputs)}
     for name, tolerance in _TOLERANCES[precision].items():

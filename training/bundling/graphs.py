@@ -1,4 +1,5 @@
-"""Trained fields as ONNX graphs: made from torch, stored smaller, quantised, and run pose by pose."""
+"""Trained fields as ONNX graphs: exports them from torch, reduces and quantises weights, and makes them run pose by
+pose."""
 
 import tempfile
 import warnings
@@ -13,17 +14,17 @@ from torch import nn
 from server.field.graph import INPUTS
 
 _OPSET = 20
-"""The first with a node for GELU."""
+"""The first version that has a GELU node."""
 _HALVE_ABOVE_BYTES = 16_384
 
 
 def to_onnx(
     module: nn.Module, poses: tuple[torch.Tensor, ...], outputs: tuple[str, ...], *, free_batch: bool = True
 ) -> onnx.ModelProto:
-    """The graph, and nothing in it but the graph; its batch axis is free, or as long as that of the poses."""
+    """The graph without metadata. Its batch axis is free, or has the length of that of the poses."""
     batch = torch.export.Dim("batch")
     with warnings.catch_warnings():
-        # PyTorch's exporter about its own pytrees, and about the one name that all three batch axes share.
+        # Warnings of PyTorch's exporter about its own pytrees, and about the name that all three batch axes share.
         warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
         warnings.filterwarnings("ignore", r"# The axis name: batch will not be used", UserWarning)
         program = torch.onnx.export(
@@ -40,15 +41,16 @@ def to_onnx(
     model = program.model_proto
     graph = model.graph
     for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
-        # The exporter notes call stacks, with paths of the machine it ran on: no scene should carry those.
+        # The exporter adds call stacks with paths of this machine, which must not be in a bundle.
         part.ClearField("metadata_props")
         part.ClearField("doc_string")
     return model
 
 
 def with_weights(model: onnx.ModelProto, module: nn.Module) -> onnx.ModelProto:
-    """The graph of another module than `to_onnx` made it of, which differs in parameters and buffers alone, and be it
-    in their shapes: tracing takes ten seconds, this none. What the exporter has folded stays as it was."""
+    """The graph of another module than the one `to_onnx` traced, where only the values and shapes of parameters and
+    buffers differ. Tracing takes ten seconds, this almost no time. Constants that the exporter has folded stay as they
+    were."""
     other = onnx.ModelProto()
     other.CopyFrom(model)
     other.graph.ClearField("value_info")
@@ -60,31 +62,33 @@ def with_weights(model: onnx.ModelProto, module: nn.Module) -> onnx.ModelProto:
 
 
 def pose_by_pose(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A graph of one pose as the body of a scan over a free batch axis, so that memory does not grow with the batch:
-    one response of `naf` takes a third of a gigabyte of intermediate values."""
+    """Wraps a graph of one pose in a scan over a free batch axis, so that memory does not grow with the batch: one
+    response of `naf` takes a third of a gigabyte of intermediate values."""
     body = onnx.GraphProto()
     body.CopyFrom(model.graph)
     outputs = [output.name for output in body.output]
-    # What the whole batch is called outside may not be called the same inside.
+    # Names that stand for the whole batch outside must differ inside.
     inside = {name: f"{name}_alone" for name in (*INPUTS, *outputs)}
     for node in body.node:
         node.input[:] = [inside.get(name, name) for name in node.input]
         node.output[:] = [inside.get(name, name) for name in node.output]
     for tensor in body.initializer:
         tensor.name = inside.get(tensor.name, tensor.name)
-    scanned, given, taken, before, after = [], [], [], [], []
+    scanned, body_inputs, body_outputs, before, after = [], [], [], [], []
     for name, shape in INPUTS.items():
-        given.append(helper.make_tensor_value_info(f"{name}_of_pose", TensorProto.FLOAT, shape))
+        body_inputs.append(helper.make_tensor_value_info(f"{name}_of_pose", TensorProto.FLOAT, shape))
         scanned.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]))
         before.append(helper.make_node("Unsqueeze", [f"{name}_of_pose", "batch_axis"], [inside[name]]))
     results = []
     for output in body.output:
         shape = [axis.dim_value for axis in output.type.tensor_type.shape.dim][1:]
-        taken.append(helper.make_tensor_value_info(f"{output.name}_of_pose", TensorProto.FLOAT, shape))
+        body_outputs.append(helper.make_tensor_value_info(f"{output.name}_of_pose", TensorProto.FLOAT, shape))
         results.append(helper.make_tensor_value_info(output.name, TensorProto.FLOAT, ["batch", *shape]))
         after.append(helper.make_node("Squeeze", [inside[output.name], "batch_axis"], [f"{output.name}_of_pose"]))
     axis = numpy_helper.from_array(np.zeros(1, np.int64), "batch_axis")
-    of_pose = helper.make_graph([*before, *body.node, *after], "pose", given, taken, [*body.initializer, axis])
+    of_pose = helper.make_graph(
+        [*before, *body.node, *after], "pose", body_inputs, body_outputs, [*body.initializer, axis]
+    )
     scan = helper.make_node("Scan", list(INPUTS), outputs, body=of_pose, num_scan_inputs=len(INPUTS))
     whole = helper.make_graph([scan], "poses", scanned, results)
     wrapped = helper.make_model(whole, opset_imports=model.opset_import, ir_version=model.ir_version)
@@ -93,8 +97,8 @@ def pose_by_pose(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def halve_weights(model: onnx.ModelProto, *, exact: str | None = None) -> onnx.ModelProto:
-    """Stores large float32 constants as float16, cast back as the graph is loaded: half the bundle, the same
-    arithmetic. Those of the module called `exact` stay as they are."""
+    """Stores large float32 constants as float16, which are converted back when the graph is loaded. This halves the
+    bundle and leaves the arithmetic the same. Constants of the module named `exact` stay as they are."""
     halved = onnx.ModelProto()
     halved.CopyFrom(model)
     graph = halved.graph
@@ -113,13 +117,13 @@ def halve_weights(model: onnx.ModelProto, *, exact: str | None = None) -> onnx.M
 
 
 def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = None) -> onnx.ModelProto:
-    """Products with at least so many constant weights in 8-bit integers: weights per column, the other factor as it
-    comes, per call. Smaller ones take no time, and what they compute is needed exactly, as is what the
-    module called `exact` computes."""
+    """Computes products with at least `least_weights` constant weights in 8-bit integers: weights are quantised per
+    column, the other factor at each call. Smaller products stay in float32, because they take little time and their
+    results must be exact; so does the module named `exact`."""
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     constants = {tensor.name: int(np.prod(tensor.dims)) for tensor in model.graph.initializer}
-    # The quantiser makes a product and a sum of a Gemm, and calls the product so.
+    # The quantiser splits a Gemm into a product and a sum, and names the product like this.
     kept = [
         name
         for node in model.graph.node
@@ -129,11 +133,13 @@ def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = N
     ]
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
-    # The quantiser transposes weights and then trips over their shapes as noted before.
+    # The quantiser transposes weights, and fails if their old shapes are still noted.
     copy.graph.ClearField("value_info")
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
         onnx.save(copy, source)
+        # guard: small products are computed exactly
+        # guard: each column of weights has a scale of its own
         quantize_dynamic(
             source,
             target,

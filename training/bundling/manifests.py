@@ -1,4 +1,5 @@
-"""What a bundle says of its scene: of a simulated one all that its file says, of a measured one what can be known."""
+"""The manifest of a bundle: for a simulated scene with everything in the scene file, for a measured scene with what is
+known of it."""
 
 import re
 from dataclasses import dataclass
@@ -15,12 +16,12 @@ from training.data.responses import ImportedDataset, ResponsesError, SimulatedRe
 
 _MARGIN_M = 0.1
 _LEVELLED_ROWS = 500
-_DIRECT_S = (-0.001, 0.0025)  # about when geometry has it arrive
+_DIRECT_S = (-0.001, 0.0025)  # around the arrival that follows from distance
 
 
 @dataclass(frozen=True)
 class Fields:
-    """What a manifest says of the bundle's own files."""
+    """What a manifest says about the bundle's files."""
 
     codec: CodecParameters
     fields: dict[str, FieldFile]
@@ -29,7 +30,7 @@ class Fields:
 
 
 def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: bool = False) -> Manifest:
-    """`whole` where the fields hold the direct sound and the first reflections."""
+    """The manifest of a simulated scene. `whole`: the fields include direct sound and first reflections."""
     scene = responses.dataset.scene
     low, high = np.min(scene.geometry.corners, axis=0), np.max(scene.geometry.corners, axis=0)
     return Manifest(
@@ -56,8 +57,9 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: 
 
 
 def measured_manifest(responses: ImportedDataset, fields: Fields) -> Manifest:
-    """Named after the source. The bounds are a box around all positions, with a little room: what lies in it but far
-    from where was measured is a guess. A visitor finds the most usual distance, and faces the emitter."""
+    """The manifest of a measured scene, named after the source. Its bounds are a box around all positions, with a small
+    margin; inside the box but far from all measurements, responses are guesses. The start is a pair at the median
+    distance, with the listener facing the emitter."""
     positions = np.concatenate([responses.listener, responses.emitter])
     name = Path(responses.source).stem
     offset = responses.emitter - responses.listener
@@ -89,9 +91,9 @@ def measured_manifest(responses: ImportedDataset, fields: Fields) -> Manifest:
 
 
 def _reference_level_db(responses: ImportedDataset) -> float:
-    """Median of what the direct sound has one metre from the emitter, were it to spread in the open.
+    """Median level of the direct sound, scaled to one metre from the emitter by spherical spreading.
 
-    Raises ResponsesError where most responses are silent when it should arrive.
+    Raises ResponsesError if most responses are silent when the direct sound should arrive.
     """
     rows = np.sort(np.random.default_rng(0).permutation(len(responses.yaw))[:_LEVELLED_ROWS])
     energies = []
@@ -102,12 +104,12 @@ def _reference_level_db(responses: ImportedDataset) -> float:
         energies.append(np.square(direct).sum(axis=-1).mean() * distance_m**2)
     median = float(np.median(energies))
     if not median > 0:
-        problem = "are silent when distance has the direct sound arrive; import them anew: is the equipment late?"
+        problem = "are silent when the direct sound should arrive; import them again: does the equipment delay them?"
         raise ResponsesError(responses.file, "responses", problem)
     return float(power_to_db(median))
 
 
 def _point(position: np.ndarray) -> Point:
-    """To the tenth of a millimetre."""
+    """A position rounded to a tenth of a millimetre."""
     x, y, z = (round(float(coordinate), 4) for coordinate in position)
     return x, y, z

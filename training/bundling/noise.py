@@ -1,12 +1,12 @@
-"""Which frozen noise a scene is given: of several draws, the one with which responses come nearest to simulated ones.
+"""Chooses a scene's frozen noise: of several random draws, the one whose responses come nearest to simulated ones.
 
-All responses of a scene share one noise, and with it what that happens to be like: how much its two signals have in
-common (a few hundredths of interaural cross-correlation, on every response alike) and how loud its first milliseconds
-are. Simulated responses have such chance in them too, each its own, so that no property of noise by itself would do to
-choose by.
+All responses of a scene share one noise, and with it its random properties: the correlation between its two signals (a
+few hundredths of interaural cross-correlation in every response) and the level of its first milliseconds. Simulated
+responses have such random properties too, each its own. So no property of the noise alone can decide which draw is
+best.
 
-Draws are compared on the same pairs, a few at a time, and those that are behind the best by more than chance explains
-are out of the race: most are told apart by a part of the pairs.
+Draws are compared on the same pairs, a few pairs at a time. A draw that is behind the best by more than chance explains
+is dropped, so most draws need only a part of the pairs.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,14 +29,15 @@ DRAWS = 16
 _PAIRS, _YAWS = 80, 3
 _ROUND_PAIRS = 10
 _BEHIND_ERRORS = 3.0
-"""Standard errors of the mean difference to the best draw."""
+"""Standard errors of the mean difference from the best draw."""
 
 
 def choose_noise(
     bundle: Bundle, dataset: Dataset, *, seed: int, progress: Progress | None = None
 ) -> npt.NDArray[np.float32]:
-    """(2, sample) of DRAWS: that with the least mean audible error of the bundle's first level over pairs that training
-    saw; of those with which more could not be measured, none. The first, where responses are finite with none."""
+    """(2, sample) the best of DRAWS draws: it has the least mean audible error of the bundle's first quality level over
+    pairs from the training set. A draw with which fewer parameters can be measured is never the best. If no draw gives
+    finite responses, the first is returned."""
     progress = progress or Progress(disable=True)
     manifest = bundle.manifest
     codec = manifest.codec.codec
@@ -55,8 +56,8 @@ def race(
     rounds: Sequence[npt.NDArray[np.int64]],
     progress: Progress,
 ) -> int:
-    """The number of the contestant with the least mean error, of those with the least share missing. Each is asked for
-    the scores of the pairs of one round after the other, until it is out of the race."""
+    """The number of the contestant with the least mean error, among those with the smallest missing share. Contestants
+    compute the scores of the pairs of one round after the other, until they are dropped."""
     running = list(range(len(contestants)))
     scores: list[list[Scores]] = [[] for _ in contestants]
     for pairs in progress.track(rounds, description="choosing the noise"):
@@ -69,7 +70,7 @@ def race(
 
 
 def _still_running(scores: dict[int, Scores]) -> list[int]:
-    """The best first, and those that are not behind it for certain."""
+    """The best contestant, and those that are not certainly worse."""
     best = min(scores, key=lambda number: (scores[number].missing, scores[number].mean))
     if not np.isfinite(scores[best].mean):
         return sorted(scores)[:1]

@@ -1,7 +1,7 @@
-"""`ShapedNearest` as a graph: measured responses are constants, everything else is arithmetic on one pose.
+"""`ShapedNearest` as a graph: measured responses are constants, and everything else is arithmetic on one pose.
 
-The graph answers with the response itself, aligned like any other. Axes: P training pairs, Y measured orientations;
-then (channel, band, stretch, sample) as in `training.baselines.shaped`.
+The graph's output is the aligned response itself. Axes: P training pairs, Y measured orientations; then (channel, band,
+stretch, sample) as in `training.baselines.shaped`.
 """
 
 import numpy as np
@@ -23,10 +23,11 @@ from training.baselines.shaped import (
 
 
 class ShapedNearestGraph(nn.Module):
-    """One pose at a time; sample `lead` of the answer (1, channel, sample) is when geometry has the sound arrive.
+    """Computes one pose at a time. The output is (1, channel, sample); sample `lead` is when the direct sound arrives
+    by geometry.
 
-    What is expected at a pose is a sum of weights that all but cancel, so arithmetic is of double precision until
-    samples are made. Responses are kept in half precision, each at a peak of one, in bands: what rounding adds is 66 dB
+    The expected values at a pose are sums of weights that almost cancel, so they are computed in double precision.
+    Responses are stored in half precision, normalised to a peak of one and split into bands: rounding errors are 66 dB
     below each sample, and no band has to be filtered again.
     """
 
@@ -56,7 +57,7 @@ class ShapedNearestGraph(nn.Module):
         training = np.flatnonzero(pairs.training)
         responses = np.stack([pairs.response(int(pair)) for pair in training])
         peaks = np.abs(responses).max(axis=-1)  # pair, yaw, channel
-        described = [shaped.described(int(pair)) for pair in training]
+        described = [shaped.describe(int(pair)) for pair in training]
         constants = {
             "yaws": yaws,
             "emitters": pairs.emitter_positions[pairs.pair_emitter[training]],
@@ -90,12 +91,12 @@ class ShapedNearestGraph(nn.Module):
             for known, end in ((self._emitters, emitter), (self._listeners, listener))
         )
         near = torch.argmin(to_emitters**2 + to_listeners**2, dim=0, keepdim=True)
-        turn = torch.argmax(torch.cos((self._yaws - yaw).float()), dim=0, keepdim=True)
+        yaw_index = torch.argmax(torch.cos((self._yaws - yaw).float()), dim=0, keepdim=True)
 
         def of_near(constant: Tensor) -> Tensor:
-            return constant[near, turn][0]
+            return constant[near, yaw_index][0]
 
-        lateness_s, energy = self._expected(listener, emitter, turn)
+        lateness_s, energy = self._expected(listener, emitter, yaw_index)
         distance = torch.linalg.vector_norm(listener - emitter, dim=-1)
         near_delay_s, near_lateness_s = self._delays_s[near], of_near(self._lateness_s)
         change = energy + self._spreading(distance) - of_near(self._energies)
@@ -103,15 +104,15 @@ class ShapedNearestGraph(nn.Module):
         weights = self._stretches(near_delay_s + near_lateness_s)
         shaped = torch.sum(of_near(self._bands).float() * (gain @ weights), dim=-2)
         later = self._lead + (lateness_s - near_lateness_s - near_delay_s) * self._rate
-        return ((of_near(self._peaks)[:, None] * self._moved(shaped, later))[None],)
+        return ((of_near(self._peaks)[:, None] * self._delay(shaped, later))[None],)
 
-    def _expected(self, listener: Tensor, emitter: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
-        """(channel,) lateness and (channel, band, stretch) energy."""
+    def _expected(self, listener: Tensor, emitter: Tensor, yaw_index: Tensor) -> tuple[Tensor, Tensor]:
+        """Lateness (channel,) and energy (channel, band, stretch)."""
         covariance = self._covariance(listener, emitter)
         scalars = self._scalar_mean + (covariance[:-1, None] @ self._scalar_weights)[:, 0]
         shares = self._share_mean + covariance[-1] @ self._share_weights
-        of_yaw = scalars.reshape(-1, *self._shape[:2])[:, turn[0]]
-        shares = shares.reshape(self._shape)[turn][0]
+        of_yaw = scalars.reshape(-1, *self._shape[:2])[:, yaw_index[0]]
+        shares = shares.reshape(self._shape)[yaw_index][0]
         direct = of_yaw[1:2]
         of_stretch = torch.cat([direct, direct + of_yaw[2:]]).T
         return of_yaw[0], (shares - torch.logsumexp(shares, dim=-2, keepdim=True)) + of_stretch[:, None]
@@ -138,7 +139,7 @@ class ShapedNearestGraph(nn.Module):
         return covariance
 
     def _spreading(self, distance_m: Tensor) -> Tensor:
-        """(stretch,) of a distance (1,)."""
+        """(stretch,) change of the log energies at a distance (1,)."""
         direct = -2.0 * torch.log(torch.clamp(distance_m, min=NEAREST_M))
         return torch.cat([direct, torch.zeros(self._shape[-1] - 1, dtype=torch.float64)])
 
@@ -150,8 +151,9 @@ class ShapedNearestGraph(nn.Module):
         bounds = [torch.ones_like(after_s), *later, torch.zeros_like(after_s)]
         return torch.stack([bounds[index] - bounds[index + 1] for index in range(count)], dim=-2)
 
-    def _moved(self, responses: Tensor, later: Tensor) -> Tensor:
-        """(channel, sample) later by fractions of samples (channel,); at the open end the outermost sample goes on."""
+    def _delay(self, responses: Tensor, later: Tensor) -> Tensor:
+        """(channel, sample) delayed by fractional numbers of samples (channel,). At the open end, the outermost sample
+        is repeated."""
         channels, samples = responses.shape
         whole = torch.round(later)
         taps = torch.arange(-KERNEL_REACH, KERNEL_REACH + 1)
@@ -165,5 +167,5 @@ class ShapedNearestGraph(nn.Module):
 
 
 def _rise(x: Tensor) -> Tensor:
-    """Raised cosine from 0 to 1 over the unit interval."""
+    """A raised cosine from 0 to 1 over the unit interval."""
     return 0.5 - 0.5 * torch.cos(torch.pi * torch.clamp(x, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""`nafir-train evaluate`, `tabulate`, `maps` and `probe`: how well a field does, as tables and pictures."""
+"""`nafir-train evaluate`, `tabulate`, `maps` and `probe`: the accuracy of fields, as tables and pictures."""
 
 import json
 import os
@@ -21,7 +21,7 @@ def evaluate(
         ),
     ],
     methods: Annotated[
-        str, typer.Option(help="What to compare with, comma by comma; an empty string for nothing.")
+        str, typer.Option(help="Methods to compare with, separated by commas; an empty string for none.")
     ] = "nearest,linear,linear-aligned",
     pairs: Annotated[int | None, typer.Option(min=1, help="Held-out pairs to draw; all if not given.")] = None,
     yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
@@ -35,7 +35,7 @@ def evaluate(
         typer.Option(
             "--output",
             "-o",
-            help="Write the results as JSON, too, and until then what is measured, to go on with.",
+            help="Write the results as JSON, too; until then it stores what is measured, to go on with.",
             callback=writable_file,
         ),
     ] = None,
@@ -43,7 +43,7 @@ def evaluate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Errors on the held-out pairs, storage and time of fields, beside baselines and the repeatability floor."""
+    """Measure errors on held-out pairs, storage and time of fields, beside baselines and the repeatability floor."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # times are of one core
     from rich.progress import track
 
@@ -93,7 +93,7 @@ def tabulate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """One Markdown table of the default levels over scenes, and what every step took where its times lie beside."""
+    """Print one Markdown table of the default levels over scenes, and the times of all steps if they were recorded."""
     from dataclasses import asdict
 
     from training.evaluation.scenes import TIMES, SceneResult, markdown, step_times, times_markdown
@@ -122,7 +122,7 @@ def maps(
     emitters: Annotated[int, typer.Option(min=1, max=8, help="How many emitters to map.")] = 3,
     spacing_m: Annotated[float, typer.Option(min=0.05, help="Between the cells of a map.")] = 0.25,
 ) -> None:
-    """Draw loudness maps side by side: simulated anew, as the field has it, nearest and linear interpolation."""
+    """Draw loudness maps side by side: simulated, predicted by the field, nearest and linear interpolation."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from rich.progress import track
 

@@ -1,6 +1,6 @@
-"""`nafir-train import`: measured or simulated responses of others, in the layouts they are published in.
+"""`nafir-train import`: imports measured or simulated responses in published layouts.
 
-What reads them is imported where it is used: every command of `nafir-train` loads this module.
+Each command imports its reader when it runs, because every command of `nafir-train` loads this module.
 """
 
 import json
@@ -33,7 +33,7 @@ _MOST_LATENCY_SAMPLES = 1_000_000
 
 
 class Axis(StrEnum):
-    """Of the floor: which way is up, no ear tells."""
+    """A horizontal axis that can be mirrored. A vertical one would change nothing that ears could tell."""
 
     X = "x"
     Y = "y"
@@ -50,7 +50,7 @@ Latency = Annotated[
     typer.Option(
         min=-_MOST_LATENCY_SAMPLES,
         max=_MOST_LATENCY_SAMPLES,
-        help="Delay of the equipment to take off, samples at the source's rate.",
+        help="Delay of the equipment to remove, in samples at the source's rate.",
     ),
 ]
 Rate = Annotated[
@@ -190,7 +190,7 @@ def import_sofa(
         source,
         output,
         conditioning,
-        partial(read, receivers=receivers, asks_ears=not (swap_ears or accept_ears or mirror)),
+        partial(read, receivers=receivers, checks_ears=not (swap_ears or accept_ears or mirror)),
         held_out=held_out,
         seed=seed,
         as_json=as_json,
@@ -224,7 +224,7 @@ def _import(
     seed: int,
     as_json: bool,
 ) -> None:
-    from training.data.importers.conditioning import SourceError, conditioned, within_limits
+    from training.data.importers.conditioning import SourceError, condition, within_limits
     from training.data.importers.report import ImportReport
     from training.data.responses import ImportedDataset
 
@@ -236,9 +236,9 @@ def _import(
         return track(items, f"importing {layout}", console=console)
 
     report = ImportReport()
-    # Closed at once where it ends early: its progress would be drawn behind the message.
+    # Closed at once if the import fails: otherwise the progress bar would be drawn after the message.
     with closing(read(source, report, track=tracked)) as named:
-        measurements = conditioned(named, conditioning, report, source=source)
+        measurements = condition(named, conditioning, report, source=source)
         dataset = ImportedDataset.write(
             output,
             within_limits(measurements, source),
@@ -250,7 +250,7 @@ def _import(
         )
     pairs, of_pairs = len(set(dataset.pair)), len(set(dataset.pair[dataset.held_out]))
     if as_json:
-        told = {
+        summary = {
             "folder": str(output),
             "layout": layout,
             "responses": len(dataset.yaw),
@@ -261,7 +261,7 @@ def _import(
             "channels": dataset.channels,
             "report": report.to_json(),
         }
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(summary, indent=2))
         return
     Console(width=None if console.is_terminal else 140).print(report.table())
     typer.echo(

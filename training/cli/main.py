@@ -39,7 +39,7 @@ def _progress() -> Progress:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    # Of the processes that torchrun starts the first speaks for all.
+    # Of the processes that torchrun starts, only the first shows progress.
     return Progress(*columns, console=Console(stderr=True), disable=os.environ.get("RANK", "0") != "0")
 
 
@@ -64,7 +64,7 @@ def simulate(
         dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, simulation=ready)
     from training.data.responses import SimulatedResponses
 
-    _tell_of(SimulatedResponses(dataset))
+    _print_findings(SimulatedResponses(dataset))
     trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
     typer.echo(f"{output}: {trained} pairs to train on and {held_out} held out, {len(dataset.yaws)} orientations each")
 
@@ -80,7 +80,7 @@ def train(
         int | None, typer.Option(min=16, max=256, help="Size of a factorised field's basis; 128 if not given.")
     ] = None,
     width: Annotated[
-        int | None, typer.Option(min=32, max=4096, help="Of a factorised field's network; 256 if not given.")
+        int | None, typer.Option(min=32, max=4096, help="Width of a factorised field's network; 256 if not given.")
     ] = None,
     seed: Seed = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the training set.")] = None,
@@ -90,19 +90,20 @@ def train(
     ] = None,
     share: Annotated[float, typer.Option(min=0.001, max=1, help="Share of the training pairs to use.")] = 1.0,
     patience: Annotated[
-        int | None, typer.Option(min=1, help="Stop after so many rounds (epochs, or twentieths of the time) in vain.")
+        int | None,
+        typer.Option(min=1, help="Stop after so many rounds (epochs, or twentieths of the time) without progress."),
     ] = None,
     learning_rate: Annotated[float | None, typer.Option(min=1e-7, help="The field's own if not given.")] = None,
     points: Annotated[
-        int | None, typer.Option(min=1, help="Points of a response a naf sees per step; 2000 if not given.")
+        int | None,
+        typer.Option(min=1, help="Points of each response that a naf trains on per step; 2000 if not given."),
     ] = None,
     teacher: Annotated[
         Path | None, typer.Option(help="Run folder of a naf on the same data, for a factorised field to learn from.")
     ] = None,
 ) -> None:
     """Train a field on a dataset. Run again after an interruption to go on; with torchrun, in several processes."""
-    # Targets are made of many small products, for which threads of linear algebra wait for each other; those of torch
-    # are its own.
+    # Targets need many small matrix products, where threads of OpenBLAS wait for each other. Torch has its own threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from training.data.responses import open_responses
     from training.learning.runs import configure, minutes_of
@@ -125,7 +126,7 @@ def train(
     )
     responses = open_responses(data)
     if os.environ.get("RANK", "0") == "0":
-        _tell_of(responses)
+        _print_findings(responses)
     with _progress() as progress:
         train_field(responses, output, configuration, progress)
     typer.echo(f"{output}: {configuration.name} is trained")
@@ -141,18 +142,18 @@ def ablate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Train the factorised field once per lever and compare errors on the held-out pairs. Run again to go on."""
+    """Train the factorised field once per factor and compare errors on the held-out pairs. Run again to go on."""
     from dataclasses import asdict
 
     from training.data.responses import open_responses
-    from training.evaluation.ablation import ablate as ablate_levers
+    from training.evaluation.ablation import ablate as ablate_factors
     from training.evaluation.ablation import table, variants
     from training.learning.runs import configure
 
     responses = open_responses(data)
     configurations = variants(configure("factorised", rank=rank, epochs=epochs, seed=seed), responses, teacher)
     with _progress() as progress:
-        rows = ablate_levers(responses, output, configurations, progress)
+        rows = ablate_factors(responses, output, configurations, progress)
     if as_json:
         typer.echo(json.dumps([asdict(row) for row in rows], indent=2))
         return
@@ -171,7 +172,7 @@ def export(
     ],
     output: Folder,
     data: Annotated[Path | None, typer.Option(help="Dataset folder, if it has moved since training.")] = None,
-    precision: Annotated[str, typer.Option(help="float32 or int8, or both, comma by comma.")] = "float32",
+    precision: Annotated[str, typer.Option(help="float32 or int8, or both, separated by a comma.")] = "float32",
     ranks: Annotated[str, typer.Option(help="Lower ranks, 64,32 say, to write factorised fields at too.")] = "",
     exact_tables: Annotated[
         bool, typer.Option("--exact-tables", help="Add every naf once more, with less arithmetic for the same numbers.")
@@ -185,7 +186,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write finished runs as the fields of a scene bundle, after checking every graph against torch, and its health."""
+    """Write finished runs as the fields of a scene bundle. Every graph is checked against torch, and by nafir check."""
     from training.bundling.export import PRECISIONS
     from training.bundling.export import export as export_bundle
     from training.data.responses import FILE, open_responses
@@ -230,7 +231,7 @@ def _rank(text: str) -> int:
 
 
 def _accepted(entries: Sequence[str]) -> dict[str, str]:
-    """Reasons by law. Raises NafirError for a law that is named twice."""
+    """Reasons by law. Raises NafirError if a law is named twice."""
     accepted: dict[str, str] = {}
     for law, reason in map(_law_and_reason, entries):
         if law in accepted:
@@ -246,8 +247,8 @@ def _law_and_reason(entry: str) -> tuple[str, str]:
     return law.strip(), reason.strip()
 
 
-def _tell_of(responses: "ResponseSet") -> None:
-    """What a dataset is like, before anybody trains on it."""
+def _print_findings(responses: "ResponseSet") -> None:
+    """Prints what training may want to know about a dataset."""
     from training.bundling.data_reference import health_of
     from training.data.responses import SimulatedResponses
 
@@ -306,14 +307,14 @@ def frontier(
 
 
 def main() -> None:
-    """Entry point of the console script: Nafir's own errors, and those of files, become one line and exit code 2."""
+    """Entry point of the console script. Nafir's own errors, and those of files, become one line and exit code 2."""
     try:
         app()
     except NafirError as exc:
         typer.echo(f"nafir-train: {exc}", err=True)
         raise SystemExit(2) from exc
     except OSError as exc:
-        # Folders that cannot be written, full disks; HDF5 words these itself and has no `strerror`.
+        # Folders that cannot be written, full disks. HDF5 writes its own messages and sets no `strerror`.
         place = "" if exc.filename is None else f"{exc.filename}: "
         typer.echo(f"nafir-train: {place}{exc.strerror or exc}", err=True)
         raise SystemExit(2) from exc

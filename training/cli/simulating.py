@@ -1,4 +1,4 @@
-"""`nafir-train simulate` and `nafir-train plan`: what a scene's simulation calls for, and that simulation."""
+"""`nafir-train plan` and `nafir-train simulate`: the plan of a scene's simulation, and the simulation."""
 
 import json
 import os
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from training.simulation.check import PlanCheck
     from training.simulation.pairs import PairSimulation
 
-# A caption is wrapped to its table.
+# Captions are wrapped to the width of their table.
 _CHECK_WIDTH = 100
 _TAIL_RAYS_TRIED = 2_000
 
@@ -35,35 +35,35 @@ Effects = Annotated[
 
 
 def wide_console(*, stderr: bool = False) -> Console:
-    """As wide as the table where nobody's terminal is narrower."""
+    """A console that is as wide as the plan's table where the output is not a terminal."""
     return Console(stderr=stderr, width=None if Console(stderr=stderr).is_terminal else 150)
 
 
 def simulation_of(scene: Path, seed: int, effects: str) -> "PairSimulation":
-    """Ready, by a plan that says what it will cost on this host."""
+    """A prepared simulation, with a plan that predicts its cost on this host."""
     from training.simulation.cost import is_brief, with_costs
     from training.simulation.run import prepared
 
-    read, decided = _decided(scene, seed, effects)
+    read, decided = _plan_by_size(scene, seed, effects)
     simulation = prepared(read, seed=seed, plan=decided)
     return replace(simulation, plan=with_costs(simulation)) if is_brief(read) else simulation
 
 
-def _decided(scene: Path, seed: int, effects: str) -> "tuple[SceneFile, SimulationPlan]":
-    """What a scene calls for, at costs that nobody measured."""
+def _plan_by_size(scene: Path, seed: int, effects: str) -> "tuple[SceneFile, SimulationPlan]":
+    """The scene and its plan, with a cost that follows from the scene file's numbers alone."""
     from training.data.scene_file import SceneFile
     from training.data.simulation_plan import overrides_among
     from training.simulation.planner import planner_of
     from training.simulation.size import SimulationSize
 
-    named = _named(effects)
+    named = _parse_effects(effects)
     read = SceneFile.read(scene)
     planner = planner_of(read, seed)
     decided = planner.everything if effects == "all" else planner.plan(overrides_among({**read.effects, **named}))
     return read, replace(decided, cost_s=60 * SimulationSize(read).core_minutes)
 
 
-def _named(effects: str) -> dict[str, bool]:
+def _parse_effects(effects: str) -> dict[str, bool]:
     from training.data.simulation_plan import SimulatedEffect
 
     if effects == "plan":
@@ -90,12 +90,12 @@ def plan(
     seed: Seed = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
-    """What simulating a scene calls for, why, and what it will take."""
+    """Show what simulating a scene calls for, why, and how long it will take."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from training.simulation.cost import is_brief, with_costs
     from training.simulation.run import prepared
 
-    read, planned = _decided(scene, seed, effects)
+    read, planned = _plan_by_size(scene, seed, effects)
     if is_brief(read):
         planned = with_costs(prepared(read, seed=seed, plan=planned, most_tail_rays=_TAIL_RAYS_TRIED))
     checked = None if check is None else _check(scene, planned, check, seed)
@@ -143,7 +143,7 @@ def _check_table(checked: "PlanCheck") -> Table:
 
 
 def print_plan(console: Console, scene: "SceneFile", plan: "SimulationPlan") -> None:
-    """The table, how much it comes to, and what the scene file will not get."""
+    """Prints the plan as a table, the size of the simulation, and notes on the scene file."""
     from training.simulation.size import SimulationSize
 
     console.print(plan_table(plan))

@@ -1,7 +1,7 @@
-"""Runs a command and writes down what it took: `python -m training.cli.stopwatch LOG STEP COMMAND ...`.
+"""Runs a command and records its time: `python -m training.cli.stopwatch LOG STEP COMMAND ...`.
 
-A line of JSON per run is added to the log: `step`, `wall_s`, `cpu_s` of the command and the processes it waited for,
-and its exit code `rc`. An interrupted command has its line too, so the times of all its pieces add up.
+Each run adds a line of JSON to the log: `step`, `wall_s`, `cpu_s` of the command and the processes it waited for, and
+the exit code `rc`. An interrupted command adds its line, too, so the times of all parts of a step can be added.
 """
 
 import json
@@ -15,9 +15,9 @@ from pathlib import Path
 
 
 def timed(log: Path, step: str, command: Sequence[str]) -> int:
-    """Exit code of the command, 128 and more for one that a signal ended."""
+    """The exit code of the command: 128 plus the number of the signal if a signal ended it."""
     started_s = time.monotonic()
-    # An interrupt from the keyboard reaches the command as well; what it does then is waited for.
+    # An interrupt from the keyboard reaches the command too. This process waits until the command has ended.
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         code = subprocess.run(command, check=False, preexec_fn=_interruptible).returncode

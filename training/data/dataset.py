@@ -1,18 +1,19 @@
-"""The dataset folder: `scene.toml`, and in `pairs.h5` the reflected sound of all pairs of probes, which is what follows
-the direct sound and the first reflections. Those are not stored: `training.simulation.references` computes them from
-the scene whenever they are needed.
+"""The dataset folder: `scene.toml`, and in `pairs.h5` the late reverberation between all pairs of probes. The direct
+sound and the first reflections are not stored: `training.simulation.references` computes them from the scene when they
+are needed.
 
 Axes: emitter, listener, yaw, ear, sample. The pair of a probe with itself is absent (zeros). Samples are float16:
-eleven bits beneath the level of each sample, 66 dB under the signal at every point of its decay down to 6e-5. Smaller
-ones are subnormal, in steps of 6e-8: there the bits run out one by one.
+eleven bits at the level of each sample, 66 dB of signal-to-noise ratio at every point of the decay down to 6e-5.
+Smaller samples are subnormal, in steps of 6e-8, and lose precision as they become smaller.
 
-Beside each response lies the energy that its diffuse part was drawn from, the same for all yaws: natural logarithms,
-axes direction, band, bin. They are good to 0.03 dB. `training.simulation.expected` makes spectrograms of them.
+The file also stores, for each response, the energies that its diffuse part was drawn from, the same for all yaws:
+natural logarithms, axes direction, band, bin, exact to 0.03 dB. `training.simulation.expected` makes spectrograms of
+them.
 
-Where the plan has one tail for all, that is stored once, and of each pair what comes before it and where in the tail's
-noise its own begins. What is read is whole.
+If the simulation plan has one tail for all pairs, the tail is stored once. Each pair then stores only what comes before
+the tail, and the sample of the tail's noise that its response begins with. Reading gives whole responses.
 
-The file also keeps the plan that it was simulated by; one from before there were plans has everything in it.
+The file keeps the plan that it was simulated by. A file that is older than plans was simulated with every effect on.
 """
 
 import json
@@ -39,16 +40,16 @@ FORMAT = 4
 _READABLE = (3, FORMAT)
 """In format 3 every pair has a tail of its own."""
 GEOMETRIC_ORDER: Literal[1] = 1
-"""Mirrored reflections of up to so many surfaces are left to geometry, as the direct sound is."""
+"""Reflections of up to this order are computed from geometry, as the direct sound is, and not stored."""
 TAKES = ("reflected", "repeats")
-"""The second is for the repeatability of the first."""
-# A wave's filters ring for less.
+"""The second take is a second simulation of the held-out pairs, which tells how repeatable the first is."""
+# Filters of a single arrival ring for less than this.
 _FILTER_S = 0.020
 
 
 def own_duration_s(scene: SceneFile, plan: SimulationPlan) -> float:
-    """How much of a response is the receiver's own: all of it, or, in whole bins, what comes until a shared tail has
-    set in and all images been heard."""
+    """The length of what each pair stores: the whole response, or, where pairs share a tail, the part until the tail
+    has set in and all image sources have been heard, in whole histogram bins."""
     if plan.tail_start_s is None:
         return scene.simulation.duration_s
     sides_m = *np.ptp(scene.geometry.corners, axis=0), scene.geometry.height_m
@@ -58,7 +59,8 @@ def own_duration_s(scene: SceneFile, plan: SimulationPlan) -> float:
 
 
 class OwnResponse(NamedTuple):
-    """`samples` (yaw, ear, sample) of `own_duration_s`, and the sample of a shared tail's noise that it begins with."""
+    """The samples (yaw, ear, sample) of one pair, `own_duration_s` long, and the sample of the shared tail's noise that
+    its tail begins with."""
 
     samples: npt.NDArray[np.float16]
     tail_begin: int
@@ -66,7 +68,7 @@ class OwnResponse(NamedTuple):
 
 @dataclass(frozen=True)
 class Dataset:
-    """Read side of a dataset folder; `create` lays out a new one for the simulation to fill."""
+    """A dataset folder that is open for reading. `create` makes a new one, which the simulation fills."""
 
     folder: Path
     scene: SceneFile
@@ -79,9 +81,9 @@ class Dataset:
 
     @classmethod
     def create(cls, folder: Path, scene_path: Path, seed: int, effects: SimulationPlan) -> "Dataset":
-        """Opens the folder if it holds the same scene, seed and plan (to resume), else makes it.
+        """Makes the folder, or opens it to resume if it holds the same scene, seed and plan.
 
-        Raises DatasetError if it holds another.
+        Raises DatasetError if the folder holds another scene, seed or plan.
         """
         scene = SceneFile.read(scene_path)
         if (folder / "pairs.h5").exists():
@@ -89,10 +91,10 @@ class Dataset:
             if existing.scene != scene or existing.seed != seed:
                 raise DatasetError(f"{folder}: holds another scene or seed; choose an empty folder")
             if existing.remaining() and existing.effects.settings != effects.settings:
-                raise DatasetError(f"{folder}: was begun by another plan of effects; choose an empty folder")
-            if existing.remaining() and not existing.keeps_energies:
-                raise DatasetError(f"{folder}: was begun when no energies were kept; choose an empty folder")
-            if existing.remaining() and not existing.keeps_tails_apart:
+                raise DatasetError(f"{folder}: was begun with another plan of effects; choose an empty folder")
+            if existing.remaining() and not existing.stores_energies:
+                raise DatasetError(f"{folder}: was begun without energies; choose an empty folder")
+            if existing.remaining() and not existing.stores_tail_once:
                 raise DatasetError(f"{folder}: was begun in format {_READABLE[0]}; choose an empty folder")
             return existing
         probes = scene.probe_positions(seed)
@@ -103,7 +105,7 @@ class Dataset:
         own_s = own_duration_s(scene, effects)
         samples = round(own_s * scene.simulation.sample_rate)
         shape = (len(probes), len(probes), len(yaws), 2, samples)
-        # Under its own name only when whole: an interrupted start must not look like a damaged dataset.
+        # The file gets its final name when it is whole: an interrupted start must not look like a damaged dataset.
         partial = folder / "pairs.partial"
         with h5py.File(partial, "w") as file:
             file.attrs.update(format=FORMAT, seed=seed, sample_rate=scene.simulation.sample_rate)
@@ -121,8 +123,8 @@ class Dataset:
 
     @classmethod
     def open(cls, folder: Path, *, finished: bool = True) -> "Dataset":
-        """Raises DatasetError if the folder is no dataset or, with `finished`, if its simulation was cut short or its
-        arrays hold what cannot be (`training.data.dataset_check`)."""
+        """Raises DatasetError if the folder is not a dataset or, with `finished`, if its simulation is not finished or
+        its arrays hold impossible values (`training.data.dataset_check`)."""
         if (folder / "responses.h5").is_file():
             raise DatasetError(f"{folder}: holds measured responses; this takes a simulated scene")
         try:
@@ -142,17 +144,17 @@ class Dataset:
                     file["probes"][()],
                     file["yaws"][()],
                     file["held_out"][()],
-                    _recorded(file.attrs.get("effects"), scene),
+                    _plan_from(file.attrs.get("effects"), scene),
                 )
         except (OSError, KeyError, TypeError, ValueError) as exc:
             raise DatasetError(f"{folder}: not a dataset folder: {exc}") from exc
         if finished and not done.all():
             raise DatasetError(f"{folder}: {np.sum(~done)} emitters are not simulated yet; run simulate again")
         if finished:
-            dataset._require_sound()
+            dataset._require_valid_arrays()
         return dataset
 
-    def _require_sound(self) -> None:
+    def _require_valid_arrays(self) -> None:
         path = self.folder / "pairs.h5"
         for name, values, shape in (
             ("probes", self.probes, (len(self.probes), 3)),
@@ -184,26 +186,26 @@ class Dataset:
 
     @cached_property
     def onset_s(self) -> npt.NDArray[np.float64]:
-        """(emitter, listener) time at which sound can first arrive, round corners where it must."""
+        """(emitter, listener) seconds until the first sound can arrive, along the shortest path around corners."""
         return self.plan.path_length_m(self.probes[:, None], self.probes[None]) / SPEED_OF_SOUND
 
     @property
-    def keeps_energies(self) -> bool:
+    def stores_energies(self) -> bool:
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             return "log_energy" in file
 
     @property
-    def keeps_tails_apart(self) -> bool:
+    def stores_tail_once(self) -> bool:
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             return bool(file.attrs["format"] == FORMAT)
 
     def remaining(self) -> list[int]:
-        """Emitters not simulated yet."""
+        """Numbers of the emitters that are not simulated yet."""
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             return [int(i) for i in np.flatnonzero(~file["done"][()])]
 
     def write_tail(self, tail: SharedTail) -> None:
-        """Stores what all pairs share, before any of them; once."""
+        """Stores the shared tail once, before any pair."""
         with h5py.File(self.folder / "pairs.h5", "r+") as file:
             if "tail" in file:
                 return
@@ -220,13 +222,13 @@ class Dataset:
         takes: Sequence[Mapping[int, OwnResponse]],
         log_energy: npt.NDArray[np.float16],
     ) -> None:
-        """Stores one emitter's responses by take and listener, of the second take those held out, and the (listener,
-        direction, band, bin) logarithms of energy of the first."""
+        """Stores the responses of one emitter: for each take, responses by listener (the second take has the held-out
+        listeners only), and the log energies (listener, direction, band, bin) of the first take."""
         with h5py.File(self.folder / "pairs.h5", "r+") as file:
             for number, (name, responses) in enumerate(zip(TAKES, takes, strict=True)):
                 pairs, begins = file[name], file["tail_begin"][number, emitter]
                 for listener, (samples, begins[listener]) in responses.items():
-                    # A chunk is a response, as it is: HDF5 has no need to copy it first.
+                    # A chunk is exactly one response, so HDF5 need not copy it first.
                     chunk = np.ascontiguousarray(samples, pairs.dtype)
                     pairs.id.write_direct_chunk((emitter, listener, 0, 0, 0), chunk)
                 file["tail_begin"][number, emitter] = begins
@@ -235,13 +237,13 @@ class Dataset:
             file["done"][emitter] = True
 
     def pairs(self, *, held_out: bool) -> npt.NDArray[np.int64]:
-        """(pair, 2) emitter and listener of the held-out pairs or of all others."""
+        """(pair, 2) emitter and listener of each held-out pair or, without `held_out`, of each training pair."""
         chosen = self.held_out if held_out else ~self.held_out & ~np.eye(len(self.probes), dtype=bool)
         return np.argwhere(chosen)
 
     @cached_property
     def tail(self) -> SharedTail | None:
-        """What all pairs share."""
+        """The tail that all pairs share, or None if each pair has its own."""
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             if "tail" not in file:
                 return None
@@ -249,18 +251,18 @@ class Dataset:
         return SharedTail(**{**stored, "start_s": float(stored["start_s"]), "first": int(stored["first"])})
 
     def read(self, pairs: npt.NDArray[np.int64], take: str = "reflected") -> npt.NDArray[np.float32]:
-        """(pair, yaw, ear, sample) reflected sound of one of the TAKES."""
+        """(pair, yaw, ear, sample) late reverberation of one of the TAKES."""
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             responses = StoredResponses(self, file, take)
             return np.stack([responses[emitter, listener] for emitter, listener in pairs])
 
     def read_energy(self, pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
-        """(pair, direction, band, bin) energy that the diffuse part of `reflected` was drawn from.
+        """(pair, direction, band, bin) energies that the diffuse part of the take `reflected` was drawn from.
 
-        Raises DatasetError for a dataset that was simulated before energies were kept.
+        Raises DatasetError for a dataset that was simulated without storing energies.
         """
-        if not self.keeps_energies:
-            raise DatasetError(f"{self.folder}: holds no energies; simulate into an empty folder")
+        if not self.stores_energies:
+            raise DatasetError(f"{self.folder}: has no energies; simulate into an empty folder")
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             logarithms = np.stack([file["log_energy"][emitter, listener] for emitter, listener in pairs])
         energies = np.exp(logarithms.astype(np.float32))
@@ -268,7 +270,7 @@ class Dataset:
 
 
 class StoredResponses:
-    """The reflected sound in an open dataset's `file`, of one of the TAKES, by emitter and listener."""
+    """Reads the late reverberation of one of the TAKES from an open dataset `file`, by emitter and listener."""
 
     def __init__(self, dataset: Dataset, file: h5py.File, take: str = "reflected") -> None:
         self._own: h5py.Dataset = file[take]
@@ -284,15 +286,15 @@ class StoredResponses:
         return self._tail.extend(self._take, own, int(self._begins[ends]))
 
 
-def _recorded(effects: str | None, scene: SceneFile) -> SimulationPlan:
+def _plan_from(effects: str | None, scene: SceneFile) -> SimulationPlan:
     if effects is None:
         return SimulationPlan.everything(scene.simulation.image_order, scene.simulation.rays, diffraction=False)
     return SimulationPlan.from_json(json.loads(effects))
 
 
 def _choose_held_out(probes: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
-    """(emitter, listener); both directions of a chosen couple, or its training twin would give the answer away by
-    reciprocity."""
+    """(emitter, listener) True for a random share of the couples of probes. Both directions of a couple are held out,
+    because by reciprocity the one would reveal the other."""
     first, second = np.triu_indices(probes, 1)
     chosen = rng.choice(len(first), max(1, round(share * len(first))), replace=False)
     held_out = np.zeros((probes, probes), dtype=bool)

@@ -1,7 +1,8 @@
-"""Every array of a dataset is looked at before anything is learned from it: one sample that is no number spoils all
-that it meets, hours later, and nobody can tell then where it came from.
+"""Checks every array of a dataset before training uses it. One sample that is not finite would spoil everything that is
+computed from it, hours later, when its origin can no longer be found.
 
-Arrays are read a pair at a time, half precision as the integers that its bits are: 1.8 GB a second from memory.
+Arrays are read one pair at a time; half-precision values are checked as the integers that their bits are, which reads
+1.8 GB/s from memory.
 """
 
 from collections.abc import Iterator
@@ -14,18 +15,18 @@ import numpy.typing as npt
 
 from server.core.errors import NafirError
 
-_LOUDEST_LOG_ENERGY = 80.0  # e to the 88 is more than single precision holds
+_LOUDEST_LOG_ENERGY = 80.0  # exp(88) overflows single precision
 
 
 class DatasetError(NafirError):
-    """A dataset folder that is missing, unfinished or of another format, or that holds what cannot be."""
+    """A dataset folder is missing, unfinished or of another format, or holds impossible values."""
 
 
 def require_finite_pairs(
     path: Path, file: h5py.File, *, probes: int, yaws: int, samples: int, takes: tuple[str, ...]
 ) -> None:
-    """Raises DatasetError that names the array and the pair for shapes that do not fit each other, responses and
-    energies that are not finite, and energies that no sound has."""
+    """Raises DatasetError, naming array and pair, for shapes that do not fit each other, responses or energies that are
+    not finite, and energies that are too large for sound."""
     for name in takes:
         _require_shape(path, file[name], (probes, probes, yaws, 2, samples))
         for emitter, listener, response in _pairs(file[name]):
@@ -36,7 +37,7 @@ def require_finite_pairs(
         if len(shape) != 5 or shape[:2] != (probes, probes):
             raise DatasetError(f"{path}: log_energy: has shape {shape}, expected {(probes, probes)} and three more")
         for emitter, listener, logarithms in _pairs(file["log_energy"]):
-            # -inf is the logarithm of no energy.
+            # Energy 0 has the logarithm -inf.
             if not np.all(logarithms <= _LOUDEST_LOG_ENERGY):
                 _refuse(path, "log_energy", emitter, listener, "has energies that are not finite, or not of sound")
     if "tail" in file:
@@ -44,7 +45,7 @@ def require_finite_pairs(
 
 
 def _pairs(array: h5py.Dataset) -> Iterator[tuple[int, int, npt.NDArray[Any]]]:
-    """Emitter, listener, and what is stored of them; nothing where nothing was written."""
+    """Yields emitter, listener and stored values of each pair of different probes."""
     for emitter in range(array.shape[0]):
         for listener in range(array.shape[1]):
             if emitter != listener:
@@ -66,9 +67,9 @@ def _require_tail(path: Path, file: h5py.File, probes: int, takes: tuple[str, ..
     length = tail["noise"].shape[-1]
     _require_shape(path, file["tail_begin"], (len(takes), probes, probes))
     begins = file["tail_begin"][()]
-    is_astray = (begins < 0) | (begins >= length)
-    if is_astray.any():
-        _, emitter, listener = (int(index) for index in np.argwhere(is_astray)[0])
+    is_outside = (begins < 0) | (begins >= length)
+    if is_outside.any():
+        _, emitter, listener = (int(index) for index in np.argwhere(is_outside)[0])
         _refuse(path, "tail_begin", emitter, listener, f"begins outside the {length} samples of the tail's noise")
 
 

@@ -1,7 +1,8 @@
-"""Impulse responses with their poses, wherever they come from: one interface to simulated and to measured ones.
+"""Impulse responses with their poses: one interface to simulated and measured ones.
 
-A row is one response: metres, radians, yaw counter-clockwise with 0 along +x. `ImportedDataset` is the folder that
-importers write; its `responses.h5` has a row per measured response, float32 and whole, the direct sound included.
+A row is one response with its pose in metres and radians; yaw is counter-clockwise, 0 along +x. `ImportedDataset` is
+the folder that importers write. Its `responses.h5` has one row per measured response: float32, whole, with the direct
+sound.
 """
 
 import json
@@ -24,8 +25,7 @@ from training.data.importers.report import ImportReport
 FORMAT = 1
 FILE = "responses.h5"
 SAME_POINT_M = 1e-3
-_AT_ONCE = 2**22
-"""Samples that are looked at."""
+_SAMPLES_PER_READ = 2**22
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int64]
@@ -35,7 +35,7 @@ _Responses = npt.NDArray[np.float32]
 
 
 class ResponsesError(NafirError):
-    """A folder of measured responses that is missing, damaged or of another format; names file and field."""
+    """A folder of measured responses is missing, damaged or of another format. The message names file and field."""
 
     def __init__(self, path: Path, field: str, problem: str) -> None:
         super().__init__(f"{path}: {field}: {problem}")
@@ -45,7 +45,7 @@ class ResponsesError(NafirError):
 
 
 class ResponseSet(Protocol):
-    """Impulse responses with their poses, one row each."""
+    """Impulse responses with their poses, one response per row."""
 
     @property
     def sample_rate(self) -> int: ...
@@ -53,42 +53,42 @@ class ResponseSet(Protocol):
     def samples(self) -> int: ...
     @property
     def channels(self) -> int:
-        """2 where the listener has ears (channel 0 = left), else 1."""
+        """2 for responses at two ears (channel 0 is left), 1 for a microphone."""
         ...
 
     @property
     def listener(self) -> _Floats:
-        """(row, 3)"""
+        """(row, 3) metres."""
         ...
 
     @property
     def emitter(self) -> _Floats:
-        """(row, 3)"""
+        """(row, 3) metres."""
         ...
 
     @property
     def yaw(self) -> _Floats:
-        """(row,)"""
+        """(row,) radians."""
         ...
 
     @property
     def pair(self) -> _Integers:
-        """(row,) counted from 0; rows of one pair differ in yaw only."""
+        """(row,) number of the pair, from 0; rows of one pair differ only in yaw."""
         ...
 
     @property
     def held_out(self) -> _Booleans:
-        """(row,) never trained on; the same for all yaws and both directions of a pair."""
+        """(row,) True for rows that training never sees: all yaws and both directions of a pair."""
         ...
 
     @property
     def onset_s(self) -> _Floats:
-        """(row,) when sound can first arrive, by geometry."""
+        """(row,) seconds until the first sound can arrive, from geometry."""
         ...
 
     @property
     def file(self) -> Path:
-        """The one they are kept in."""
+        """The HDF5 file that holds the responses."""
         ...
 
     def read(self, rows: npt.ArrayLike) -> _Responses:
@@ -97,7 +97,7 @@ class ResponseSet(Protocol):
 
 
 class SimulatedResponses:
-    """A simulated dataset as rows: pairs in order of emitter, then listener, all yaws of each. Reflected sound only."""
+    """The rows of a simulated dataset, ordered by emitter, listener and yaw. They hold late reverberation only."""
 
     channels = 2
 
@@ -126,7 +126,7 @@ class SimulatedResponses:
         return self.dataset.folder / "pairs.h5"
 
     def ends(self, row: int) -> tuple[int, int]:
-        """Emitter and listener of a row, numbers of probes."""
+        """Probe numbers of the emitter and the listener of a row."""
         emitter, listener = self._pairs[self.pair[row]]
         return int(emitter), int(listener)
 
@@ -134,12 +134,12 @@ class SimulatedResponses:
         rows = np.asarray(rows, dtype=np.int64)
         pairs, which = np.unique(self.pair[rows], return_inverse=True)
         of_pairs = self.dataset.read(self._pairs[pairs])
-        return _finite(of_pairs[which, rows % len(self.dataset.yaws)], self.file)
+        return _require_finite_samples(of_pairs[which, rows % len(self.dataset.yaws)], self.file)
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One response `(channel, sample)` as an importer hands it over."""
+    """One response `(channel, sample)` with its pose, as an importer yields it."""
 
     listener: tuple[float, float, float]
     emitter: tuple[float, float, float]
@@ -150,13 +150,13 @@ class Measurement:
 
 @dataclass(frozen=True)
 class ImportedDataset:
-    """Read side of a folder of measured responses; `write` makes one."""
+    """A folder of measured responses that is open for reading. `write` makes one."""
 
     folder: Path
     layout: str
     """The importer's name."""
     source: str
-    """Where the responses were read from, as it was named then."""
+    """The path that the responses were imported from."""
     sample_rate: int
     samples: int
     channels: int
@@ -173,7 +173,8 @@ class ImportedDataset:
 
     @cached_property
     def onset_s(self) -> _Floats:
-        """Along the straight line: nothing is known of walls, so a pair out of sight hears its first sound later."""
+        """(row,) seconds along the straight line. The walls are unknown, so a pair that is out of sight hears its first
+        sound later."""
         return np.asarray(np.linalg.norm(self.emitter - self.listener, axis=-1) / SPEED_OF_SOUND)
 
     @property
@@ -182,9 +183,9 @@ class ImportedDataset:
 
     def read(self, rows: npt.ArrayLike) -> _Responses:
         rows = np.asarray(rows, dtype=np.int64)
-        ascending, which = np.unique(rows, return_inverse=True)  # as HDF5 wants them
+        ascending, which = np.unique(rows, return_inverse=True)  # HDF5 reads rows in ascending order
         with h5py.File(self.folder / FILE, "r") as file:
-            return _finite(np.asarray(file["responses"][ascending], dtype=np.float32), self.file)[which]
+            return _require_finite_samples(np.asarray(file["responses"][ascending], dtype=np.float32), self.file)[which]
 
     @classmethod
     def open(cls, folder: Path) -> "ImportedDataset":
@@ -244,11 +245,12 @@ class ImportedDataset:
         held_out_share: float = 0.1,
         seed: int = 0,
     ) -> "ImportedDataset":
-        """Takes measurements one by one, of any lengths (shorter ones end in zeros), and counts them in the report,
-        which the iteration may still extend. The folder appears whole or not at all; an earlier import is replaced.
+        """Writes the measurements to a folder and counts them in the report, which the iteration may still extend.
+        Measurements may differ in length; shorter ones are padded with zeros. The folder appears only when it is
+        complete, and an earlier import in it is replaced.
 
-        Raises ResponsesError for measurements that differ in rate or channels, for one that is empty or not finite, or
-        none at all, and DatasetError if the folder holds a simulated dataset.
+        Raises ResponsesError if there are no measurements, if they differ in sample rate or channels, or if one is
+        empty or not finite, and DatasetError if the folder holds a simulated dataset.
         """
         if (folder / "pairs.h5").exists():
             raise DatasetError(f"{folder}: holds a simulated dataset; choose another folder")
@@ -283,7 +285,8 @@ def _write_rows(
     source: str,
     held_out: tuple[float, int],
 ) -> None:
-    """A file of `first` and those that remain. `held_out` is the share, and the seed it is drawn by."""
+    """Writes the measurements to the file `path`. `held_out` is the share of couples that are held out, and the seed
+    that chooses them."""
     listener, emitter, yaw = [], [], []
     with h5py.File(path, "w") as file:
         channels, samples = first.response.shape
@@ -321,9 +324,9 @@ def _write_rows(
 
 
 def open_responses(folder: Path) -> SimulatedResponses | ImportedDataset:
-    """Whichever kind of dataset the folder holds.
+    """Opens a simulated dataset or a folder of imported responses.
 
-    Raises DatasetError or ResponsesError if it holds neither, or a damaged one.
+    Raises DatasetError or ResponsesError if the folder holds neither, or a damaged one.
     """
     if (folder / "pairs.h5").exists():
         return SimulatedResponses(Dataset.open(folder))
@@ -331,12 +334,13 @@ def open_responses(folder: Path) -> SimulatedResponses | ImportedDataset:
 
 
 def choose_held_out(emitter: _Floats, listener: _Floats, share: float, seed: int) -> _Booleans:
-    """(row,) True for all rows of a share of the couples of points, drawn at random: every yaw, and both directions
-    where both were measured, or the twin would give the answer away by reciprocity. At least one, and never all,
-    unless the share is zero."""
+    """(row,) True for all rows of a random share of the couples of points: every yaw, and both directions if both were
+    measured, because by reciprocity one direction would reveal the other. Unless the share is zero, at least one couple
+    is held out, and never all."""
     ends = np.round(np.stack([emitter, listener], axis=1) / SAME_POINT_M).astype(np.int64)
     _, point = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
     couples, couple = np.unique(np.sort(point.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+    # guard: one couple at least is not held out
     wanted = 0 if share == 0 else min(max(1, round(share * len(couples))), len(couples) - 1)
     chosen = np.random.default_rng([seed, 1]).choice(len(couples), wanted, replace=False)
     return np.isin(couple.reshape(-1), chosen)
@@ -344,23 +348,26 @@ def choose_held_out(emitter: _Floats, listener: _Floats, share: float, seed: int
 
 def _require_usable(measurement: Measurement, row: int, source: str) -> None:
     pose = (*measurement.listener, *measurement.emitter, measurement.yaw)
+    # guard: a response without samples is not stored
     if measurement.response.shape[-1] == 0:
         raise ResponsesError(Path(source), "responses", f"row {row} has no samples; leave it out")
+    # guard: a response that is not finite is not stored
     if not np.isfinite(measurement.response).all() or not np.isfinite(pose).all():
         raise ResponsesError(Path(source), "responses", f"row {row} is not finite, response or pose; leave it out")
 
 
-def _finite(responses: _Responses, path: Path) -> _Responses:
-    """Raises ResponsesError for what would spoil everything that is trained on it."""
+def _require_finite_samples(responses: _Responses, path: Path) -> _Responses:
+    """Returns the responses; raises ResponsesError if a sample is not finite."""
+    # guard: a damaged file is not learned from
     if not np.isfinite(responses).all():
         raise ResponsesError(path, "responses", "hold samples that are not finite; simulate or import them anew")
     return responses
 
 
 def _require_finite(path: Path, responses: h5py.Dataset, listener: _Generic, emitter: _Generic) -> None:
-    """Raises ResponsesError that names the first row, and its ends, that holds what is no number. Reads a few rows at
-    a time."""
-    size = max(1, _AT_ONCE // (responses.shape[1] * responses.shape[2]))
+    """Raises ResponsesError, naming the first row whose samples are not finite and its positions. Reads a few rows at a
+    time."""
+    size = max(1, _SAMPLES_PER_READ // (responses.shape[1] * responses.shape[2]))
     for start in range(0, len(responses), size):
         is_bad = ~np.isfinite(responses[start : start + size]).all(axis=(1, 2))
         if is_bad.any():

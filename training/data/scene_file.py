@@ -1,4 +1,4 @@
-"""The scene file a person writes (TOML) and the probe positions that follow from it."""
+"""The scene file (TOML) that describes a place, and the probe positions that follow from it."""
 
 import math
 import tomllib
@@ -20,25 +20,25 @@ from training.data.simulation_plan import SimulatedEffect
 HISTOGRAM_BIN_S = 0.004
 
 _DRAWS_PER_CELL = 32
-# Two probes make one couple, and that one is held out.
+# At least one couple of probes is held out, and two probes make only one couple.
 _FEWEST_PROBES = 3
-# Cells of the grid that are tried for walls together.
-_CELLS_AT_ONCE = 256
+
+_CELLS_PER_BATCH = 256
 LONGEST_SIDE_M, SHORTEST_SIDE_M = 1_000.0, 0.5
 TALLEST_M = 200.0
-"""The tallest rooms that there are have 160 m; the longest halls, some 500."""
+"""The tallest halls have 160 m, and the longest some 500 m."""
 CLEARANCE_M = 0.05
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class SceneFileError(NafirError):
-    """A scene file that cannot be used; names the file and the field at fault."""
+    """A scene file that cannot be used. The message names the file and the field at fault."""
 
 
 class Probes(Strict):
-    """A jittered grid of positions that serve as listeners and emitters alike, and one in the middle of each
-    opening. Around each there is room for a sphere of CLEARANCE_M that counts rays."""
+    """A jittered grid of positions, each of which serves as listener and as emitter, and one more in the middle of each
+    opening. Around each there is room for a sphere of radius CLEARANCE_M that counts rays."""
 
     spacing_m: Annotated[float, Field(ge=0.001, le=LONGEST_SIDE_M, allow_inf_nan=False)]
     jitter_m: Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -53,9 +53,10 @@ class Probes(Strict):
 
 
 class Simulation(Strict):
-    """Nobody hears a head turn by less than a degree (Mills, J. Acoust. Soc. Am. 30, 1958), so there are `yaws` of 360
-    at most. Of `arrival_directions` more than a head was measured in tell nothing, and the spread that `rays` leave
-    falls with their square root: a hundred times the usual number is a tenth of what is inaudible already."""
+    """Parameters of the simulation. `yaws` is at most 360 because listeners do not hear a head turn by less than one
+    degree (Mills, J. Acoust. Soc. Am. 30, 1958). `arrival_directions` beyond the number that a head was measured in add
+    nothing. The random error of `rays` falls with the square root of their number: a hundred times the usual number has
+    a tenth of an error that is inaudible already."""
 
     sample_rate: Annotated[int, Field(ge=8000, le=96000)]
     duration_s: Annotated[float, Field(ge=0.25, allow_inf_nan=False)]
@@ -88,12 +89,12 @@ class Simulation(Strict):
 
     @property
     def histogram_bins(self) -> int:
-        """Of the energy that rays bring, over the duration."""
+        """Number of time bins in which the energy of rays is collected."""
         return round(self.duration_s / HISTOGRAM_BIN_S)
 
 
 class SceneFile(Strict):
-    """A whole scene file; see `training/scenes/` for annotated ones."""
+    """A whole scene file; `training/scenes/` has annotated examples."""
 
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
     name: str
@@ -104,7 +105,7 @@ class SceneFile(Strict):
     probes: Probes
     simulation: Simulation
     effects: dict[str, bool] = Field(default_factory=dict)
-    """On or off, whatever a plan of rendering or simulation would decide."""
+    """Effects that are on or off, whatever the plans of rendering and simulation say."""
 
     @classmethod
     def read(cls, path: Path) -> "SceneFile":
@@ -131,7 +132,7 @@ class SceneFile(Strict):
 
     @model_validator(mode="after")
     def _is_a_room(self) -> Self:
-        """In metres, that somebody could stand in."""
+        """Checks that sizes are plausible in metres."""
         sides = {"corners": max(self.plan_extent_m), "height_m": self.geometry.height_m}
         for (name, side_m), longest_m in zip(sides.items(), (LONGEST_SIDE_M, TALLEST_M), strict=True):
             if side_m > longest_m:
@@ -145,7 +146,7 @@ class SceneFile(Strict):
 
     @model_validator(mode="after")
     def _fits_into_the_room(self) -> Self:
-        """What would otherwise come to light only when hours of simulation and training are to be exported."""
+        """Refuses here what would otherwise be found at export, after hours of simulation and training."""
         plan, (low, high) = self.geometry.floor_plan, self.probes.heights_m
         if not CLEARANCE_M <= low < high <= plan.height_m - CLEARANCE_M:
             raise ValueError(
@@ -172,7 +173,7 @@ class SceneFile(Strict):
 
     @property
     def plan_extent_m(self) -> tuple[float, float]:
-        """Of the floor plan, along x and y."""
+        """Size of the floor plan along x and y."""
         x, y = np.ptp(self.geometry.corners, axis=0).tolist()
         return x, y
 
@@ -183,7 +184,7 @@ class SceneFile(Strict):
 
     @property
     def grid_cells(self) -> int:
-        """Of the grid of probes; those outside of the walls stay empty."""
+        """Number of cells in the grid of probes; cells outside the walls get no probe."""
         return math.prod(self._cells)
 
     def probe_positions(self, seed: int) -> npt.NDArray[np.float64]:
@@ -195,11 +196,11 @@ class SceneFile(Strict):
         size = (high - low) / cells
         column, row = np.meshgrid(np.arange(cells[0]), np.arange(cells[1]), indexing="ij")
         centres = low + (np.stack([column.ravel(), row.ravel()], axis=-1) + 0.5) * size
-        # Several draws per cell, the first clear of the walls wins: cells along a wall keep their probe.
+        # Each cell takes its first draw that is clear of the walls, so that cells along a wall have probes too.
         draws = centres[:, None] + rng.uniform(-grid.jitter_m, grid.jitter_m, (len(centres), _DRAWS_PER_CELL, 2))
         clear = np.zeros(draws.shape[:2], dtype=np.bool_)
-        for begin in range(0, len(draws), _CELLS_AT_ONCE):
-            some = slice(begin, begin + _CELLS_AT_ONCE)
+        for begin in range(0, len(draws), _CELLS_PER_BATCH):
+            some = slice(begin, begin + _CELLS_PER_BATCH)
             on_floor = np.concatenate([draws[some], np.zeros((*draws[some].shape[:2], 1))], axis=-1)
             clear[some] = plan.contains(on_floor) & (plan.wall_distance_m(on_floor) >= grid.wall_clearance_m)
         first = np.argmax(clear, axis=1)

@@ -1,4 +1,4 @@
-"""What keeps an opening of a scene file from being a passage from one wall of its floor plan to another. Metres."""
+"""Checks that each opening of a scene file leads from one wall of the floor plan to another. Lengths are in metres."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -9,11 +9,11 @@ from server.scene.geometry import Geometry, Opening, PlanPoint
 from server.scene.rooms import ON_WALL_M
 
 NARROWEST_M = 0.1
-"""A probe stands in the middle of an opening, and counts rays in a sphere that must fit between its posts."""
+"""The probe in the middle of an opening counts rays in a sphere, which must fit into the opening."""
 
 
 def faults_of(geometry: Geometry) -> list[str]:
-    """One for each opening at fault, which it begins with: `openings.0 ...`; nothing where all are passages."""
+    """One message for each opening at fault, beginning with its field (`openings.0 ...`); empty if all are valid."""
     plan = shapely.Polygon(geometry.corners)
     alone = [_fault(opening, plan) for opening in geometry.openings]
     faults = [f"openings.{index}: {fault}" for index, fault in enumerate(alone) if fault]
@@ -22,7 +22,7 @@ def faults_of(geometry: Geometry) -> list[str]:
     return [
         f"openings.{second}: {fault}"
         for (first, one), (second, other) in combinations(enumerate(geometry.openings), 2)
-        if (fault := _meeting(first, one, other))
+        if (fault := _overlap_fault(first, one, other))
     ]
 
 
@@ -45,8 +45,9 @@ def _fault(opening: Opening, plan: shapely.Polygon) -> str:
     return ""
 
 
-def _meeting(first: int, one: Opening, other: Opening) -> str:
-    """Of two passages; they may share a post, and nothing else."""
+def _overlap_fault(first: int, one: Opening, other: Opening) -> str:
+    """The fault of two openings that touch, or an empty string. Two openings may share one end point, and nothing
+    else."""
     line, across = _line(one), _line(other)
     if line.distance(across) >= ON_WALL_M:
         return ""

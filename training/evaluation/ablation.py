@@ -1,7 +1,7 @@
-"""Does a lever pay? One run per lever on the same data, all else equal, and their errors side by side.
+"""An ablation: trains one run per factor on the same data, with all else equal, and compares their errors.
 
-Every run is resumable, and so is the whole: finished runs are not trained again. Errors are those of the pairs held out
-from all training, against the responses themselves, in units that do not depend on what a run was trained with.
+Every run can be resumed, and finished runs are not trained again. Errors are those of the held-out pairs against the
+responses themselves, in units that do not depend on how a run was trained.
 """
 
 from collections.abc import Iterable
@@ -27,13 +27,13 @@ _DECAY_RANGE_DB = 40.0
 
 
 class AblationError(NafirError):
-    """An ablation that has nothing to measure."""
+    """An ablation that has nothing to compare."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One run and its errors: `spectral` the mean absolute error in ln magnitude, `level_db` that of each response's
-    energy, `decay_db` that of the decay curves over their first 40 dB."""
+    """One run and its errors. `spectral`: mean absolute error in ln magnitude. `level_db`: mean error of the energy of
+    each response. `decay_db`: mean error of decay curves over their first 40 dB."""
 
     name: str
     configuration: Configuration
@@ -43,10 +43,10 @@ class Row:
 
 
 def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) -> dict[str, Configuration]:
-    """The base and, by name, it with one lever moved: of those that these data allow."""
+    """The base configuration, and variants of it by name, each with one factor changed, as far as these data allow."""
     recipe = base.recipe
     if not isinstance(recipe, FactorisedRecipe):
-        raise AblationError(f"field: {base.name} has no levers; the factorised field has")
+        raise AblationError(f"field: {base.name} has no factors to vary; the factorised field has")
     changed = {
         "no level correction": replace(recipe, level_correction=False),
         "no error of energies": replace(recipe, energy_weight=0.0),
@@ -64,9 +64,9 @@ def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) 
 def ablate(
     responses: ResponseSet, folder: Path, configurations: dict[str, Configuration], progress: Progress
 ) -> list[Row]:
-    """Trains what is not yet trained, in folders of its own, and measures all.
+    """Trains each configuration in its own folder, unless it is trained already, and measures all.
 
-    Raises AblationError if nothing is held out.
+    Raises AblationError if no pair is held out.
     """
     rows = np.flatnonzero(responses.held_out)
     if not len(rows):
@@ -92,7 +92,7 @@ def _errors(learner: FactorisedLearner, rows: npt.NDArray[np.int64]) -> tuple[fl
     for start in range(0, len(rows), _BATCH):
         some = rows[start : start + _BATCH]
         ends = (part[some].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw))
-        predicted = graph.of_frames(*map(torch.from_numpy, ends))[0].numpy().astype(np.float64)
+        predicted = graph.forward_all_frames(*map(torch.from_numpy, ends))[0].numpy().astype(np.float64)
         read = responses.read(some)
         truth = np.stack([align(one, delay_samples(responses, row)) for one, row in zip(read, some, strict=True)])
         power = np.abs(codec.transform(truth)) ** 2
@@ -107,12 +107,12 @@ def _errors(learner: FactorisedLearner, rows: npt.NDArray[np.int64]) -> tuple[fl
 
 
 def _decay_db(power: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(..., frequency, frame) power to (..., frame) energy from each frame on, over all frequencies."""
+    """(..., frequency, frame) power to (..., frame) energy from each frame on, summed over frequencies."""
     energy = power.sum(axis=-2)
     return np.asarray(10 * np.log10(np.maximum(np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1], 1e-30)))
 
 
 def table(rows: Iterable[Row]) -> list[tuple[str, ...]]:
-    """Header and rows of text."""
+    """The header and the rows, as text."""
     lines = [(row.name, f"{row.spectral:.4f}", f"{row.level_db:.2f}", f"{row.decay_db:.2f}") for row in rows]
-    return [("lever", "spectral (ln)", "level (dB)", "decay (dB)"), *lines]
+    return [("factor", "spectral (ln)", "level (dB)", "decay (dB)"), *lines]

@@ -1,4 +1,5 @@
-"""Linear decoding: how much of a quantity a ridge regression reads from features, of places it was not fitted to."""
+"""Linear decoding: how much of a quantity a ridge regression can predict from features, at places that it was not
+fitted to."""
 
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ _PENALTIES = np.logspace(-3, 5, 33)
 
 @dataclass(frozen=True)
 class RidgeRegression:
-    """Prediction is `(features - centre) / scale @ weights + offset`."""
+    """The prediction is `(features - centre) / scale @ weights + offset`."""
 
     centre: _Floats
     scale: _Floats
@@ -24,8 +25,9 @@ class RidgeRegression:
 
     @classmethod
     def fit(cls, features: _Floats, target: _Floats) -> "RidgeRegression":
-        """(row, feature) and (row,). Of the penalties the one of least error when rows are left out one by one, which
-        the singular values give in closed form (Golub, Heath and Wahba, Technometrics 21, 215, 1979)."""
+        """Fits features (row, feature) to a target (row,). Of several penalties it takes the one with the least
+        leave-one-out error, which has a closed form by the singular values (Golub, Heath and Wahba, Technometrics 21,
+        215, 1979)."""
         centre, scale = features.mean(axis=0), features.std(axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         offset = float(target.mean())
@@ -48,8 +50,8 @@ class RidgeRegression:
 
 @dataclass(frozen=True)
 class Decoding:
-    """explained: (repeat,) share of the variance over places that is explained at places left out, 1 at best and below
-    0 where the mean would do better; predicted: (place,) what those predictions were, averaged over repeats."""
+    """explained: (repeat,) share of the variance over places that is predicted at left-out places; at most 1, and below
+    0 if the mean would predict better. predicted: (place,) these predictions, averaged over repeats."""
 
     explained: _Floats
     predicted: _Floats
@@ -60,15 +62,15 @@ class Decoding:
 
     @property
     def spread(self) -> float:
-        """Standard deviation over repeats, which divide places into folds anew."""
+        """Standard deviation over repeats, each of which divides the places into folds in another way."""
         return float(self.explained.std(ddof=1))
 
 
 def decode(features: _Floats, place: npt.NDArray[np.integer], target: _Floats, *, seed: int = 0) -> Decoding:
-    """Cross-validated: (row, feature) features of rows (row,) at places, each of a `target` (place,). All rows of a
-    place are left out together, and a place is predicted by the mean over its rows.
+    """Cross-validated decoding of `target` (place,) from features (row, feature); `place` (row,) is the place of each
+    row. All rows of a place are left out together, and the prediction for a place is the mean over its rows.
 
-    Raises ValueError for fewer places than folds.
+    Raises ValueError if there are fewer places than folds.
     """
     places = len(target)
     if places < FOLDS:

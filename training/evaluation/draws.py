@@ -1,16 +1,16 @@
-"""What held-out pairs of a simulated scene are like in the median of many simulations.
+"""Reference parameters of held-out pairs: medians over many simulations.
 
-A simulation draws: its rays, and the noise that diffuse sound is made of. Two fields that are both nearer to what is
-expected than one simulation is cannot be told apart by it. Medians of parameters over many draws can tell them, and one
-draw whose direct sound happens to be mistaken for a reflection does not move them.
+A simulation is random in its rays and in the noise of diffuse sound. If two fields are both nearer to the expected
+response than a single simulation is, that simulation cannot tell which is better. Medians of parameters over many draws
+can, and a single draw in which the direct sound is mistaken for a reflection does not change them.
 
-Draws are simulations of the seeds that follow the dataset's, by the dataset's own plan but for the rays of a tail that
-all pairs share: what those happen to be like is the same error of every pair, and no median over pairs takes it away.
-Parameters are kept beside the dataset, a file per draw and emitter, so that what is interrupted goes on and nothing is
-drawn twice.
+Draws are simulations with the seeds that follow the dataset's, by the dataset's own plan, except that a shared tail
+gets more rays. Its random error is the same for every pair, so a median over pairs would not remove it. Parameters are
+stored beside the dataset, in a file per draw and emitter, so that an interrupted evaluation can be resumed and nothing
+is simulated twice.
 
-An odd number of draws has a median that was drawn. Of an even number two are averaged, which of an interaural time
-difference that is one thing in half of the draws and another in the rest makes a third.
+The median of an odd number of draws is one of the drawn values. For an even number, two values are averaged. This may
+give a value that no draw has, if an interaural time difference takes one of two values.
 """
 
 import hashlib
@@ -34,9 +34,9 @@ from training.simulation.references import GeometricSound
 
 _FOLDER = "draws"
 _FORMAT = 2
-"""Another number wherever simulations or what is measured of them come to be another."""
+"""Must change whenever simulations, or the parameters that are measured in them, change."""
 _WORKERS = 2
-# For one draw of 20,000 rays the reverberation times of a whole small room lie 0.9 % off.
+# With 20,000 rays, the reverberation time of a small room has an error of 0.9 %, the same for all pairs.
 _TAIL_RAYS = 16
 _NAMES = tuple(field.name for field in fields(RoomParameters))
 _Floats = npt.NDArray[np.float64]
@@ -45,8 +45,8 @@ _Floats = npt.NDArray[np.float64]
 def median_parameters(
     held_out: HeldOut, draws: int, *, decay_db: float = 30.0, track: Track = lambda steps, _: steps
 ) -> list[RoomParameters]:
-    """Of each held-out pair at the orientations that are heard, over so many draws, of which none is one of the
-    dataset's own takes. What cannot be measured of more than half of them is missing.
+    """Parameters of each held-out pair at the evaluated orientations: medians over `draws` simulations, none of which
+    is in the dataset. A value that cannot be measured in more than half of the draws is missing.
 
     Raises EvaluationError for measured data.
     """
@@ -56,13 +56,13 @@ def median_parameters(
     ends = [divmod(int(pair), len(dataset.probes)) for pair in held_out.held_out]
     medians = _Draws(dataset, decay_db).medians(sorted({emitter for emitter, _ in ends}), draws, track)
     return [
-        RoomParameters(**{name: values[held_out.heard] for name, values in medians[emitter, listener].items()})
+        RoomParameters(**{name: values[held_out.yaw_indices] for name, values in medians[emitter, listener].items()})
         for emitter, listener in ends
     ]
 
 
 class _Draws:
-    """Of one dataset; responses are whole, and measured with decays of `decay_db`."""
+    """The draws of one dataset. Responses are whole; decay times are measured over `decay_db`."""
 
     def __init__(self, dataset: Dataset, decay_db: float) -> None:
         self._dataset = dataset
@@ -75,7 +75,7 @@ class _Draws:
         self._folder = dataset.folder / _FOLDER / simulated.hexdigest()[:12]
 
     def medians(self, emitters: list[int], draws: int, track: Track) -> dict[tuple[int, int], dict[str, _Floats]]:
-        """Parameters (yaw,) or (yaw, ear) by name, of every held-out pair of these emitters by its ends."""
+        """Parameters (yaw,) or (yaw, ear) by name, for each held-out pair of these emitters, by (emitter, listener)."""
         steps = [(draw, emitter) for draw in range(draws) for emitter in emitters]
         missing = [step for step in steps if not self._file(*step).exists()]
         if missing:
@@ -89,7 +89,7 @@ class _Draws:
         return of_pairs
 
     def _listeners(self, emitter: int) -> list[int]:
-        """All that are held out, whichever of them are asked for."""
+        """All held-out listeners of an emitter, even if only some are evaluated."""
         return [int(listener) for listener in np.flatnonzero(self._dataset.held_out[emitter])]
 
     def _file(self, draw: int, emitter: int) -> Path:
@@ -102,7 +102,7 @@ class _Draws:
             self._simulations[number] = PairSimulation.prepare(
                 dataset.scene, dataset.probes, dataset.yaws, seed=dataset.seed + 1 + number, plan=self._plan
             )
-        # What takes long is compiled, and leaves the interpreter to others.
+        # The compiled code, which takes most of the time, releases the interpreter's lock.
         pool = ThreadPoolExecutor(_WORKERS, "draw")
         try:
             results = pool.map(self._draw, steps)
@@ -120,7 +120,7 @@ class _Draws:
             response = self._geometric.complete(emitter, listener, simulation.whole(take, own))
             measured.append(vars(measure(response, self._dataset.sample_rate, decay_db=self._decay_db)))
         path = self._file(draw, emitter)
-        partial = path.with_suffix(f".{os.getpid()}.partial")  # another process may be at it
+        partial = path.with_suffix(f".{os.getpid()}.partial")  # another process may write the same file
         with partial.open("wb") as file:
             columns: dict[str, Any] = {name: np.stack([of_pair[name] for of_pair in measured]) for name in _NAMES}
             np.savez(file, **columns)
@@ -128,8 +128,8 @@ class _Draws:
 
 
 def _median(values: _Floats) -> _Floats:
-    """Over the first axis, of what is there in at least half of it."""
+    """Median over the first axis; NaN where more than half of the values are missing."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # where nothing is
+        warnings.simplefilter("ignore", RuntimeWarning)  # where all values are NaN
         median = np.nanmedian(values, axis=0)
     return np.where(np.isnan(values).mean(axis=0) > 0.5, np.nan, median)

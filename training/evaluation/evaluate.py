@@ -1,7 +1,7 @@
-"""Evaluation of any number of methods on held-out pairs: errors entry by entry, storage, and time per response.
+"""Evaluates any number of methods on held-out pairs: errors, storage, and time per response.
 
-Axes: one held-out pair's impulse responses are `(yaw, channel, sample)`. Errors are those of
-`server.acoustics.metrics`, entry by entry `(pair, yaw)`.
+Axes: the responses of one held-out pair are `(yaw, channel, sample)`. Errors are those of `server.acoustics.metrics`,
+for each `(pair, yaw)`.
 """
 
 import statistics
@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -26,14 +27,14 @@ from server.acoustics.metrics import (
 )
 from server.acoustics.room_parameters import RoomParameters, measure
 from training.baselines.held_out import EvaluationError, HeldOut, Responses
-from training.evaluation.kept_errors import Errors, KeptErrors
+from training.evaluation.stored_errors import Errors, StoredErrors
 
 FLOOR = "floor"
 ONE_SIMULATION = "one simulation"
 METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS)
-# Means that are nearer to each other are taken for luck of the draw.
+# A difference of means within this many standard errors is attributed to chance.
 _STANDARD_ERRORS = 2.0
-# A method that cannot be measured where another can must not win by leaving those entries out.
+# A method must not win because its hardest entries cannot be measured.
 _MISSING_ALLOWANCE = 0.01
 _TIMED_PAIRS = 7
 _TIMED_S = 5.0
@@ -42,19 +43,18 @@ _SPECTRAL_FLOOR = 1e-5
 
 Kind = Literal["field", "baseline", "simulation", "floor"]
 RATED = frozenset({"field", "baseline"})
-"""What is told from what, and how long it takes: simulations are there to compare with."""
+"""The kinds that are compared with each other and timed. Simulations only serve for comparison."""
 Source = Callable[[int, npt.NDArray[np.integer]], Responses | None]
-"""Held-out index and orientations (n,), indices into the yaws of the data, to (n, channel, sample); None where the
-method has no answer. Called from several threads."""
+"""Takes the index of a held-out pair and indices (n,) of the data's yaws, and gives (n, channel, sample), or None if
+the method has no estimate. It is called from several threads."""
 _Errors = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Column:
-    """One method. storage_bytes: what it has to keep of the scene; method: its name in published tables;
-    extra_ms: time per response that `source` does not spend because it was spent beforehand. Of kind "floor" it is a
-    second simulation, compared with the first whatever the others are compared with, and of kind "simulation" one that
-    is compared as they are."""
+    """One method. storage_bytes: what it must store for the scene. method: its name in published tables. extra_ms: time
+    per response that `source` does not take because it was spent beforehand. A column of kind "floor" is a second
+    simulation, which is always compared with the first. One of kind "simulation" is compared like a method."""
 
     name: str
     source: Source
@@ -66,8 +66,8 @@ class Column:
 
 @dataclass(frozen=True)
 class Result:
-    """A column measured. ms: of one response on one core, everything included; beats: baselines whose mean error is
-    larger over the entries both could be measured in, by metric; surpassed_by: fields and baselines whose error is
+    """The results of a column. ms: time of one response on one core, everything included. beats: baselines with a
+    larger mean error, by metric, over the entries that both have. surpassed_by: fields and baselines whose error is
     smaller by more than two standard errors of the difference over pairs."""
 
     name: str
@@ -83,9 +83,9 @@ class Result:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What `nafir-train evaluate` reports; `held_out` is how many pairs there are, `pairs` how many were measured,
-    `draws` of how many simulations parameters were compared with the medians. The floor is what two simulations differ
-    by, so where there are several nothing is told in its multiples."""
+    """The result of `nafir-train evaluate`. `held_out` is the number of held-out pairs, `pairs` that of the evaluated
+    ones, `draws` the number of simulations whose median parameters are the reference. The floor is the difference
+    between two simulations, so with several draws errors are not given in multiples of it."""
 
     data: str
     pairs: int
@@ -109,7 +109,7 @@ class Evaluation:
         return next((result for result in self.results if result.kind == "floor"), None)
 
     def to_json(self) -> dict[str, object]:
-        """Plain values for `json.dumps`; entry-wise errors are left out."""
+        """Plain values for `json.dumps`, without the errors of single entries."""
         floor = self.floor
         columns = {}
         for result in self.results:
@@ -142,6 +142,63 @@ class Evaluation:
         }
 
 
+@dataclass(frozen=True)
+class _PairErrors:
+    """Measures the errors of all columns for one held-out pair at a time."""
+
+    held_out: HeldOut
+    columns: Sequence[Column]
+    truth: Sequence[RoomParameters]
+    decay_db: float
+    stored: StoredErrors | None
+
+    @cached_property
+    def _codec(self) -> Codec:
+        return spectral_codec(self.held_out.sample_rate, self.held_out.samples)
+
+    def of_pair(self, pair: int) -> Errors:
+        """Errors by column, from `stored` if they are there, and put there if not."""
+        if self.stored is not None and (found := self.stored.get(pair)) is not None:
+            return found
+        reference = np.asarray(self.held_out.reference(pair), dtype=np.float32)
+        simulated = measure(reference, self.held_out.sample_rate, decay_db=self.decay_db)
+        spectrogram = self._codec.log_magnitude(self._codec.transform(reference))
+        errors = [self._of_column(column, pair, reference.shape, simulated, spectrogram) for column in self.columns]
+        if self.stored is not None:
+            self.stored.put(pair, errors)
+        return errors
+
+    def _of_column(
+        self,
+        column: Column,
+        pair: int,
+        shape: tuple[int, ...],
+        simulated: RoomParameters,
+        spectrogram: npt.NDArray[np.floating],
+    ) -> dict[str, _Errors]:
+        """Errors (yaw,) by metric. The reference has this `shape`, parameters and log-magnitude spectrogram."""
+        answer = column.source(pair, self.held_out.yaw_indices)
+        if answer is None:
+            return {metric.name: np.full(shape[0], np.nan) for metric in METRICS}
+        estimate = np.asarray(answer, dtype=np.float32)
+        if estimate.shape != shape:
+            raise EvaluationError(f"{column.name}: responses of {estimate.shape} where the data have {shape}")
+        sample_rate = self.held_out.sample_rate
+        true = self.truth[pair] if self.truth and column.kind != "floor" else simulated
+        onset = np.round(np.nan_to_num(true.onset_s, nan=0.0) * sample_rate).astype(np.int64)
+        estimated = measure(estimate, sample_rate, decay_db=self.decay_db, onset=onset)
+        errors = parameter_errors(true, estimated)
+        errors[SPECTRAL_LOSS.name] = spectral_loss(
+            spectrogram, self._codec.log_magnitude(self._codec.transform(estimate))
+        )
+        if column.kind == "simulation":  # the reference itself
+            errors[SPECTRAL_LOSS.name][:] = np.nan
+        for metric in METRICS:
+            if metric.needs_direct_sound and not self.held_out.visible[pair]:
+                errors[metric.name] = np.full(shape[0], np.nan)
+        return errors
+
+
 def evaluate(
     held_out: HeldOut,
     columns: Sequence[Column],
@@ -151,61 +208,27 @@ def evaluate(
     draws: int = 1,
     decay_db: float = 30.0,
     threads: int = 2,
-    kept: KeptErrors | None = None,
+    stored: StoredErrors | None = None,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
-    """Measures every held-out pair at every orientation that is heard, in every column.
+    """Measures every held-out pair at every orientation that is evaluated, in every column.
 
-    Where the emitter is not in sight there is no direct sound, and metrics that need one are missing; what a method
-    does not answer is missing in all of them. The direct sound is sought within 3 ms of where the reference has it.
-    `of`: the held-out pairs that these were drawn from. `truth`: what parameters are compared with, pair by pair,
-    medians of so many `draws`; where there is none, with the reference's own. Spectra are always compared with the
-    reference. Sources are called from several `threads` for errors, and one at a time for what they take. Errors of
-    pairs that `kept` holds are not measured again. `track` may wrap the loop over pairs in a progress bar.
+    If the emitter is not in sight there is no direct sound, and metrics that need one are missing. If a method has no
+    estimate, all metrics are missing. The direct sound is searched for within 3 ms of that of the reference.
+
+    of: the number of held-out pairs that these were drawn from. truth: reference parameters by pair, which are medians
+    over `draws` simulations; without it, those of the reference response. Spectra are always compared with the
+    reference response. Sources are called from several `threads` for errors, and one at a time for timing. Pairs in
+    `stored` are not measured again. `track` may wrap the loop over pairs in a progress bar.
     """
-    codec = spectral_codec(held_out.sample_rate, held_out.samples)
     names = [column.name for column in columns]
     if len(set(names)) < len(names):
         raise EvaluationError(f"two columns have the same name among {', '.join(names)}")
-
-    def pair_errors(pair: int) -> Errors:
-        if kept is not None and (found := kept.get(pair)) is not None:
-            return found
-        reference = np.asarray(held_out.reference(pair), dtype=np.float32)
-        simulated = measure(reference, held_out.sample_rate, decay_db=decay_db)
-        parameters = truth[pair] if truth else simulated
-        spectrogram = codec.log_magnitude(codec.transform(reference))
-
-        def errors_of(column: Column) -> dict[str, _Errors]:
-            answer = column.source(pair, held_out.heard)
-            if answer is None:
-                return {metric.name: np.full(len(reference), np.nan) for metric in METRICS}
-            estimate = np.asarray(answer, dtype=np.float32)
-            if estimate.shape != reference.shape:
-                raise EvaluationError(
-                    f"{column.name}: responses of {estimate.shape} where the data have {reference.shape}"
-                )
-            true = simulated if column.kind == "floor" else parameters
-            onset = np.round(np.nan_to_num(true.onset_s, nan=0.0) * held_out.sample_rate).astype(np.int64)
-            estimated = measure(estimate, held_out.sample_rate, decay_db=decay_db, onset=onset)
-            errors = parameter_errors(true, estimated)
-            errors[SPECTRAL_LOSS.name] = spectral_loss(spectrogram, codec.log_magnitude(codec.transform(estimate)))
-            if column.kind == "simulation":  # the reference itself
-                errors[SPECTRAL_LOSS.name][:] = np.nan
-            for metric in METRICS:
-                if metric.needs_direct_sound and not held_out.visible[pair]:
-                    errors[metric.name] = np.full(len(reference), np.nan)
-            return errors
-
-        errors = [errors_of(column) for column in columns]
-        if kept is not None:
-            kept.put(pair, errors)
-        return errors
-
+    measurement = _PairErrors(held_out, columns, truth, decay_db, stored)
     pool = ThreadPoolExecutor(threads)
     try:
         pairs = range(len(held_out))
-        by_pair = [errors for _, errors in zip(track(pairs), pool.map(pair_errors, pairs), strict=True)]
+        by_pair = [errors for _, errors in zip(track(pairs), pool.map(measurement.of_pair, pairs), strict=True)]
     finally:
         pool.shutdown(cancel_futures=True)
     errors = {
@@ -217,7 +240,7 @@ def evaluate(
         pairs=len(held_out),
         held_out=of or len(held_out),
         visible_pairs=int(np.count_nonzero(held_out.visible)),
-        yaws=len(held_out.heard),
+        yaws=len(held_out.yaw_indices),
         channels=held_out.channels,
         left_out=held_out.left_out,
         draws=draws,
@@ -226,24 +249,24 @@ def evaluate(
 
 
 def spectral_codec(sample_rate: int, samples: int) -> Codec:
-    """Of spectral losses, the same for every method: windows of about 11 ms (256 at 24 kHz), a quarter of one apart,
-    and a floor under magnitudes 100 dB below a unit impulse. The paper's windows are twice as long and its floor 40 dB
-    higher, which hides all of our late tails."""
+    """The codec of spectral losses, the same for every method: windows of about 11 ms (256 samples at 24 kHz) at steps
+    of a quarter, and a floor of magnitudes 100 dB below a unit impulse. The paper's windows are twice as long, and its
+    floor is 40 dB higher, which would hide all of our late tails."""
     n_fft = 2 ** round(np.log2(_SPECTRAL_WINDOW_S * sample_rate))
     return Codec(sample_rate, n_fft, n_fft // 4, samples, _SPECTRAL_FLOOR)
 
 
 def milliseconds_per_response(column: Column, held_out: HeldOut) -> float | None:
-    """Median time of one response, asked for alone in this thread after a first time that does not count: what a
-    method reads from disk is in memory by then. None if the method has no answer to any pair."""
+    """Median time of one response, computed alone in this thread. A first run, which loads data from disk, does not
+    count. None if the method has no estimate for any pair."""
     times_s = []
     began = time.perf_counter()
     for number, pair in enumerate(np.linspace(0, len(held_out) - 1, min(_TIMED_PAIRS, len(held_out))).astype(int)):
-        turn = held_out.heard[[number % len(held_out.heard)]]
-        if column.source(int(pair), turn) is None:
+        yaw_index = held_out.yaw_indices[[number % len(held_out.yaw_indices)]]
+        if column.source(int(pair), yaw_index) is None:
             continue
         start = time.perf_counter()
-        column.source(int(pair), turn)
+        column.source(int(pair), yaw_index)
         times_s.append(time.perf_counter() - start)
         if time.perf_counter() - began > _TIMED_S:
             break
@@ -276,7 +299,7 @@ def _result(
 
 
 def _ratio(summary: Summary, floor: Result | None, metric: Metric) -> float | None:
-    """Mean error over that of the floor."""
+    """The mean error over that of the floor."""
     least = None if floor is None else floor.summaries[metric.name].mean
     return None if summary.mean is None or not least else summary.mean / least
 
@@ -290,7 +313,7 @@ def _beats(ours: _Errors, theirs: _Errors) -> bool:
 
 
 def _surpasses(ours: _Errors, theirs: _Errors) -> bool:
-    """By more than chance: entries of one pair are no draws of their own."""
+    """Whether the gain exceeds chance. The entries of one pair are averaged, because they are not independent."""
     gains = (theirs - ours).reshape(len(ours), -1)
     measured = ~np.isnan(gains)
     gain = np.sum(gains, axis=1, where=measured)[measured.any(axis=1)] / measured.sum(axis=1)[measured.any(axis=1)]

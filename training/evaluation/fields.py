@@ -1,4 +1,4 @@
-"""Fields of scene bundles as columns of an evaluation, and what was measured of them written back."""
+"""Fields of scene bundles as columns of an evaluation; writes measured errors into the bundle."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,17 +12,17 @@ from server.responses.full_response import FullResponse
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy, QualityLevel
 from training.baselines.held_out import EvaluationError, HeldOut, Responses, require_same_scene
-from training.baselines.moved_lattice import with_moved_lattice
+from training.baselines.moved_nodes import with_moved_nodes
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
 
-_PLACES = 8
-"""Of a lattice; held-out pairs take turns."""
+_LATTICE_POSITIONS = 8
+"""Number of random positions of a lattice, which are used for held-out pairs in turn."""
 
 
 def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
-    """Every quality level of every bundle, named by level, or by bundle folder where there are several bundles.
+    """A column for each quality level of each bundle, named by level, or by bundle folder if there are several bundles.
 
-    Raises DatasetError or EvaluationError for a bundle of other data.
+    Raises DatasetError or EvaluationError if a bundle does not fit the data.
     """
     columns = []
     for bundle in bundles:
@@ -44,15 +44,15 @@ def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
 
 
 def _method(architecture: str) -> str:
-    """What others published of it is looked up by."""
+    """The name of the architecture in tables of published figures."""
     if architecture == "naf-whole":
         return architecture
     return "naf" if architecture.startswith("naf") else ""
 
 
 def field_source(field: AcousticField, held_out: HeldOut) -> Source:
-    """Whole responses as the server answers with them: the direct sound is joined to what the field says, unless it
-    holds that. A lattice on which responses are reused is moved and turned between pairs."""
+    """Whole responses as the server gives them: direct sound and first reflections are added, unless the field includes
+    them. Nodes whose responses are reused are moved between pairs."""
     codec = field.bundle.manifest.codec.codec
     if codec.sample_rate != held_out.sample_rate:
         raise EvaluationError(
@@ -62,15 +62,18 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
         raise EvaluationError(
             f"{field.bundle.folder}: has {field.channels} channels, {held_out.name} has {held_out.channels}"
         )
-    rng = np.random.default_rng(_PLACES)
-    fields = [field] if field.nodes is None else [with_moved_lattice(field, rng) for _ in range(_PLACES)]
+    rng = np.random.default_rng(_LATTICE_POSITIONS)
+    is_moved = field.kind.reuses_responses
+    fields = [with_moved_nodes(field, rng) for _ in range(_LATTICE_POSITIONS)] if is_moved else [field]
     wholes = [FullResponse.through_kemar(moved) for moved in fields]
     listeners, emitters = held_out.listeners, held_out.emitters
 
-    def source(index: int, turns: npt.NDArray[np.integer]) -> Responses:
-        shape = (len(turns), 3)
+    def source(index: int, yaw_indices: npt.NDArray[np.integer]) -> Responses:
+        shape = (len(yaw_indices), 3)
         responses = wholes[index % len(wholes)].impulse_responses(
-            np.broadcast_to(listeners[index], shape), np.broadcast_to(emitters[index], shape), held_out.yaws[turns]
+            np.broadcast_to(listeners[index], shape),
+            np.broadcast_to(emitters[index], shape),
+            held_out.yaws[yaw_indices],
         )
         return _of_length(responses, held_out.samples)
 
@@ -78,7 +81,8 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
 
 
 def record_accuracy(bundle: Bundle, evaluation: Evaluation) -> Bundle:
-    """Writes the measured errors of every quality level into the bundle's manifest; `evaluation` is of it alone."""
+    """Writes the measured errors of each quality level into the bundle's manifest. `evaluation` must be of this bundle
+    alone."""
     floor = {} if evaluation.floor is None else _means(evaluation, evaluation.floor.name)
 
     def measured(level: QualityLevel) -> QualityLevel:
@@ -109,6 +113,7 @@ def _name(bundle: Bundle, level: str, *, several: bool, levels: int) -> str:
 
 
 def _of_length(responses: npt.NDArray[np.float32], samples: int) -> npt.NDArray[np.float32]:
-    """Cut, or ended with zeros: a measurement may be longer than what was trained on."""
+    """The responses, cut or padded with zeros to `samples`, because a measurement may be longer than the training
+    responses."""
     kept = responses[..., :samples]
     return np.pad(kept, ((0, 0), (0, 0), (0, samples - kept.shape[-1])))

@@ -1,4 +1,4 @@
-"""The figure of an evaluation: decays of a few held-out pairs above, the spread of every error below."""
+"""The figure of an evaluation: decays of a few held-out pairs, and below them the distribution of each error."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -39,8 +39,7 @@ _DPI = 110
 _ACROSS = 5  # panels of errors
 _PERCENTILES = (5, 25, 50, 75, 95)
 _LOGARITHMIC_FROM = 10.0
-"""Ratio between the largest and the smallest 5 to 95 % of a metric, from which on a linear axis would flatten half of
-it."""
+"""From this ratio between the largest and the smallest median of a metric on, its axis is logarithmic."""
 _MOST_DECADES = 4.0
 _BELOW: Mapping[str, Any] = {"marker": "<", "markeredgecolor": "white", "markersize": 9}
 
@@ -52,7 +51,7 @@ def draw_figure(
     references: Callable[[int], Responses],
     reference_name: str,
     columns: Mapping[str, Source],
-    turn: npt.NDArray[np.integer],
+    yaw_index: npt.NDArray[np.integer],
     examples: Sequence[tuple[int, str]],
     sample_rate: float,
 ) -> None:
@@ -62,7 +61,7 @@ def draw_figure(
         references=references,
         reference_name=reference_name,
         columns=columns,
-        turn=turn,
+        yaw_index=yaw_index,
         examples=examples,
         sample_rate=sample_rate,
     )
@@ -75,15 +74,15 @@ def figure_of(
     references: Callable[[int], Responses],
     reference_name: str,
     columns: Mapping[str, Source],
-    turn: npt.NDArray[np.integer],
+    yaw_index: npt.NDArray[np.integer],
     examples: Sequence[tuple[int, str]],
     sample_rate: float,
 ) -> Figure:
     """Decays above, errors below.
 
-    `examples`: held-out pairs whose decays are shown, each with a title; `reference_name` is what their own responses
-    are called. `columns`: the estimates drawn beside the reference in those panels, named as in the evaluation; first
-    channel, at the orientation `turn` (1,), an index into the yaws of the data.
+    `examples`: held-out pairs whose decays are shown, each with a title. `reference_name`: the label of their own
+    responses. `columns`: the estimates that are drawn beside the reference, named as in the evaluation; their first
+    channel is shown. `yaw_index` (1,) is the index of the orientation in the data's yaws.
     """
     rows = len(evaluation.results)
     heights = 3.6, 2 * (0.9 + 0.22 * rows) + 1.0
@@ -95,7 +94,7 @@ def figure_of(
     for axes, (pair, title) in zip(panels, examples, strict=True):
         _draw_decay(axes, references(pair)[0, 0], sample_rate, reference_name, _REFERENCE_COLOUR)
         for name, source in columns.items():
-            if (answer := source(pair, turn)) is not None:
+            if (answer := source(pair, yaw_index)) is not None:
                 _draw_decay(axes, answer[0, 0], sample_rate, name, _COLOURS[evaluation.of(name).kind])
         axes.set(xlabel="time (s)", ylim=(_DECAY_FLOOR_DB, 3.0))
         axes.set_title(title, fontsize=11, color=_TEXT)
@@ -162,18 +161,19 @@ def _draw_all_errors(part: SubFigure, evaluation: Evaluation) -> None:
 
 
 def _counted(evaluation: Evaluation) -> str:
-    """Which pairs and orientations were measured, of how many."""
+    """How many pairs and orientations were evaluated, of how many."""
     pairs = (
         f"all {evaluation.pairs}"
         if evaluation.pairs == evaluation.held_out
         else f"{evaluation.pairs} of {evaluation.held_out}"
     )
-    turns = "one orientation" if evaluation.yaws == 1 else f"{evaluation.yaws} orientations"
-    return f"{pairs} held-out pairs, {turns} each"
+    orientations = "one orientation" if evaluation.yaws == 1 else f"{evaluation.yaws} orientations"
+    return f"{pairs} held-out pairs, {orientations} each"
 
 
 def _draw_errors(axes: Axes, results: Sequence[Result], metric: Metric) -> bool:
-    """A row per method; where a median lies below a logarithmic axis, an arrow says so. Returns whether one does."""
+    """A row for each method. Where a median lies below a logarithmic axis, an arrow marks it; returns whether there is
+    one."""
     present = [result.errors[metric.name][~np.isnan(result.errors[metric.name])] for result in results]
     spreads = {row: np.percentile(values, _PERCENTILES) for row, values in enumerate(present) if len(values)}
     low, is_logarithmic = _lower_end(list(spreads.values()))
@@ -197,7 +197,7 @@ def _draw_errors(axes: Axes, results: Sequence[Result], metric: Metric) -> bool:
 
 
 def _lower_end(spreads: Sequence[npt.NDArray[np.floating]]) -> tuple[float, bool]:
-    """Where the axis of these percentiles begins, and whether it is logarithmic."""
+    """Where the axis for these percentiles begins, and whether it is logarithmic."""
     medians = [spread[2] for spread in spreads if spread[2] > 0]
     if not medians or max(medians) < _LOGARITHMIC_FROM * min(medians):
         return 0.0, False

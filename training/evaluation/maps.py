@@ -1,9 +1,10 @@
-"""Loudness maps side by side, as the paper's figure: simulated anew on a grid, as the field has it, and interpolated
-from the training listeners.
+"""Loudness maps side by side, as in the paper's figure: simulated on a grid, predicted by the field, and interpolated
+between the training listeners.
 
 Level is energy per ear, averaged over ears and two opposite head orientations, in dB relative to the emitter's free
-field at one metre, as `server.responses.loudness` defines it. Grids are (row, column), row 0 the southernmost, NaN
-outside the room. Metres."""
+field at one metre, as in `server.responses.loudness`. Grids are (row, column), row 0 the southernmost, NaN outside the
+room. Metres.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -32,14 +33,14 @@ _Floats = npt.NDArray[np.float64]
 
 _YAWS = np.array([0.0, np.pi])
 _SEED = 30
-# Nearer to a wall than this, a receiver's sphere catches too few rays.
+# Closer to a wall, a receiver's sphere would be too small to catch enough rays.
 _CLEARANCE_M = 0.08
 
 
 @dataclass(frozen=True)
 class EmitterMaps:
-    """Maps of one emitter by method, the simulation first, all on the grid of `grid`; listeners (n, 3) are those that
-    interpolation starts from; corners (n, 2) are the room's."""
+    """Maps of one emitter by method, the simulation first, all on the grid of `grid`. `listeners` (n, 3) are the
+    training listeners between which responses are interpolated; `corners` (n, 2) are those of the floor plan."""
 
     corners: _Floats
     emitter: _Floats
@@ -48,13 +49,14 @@ class EmitterMaps:
     levels_db: dict[str, _Floats]
 
     def errors_db(self, method: str) -> float:
-        """Mean magnitude over all cells."""
+        """Mean absolute error over all cells."""
         truth, *_ = self.levels_db.values()
         return float(np.nanmean(np.abs(self.levels_db[method] - truth)))
 
 
 def spread_out(points: _Floats, start: _Floats, count: int) -> list[int]:
-    """The point nearest to `start`, then always the one farthest from those chosen; indices into (point, 3)."""
+    """Indices of `count` points (point, 3): the point nearest to `start`, then always the one farthest from those
+    chosen so far."""
     chosen = [int(np.argmin(np.linalg.norm(points - start, axis=-1)))]
     while len(chosen) < min(count, len(points)):
         nearest = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)
@@ -70,8 +72,8 @@ def map_emitters(
     spacing_m: float,
     track: Callable[[Sequence[int], str], Iterable[int]] = lambda steps, _: steps,
 ) -> list[EmitterMaps]:
-    """Maps of so many probes as emitters. Raises EvaluationError for measured data, which have no walls, and
-    DatasetError for a field of another scene."""
+    """Maps for `emitters` probes as emitters. Raises EvaluationError for measured data, whose walls are unknown, and
+    DatasetError if the field is of another scene."""
     dataset = held_out.simulated
     if dataset is None:
         raise EvaluationError(f"{held_out.name}: maps need a simulated scene, whose walls are known")
@@ -124,8 +126,8 @@ def _maps(
 
 
 def _training_gram(pairs: TrainingPairs, yaws: _Floats, emitter: int) -> tuple[_Floats, _Floats]:
-    """(n, 3) listeners that were trained on with this emitter, and (n, n) products of their waveforms, per ear: the
-    energy of any weighted sum of them follows."""
+    """(n, 3) training listeners of this emitter, and (n, n) dot products of their waveforms, per ear. They give the
+    energy of any weighted sum of the waveforms."""
     known = np.flatnonzero(pairs.training & (pairs.pair_emitter == emitter))
     opposite = [int(np.argmin(np.abs(np.angle(np.exp(1j * (yaws - yaw)))))) for yaw in _YAWS]
     waves = np.stack([pairs.response(int(pair))[opposite] for pair in known]).reshape(len(known), -1)
@@ -134,8 +136,8 @@ def _training_gram(pairs: TrainingPairs, yaws: _Floats, emitter: int) -> tuple[_
 
 
 def _interpolated_power(listeners: _Floats, gram: _Floats, cells: _Floats) -> tuple[_Floats, _Floats]:
-    """(cell,) energies of the nearest waveform, and of waveforms interpolated linearly in plan (the nearest in plan
-    outside of the listeners' hull)."""
+    """(cell,) energies of the nearest waveform, and of linear interpolation in plan (the nearest listener in plan
+    outside the listeners' hull)."""
     nearest = np.argmin(np.linalg.norm(cells[:, None] - listeners, axis=-1), axis=-1)
     linear = np.empty(len(cells))
     for number, cell in enumerate(cells):
@@ -150,7 +152,7 @@ def _interpolated_power(listeners: _Floats, gram: _Floats, cells: _Floats) -> tu
 
 
 def _simulated_power(dataset: Dataset, emitter: _Floats, cells: _Floats) -> _Floats:
-    """(cell,) energies per ear, simulated with the rays of the dataset."""
+    """(cell,) energies per ear, simulated with the dataset's number of rays."""
     settings = dataset.scene.simulation
     directions = sphere_directions(settings.arrival_directions)
     tracer = RoomTracer.of(dataset.scene, dataset.effects, cells)
@@ -167,7 +169,7 @@ def _simulated_power(dataset: Dataset, emitter: _Floats, cells: _Floats) -> _Flo
 
 
 def draw_maps(maps: Sequence[EmitterMaps], path: Path) -> None:
-    """Writes a PNG: a row per emitter and a column per method, one colour scale for all."""
+    """Writes a PNG with a row per emitter, a column per method and a common colour scale."""
     methods = list(maps[0].levels_db)
     walls = maps[0].corners
     width, height = np.ptp(walls, axis=0)

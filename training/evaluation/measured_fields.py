@@ -1,8 +1,8 @@
-"""Fields that were trained on measured responses, straight from their run folders: no scene bundle holds them, for
-nothing is known of their walls.
+"""Fields trained on measured responses, read from their run folders. A bundle cannot hold them, because their walls are
+unknown.
 
-A field says magnitudes and what it knows of phase; the rest of phase is noise that stands still, as the server fills it
-in. Measured responses hold their direct sound, so nothing is joined to them.
+A field predicts magnitudes, and phase as far as it is known. The other part of the phase is frozen noise, as in the
+server. Measured responses include direct sound, so nothing is added.
 
 Axes: B poses; (B, channel, frequency, frame) and (B, channel, sample).
 """
@@ -28,20 +28,20 @@ from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
 from training.models.targets import LEAD_SAMPLES, align
 
-Answers = tuple[npt.NDArray[np.float32], ...]
+Outputs = tuple[npt.NDArray[np.float32], ...]
 _BYTES_PER_PARAMETER = 4
 
 
 def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
-    """Raises RunError for a run that is missing, unfinished or of other data, and EvaluationError for one on simulated
-    responses, whose direct sound and levels only a bundle knows."""
+    """Raises RunError for a run that is missing, unfinished or of other data, and EvaluationError for a run on
+    simulated responses, whose direct sound and levels are part of a bundle."""
     if isinstance(responses, SimulatedResponses):
         raise EvaluationError(f"{run}: was trained on a simulated scene; export it and evaluate the bundle")
     learner = load_learner(responses, run)
     codec: Codec
     predict: Callable[..., tuple[torch.Tensor, ...]]
     if isinstance(learner, FactorisedLearner):
-        codec, predict = learner.cells.codec, ExportedField(learner.field, learner.cells).eval().of_frames
+        codec, predict = learner.cells.codec, ExportedField(learner.field, learner.cells).eval().forward_all_frames
     elif isinstance(learner, NafLearner):
         codec, predict = learner.codec, NafGraph(learner.field, learner.codec, tabled=True).eval()
     else:
@@ -50,18 +50,18 @@ def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
     noise = FrozenNoise.from_signal(codec, even_noise(codec, np.random.default_rng([configuration.seed, 6])))
     listeners, emitters = held_out.listeners, held_out.emitters
 
-    def source(index: int, turns: npt.NDArray[np.integer]) -> Responses:
-        shape = (len(turns), 3)
+    def source(index: int, yaw_indices: npt.NDArray[np.integer]) -> Responses:
+        shape = (len(yaw_indices), 3)
         poses = (
             np.broadcast_to(listeners[index], shape),
             np.broadcast_to(emitters[index], shape),
-            held_out.yaws[turns],
+            held_out.yaws[yaw_indices],
         )
         with torch.no_grad():
-            answers = predict(*(torch.from_numpy(np.array(pose, dtype=np.float32)) for pose in poses))
-        aligned = decoded(tuple(answer.numpy() for answer in answers), codec, noise)
+            outputs = predict(*(torch.from_numpy(np.array(pose, dtype=np.float32)) for pose in poses))
+        aligned = decoded(tuple(output.numpy() for output in outputs), codec, noise)
         later = float(held_out.delays_s[held_out.held_out[index]]) * held_out.sample_rate - LEAD_SAMPLES
-        return moved_later(aligned, later)
+        return undo_alignment(aligned, later)
 
     parameters = sum(parameter.numel() for parameter in learner.field.parameters())
     return Column(
@@ -73,18 +73,18 @@ def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
     )
 
 
-def decoded(answers: Answers, codec: Codec, noise: FrozenNoise) -> npt.NDArray[np.float32]:
-    """Aligned responses from what a field says: those themselves, or log-magnitude, instantaneous frequency, certainty
-    and, of two ears, interaural coherence as real and imaginary parts."""
-    if len(answers) == 1:
-        return answers[0]
-    log_magnitude, frequency, certainty, *interaural = answers
+def decoded(outputs: Outputs, codec: Codec, noise: FrozenNoise) -> npt.NDArray[np.float32]:
+    """Aligned responses from a field's outputs: the responses themselves, or log-magnitude, instantaneous frequency,
+    certainty and, for two ears, interaural coherence (real and imaginary parts)."""
+    if len(outputs) == 1:
+        return outputs[0]
+    log_magnitude, frequency, certainty, *interaural = outputs
     magnitude, phase = codec.magnitude(log_magnitude), codec.integrate(frequency)
     if interaural:
         coherence = np.asarray(interaural[0][:, 0] + 1j * interaural[0][:, 1], dtype=np.complex64)
         spectrogram = _with_phase(magnitude, phase, certainty, coherence, noise)
     else:
-        # A lone microphone is the left of two ears that have nothing to do with each other.
+        # One microphone is treated as the left of two uncorrelated ears.
         magnitude, phase, certainty = (np.repeat(values, 2, axis=1) for values in (magnitude, phase, certainty))
         unlike = np.zeros(magnitude[:, 0].shape, np.complex64)
         spectrogram = _with_phase(magnitude, phase, certainty, unlike, noise)[:, :1]
@@ -104,8 +104,9 @@ def _with_phase(
     return spectrogram
 
 
-def moved_later(aligned: npt.NDArray[np.float32], samples: float) -> npt.NDArray[np.float32]:
-    """The inverse of aligning: (..., sample) later by a fraction of samples, silent before, cut at the end."""
+def undo_alignment(aligned: npt.NDArray[np.float32], samples: float) -> npt.NDArray[np.float32]:
+    """The inverse of alignment: (..., sample) delayed by a fractional number of samples, silent before, and cut at the
+    end."""
     count = aligned.shape[-1]
     room = np.pad(aligned, [(0, 0)] * (aligned.ndim - 1) + [(0, max(0, int(np.ceil(samples))))])
     return align(room, -samples)[..., :count].astype(np.float32)

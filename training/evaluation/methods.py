@@ -1,4 +1,4 @@
-"""Methods by name: what a field is compared with."""
+"""Methods by name, with which a field is compared."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,15 +17,15 @@ from training.evaluation.evaluate import FLOOR, ONE_SIMULATION, Column, Source
 DEFAULT_METHODS = ("nearest", "linear", "linear-aligned")
 Answer = Callable[[int, npt.NDArray[np.integer]], Responses | None]
 
-# Where listeners stand about a metre apart, as in most of our data, there is little left to interpolate above.
+# Listeners are about a metre from each other in most of our data, so interpolation fails at higher frequencies.
 _HELMHOLTZ_CUTOFF_HZ = 500.0
-_BYTES_PER_SAMPLE = 2  # float16, as simulated datasets keep their responses
+_BYTES_PER_SAMPLE = 2  # float16, as in simulated datasets
 
 
 def method_columns(names: Sequence[str], held_out: HeldOut, track: Track = lambda steps, _: steps) -> list[Column]:
-    """A column per name; `track` may wrap what takes long before anything is measured in a progress bar.
+    """A column for each name. `track` may show the progress of preparations that take long.
 
-    Raises EvaluationError for an unknown name, or a method that these data do not allow.
+    Raises EvaluationError for an unknown name, or for a method that does not work with these data.
     """
     for name in names:
         if name not in METHODS:
@@ -35,22 +35,24 @@ def method_columns(names: Sequence[str], held_out: HeldOut, track: Track = lambd
 
 
 def floor_columns(held_out: HeldOut) -> list[Column]:
-    """What a second take of the same pairs differs from the first by; none where there is none."""
+    """A column for the second take of the held-out pairs; none if there is no second take."""
     repeats = held_out.repeats
     if repeats is None:
         return []
-    return [Column(FLOOR, lambda index, turns: repeats[int(held_out.held_out[index])][turns], "floor")]
+    return [Column(FLOOR, lambda index, yaw_indices: repeats[int(held_out.held_out[index])][yaw_indices], "floor")]
 
 
 def simulation_column(held_out: HeldOut) -> Column:
-    """What one simulation is off by, as fields are."""
+    """A column for the errors of one simulation, when the reference is a median over several."""
     return Column(
-        ONE_SIMULATION, at_pairs(held_out, lambda pair, turns: held_out.pairs.response(pair)[turns]), "simulation"
+        ONE_SIMULATION,
+        at_pairs(held_out, lambda pair, yaw_indices: held_out.pairs.response(pair)[yaw_indices]),
+        "simulation",
     )
 
 
 class _Prepared:
-    """What methods share, made when the first of them asks for it."""
+    """Data that methods share, computed when the first of them needs it."""
 
     def __init__(self, held_out: HeldOut, track: Track) -> None:
         self.held_out = held_out
@@ -66,17 +68,19 @@ class _Prepared:
 def _plain(name: str, prepared: _Prepared) -> Column:
     interpolate = {"nearest": nearest, "linear": linear}[name]
     pairs = prepared.held_out.pairs
-    return _of_stored(name, prepared.held_out, lambda pair, turns: interpolate(pairs, pair, turns))
+    return _of_stored(name, prepared.held_out, lambda pair, yaw_indices: interpolate(pairs, pair, yaw_indices))
 
 
 def _aligned(name: str, prepared: _Prepared) -> Column:
     held_out = prepared.held_out
     pairs, delays_s, rate = held_out.pairs, held_out.delays_s, held_out.sample_rate
-    return _of_stored(name, held_out, lambda pair, turns: linear_aligned(pairs, pair, delays_s, rate, turns))
+    return _of_stored(
+        name, held_out, lambda pair, yaw_indices: linear_aligned(pairs, pair, delays_s, rate, yaw_indices)
+    )
 
 
 def _of_stored(name: str, held_out: HeldOut, answer: Answer) -> Column:
-    """A method that keeps the training responses as they are."""
+    """A method that stores the training responses as they are."""
     stored = int(held_out.pairs.training.sum()) * len(held_out.yaws) * held_out.channels * held_out.samples
     return Column(name, at_pairs(held_out, answer), "baseline", stored * _BYTES_PER_SAMPLE, name)
 
@@ -89,11 +93,11 @@ def _coded(name: str, prepared: _Prepared) -> Column:
     pairs = replace(held_out.pairs, responses=coded)
     return Column(
         name,
-        at_pairs(held_out, lambda pair, turns: interpolate(pairs, pair, turns)),
+        at_pairs(held_out, lambda pair, yaw_indices: interpolate(pairs, pair, yaw_indices)),
         "baseline",
         coded.storage_bytes,
         name,
-        # Inside a plan's triangulation three responses are decoded for one.
+        # Inside a triangle of listeners, three responses must be decoded for one.
         extra_ms=coded.decoding_ms() * {"nearest": 1, "linear": 3}[way],
     )
 
@@ -120,8 +124,8 @@ def _image_sources(name: str, prepared: _Prepared) -> Column:
     emitters, listeners = held_out.emitters, held_out.listeners
     return Column(
         name,
-        lambda index, turns: images.response(
-            emitters[index], listeners[index], turns, number=int(held_out.held_out[index])
+        lambda index, yaw_indices: images.response(
+            emitters[index], listeners[index], yaw_indices, number=int(held_out.held_out[index])
         ),
         "baseline",
         (dataset.folder / "scene.toml").stat().st_size,
@@ -130,8 +134,8 @@ def _image_sources(name: str, prepared: _Prepared) -> Column:
 
 
 def at_pairs(held_out: HeldOut, answer: Answer) -> Source:
-    """The source of a method that knows the pairs of the dataset by number."""
-    return lambda index, turns: answer(int(held_out.held_out[index]), turns)
+    """The source of a method that takes the number of a pair in the dataset."""
+    return lambda index, yaw_indices: answer(int(held_out.held_out[index]), yaw_indices)
 
 
 METHODS: dict[str, Callable[[str, _Prepared], Column]] = {

@@ -1,7 +1,7 @@
-"""Mel-frequency cepstral coefficients (Davis and Mermelstein, IEEE Trans. ASSP 28, 357, 1980), as recognisers of speech
-compute them: log energies of triangular filters evenly spaced on the mel scale, and their cosine transform.
+"""Mel-frequency cepstral coefficients (Davis and Mermelstein, IEEE Trans. ASSP 28, 357, 1980), as in speech
+recognition: log energies of triangular filters that are evenly spaced on the mel scale, and their cosine transform.
 
-Libraries that offer them bring a whole toolkit along; what is asked of them here is a filter bank and two transforms.
+Libraries that offer them depend on whole toolkits, and a filter bank and two transforms suffice here.
 """
 
 import numpy as np
@@ -28,8 +28,8 @@ def hertz(mels: npt.ArrayLike) -> _Floats:
 
 
 def mel_filters(sample_rate: int, n_fft: int) -> _Floats:
-    """(filter, bin) weights of power: triangles with a peak of one, each from the centre of the one below to that of
-    the one above."""
+    """(filter, bin) weights of power: triangles with a peak of one, from the centre of the filter below to that of the
+    filter above."""
     centres = hertz(np.linspace(0.0, mel(sample_rate / 2), FILTERS + 2))
     frequency = np.fft.rfftfreq(n_fft, 1 / sample_rate)
     rising = (frequency - centres[:-2, None]) / np.diff(centres)[:-1, None]
@@ -38,7 +38,8 @@ def mel_filters(sample_rate: int, n_fft: int) -> _Floats:
 
 
 def mfcc(signal: npt.ArrayLike, sample_rate: int) -> _Floats:
-    """(..., sample) to (..., coefficient, frame); frames of 25 ms, 10 ms apart, the first beginning with the signal."""
+    """(..., sample) to (..., coefficient, frame). Frames have 25 ms and begin every 10 ms, the first with the
+    signal."""
     samples = np.asarray(signal, dtype=np.float64)
     window, step = round(WINDOW_S * sample_rate), round(STEP_S * sample_rate)
     if samples.shape[-1] < window:

@@ -1,7 +1,7 @@
-"""What a field knows of walls nobody told it of: the distance from the listener to the nearest wall, decoded linearly
-from its hidden features, against MFCC of the true responses (Luo et al., NeurIPS 2022, section 4.4).
+"""What a field has learned about walls: the distance from the listener to the nearest wall, decoded linearly from its
+hidden features, compared with decoding from MFCC of the true responses (Luo et al., NeurIPS 2022, section 4.4).
 
-Rows are pairs of probes, places are their listeners. Of a field that answers point by point in time and frequency, the
+Rows are pairs of probes, places are their listeners. If a field predicts point by point in time and frequency, the
 features of a pose are the mean over all points. Metres, radians.
 """
 
@@ -26,7 +26,7 @@ Track = Callable[[Sequence[int], str], Iterable[int]]
 
 HIDDEN = "hidden_features"
 _PRODUCTS = {"MatMul", "Gemm"}
-_MOST_AXES = 3  # of what goes into a layer; the spreading of bands and frames has more
+_MOST_AXES = 3  # of a layer's input; the products that spread bands and frames have more
 _CHUNK = 64
 _YAWS = 2
 _MAPPED_EMITTERS = 4
@@ -34,9 +34,9 @@ _SPACING_M = 0.2
 
 
 def with_hidden_output(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The graph with one more output, HIDDEN: what goes into its last linear layer.
+    """The graph with an additional output HIDDEN: the input of its last linear layer.
 
-    Raises EvaluationError for a graph without one, such as one whose weights are integers.
+    Raises EvaluationError for a graph without one, for example with integer weights.
     """
     model = onnx.shape_inference.infer_shapes(model)
     scan = next((node for node in model.graph.node if node.op_type == "Scan"), None)
@@ -45,7 +45,7 @@ def with_hidden_output(model: onnx.ModelProto) -> onnx.ModelProto:
     if scan is None:
         graph.node.append(helper.make_node("Identity", [tensor], [HIDDEN]))
     else:
-        # In a scan, pose by pose, the mean is taken before it is kept.
+        # Inside a scan, features are averaged for each pose, to save memory.
         graph.initializer.append(numpy_helper.from_array(np.arange(axes - 1), f"{HIDDEN}_axes"))
         graph.node.append(helper.make_node("ReduceMean", [tensor, f"{HIDDEN}_axes"], [f"{HIDDEN}_of_pose"], keepdims=0))
         graph.output.append(helper.make_tensor_value_info(f"{HIDDEN}_of_pose", TensorProto.FLOAT, None))
@@ -55,7 +55,7 @@ def with_hidden_output(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def _last_layer_input(graph: onnx.GraphProto) -> tuple[str, int]:
-    """Name and axes of the tensor that the last product with constant weights takes."""
+    """Name and number of axes of the input of the last product with constant weights."""
     constant = {tensor.name for tensor in graph.initializer}
     axes = {value.name: len(value.type.tensor_type.shape.dim) for value in (*graph.value_info, *graph.input)}
     last: tuple[str, int] | None = None
@@ -74,14 +74,14 @@ def _last_layer_input(graph: onnx.GraphProto) -> tuple[str, int]:
 
 
 class HiddenFeatures:
-    """Features of poses from one of a bundle's fields."""
+    """Computes features of poses with one of a bundle's fields."""
 
     def __init__(self, bundle: Bundle, field: str) -> None:
         model = onnx.load_model_from_string(bundle.models[bundle.manifest.fields[field].file])
         self._session: InferenceSession = open_session(with_hidden_output(model).SerializeToString())
 
     def of(self, listeners: _Floats, emitters: _Floats, yaws: _Floats) -> _Floats:
-        """(B, 3), (B, 3) and (B,) to (B, feature)."""
+        """Listeners (B, 3), emitters (B, 3) and yaws (B,) to features (B, feature)."""
         features = []
         for start in range(0, len(yaws), _CHUNK):
             part = slice(start, start + _CHUNK)
@@ -92,9 +92,9 @@ class HiddenFeatures:
 
 
 @dataclass(frozen=True)
-class Probing:
-    """places: (place, 3) listeners; distance_m: (place,) to the nearest wall, in plan; the map is of cells (cell, 2) in
-    the room, spacing_m apart, their true distances and those decoded from the field's features."""
+class ProbeResult:
+    """places: (place, 3) listeners; distance_m: (place,) to the nearest wall, in plan. The map has cells (cell, 2) in
+    the room, at steps of spacing_m, with their true distances and those decoded from the field's features."""
 
     field: str
     plan: FloorPlan
@@ -130,12 +130,12 @@ def probe(
     emitters: int | None = None,
     seed: int = 0,
     track: Track = lambda steps, _: steps,
-) -> Probing:
-    """Decodes the distance to the nearest wall at every probe of the dataset from the named field's features (by
-    default that of the first quality level), of `emitters` probes drawn at random, or all.
+) -> ProbeResult:
+    """Decodes the distance to the nearest wall at each probe of the dataset from the features of a field (by default
+    that of the first quality level), for `emitters` random probes as emitters, or all.
 
-    Raises EvaluationError for measured data, which have no walls, for too few probes, and for a field that the bundle
-    lacks or that has no features; DatasetError for a bundle of another scene.
+    Raises EvaluationError for measured data, whose walls are unknown, for too few probes, and for a field that the
+    bundle lacks or that has no features; DatasetError if the bundle is of another scene.
     """
     dataset = held_out.simulated
     if dataset is None:
@@ -148,15 +148,15 @@ def probe(
     if len(places) <= FOLDS:
         raise EvaluationError(f"{held_out.name}: {len(places)} probes are too few to decode from")
     hidden = HiddenFeatures(bundle, name)
-    turns = np.linspace(0, len(held_out.yaws), _YAWS, endpoint=False).astype(int)
+    yaw_indices = np.linspace(0, len(held_out.yaws), _YAWS, endpoint=False).astype(int)
     rng = np.random.default_rng([seed, 12])
     count = len(places) if emitters is None else min(emitters, len(places))
     features, coefficients, place = [], [], []
     for emitter in track(sorted(int(number) for number in rng.choice(len(places), count, replace=False)), "probing"):
         others = np.flatnonzero(np.arange(len(places)) != emitter)
-        features.append(_features(hidden, places[others], places[emitter], held_out.yaws[turns]))
+        features.append(_features(hidden, places[others], places[emitter], held_out.yaws[yaw_indices]))
         for listener in others:
-            response = held_out.pairs.response(emitter * len(places) + int(listener))[turns]
+            response = held_out.pairs.response(emitter * len(places) + int(listener))[yaw_indices]
             coefficients.append(mfcc(response, held_out.sample_rate).mean(axis=(0, 1)).ravel())
         place.append(others)
     rows, at = np.concatenate(features), np.concatenate(place)
@@ -164,11 +164,11 @@ def probe(
     cells = _cells(dataset.plan)
     heights = np.full((len(cells), 1), float(np.median(places[:, 2])))
     mapped = [
-        _features(hidden, np.concatenate([cells, heights], axis=-1), places[emitter], held_out.yaws[turns])
+        _features(hidden, np.concatenate([cells, heights], axis=-1), places[emitter], held_out.yaws[yaw_indices])
         for emitter in rng.choice(len(places), min(_MAPPED_EMITTERS, len(places)), replace=False)
     ]
     reader = RidgeRegression.fit(rows, distance_m[at])
-    return Probing(
+    return ProbeResult(
         name,
         dataset.plan,
         places,
@@ -190,7 +190,7 @@ def _features(hidden: HiddenFeatures, listeners: _Floats, emitter: _Floats, yaws
 
 
 def _cells(plan: FloorPlan) -> _Floats:
-    """(cell, 2) centres of a grid over the plan that are in the room."""
+    """(cell, 2) centres of those cells of a grid over the plan that are in the room."""
     low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
     x, y = (np.arange(a + _SPACING_M / 2, b, _SPACING_M) for a, b in zip(low, high, strict=True))
     cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -1,4 +1,5 @@
-"""The figure of a probe: where walls are, where the field's features say they are, and the same from MFCC."""
+"""The figure of a probe: true distances to walls, distances decoded from the field's features, and distances decoded
+from MFCC."""
 
 from pathlib import Path
 
@@ -8,15 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from training.evaluation.probe import Probing
+from training.evaluation.probe import ProbeResult
 
 _COLOURS = {"features": "#0b6e99", "MFCC": "#d1495b"}
 _MAP = "viridis"
 
 
-def draw_probe(probing: Probing, path: Path) -> None:
-    """Writes a PNG: maps of the true distance, of that decoded from features, decoded from features and from MFCC at
-    places left out, and the last two against the truth."""
+def draw_probe(probing: ProbeResult, path: Path) -> None:
+    """Writes a PNG with four panels: a map of the true distance, a map of the distance decoded from features, distances
+    decoded from MFCC at left-out places, and decoded against true distances at left-out places."""
     figure = Figure(figsize=(15.5, 3.9), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": (1.0, 1.0, 1.0, 0.85)})
@@ -52,7 +53,7 @@ def draw_probe(probing: Probing, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _draw_walls(axes: Axes, probing: Probing, title: str) -> None:
+def _draw_walls(axes: Axes, probing: ProbeResult, title: str) -> None:
     walls = np.asarray(probing.plan.corners)
     axes.plot(*np.concatenate([walls, walls[:1]]).T, color="black", linewidth=2.0)
     low, high = walls.min(axis=0) - 0.2, walls.max(axis=0) + 0.2

@@ -1,7 +1,7 @@
-"""Figures that others published for the methods of our tables, each with the data it was measured on.
+"""Figures that others have published for the methods in our tables, with the data that they were measured on.
 
-None is of our scenes: rooms, source-listener distances and definitions differ, so they are for orientation beside a
-row and never an oracle. What the authors did not print is absent.
+None is for our scenes. Rooms, source-listener distances and definitions differ, so the figures only give orientation
+and are never a reference. Figures that the authors did not print are absent.
 """
 
 from collections.abc import Mapping
@@ -53,5 +53,5 @@ MESHRIR = PublishedTable(
 
 
 def published_table(*, simulated: bool) -> PublishedTable:
-    """The table whose data are of the same kind."""
+    """The table for data of the same kind."""
     return SOUNDSPACES if simulated else MESHRIR

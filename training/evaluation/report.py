@@ -1,4 +1,4 @@
-"""Tables of an evaluation: a row per method and a column per metric, as in Luo et al. (NeurIPS 2022)."""
+"""Tables of an evaluation, with a row per method and a column per metric, as in Luo et al. (NeurIPS 2022)."""
 
 from collections.abc import Iterator
 
@@ -13,8 +13,8 @@ _PUBLISHED_OTHERS = ("inras", "neraf", "minaf", "avr")
 
 
 def report(evaluation: Evaluation, published: PublishedTable) -> Table:
-    """The table for people: mean error and, dim, how many entries are missing. Bold is the best of fields and
-    baselines, and whatever cannot be told from it; green a field that beats every baseline there is."""
+    """The table for the terminal: mean errors and, dimmed, numbers of missing entries. Bold: the best of fields and
+    baselines, and every method that is not significantly worse. Green: a field that beats every baseline."""
     table = Table(title=_title(evaluation), caption=_caption(evaluation, published), caption_justify="left")
     table.add_column("method")
     for metric in METRICS:
@@ -36,7 +36,7 @@ def report(evaluation: Evaluation, published: PublishedTable) -> Table:
 
 
 def markdown(evaluation: Evaluation, published: PublishedTable) -> str:
-    """The same table for a README: published figures in parentheses behind ours, missing entries as `(n missing)`."""
+    """The table as Markdown. Published figures follow ours in parentheses; missing entries appear as `(n missing)`."""
     lines = [
         f"{_title(evaluation)}. {_caption(evaluation, published)}",
         "",
@@ -91,7 +91,7 @@ def _head(metric: Metric) -> str:
 
 
 def _best(evaluation: Evaluation, metric: Metric) -> set[str]:
-    """The method of the least mean error, and those that it does not surpass."""
+    """The method with the least mean error, and those that are not significantly worse."""
     means = {
         result.name: mean
         for result in evaluation.results
@@ -119,7 +119,7 @@ def _figure(result: Result, metric: Metric) -> str:
 
 
 def _unexpected(evaluation: Evaluation, result: Result, metric: Metric) -> int:
-    """Entries missing beyond those that have no direct sound, or no second ear, whatever the method."""
+    """The number of missing entries, without those that every method lacks for want of direct sound or a second ear."""
     summary = result.summaries[metric.name]
     if summary.count == 0:
         return 0
@@ -145,5 +145,5 @@ def _time(result: Result) -> str:
 
 
 def short(value: float) -> str:
-    """Three significant digits, never an exponent."""
+    """Three significant digits, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:#.3g}".rstrip(".")

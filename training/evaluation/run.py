@@ -13,9 +13,9 @@ from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import Column, Evaluation, Kind, evaluate
 from training.evaluation.fields import field_columns
 from training.evaluation.figure import draw_figure
-from training.evaluation.kept_errors import KeptErrors, signature
 from training.evaluation.methods import DEFAULT_METHODS, floor_columns, method_columns, simulation_column
 from training.evaluation.published import PublishedTable, published_table
+from training.evaluation.stored_errors import StoredErrors, signature
 
 
 def evaluate_bundles(
@@ -32,12 +32,13 @@ def evaluate_bundles(
     keep: Path | None = None,
     track: Track = lambda steps, _: steps,
 ) -> tuple[Evaluation, PublishedTable]:
-    """Every quality level of every bundle, and the field of every run folder on measured data, beside `methods` and the
-    floor, on the same pairs and orientations: all that are held out, or as many as asked for. Parameters are compared
-    with the medians of so many `draws` of the simulation, or of one with its own. Optionally with a figure (PNG). What
-    is measured is put into the file `keep` pair by pair, to go on with if interrupted, which in the end is removed.
+    """Evaluates each quality level of each bundle, and the field of each run folder on measured data, beside `methods`
+    and the floor. All are evaluated on the same held-out pairs and orientations: all of them, or as many as `pairs` and
+    `yaws` say. Parameters are compared with medians over `draws` simulations, or with those of the dataset's own
+    simulation. `figure` is a PNG to draw. Errors are stored in the file `keep` pair by pair, so that an interrupted
+    evaluation can be resumed; the file is removed at the end.
 
-    Raises EvaluationError, DatasetError if the dataset is of another scene than a bundle, and RunError for a run of
+    Raises EvaluationError, DatasetError if the dataset and a bundle are of different scenes, and RunError for a run on
     other data.
     """
     with open_held_out(data) as everything:
@@ -45,30 +46,30 @@ def evaluate_bundles(
         truth = median_parameters(held_out, draws, track=track) if draws > 1 else []
         columns = field_columns(bundles, held_out)
         if runs:
-            # Torch takes seconds to load, and bundles do without.
+            # Torch takes seconds to load, and bundles do not need it.
             from training.evaluation.measured_fields import run_column
 
             responses = open_responses(data)
             columns += [run_column(run, responses, held_out) for run in runs]
         columns += method_columns(methods, held_out, track)
         measured = [*columns, *([simulation_column(held_out)] if truth else []), *floor_columns(held_out)]
-        kept = None
+        stored = None
         if keep is not None:
-            made_of = [[bundle.digest for bundle in bundles], [signature(folder) for folder in (*runs, data)]]
-            kept = KeptErrors(keep, [made_of, [column.name for column in measured], pairs, yaws, draws, seed])
+            depends_on = [[bundle.digest for bundle in bundles], [signature(folder) for folder in (*runs, data)]]
+            stored = StoredErrors(keep, [depends_on, [column.name for column in measured], pairs, yaws, draws, seed])
         evaluation = evaluate(
             held_out,
             measured,
             of=len(everything),
             truth=truth,
             draws=draws,
-            kept=kept,
+            stored=stored,
             track=lambda steps: track(steps, "evaluating"),
         )
         if figure is not None:
             _draw(evaluation, figure, held_out, columns)
-        if kept is not None:
-            kept.discard()
+        if stored is not None:
+            stored.discard()
         return evaluation, published_table(simulated=held_out.simulated is not None)
 
 
@@ -79,14 +80,14 @@ def _draw(evaluation: Evaluation, path: Path, held_out: HeldOut, columns: Sequen
         references=held_out.reference,
         reference_name="measured response" if held_out.simulated is None else "simulated response",
         columns={column.name: column.source for column in _drawn(columns)},
-        turn=held_out.heard[:1],
+        yaw_index=held_out.yaw_indices[:1],
         examples=_examples(held_out),
         sample_rate=held_out.sample_rate,
     )
 
 
 def _drawn(columns: Sequence[Column]) -> list[Column]:
-    """The first field and the first baseline: two levels of a field would hide each other."""
+    """The first field and the first baseline. A second level of a field would hide the first."""
     first: dict[Kind, Column] = {}
     for column in columns:
         first.setdefault(column.kind, column)
@@ -94,7 +95,7 @@ def _drawn(columns: Sequence[Column]) -> list[Column]:
 
 
 def _examples(held_out: HeldOut) -> list[tuple[int, str]]:
-    """Held-out pairs worth looking at: the closest and farthest in sight, and out of sight."""
+    """Held-out pairs to show: the closest and the farthest, in sight and out of sight."""
     distance = np.linalg.norm(held_out.emitters - held_out.listeners, axis=-1)
     examples = []
     for visible, label in ((True, "in sight"), (False, "round the corner")):

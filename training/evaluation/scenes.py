@@ -1,7 +1,7 @@
-"""One table over scenes: what the default level of each bundle gets wrong, beside the paper's network, of reflected
-sound and of whole responses, the nearest response and the repeatability floor, and what they take.
+"""A table over scenes: errors of the default level of each bundle, beside the paper's network (for late reverberation
+and for whole responses), the nearest response and the repeatability floor, with times.
 
-Reads what `nafir-train evaluate --json` wrote for each scene.
+Reads the files that `nafir-train evaluate --json` writes for each scene.
 """
 
 import json
@@ -17,20 +17,20 @@ from training.evaluation.evaluate import FLOOR, METRICS, ONE_SIMULATION
 from training.evaluation.report import short
 
 TIMES = "times.jsonl"
-"""What each step took, beside the results of a scene."""
+"""The file with the time of each step, beside the results of a scene."""
 
 NAF, NAF_WHOLE, NEAREST = "naf", "naf-whole", "nearest"
 _NOT_METHODS = {ONE_SIMULATION, FLOOR}
 
 
 class ResultError(NafirError):
-    """A file that holds no evaluation of a bundle."""
+    """A file that is not the evaluation of a bundle."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """Mean errors by metric, those that could be measured, the methods that err less by more than chance, and
-    milliseconds per response."""
+    """Mean errors by metric, as far as they could be measured; for each metric the methods with a significantly smaller
+    error; and milliseconds per response."""
 
     errors: Mapping[str, float]
     surpassed_by: Mapping[str, Sequence[str]]
@@ -39,13 +39,13 @@ class Method:
 
     @property
     def megabytes(self) -> float:
-        """Not finite where nothing is stored."""
+        """NaN if nothing is stored."""
         return math.nan if self.storage_bytes is None else self.storage_bytes / 1e6
 
 
 @dataclass(frozen=True)
 class SceneResult:
-    """`methods` by what they are in the table: the default level first, under its own name."""
+    """`methods` by their names in the table; the default level is first, under its own name."""
 
     scene: str
     pairs: int
@@ -101,11 +101,11 @@ class SceneResult:
         }
 
     def worse_than(self, other: str) -> list[str]:
-        """Metrics in which the default level errs more, and not by chance."""
+        """Metrics in which the default level has a significantly larger error."""
         return [name for name, surpassing in self.ours.surpassed_by.items() if other in surpassing]
 
     def larger_than(self, other: str) -> list[str]:
-        """Metrics in which the default level errs more in the mean, by chance or not."""
+        """Metrics in which the default level has a larger mean error, significantly or not."""
         theirs = self.methods[other].errors
         return [name for name, error in self.ours.errors.items() if error > theirs.get(name, math.inf)]
 
@@ -121,11 +121,11 @@ def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
 
 
 def markdown(results: Sequence[SceneResult]) -> str:
-    """A row per scene and method; bold is the best of the default level, the paper's network and nearest, and what errs
-    no more than it by two standard errors of the difference over pairs. Then means over the scenes, where bold is the
-    smallest, and scene by scene what the paper's network does better.
+    """A row for each scene and method. Bold is the best of the default level, the paper's network and the nearest
+    response, and every method that is not worse by two standard errors of the difference over pairs. Then come means
+    over the scenes, with the smallest in bold, and for each scene the metrics in which the paper's network is better.
 
-    Raises ResultError for scenes that are compared with medians of different numbers of draws.
+    Raises ResultError if scenes are compared with medians of different numbers of draws.
     """
     if len(drawn := sorted({result.draws for result in results})) > 1:
         numbers = " and ".join(map(str, drawn))
@@ -161,7 +161,7 @@ def _cell(result: SceneResult, name: str, metric: Metric) -> str:
 
 
 def _number(value: float, *, is_bold: bool = False) -> str:
-    """Empty where there is none."""
+    """Empty for NaN."""
     if not math.isfinite(value):
         return ""
     return f"**{short(value)}**" if is_bold else short(value)
@@ -172,7 +172,7 @@ def _finite(value: float | None) -> float:
 
 
 def _mean_rows(results: Sequence[SceneResult]) -> list[str]:
-    """Means over the scenes, of the methods that all of them have."""
+    """Means over the scenes, for methods that all scenes have."""
     means: dict[str, list[float]] = {}
     for name in _shown(results[0]):
         of_scenes = [result.ours if name == results[0].level else result.methods.get(name) for result in results]
@@ -198,33 +198,34 @@ def _mean_rows(results: Sequence[SceneResult]) -> list[str]:
 def _remarks(results: Sequence[SceneResult]) -> list[str]:
     remarks = []
     for result in results:
-        said = "; ".join(_beside(result, naf) for naf in (NAF, NAF_WHOLE) if naf in result.methods)
-        if not said:
+        comparisons = "; ".join(_beside(result, naf) for naf in (NAF, NAF_WHOLE) if naf in result.methods)
+        if not comparisons:
             continue
         orientations = "1 orientation" if result.yaws == 1 else f"{result.yaws} orientations"
         drawn = f"{result.pairs} pairs, {result.visible_pairs} in sight, {orientations}"
         if result.draws > 1:
             drawn += f", medians of {result.draws} draws"
-        remarks.append(f"- {result.scene} ({drawn}): {said}.")
+        remarks.append(f"- {result.scene} ({drawn}): {comparisons}.")
     return remarks
 
 
 def _beside(result: SceneResult, naf: str) -> str:
     worse, larger = result.worse_than(naf), result.larger_than(naf)
-    told = ", ".join(metric.label for metric in METRICS if metric.name in worse)
-    untold = ", ".join(metric.label for metric in METRICS if metric.name in larger and metric.name not in worse)
-    if told:
-        said = f"errs more than {naf} in {told}" + (f", and in {untold} not by more than chance" if untold else "")
+    significant = ", ".join(metric.label for metric in METRICS if metric.name in worse)
+    others = ", ".join(metric.label for metric in METRICS if metric.name in larger and metric.name not in worse)
+    if significant:
+        text = f"errs more than {naf} in {significant}"
+        text += f", and in {others} not by more than chance" if others else ""
     else:
-        said = f"errs no more than {naf} in any metric"
-        said += f" but {untold}, and there not by more than chance" if untold else ""
+        text = f"errs no more than {naf} in any metric"
+        text += f" but {others}, and there not by more than chance" if others else ""
     naf_ms, ms = result.methods[naf].ms, result.ours.ms
-    return said if naf_ms is None or ms is None else f"{said}, {short(naf_ms / ms)} times as fast"
+    return text if naf_ms is None or ms is None else f"{text}, {short(naf_ms / ms)} times as fast"
 
 
 @dataclass(frozen=True)
 class StepTime:
-    """Seconds that one step of one scene took, all its pieces together."""
+    """Seconds that one step of one scene took, summed over interrupted parts."""
 
     step: str
     wall_s: float
@@ -232,7 +233,7 @@ class StepTime:
 
 
 def step_times(log: Path) -> list[StepTime]:
-    """Of a log that `training.cli.stopwatch` wrote, in order of first appearance. Raises ResultError."""
+    """Times from a log of `training.cli.stopwatch`, in order of first appearance. Raises ResultError."""
     totals: dict[str, list[float]] = {}
     try:
         for line in log.read_text().splitlines():
@@ -247,7 +248,7 @@ def step_times(log: Path) -> list[StepTime]:
 
 
 def times_markdown(times: Mapping[str, Sequence[StepTime]]) -> str:
-    """A row per scene, a column per step: minutes of wall time, CPU minutes in parentheses, and the sums."""
+    """A row for each scene and a column for each step: minutes of wall time, CPU minutes in parentheses, and sums."""
     steps = list(dict.fromkeys(step.step for of_scene in times.values() for step in of_scene))
     rows = {scene: {step.step: step for step in of_scene} for scene, of_scene in times.items()}
     lines = ["| minutes | " + " | ".join([*steps, "all"]) + " |", "| --- |" + " ---: |" * (len(steps) + 1)]

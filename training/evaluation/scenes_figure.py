@@ -1,4 +1,4 @@
-"""The figure over scenes: by how much each method errs, in units of what two simulations differ by."""
+"""The figure over scenes: the errors of each method, in multiples of the difference between two simulations."""
 
 import math
 from collections.abc import Sequence
@@ -17,28 +17,28 @@ from training.evaluation.scenes import NAF, NAF_WHOLE, NEAREST, SceneResult
 _DEFAULT = "default level"
 _STYLES = {
     NAF_WHOLE: ("v", "#edae49", "the paper's network, whole responses (naf-whole)"),
-    NAF: ("^", "#d1495b", "the same network, reflected sound (naf)"),
+    NAF: ("^", "#d1495b", "the same network, late reverberation (naf)"),
     NEAREST: ("s", "#66a182", "nearest pair"),
     ONE_SIMULATION: ("x", "#8d6a9f", "one simulation"),
     _DEFAULT: ("o", "#0b6e99", "default level"),
 }
-"""Marker, colour and label; the last is drawn on top."""
+"""Marker, colour and label of each method; the last is drawn on top."""
 _FLOOR_COLOUR, _TEXT = "#8d6a9f", "#2b3a42"
-# IACC early says what IACC says, and an onset is exact where geometry makes it.
+# Early IACC behaves like IACC, and the onset is exact because it comes from geometry.
 _SHOWN = [metric for metric in METRICS if metric.name not in {"iacc_early", "onset"}]
 _ACROSS = 4
 
 
 def draw_scenes(results: Sequence[SceneResult], path: Path) -> None:
-    """Writes a PNG."""
+    """Writes the figure as a PNG."""
     figure = figure_of(results)
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=110)
 
 
 def figure_of(results: Sequence[SceneResult]) -> Figure:
-    """A panel per metric, scenes from left to right, mean errors over the floor's mean error upwards. What cannot be
-    measured, and whatever has no floor, is left out."""
+    """A panel per metric: scenes from left to right, and the mean error over the floor's mean error upwards. Values
+    that could not be measured, or have no floor, are left out."""
     down = math.ceil(len(_SHOWN) / _ACROSS)
     width = max(11.5, 0.5 * len(results) * _ACROSS)
     figure = Figure(figsize=(width, 2.9 * down + 1.0), layout="constrained", facecolor="white")

@@ -1,4 +1,4 @@
-"""Errors of a quality level on a sample of a dataset's pairs, held out unless others are asked for.
+"""Errors of a quality level on a sample of a dataset's pairs, by default of the held-out pairs.
 
 Axes: entries are (pair, yaw); responses (yaw, ear, sample).
 """
@@ -30,7 +30,7 @@ _Responses = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Entry:
-    """One pair and the head orientations it is heard at."""
+    """One pair with its reference at a few head orientations."""
 
     emitter: npt.NDArray[np.float64]
     listener: npt.NDArray[np.float64]
@@ -38,18 +38,18 @@ class Entry:
     visible: bool
     reference: _Responses
     reflected: _Responses
-    """What a field is asked for: the reference without its direct sound and its first reflections."""
+    """The part of the reference that a field predicts, without direct sound and first reflections."""
     repeat: _Responses | None
-    """Of a pair that is held out."""
+    """The second simulation of a held-out pair."""
     parameters: RoomParameters
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean errors by metric in their units, the same in JND, and the mean of those in JND pair by pair (pair,).
+    """Mean errors by metric in their units, the same in JND, and for each pair (pair,) the mean of those in JND.
 
     `missing` is the share of audible errors that could not be measured; they are in no mean. `steps` are the largest
-    changes over a centimetre, in JND by metric, as far as they were looked for.
+    changes over a centimetre, in JND by metric, as far as they were measured.
     """
 
     errors: dict[str, float]
@@ -60,7 +60,7 @@ class Errors:
 
     @classmethod
     def mean(cls, of: Sequence[Self]) -> Self:
-        """Of several measurements of the same sample; `steps` are those of the first."""
+        """The mean of several measurements of the same sample, with the `steps` of the first."""
 
         def over(dictionaries: list[dict[str, float]]) -> dict[str, float]:
             return {name: math.fsum(each[name] for each in dictionaries) / len(of) for name in dictionaries[0]}
@@ -75,23 +75,24 @@ class Errors:
 
 
 class Estimate:
-    """Whole responses of a field. Where it starts warm, each is asked for a step after its neighbour, as on a walk."""
+    """Whole responses of a field. If its phase iteration starts from the previous response, each pose is computed after
+    its neighbour, as on a walk."""
 
     def __init__(self, field: AcousticField) -> None:
         self._whole = FullResponse.through_kemar(field)
-        self._walks = field.level.phase.warm
+        self._is_warm = field.level.phase.warm
 
     def __call__(self, entry: Entry) -> _Responses:
         listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
-        if self._walks:
+        if self._is_warm:
             self._whole.impulse_responses(listeners + np.array([_STEP_M, 0.0, 0.0]), emitters, entry.yaws)
         return self._whole.impulse_responses(listeners, emitters, entry.yaws)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors in JND by (pair, metric), NaN where none could be measured, and of each pair (pair,) the share that could
-    not be."""
+    """Errors in JND by (pair, metric), NaN where they could not be measured, and for each pair (pair,) the share that
+    could not be measured."""
 
     errors: _Floats
     missing_shares: _Floats
@@ -104,7 +105,7 @@ class Scores:
 
     @classmethod
     def unmeasurable(cls, pairs: int) -> "Scores":
-        """Where no response is finite."""
+        """The scores if no response is finite."""
         return cls(np.full((pairs, 1), np.inf), np.ones(pairs))
 
     @property
@@ -113,13 +114,13 @@ class Scores:
 
     @property
     def mean(self) -> float:
-        """Over metrics, of each one's mean over pairs."""
+        """The mean over metrics of each metric's mean over pairs."""
         is_known = np.isfinite(self.errors).any(axis=0)
         return float(np.mean(np.nanmean(self.errors[:, is_known], axis=0))) if is_known.any() else math.inf
 
     def behind(self, best: "Scores") -> float:
-        """By how many standard errors the mean error is greater than the best's, over the pairs that both have; without
-        end where there is none."""
+        """By how many standard errors the mean error is greater than the best one's, over the pairs that both have;
+        infinite if nothing could be measured."""
         if not np.isfinite(self.mean):
             return math.inf
         difference = np.nanmean(self.errors - best.errors, axis=-1)
@@ -130,7 +131,7 @@ class Scores:
 
 
 class SampledPairs:
-    """`pairs` pairs at `yaws` orientations each, spread evenly; all where there are no more."""
+    """A sample of `pairs` pairs at `yaws` evenly spaced orientations, or all if there are fewer."""
 
     def __init__(
         self, dataset: Dataset, codec: Codec, *, pairs: int, yaws: int, seed: int, held_out: bool = True
@@ -140,7 +141,7 @@ class SampledPairs:
         rng = np.random.default_rng([seed, 7])
         all_pairs = dataset.pairs(held_out=held_out)
         chosen = all_pairs[np.sort(rng.choice(len(all_pairs), min(pairs, len(all_pairs)), replace=False))]
-        turns = np.unique(np.linspace(0, len(dataset.yaws), yaws, endpoint=False).astype(int))
+        yaw_indices = np.unique(np.linspace(0, len(dataset.yaws), yaws, endpoint=False).astype(int))
         with h5py.File(Path(dataset.folder) / "pairs.h5", "r") as file:
             first, second = References(dataset, file), References(dataset, file, "repeats")
             reflected = StoredResponses(dataset, file)
@@ -148,25 +149,25 @@ class SampledPairs:
             for emitter, listener in chosen:
                 pair = int(emitter) * len(dataset.probes) + int(listener)
                 ends = dataset.probes[emitter], dataset.probes[listener]
-                reference = first[pair][turns]
+                reference = first[pair][yaw_indices]
                 entry = Entry(
                     *ends,
-                    yaws=dataset.yaws[turns],
+                    yaws=dataset.yaws[yaw_indices],
                     visible=bool(dataset.plan.is_visible(*ends)),
                     reference=reference,
-                    reflected=reflected[emitter, listener][turns],
-                    repeat=second[pair][turns] if held_out else None,
+                    reflected=reflected[emitter, listener][yaw_indices],
+                    repeat=second[pair][yaw_indices] if held_out else None,
                     parameters=measure(reference, self._sample_rate),
                 )
                 self.entries.append(entry)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Pairs, and orientations of each."""
+        """The number of pairs, and of orientations of each."""
         return len(self.entries), len(self.entries[0].yaws)
 
     def errors_of(self, estimate: Callable[[Entry], _Responses]) -> Errors:
-        """`estimate` gives (yaw, ear, sample) of an entry, direct sound included."""
+        """`estimate` gives (yaw, ear, sample) whole responses for an entry."""
         by_entry: list[dict[str, _Floats]] = []
         audible_by_entry: list[dict[str, _Floats]] = []
         for entry in self.entries:
@@ -178,7 +179,7 @@ class SampledPairs:
         )
 
     def scores_of(self, estimate: Callable[[Entry], _Responses], numbers: npt.NDArray[np.int64]) -> "Scores":
-        """Audible errors of some entries alone, without the spectrum: in a third of the time that `errors_of` takes."""
+        """Audible errors of some entries, without the spectral loss: it takes a third of the time of `errors_of`."""
         entries = [self.entries[number] for number in numbers]
         audible = [in_jnd(self._differences(entry, estimate(entry)), entry.parameters) for entry in entries]
         return Scores(
@@ -187,7 +188,7 @@ class SampledPairs:
         )
 
     def floor(self) -> Errors:
-        """What a second simulation of the same pairs, held out, differs by."""
+        """The errors of a second simulation of the same held-out pairs."""
 
         def second(entry: Entry) -> _Responses:
             assert entry.repeat is not None
@@ -212,18 +213,18 @@ class SampledPairs:
 
 
 def _means(entries: list[dict[str, _Floats]]) -> dict[str, float]:
-    """Means over all that could be measured; a metric that never could is left out."""
+    """Means over all values that could be measured. A metric without any is left out."""
     stacked = {name: np.concatenate([entry[name].ravel() for entry in entries]) for name in entries[0]}
     return {name: float(np.nanmean(values)) for name, values in stacked.items() if np.isfinite(values).any()}
 
 
 def _mean(values: _Floats) -> float:
-    """Of what could be measured."""
+    """The mean of the values that could be measured."""
     return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
 
 
 def _missing(entries: list[dict[str, _Floats]]) -> float:
-    """The share of them that could not be measured."""
+    """The share of values that could not be measured."""
     return float(np.mean(np.isnan(np.concatenate([values.ravel() for entry in entries for values in entry.values()]))))
 
 

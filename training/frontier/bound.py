@@ -1,4 +1,4 @@
-"""How good a field's levels would be with the phase of the reference: a bound for every way of finding one."""
+"""A bound for every method of finding a phase: the accuracy of a field's magnitudes with the phase of the reference."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,7 +9,8 @@ from training.models.targets import align
 
 
 class TruePhase:
-    """Whole responses (yaw, ear, sample): predicted magnitudes, the phase of the reference, and what geometry adds."""
+    """Whole responses (yaw, ear, sample) with predicted magnitudes, the phase of the reference, and the parts that come
+    from geometry."""
 
     def __init__(self, field: AcousticField) -> None:
         manifest = field.bundle.manifest

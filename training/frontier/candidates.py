@@ -1,51 +1,30 @@
-"""Which quality levels a bundle could offer: every field with every way of finding its phase, and of reusing responses.
+"""The quality levels that a bundle could offer: every field with every method of finding its phase, and of reusing
+responses.
 
-Shorter responses are not among them: room parameters are taken from the first 35 dB of a decay and would not hear that
-the rest was cut off, so cutting it would always seem to be worth the time it saves.
+Shorter responses are not among them. Room parameters depend only on the first 35 dB of a decay, so they would not show
+that the rest was cut off.
 """
 
 from collections.abc import Iterable, Iterator
 
 from server.core.errors import BundleError
+from server.field.kinds.catalogue import KINDS
 from server.scene.bundle import Bundle
-from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel, Reuse
+from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel
 
 NONE = "none"
-"""Instead of a field's name: no field."""
+"""Stands for no field, in place of a field's name."""
 GRIFFIN_LIM_ITERATIONS = (1, 4, 16, 64)
-_LATTICES = (
-    (0.1, 15),
-    (0.25, 15),
-    (0.25, 30),
-    (0.5, 30),
-    (0.5, 60),
-    (1.0, 30),
-    (1.0, 60),
-    (1.0, 120),
-    (2.0, 60),
-    (2.0, 120),
-    (2.0, 360),
-    (5.0, 120),
-    (5.0, 360),
-)
-"""Spacing in metres, turn in degrees."""
-
-
-REUSES = (
-    *(Reuse(spacing_m=spacing_m, turn_deg=turn_deg) for spacing_m, turn_deg in _LATTICES),
-    *(Reuse(spacing_m=spacing_m, turn_deg=turn_deg, first_reflections="node") for spacing_m, turn_deg in _LATTICES),
-)
-"""Lattices from a step's length to one node per room, each with first reflections of its own and kept with the rest."""
 
 
 def candidates(
     bundle: Bundle, phases_of: Iterable[str] | None = None, reuse_of: Iterable[str] = ()
 ) -> list[QualityLevel]:
-    """One level per combination worth measuring, named after what sets it apart.
+    """One level per combination, named after what distinguishes it.
 
-    Swept over phases are the fields that `phases_of` names, by default all: what Griffin and Lim's iteration adds in
-    time does not depend on the field beneath. Swept over lattices on which responses are reused are those that
-    `reuse_of` names; either may name `NONE`. Raises BundleError for a name that is no field.
+    `phases_of` names the fields for which all methods of finding the phase are measured, by default all fields; the
+    time of Griffin and Lim's iteration does not depend on the field. `reuse_of` names the fields for which all kinds
+    of reuse are measured. Either may be `NONE`. Raises BundleError for a name that is not a field.
     """
     fields = bundle.manifest.fields
     reused = set(reuse_of)
@@ -57,13 +36,7 @@ def candidates(
             other = min(named - {NONE})
             raise BundleError(bundle.folder, "fields", f"{NONE!r} and {other!r} contradict each other: leave one out")
     levels = [level for name, file in fields.items() for level in _levels(bundle.manifest, name, file, name in swept)]
-    return [*levels, *(_reusing(name, reuse) for name in fields if name in reused for reuse in REUSES)]
-
-
-def _reusing(name: str, reuse: Reuse) -> QualityLevel:
-    whole = "" if reuse.first_reflections == "pose" else "-whole"
-    title = f"{name}-{100 * reuse.spacing_m:.0f}cm-{reuse.turn_deg:.0f}deg{whole}"
-    return QualityLevel(name=title, field=name, reuse=reuse)
+    return [*levels, *(level for name in fields if name in reused for kind in KINDS for level in kind.candidates(name))]
 
 
 def _levels(manifest: Manifest, name: str, file: FieldFile, with_phases: bool) -> Iterator[QualityLevel]:

@@ -1,4 +1,4 @@
-"""What quality levels cost: milliseconds per pose on one core, memory and storage."""
+"""The cost of quality levels: milliseconds per pose on one core, memory and storage."""
 
 import math
 import multiprocessing
@@ -17,7 +17,7 @@ from server.bench.machine import processor
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES, Kept
+from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.rendering.hrtf import HeadFilters
 from server.responses.full_response import kemar
 from server.scene.bundle import Bundle
@@ -25,15 +25,15 @@ from server.scene.manifest import Cost, QualityLevel
 from server.streaming.calibration import Listener
 from training.frontier.walk import POSES_PER_S, walk
 
-STRETCH_S = 5
-_FEW = 12
-_STRETCHES_OF_MISSES = 12
+SEGMENT_S = 5
+_FEW_POSES = 12
+_SEGMENTS_OF_MISSES = 12
 _WARM_UP = 3
 
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """The process keeps to one of its cores, where the system lets it."""
+    """Restricts the process to one of its cores, if the system allows it."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -47,8 +47,8 @@ def one_core() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Times:
-    """Milliseconds: `walk` (pose,) of a walk that begins with nothing kept, `miss` (pose,) of poses that find nothing;
-    `kept_mb` is what was kept in the end."""
+    """Milliseconds: `walk` (pose,) on a walk that begins with an empty cache, and `miss` (pose,) for poses that are not
+    in the cache. `kept_mb` is the final size of the cache."""
 
     walk: npt.NDArray[np.float64]
     miss: npt.NDArray[np.float64]
@@ -63,13 +63,13 @@ def measure(
     seed: int = 0,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Times]:
-    """What a pose takes at each level, on a `walk` of `walk_s` through the scene.
+    """The time per pose at each level, on a walk of `walk_s` through the scene.
 
-    Time is that of this thread, which is all that computes, so that what else the machine does counts little. All
-    levels walk a few seconds each in turn, so that it meets all of them, and each finds its numbers in the processor's
-    caches, as a stream does. To a level that computes every response anew one pose is
-    like another: it takes the first few of each stretch, and none once it has had its `budget_s`, but for three
-    stretches.
+    The time is the CPU time of this thread, which does all the computing, so that other processes have little
+    influence. The levels take turns, a few seconds each: changes of the machine's speed then affect all levels, and
+    each level finds its data in the processor's caches, as in a stream. For a level that computes every response anew,
+    all poses take the same time. It computes the first few poses of each segment, and none after its `budget_s`, but at
+    least three segments.
     """
     poses = walk(levels.bundle, duration_s=walk_s, seed=seed)
     filters = kemar(levels.default.sample_rate)
@@ -81,31 +81,31 @@ def measure(
             listener.time_ms(pose)
         listener.forget()
     rng = np.random.default_rng(seed)
-    stretch = STRETCH_S * POSES_PER_S
-    starts = range(0, len(poses), stretch)
+    segment = SEGMENT_S * POSES_PER_S
+    starts = range(0, len(poses), segment)
     for start in starts:
         for name in rng.permutation(list(levels)):
             listener = listeners[name]
-            if levels[name].level.reuse is not None:
-                times[name] += [listener.time_ms(pose) for pose in poses[start : start + stretch]]
-            elif math.fsum(times[name]) <= 1000 * budget_s or start < 3 * stretch:
-                times[name] += [listener.time_ms(pose) for pose in poses[start : start + _FEW]]
+            if levels[name].kind.reuses_responses:
+                times[name] += [listener.time_ms(pose) for pose in poses[start : start + segment]]
+            elif math.fsum(times[name]) <= 1000 * budget_s or start < 3 * segment:
+                times[name] += [listener.time_ms(pose) for pose in poses[start : start + _FEW_POSES]]
         advance()
     kept_mb = {name: listener.kept_bytes / 1e6 for name, listener in listeners.items()}
-    for start in starts[:: len(starts) // _STRETCHES_OF_MISSES or 1]:
+    for start in starts[:: len(starts) // _SEGMENTS_OF_MISSES or 1]:
         for name, level in levels.items():
-            if level.level.reuse is not None:
-                for pose in poses[start : start + _FEW]:
+            if level.kind.reuses_responses:
+                for pose in poses[start : start + _FEW_POSES]:
                     listeners[name].forget()
                     misses[name].append(listeners[name].time_ms(pose))
     return {name: Times(np.array(times[name]), np.array(misses[name] or times[name]), kept_mb[name]) for name in levels}
 
 
 def _alone(field: AcousticField, filters: HeadFilters) -> Listener:
-    """Who shares with no other level what is kept."""
-    kept: Kept = BoundedCache(KEPT_BYTES)
-    alone = AcousticField(field.bundle, field.level, field.graph, kept=kept)
-    return Listener(alone, filters, kept=kept, time_s=time.thread_time)
+    """A listener with its own cache of responses."""
+    cache: NodeCache = BoundedCache(NODE_CACHE_BYTES)
+    alone = AcousticField(field.bundle, field.level, field.graph, node_cache=cache)
+    return Listener(alone, filters, node_cache=cache, time_s=time.thread_time)
 
 
 def cost_of(bundle: Bundle, level: QualityLevel, times: Times, memory_mb: float) -> Cost:
@@ -123,7 +123,7 @@ def cost_of(bundle: Bundle, level: QualityLevel, times: Times, memory_mb: float)
 
 
 def memory_mb(folder: Path, levels: Sequence[str]) -> dict[str, float]:
-    """What serving each level adds to a fresh process, MB."""
+    """The memory in MB that serving each level adds to a new process."""
     context = multiprocessing.get_context("spawn")
     added = {}
     for level in levels:
@@ -134,7 +134,7 @@ def memory_mb(folder: Path, levels: Sequence[str]) -> dict[str, float]:
 
 def _added_mb(folder: Path, level: str) -> float:
     bundle = Bundle.load(folder)
-    # One level served before the count, so that libraries and compiled code are none of the cost.
+    # One level is served before the measurement, so that libraries and compiled code do not count.
     first = _serving(bundle, None)
     before = psutil.Process().memory_info().rss
     second = _serving(bundle, level)

@@ -1,4 +1,4 @@
-"""The frontier as a picture: audible error over the time a pose takes."""
+"""The frontier as a picture: audible error over the time per pose."""
 
 from pathlib import Path
 
@@ -13,19 +13,19 @@ from training.frontier.sweep import Frontier
 _PARETO, _OTHER, _FLOOR, _DEADLINE, _BOUND, _TEXT = "#0b6e99", "#aeb9c1", "#8d6a9f", "#d1495b", "#66a182", "#2b3a42"
 _SPREAD = "#bfdbe6"
 _LABEL_HEIGHT = 0.042
-"""Of the axes' height: labels are no closer."""
+"""The least distance between labels, as a share of the axes' height."""
 
 
 def draw_frontier(frontier: Frontier, path: Path) -> None:
-    """Writes a PNG: all points at their mean time, the line of those worth it and how far from it poses are, the
-    repeatability floor, the block deadline. Named are the levels that are offered."""
+    """Writes a PNG: all points at their mean time, the line of the Pareto-optimal ones with the spread of their times,
+    the repeatability floor, and the deadline of a block. The levels that are offered have names."""
     figure = Figure(figsize=(11.5, 6.6), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     best, offered = list(frontier.best), list(frontier.offered)
     others = [point for point in frontier.points if point not in best and not point.bound]
     bounds = [point for point in frontier.points if point.bound]
-    axes.scatter(*_coordinates(others), s=20, color=_OTHER, label="measured, not worth its time", zorder=2)
+    axes.scatter(*_coordinates(others), s=20, color=_OTHER, label="measured, not Pareto-optimal", zorder=2)
     axes.scatter(*_coordinates(bounds), s=48, marker="x", color=_BOUND, label="if the phase were known", zorder=3)
     axes.hlines(
         [point.audible_error for point in best],
@@ -43,7 +43,7 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
         facecolors="white",
         edgecolors=_PARETO,
         linewidths=1.6,
-        label="worth its time",
+        label="Pareto-optimal",
         zorder=4,
     )
     axes.scatter(*_coordinates(offered), s=44, color=_PARETO, label="quality level of the bundle", zorder=5)
@@ -73,7 +73,7 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
 
 
 def _name(axes: Axes, points: list[Point], default: Point) -> None:
-    """Names to the right of the points and above them, none over another."""
+    """Puts names to the right of the points and above them, without overlap."""
     top = axes.get_ylim()[1]
     taken = top
     for point in sorted(points, key=lambda point: point.audible_error, reverse=True):

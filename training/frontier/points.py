@@ -1,4 +1,4 @@
-"""Points of the frontier: what a quality level gets wrong, what it costs, and which levels are worth their time."""
+"""Points of the frontier: errors and cost of a quality level, and which levels are Pareto-optimal."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,21 +11,21 @@ from server.scene.manifest import Accuracy, Cost, QualityLevel
 
 _Floats = npt.NDArray[np.float64]
 _MISSING_ALLOWANCE = 0.01
-OFFERED_APART = 3.0
-ALIKE = 1.03
-"""Errors, below one JND most of them, whose difference nobody would wait for."""
-AS_SOON = 1.1
-"""Times whose difference may be the host's mood."""
+LEAST_COST_RATIO = 3.0
+SIMILAR_ERROR = 1.03
+"""Errors, mostly below one JND, whose ratio is less than this count as equal."""
+SIMILAR_TIME = 1.1
+"""Times whose ratio is less than this count as equal, because the host's speed varies."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A level with its measured `accuracy` and `cost`; `audible` are its mean errors in JND by metric, `by_pair`
-    (pair,) the mean of them for each held-out pair.
+    """A level with its measured `accuracy` and `cost`. `audible` are its mean errors in JND by metric, `by_pair`
+    (pair,) their mean for each held-out pair.
 
-    A level that no server can offer, such as the true phase, is a `bound`: drawn for orientation only. So is one whose
-    responses cannot be measured as often as the references can (`missing`, a share): it must not win by leaving the
-    hard ones out.
+    A `bound`, such as the true phase, is a level that no server can offer; it is drawn for comparison only. `missing`
+    is the share of errors that cannot be measured: a level must not win because its hardest responses cannot be
+    measured.
     """
 
     level: QualityLevel
@@ -51,11 +51,10 @@ class Point:
 
 
 def pareto(points: Sequence[Point], *, missing: float = 0.0) -> list[Point]:
-    """Those that no cheaper one equals, cheapest first, of all that miss hardly more than `missing`. Their cost is the
-    mean.
+    """The Pareto-optimal points by mean cost, cheapest first, among those with hardly more missing than `missing`.
 
-    Each is more accurate than the one before it by more than one standard error of their difference over the held-out
-    pairs, so that what is called better is not the luck of the draw.
+    Each is more accurate than the one before by more than one standard error of their difference over the held-out
+    pairs, so that chance does not decide.
     """
     best: list[Point] = []
     eligible = [point for point in points if not point.bound and point.missing <= missing + _MISSING_ALLOWANCE]
@@ -74,30 +73,31 @@ def _is_better(ours: _Floats, theirs: _Floats) -> bool:
 
 
 def default_point(best: Sequence[Point], *, ms: float) -> Point:
-    """The most accurate of Pareto-optimal points whose response takes at most `ms` where nothing was kept; or rather,
-    of those hardly less accurate (`ALIKE`), the most accurate that takes hardly longer (`AS_SOON`) than the quickest.
-    Where none is in time, the one whose response takes least."""
+    """The default level: of the Pareto-optimal points whose response takes at most `ms` without the cache, and whose
+    error is similar to the least one, it takes those that are about as quick as the quickest, and of them the most
+    accurate. If no response takes at most `ms`, it is the quickest."""
     quick = [point for point in best if point.cost.ms_miss <= ms]
     if not quick:
         return min(best, key=lambda point: point.cost.ms_miss)
     least = min(point.audible_error for point in quick)
-    alike = [point for point in quick if point.audible_error <= ALIKE * least]
+    alike = [point for point in quick if point.audible_error <= SIMILAR_ERROR * least]
     soonest_ms = min(point.cost.ms_miss for point in alike)
     return min(
-        (point for point in alike if point.cost.ms_miss <= AS_SOON * soonest_ms), key=lambda point: point.audible_error
+        (point for point in alike if point.cost.ms_miss <= SIMILAR_TIME * soonest_ms),
+        key=lambda point: point.audible_error,
     )
 
 
 def offered_points(best: Sequence[Point], default: Point) -> list[Point]:
-    """A few of the Pareto-optimal points, the default first: from it on down and up, each the most accurate of those
-    that cost a third or less of the one before it, or three times as much or more."""
+    """A few of the Pareto-optimal points, the default first. From it on down and up, each is the most accurate of those
+    that cost a third of the one before or less, or three times as much or more."""
     offered = [default]
     for point in reversed(best):
-        if point.cost.ms_mean * OFFERED_APART <= offered[-1].cost.ms_mean:
+        if point.cost.ms_mean * LEAST_COST_RATIO <= offered[-1].cost.ms_mean:
             offered.append(point)
     dearest = default
     for point in best:
-        if point.cost.ms_mean >= OFFERED_APART * dearest.cost.ms_mean:
+        if point.cost.ms_mean >= LEAST_COST_RATIO * dearest.cost.ms_mean:
             dearest = point
             offered.append(point)
     return offered

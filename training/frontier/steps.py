@@ -1,6 +1,6 @@
-"""How much what is heard changes from one pose to another a centimetre away.
+"""How much the sound changes between two poses that are a centimetre from each other.
 
-Of responses computed anew for every pose, little; where poses share responses, by a jump at the border of a cell.
+It changes little if every response is computed anew. If poses share responses, it jumps at the border of a cell.
 """
 
 import itertools
@@ -21,15 +21,15 @@ _WALK_S = 60.0
 
 
 def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, float]:
-    """In JND by metric: the largest change of `count` steps of a walk, or of all that lead to another node.
+    """For each metric, the largest change in JND over `count` steps of a walk, or over those that lead to another node.
 
-    Steps are spread evenly over the walk, and where the level reuses responses, over those from one node to another.
-    DRR counts where both poses have the emitter in sight, as everywhere.
+    The steps are evenly spread over the walk or, if the level reuses responses, over the steps that lead to another
+    node. DRR counts if the emitter is in sight of both poses.
     """
     emitter = field.bundle.manifest.start.emitter
     poses = walk(field.bundle, duration_s=_WALK_S, poses_per_s=SPEED_M_PER_S / STEP_M, seed=seed)
     steps = list(itertools.pairwise(poses))
-    if field.nodes is not None:
+    if field.kind.reuses_responses:
         nodes = [field.snap(pose.position, emitter, pose.yaw) for pose in poses]
         steps = [step for step, (one, other) in zip(steps, itertools.pairwise(nodes), strict=True) if one != other]
     spread = np.linspace(0, len(steps) - 1, min(count, len(steps))).astype(int) if steps else np.array([], int)

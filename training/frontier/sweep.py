@@ -1,7 +1,7 @@
-"""The sweep: every candidate level measured, the Pareto-optimal ones written into the bundle.
+"""The sweep: measures every candidate level, and writes the Pareto-optimal ones into the bundle.
 
-Accuracy comes level by level and is kept in a file as it comes, so that an interrupted sweep goes on where it stopped.
-Cost is measured at the end, of all levels in one run.
+Errors are measured level by level and stored in a file, so that an interrupted sweep can be resumed. Times are measured
+at the end, for all levels in one run.
 """
 
 import dataclasses
@@ -20,23 +20,23 @@ from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, QualityLevel
 from training.baselines.held_out import require_same_scene
-from training.baselines.moved_lattice import with_moved_lattice
+from training.baselines.moved_nodes import with_moved_nodes
 from training.data.dataset import Dataset
 from training.frontier.accuracy import Errors, Estimate, SampledPairs
 from training.frontier.bound import TruePhase
-from training.frontier.cost import STRETCH_S, cost_of, measure, memory_mb, one_core
+from training.frontier.cost import SEGMENT_S, cost_of, measure, memory_mb, one_core
 from training.frontier.points import Point, default_point, offered_points, pareto
 from training.frontier.steps import largest_steps
 
-_SOUND = 4
-"""Another number wherever the same graph comes to sound otherwise: what was kept of before is measured anew."""
+_FORMAT = 4
+"""Must change whenever the same graph comes to give other responses: older stored errors are then measured again."""
 _OFFSETS = 4
 _STEPS = 60
 
 
 @dataclass(frozen=True)
 class Frontier:
-    """All points measured, the Pareto-optimal ones quickest first, which of them is the default, and the floor."""
+    """All measured points, the Pareto-optimal ones (quickest first), the default among them, and the floor."""
 
     scene: str
     pairs: int
@@ -49,7 +49,7 @@ class Frontier:
 
     @property
     def offered(self) -> tuple[Point, ...]:
-        """What a bundle should offer of them, the default first."""
+        """The points that a bundle should offer as quality levels, the default first."""
         return tuple(offered_points(self.best, self.default))
 
     def to_json(self) -> dict[str, Any]:
@@ -83,9 +83,9 @@ class Frontier:
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: held-out `pairs` at `yaws` each; a walk of `walk_s`, of which a level that computes every
-    response anew gets `budget_s`; the default level is, of those whose response takes at most `default_ms`, the
-    quickest that is about as accurate as the most accurate."""
+    """How much is measured: held-out `pairs` at `yaws` orientations each, and a walk of `walk_s`, of which a level that
+    computes every response anew uses `budget_s`. The default level is the quickest that is about as accurate as the
+    most accurate, among those whose response takes at most `default_ms`."""
 
     pairs: int = 40
     yaws: int = 3
@@ -98,9 +98,9 @@ class Effort:
 def sweep(
     bundle: Bundle, dataset: Dataset, levels: Sequence[QualityLevel], folder: Path, effort: Effort, progress: Progress
 ) -> Frontier:
-    """Measures `levels` of the bundle on the dataset's held-out pairs; what is done is kept in `folder`.
+    """Measures `levels` of the bundle on the dataset's held-out pairs. Results are stored in `folder` as they come.
 
-    Raises DatasetError if the dataset is of another scene than the bundle.
+    Raises DatasetError if dataset and bundle are of different scenes.
     """
     require_same_scene(bundle, dataset)
     folder.mkdir(parents=True, exist_ok=True)
@@ -108,7 +108,7 @@ def sweep(
     sample = SampledPairs(dataset, trial.manifest.codec.codec, pairs=effort.pairs, yaws=effort.yaws, seed=effort.seed)
     floor = sample.floor()
     errors = _accuracies(trial, sample, levels, folder / "accuracy.json", effort, progress)
-    task = progress.add_task("timing", total=math.ceil(effort.walk_s / STRETCH_S))
+    task = progress.add_task("timing", total=math.ceil(effort.walk_s / SEGMENT_S))
     with one_core():
         times = measure(
             FieldsByLevel.load(trial),
@@ -138,8 +138,8 @@ def sweep(
 
 
 def with_levels(bundle: Bundle, levels: Sequence[QualityLevel], folder: Path) -> Bundle:
-    """The bundle written to `folder`, its own or another, with these levels in place of its own, and without the fields
-    none of them needs."""
+    """Writes the bundle to `folder`, its own or another one, with these levels in place of its own, and without the
+    fields that none of them uses."""
     manifest = bundle.manifest
     fields = {name: file for name, file in manifest.fields.items() if name in {level.field for level in levels}}
     names = {ARRAYS_FILE, *(file.file for file in fields.values())}
@@ -154,8 +154,8 @@ def with_levels(bundle: Bundle, levels: Sequence[QualityLevel], folder: Path) ->
 
 
 def record(bundle: Bundle, frontier: Frontier, folder: Path) -> Bundle:
-    """The bundle written to `folder`, its own or another, with the levels that it should offer and, beside them, all
-    Pareto-optimal points that were measured."""
+    """Writes the bundle to `folder`, its own or another one, with the levels that it should offer, and records all
+    Pareto-optimal points."""
     fields = bundle.manifest.fields
     offered = [point.level for point in frontier.offered]
     points = []
@@ -174,17 +174,17 @@ def _point(level: QualityLevel, cost: Cost, errors: Errors, floor: Errors, sampl
     return Point(measured, errors.audible, errors.by_pair, errors.missing)
 
 
-def _true_phase(trial: Bundle, like: Point, sample: SampledPairs, floor: Errors) -> Point:
-    """What the first level would be if it knew the phase of every bin: drawn at its cost."""
-    errors = sample.errors_of(TruePhase(AcousticField.load(trial, level=like.level.name)))
-    level = like.level.model_copy(update={"name": f"{like.level.name}-true-phase"})
-    return dataclasses.replace(_point(level, like.cost, errors, floor, sample), bound=True)
+def _true_phase(trial: Bundle, first: Point, sample: SampledPairs, floor: Errors) -> Point:
+    """The point that the first level would have if it knew the phase of every bin, drawn at that level's cost."""
+    errors = sample.errors_of(TruePhase(AcousticField.load(trial, level=first.level.name)))
+    level = first.level.model_copy(update={"name": f"{first.level.name}-true-phase"})
+    return dataclasses.replace(_point(level, first.cost, errors, floor, sample), bound=True)
 
 
 def _accuracies(
     trial: Bundle, sample: SampledPairs, levels: Sequence[QualityLevel], path: Path, effort: Effort, progress: Progress
 ) -> dict[str, Errors]:
-    """By level; those that `path` holds already, of the same graph, noise and sample, are not measured again."""
+    """Errors by level. Those that `path` has for the same graph, noise and sample are not measured again."""
     kept: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     task = progress.add_task("accuracy", total=len(levels))
     errors = {}
@@ -201,16 +201,16 @@ def _accuracies(
 
 
 def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:
-    """Of a level with a lattice, the mean over several places and headings of it."""
+    """The errors of a level. Where it reuses responses, they are the mean over several positions of its nodes."""
     steps = largest_steps(field, count=_STEPS, seed=seed)
-    if field.nodes is None:
+    if not field.kind.reuses_responses:
         return dataclasses.replace(sample.errors_of(Estimate(field)), steps=steps)
     rng = np.random.default_rng([seed, 12])
-    measured = [sample.errors_of(Estimate(with_moved_lattice(field, rng))) for _ in range(_OFFSETS)]
+    measured = [sample.errors_of(Estimate(with_moved_nodes(field, rng))) for _ in range(_OFFSETS)]
     return dataclasses.replace(Errors.mean(measured), steps=steps)
 
 
 def _key(trial: Bundle, level: QualityLevel, effort: Effort) -> str:
     manifest = trial.manifest
-    made_of = [manifest.files[name] for name in (manifest.fields[level.field].file, ARRAYS_FILE)]
-    return json.dumps([_SOUND, level.model_dump(mode="json"), made_of, effort.pairs, effort.yaws, effort.seed])
+    depends_on = [manifest.files[name] for name in (manifest.fields[level.field].file, ARRAYS_FILE)]
+    return json.dumps([_FORMAT, level.model_dump(mode="json"), depends_on, effort.pairs, effort.yaws, effort.seed])

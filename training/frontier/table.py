@@ -1,4 +1,4 @@
-"""The frontier as a table for people."""
+"""The frontier as a table for the terminal."""
 
 from collections.abc import Mapping
 
@@ -12,7 +12,7 @@ _SHOWN = [metric for metric in PARAMETER_METRICS if metric.name in THRESHOLDS]
 
 
 def report(frontier: Frontier) -> Table:
-    """The quality levels, quickest first, each error in its unit and, in brackets, in JND."""
+    """The Pareto-optimal quality levels, quickest first, with each error in its unit and, in brackets, in JND."""
     table = Table(
         title=f"{frontier.scene}: {len(frontier.best)} of {len(frontier.points)} levels measured are worth their time",
         caption=(

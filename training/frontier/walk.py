@@ -1,4 +1,4 @@
-"""The walk over which quality levels are measured: somebody strolls through a scene, looking about.
+"""The walk on which quality levels are measured: a listener strolls through a scene and looks around.
 
 Metres, radians, seconds.
 """
@@ -21,8 +21,8 @@ _Floats = npt.NDArray[np.float64]
 
 
 def walk(bundle: Bundle, *, duration_s: float, poses_per_s: float = POSES_PER_S, seed: int) -> list[Pose]:
-    """A listener's poses: straight from one place in sight to the next, at ear height throughout, looking ahead and to
-    either side in turn. The same places for the same seed, however many poses there are on the way."""
+    """The poses of a listener who walks straight from one place to the next one in sight, at constant ear height,
+    looking ahead and to both sides in turn. The places are the same for the same seed, at any rate of poses."""
     rng = np.random.default_rng([seed, 11])
     step_m = SPEED_M_PER_S / poses_per_s
     poses: list[Pose] = []
@@ -44,7 +44,7 @@ def walk(bundle: Bundle, *, duration_s: float, poses_per_s: float = POSES_PER_S,
 
 
 def _places(bundle: Bundle, rng: np.random.Generator) -> Iterator[_Floats]:
-    """For ever: places at the height of the scene's start, each in sight of the one before it."""
+    """An endless sequence of places at the height of the scene's start, each in sight of the one before."""
     low, high = np.array(bundle.manifest.bounds.minimum), np.array(bundle.manifest.bounds.maximum)
     at = np.array(bundle.manifest.start.listener)
     low[2] = high[2] = at[2]

@@ -1,9 +1,9 @@
-"""Energies of responses as an error to train on: what clarity, decay times and levels are made of.
+"""An error of energies to train on: clarity, decay times and levels are made of energies.
 
-Errors of single bins average out in no sum of them where they are alike, and a sum is what is heard. So sums are
-compared too: of runs of frames and of all that is still to come, by octave and over all.
+Errors of single bins that have the same sign do not average out in a sum, and listeners hear sums. So the loss also
+compares energies of runs of frames, and the energy still to come after each frame, by octave and over all octaves.
 
-Axes: levels are natural logarithms of magnitude, flat as the heads have them; energies (B, channel, octave, step).
+Axes: levels are natural logarithms of magnitude, flat in the heads' layout; energies are (B, channel, octave, step).
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from training.models.cells import Cells
 from training.models.factorised import Heads
 
-# A mean of ln |S| lies so far below ln of the root of the mean power, for the Rayleigh-distributed magnitude of noise:
-# half of Euler's constant.
+# For the Rayleigh-distributed magnitude of noise, the mean of ln |S| lies half of Euler's constant below the logarithm
+# of the root mean square.
 RAYLEIGH_DEFICIT = float(np.euler_gamma / 2)
 _RUN = 4
 _EVERY = 4
@@ -24,9 +24,9 @@ _TINY = 1e-12
 
 
 class EnergyError(nn.Module):
-    """Mean squared differences of energies, in squared ln of magnitude.
+    """Mean squared differences of energies, in squared nepers of amplitude.
 
-    `deficit` is by how much predicted levels of single bins lie below those of their expected power.
+    `deficit` is how far the predicted levels of single bins lie below those of their expected power.
     """
 
     _of_bins: Tensor
@@ -49,12 +49,13 @@ class EnergyError(nn.Module):
             self.register_buffer(name, torch.tensor(np.asarray(sums, dtype=np.float32)), persistent=False)
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Of flat levels in physical units, (B, size of `heads.levels`)."""
+        """The error of flat levels (B, size of `heads.levels`) in physical units."""
         ours, theirs = self._energies(predicted, self._deficit), self._energies(target, 0.0)
         return torch.stack([nn.functional.mse_loss(a, b) for a, b in zip(ours, theirs, strict=True)]).sum()
 
     def _energies(self, flat: Tensor, deficit: float) -> list[Tensor]:
-        """Half the logarithm of what is to come by octave, of the same in all, and of runs of fine frames by octave."""
+        """Half the logarithms of three kinds of energy: the energy still to come by octave, the same summed over
+        octaves, and that of runs of fine frames by octave."""
         fine, late = (torch.exp(2 * flat[:, part].unflatten(1, shape)) for part, shape in self._shapes.values())
         by_octave = torch.cat(
             [self._of_bins @ fine * np.exp(2 * deficit), self._of_cells @ late * self._widths], dim=-1
@@ -67,6 +68,6 @@ class EnergyError(nn.Module):
 
 
 def _octaves(frequencies_hz: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(octave, frequency) one where a frequency is nearest, in octaves, to the octave's centre."""
+    """(octave, frequency) 1 where the centre of this octave band is the nearest on a logarithmic scale, else 0."""
     distance = np.abs(np.log2(np.maximum(frequencies_hz, 1.0)) - np.log2(OCTAVE_BANDS_HZ)[:, None])
     return np.asarray(np.argmin(distance, axis=0) == np.arange(len(OCTAVE_BANDS_HZ))[:, None], dtype=np.float64)

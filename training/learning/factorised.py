@@ -11,37 +11,36 @@ from rich.progress import Progress
 from torch import Tensor
 
 from training.data.responses import ResponseSet, SimulatedResponses
+from training.learning.distillation import DistillationTargets, distillation_targets
 from training.learning.energies import RAYLEIGH_DEFICIT, EnergyError
 from training.learning.learner import Losses, Rows
-from training.learning.lessons import DistillationTargets, lessons_of
 from training.learning.naf import NafLearner
 from training.learning.runs import Configuration, FactorisedRecipe, RecipeError, require_same_data, restore
 from training.learning.schedule import one_cycle
 from training.models.cells import Cells
 from training.models.factorised import FactorisedField, FieldShape
-from training.models.level_correction import LevelsInterpolated, level_correction
+from training.models.level_correction import InterpolatedLevels, level_correction
 from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
 
-# What a target differs by from the best possible prediction (ln magnitude of one noisy bin, of a pooled cell; unit
-# phasors): errors are measured in these, so that every head's loss starts to matter at the same distance from its
-# floor.
+# Errors are measured in units of how far targets scatter about the best possible prediction: in ln magnitude for one
+# noisy bin and for a pooled cell, and in unit phasors. The losses of all heads then have the same floor.
 _SPREADS = {"fine": 0.64, "late": 0.25, "phasor": 1.0, "interaural": 1.0}
-# Coherences are smooth in the poses, so errors of few hundredths are left; weighted alike they would be lost beside the
-# levels'.
+# Coherence is smooth in the poses, and its errors are a few hundredths; with equal weights they would not count beside
+# the errors of levels.
 _HEAD_WEIGHTS = {"fine": 1.0, "late": 1.0, "phasor": 2.0, "interaural": 10.0}
 _LEVEL_HEADS = ("fine", "late")
 TARGETS = "targets"
-"""Folder of targets in that of a dataset."""
+"""The folder of targets, inside that of the dataset."""
 _WEIGHT_DECAY = 1e-2
 _SAMPLE_ROWS = 3000
-# A measured response starts with the direct sound, whose phase can be learned; reflections have hardly one.
+# A measured response begins with the direct sound, whose phase can be learned, unlike that of reflections.
 _KNOWN_FRAMES_OF_WHOLE_RESPONSES = 12
 
 
 class FactorisedLearner:
-    """Learns from targets that are computed once and kept beside the responses."""
+    """Learns from targets that are computed once and stored beside the responses."""
 
     def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
         shape, recipe = configuration.shape, configuration.recipe
@@ -63,11 +62,11 @@ class FactorisedLearner:
         deficit = 0.0 if self._expected else RAYLEIGH_DEFICIT
         self._energy_error = EnergyError(self.cells, self.field.heads, deficit=deficit)
         self._targets: Targets | None = None
-        self._lessons: DistillationTargets | None = None
+        self._distilled: DistillationTargets | None = None
 
     def prepare(self, progress: Progress) -> None:
         if self.recipe.teacher is not None:
-            self._lessons = self._taught(Path(self.recipe.teacher))
+            self._distilled = self._distill(Path(self.recipe.teacher))
         folder = self.responses.file.parent / TARGETS
         self._targets = load_targets(self.responses, self.cells, folder, progress, expected=self._expected)
 
@@ -83,7 +82,8 @@ class FactorisedLearner:
 
     @torch.no_grad()
     def initialise(self, rows: Rows, seed: int) -> None:
-        """Normalisation, and a basis that starts from the principal components of the training spectrograms."""
+        """Sets the normalisation, and a basis that begins with the principal components of the training
+        spectrograms."""
         field = self.field
         sample = np.sort(np.random.default_rng([seed, 4]).choice(rows, min(_SAMPLE_ROWS, len(rows)), replace=False))
         flat = torch.from_numpy(self.targets.flat[sample]).float()
@@ -102,11 +102,11 @@ class FactorisedLearner:
         return one_cycle(fraction)
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
-        """Lessons are counted on from the last response."""
-        if self._lessons is None:
+        """Rows of distillation targets follow those of the responses."""
+        if self._distilled is None:
             return rng.permutation(rows)
         measured = len(self.targets.yaw)
-        return rng.permutation(np.concatenate([rows, measured + np.arange(len(self._lessons.yaw))]))
+        return rng.permutation(np.concatenate([rows, measured + np.arange(len(self._distilled.yaw))]))
 
     def validation(self, rows: Rows) -> Rows:
         return rows
@@ -115,8 +115,8 @@ class FactorisedLearner:
         rows = np.sort(rows)
         measured = int(np.searchsorted(rows, len(self.targets.yaw)))
         parts = [_rows_of(self.targets, rows[:measured])]
-        if self._lessons is not None:
-            parts.append(_rows_of(self._lessons, rows[measured:] - len(self.targets.yaw)))
+        if self._distilled is not None:
+            parts.append(_rows_of(self._distilled, rows[measured:] - len(self.targets.yaw)))
         listener, emitter, yaw, flat = (
             torch.from_numpy(np.concatenate(columns)) for columns in zip(*parts, strict=True)
         )
@@ -128,12 +128,12 @@ class FactorisedLearner:
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
         field, flat, measured = self.field, targets[0].float(), targets[1]
         off = prediction - (flat - field.mean) / field.spread
-        squared = off * off  # whose gradient is quicker than that of a power
+        squared = off * off  # its gradient is faster than that of a power
         losses = {}
-        # Split, not sliced: the gradient of every slice would be as wide as the whole.
+        # Split in place of slicing, because the gradient of each slice would be as wide as the whole.
         for name, part in zip(field.heads.shapes, squared.split(field.heads.sizes, dim=1), strict=True):
             of_rows = part.mean(dim=1)
-            # Lessons are of levels alone.
+            # Distillation targets have valid levels only.
             counted = of_rows if name in _LEVEL_HEADS else of_rows * measured
             losses[name] = _HEAD_WEIGHTS[name] * counted.mean()
         if self.recipe.energy_weight:
@@ -143,21 +143,21 @@ class FactorisedLearner:
             losses["energy"] = self.recipe.energy_weight * error
         return losses
 
-    def _taught(self, run: Path) -> DistillationTargets:
-        """Raises RunError if the folder holds no finished run on these data, and RecipeError if it is of another
+    def _distill(self, run: Path) -> DistillationTargets:
+        """Raises RunError if the folder holds no finished run on these data, and RecipeError if it is a run of another
         kind."""
         configuration = Configuration.read(run)
         if configuration.kind != "naf" or configuration.name in {"naf-time-domain", "naf-whole"}:
-            problem = "a naf with spectrograms of what is learned here can teach"
+            problem = "only a naf that predicts spectrograms of late reverberation can teach"
             raise RecipeError(f"teacher: {run} holds {configuration.name}; {problem}")
         require_same_data(self.responses, run)
         teacher = NafLearner(self.responses, configuration)
         restore(teacher.field, run, configuration)
-        return lessons_of(teacher, self.cells, self.recipe.lessons, configuration.seed)
+        return distillation_targets(teacher, self.cells, self.recipe.distilled_poses, configuration.seed)
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> None:
-        """Correct levels by what is heard of them too little, or too much, on average over the training set."""
+        """Corrects predicted levels by their mean deficit over the training set."""
         if not self.recipe.level_correction:
             return
         field, levels = self.field, self.field.heads.levels
@@ -171,8 +171,8 @@ class FactorisedLearner:
                 predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
                 yield flat[:, levels].to(device).float(), predicted[:, levels], field.encoder.sight(features)
 
-        heard = LevelsInterpolated(self.cells, self.responses.channels).to(device)
-        field.level_correction[:, levels] = level_correction(examples, heard, field.heads.areas)
+        decode = InterpolatedLevels(self.cells, self.responses.channels).to(device)
+        field.level_correction[:, levels] = level_correction(examples, decode, field.heads.areas)
 
 
 def _rows_of(source: Targets | DistillationTargets, rows: Rows) -> tuple[npt.NDArray[np.floating], ...]:

@@ -1,4 +1,4 @@
-"""Which learner a configuration asks for."""
+"""Makes the learner for a configuration."""
 
 from training.data.responses import ResponseSet
 from training.learning.factorised import FactorisedLearner
@@ -7,5 +7,5 @@ from training.learning.runs import Configuration
 
 
 def learner_of(responses: ResponseSet, configuration: Configuration) -> FactorisedLearner | NafLearner:
-    """With fresh parameters, drawn from torch's generator."""
+    """A learner with new parameters, drawn from torch's generator."""
     return (NafLearner if configuration.kind == "naf" else FactorisedLearner)(responses, configuration)

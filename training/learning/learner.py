@@ -1,7 +1,7 @@
-"""What the training loop asks of a kind of field.
+"""The interface between the training loop and a kind of field.
 
-Rows count the responses that may be trained on, from 0, in the order of the response set; `rows` of them are given to
-most calls because some are held back to watch for overfitting.
+Rows count the responses that are not held out, from 0, in the order of the response set. Most calls take the `rows` to
+use, because some rows are for validation.
 """
 
 from typing import Any, Protocol
@@ -16,48 +16,49 @@ Losses = dict[str, Tensor]
 
 
 class Learner(Protocol):
-    """A field, its targets and its loss. The `field` is what a checkpoint keeps: parameters and buffers."""
+    """A field, its targets and its loss. A checkpoint stores the parameters and buffers of `field`."""
 
     @property
     def field(self) -> nn.Module: ...
 
     def prepare(self, progress: Progress) -> None:
-        """Brings targets within reach; whatever is costly to compute is kept beside the responses."""
+        """Computes targets, or loads them. Results that take long are stored beside the responses."""
         ...
 
     @property
     def prepared_s(self) -> float:
-        """Seconds that preparing took, whenever that was."""
+        """Seconds that preparation took when it was first done."""
         ...
 
     def initialise(self, rows: Rows, seed: int) -> None:
-        """Once, before the first step: normalisation, and whatever training should start from."""
+        """Is called once before the first step: sets the normalisation and initial parameters."""
         ...
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Parameters with their weight decay."""
+        """Groups of parameters with their weight decay."""
         ...
 
     def momentum_and_rate(self, fraction: float) -> tuple[float, float]:
-        """Adam's first beta, and the share of the learning rate, when that fraction of the training is done."""
+        """Adam's first beta, and the share of the learning rate, when a `fraction` of the training is done."""
         ...
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
-        """What one pass over the rows visits, in order."""
+        """The rows that one epoch visits, in order."""
         ...
 
     def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """Inputs of the field and targets of these rows; without a generator repeatable, for validation."""
+        """Inputs of the field, and targets, for these rows. Without a generator the result is repeatable, for
+        validation."""
         ...
 
     def validation(self, rows: Rows) -> Rows:
-        """Which of the rows held back to look at."""
+        """The validation rows that are used."""
         ...
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
-        """Weighted parts, to be summed up: means over the batch, float32."""
+        """Weighted terms of the loss: means over the batch, float32."""
         ...
 
     def finish(self, rows: Rows) -> None:
-        """Once, after the last step, with the best parameters found."""
+        """Is called once after the last step, with the parameters that are kept."""
         ...

@@ -1,4 +1,4 @@
-"""The paper's network and its loss: random points of a few whole responses per step."""
+"""The paper's network and its loss. Each step trains on random points of a few whole responses."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ _ENVELOPE_SAMPLES = 65
 
 
 class NafLearner:
-    """Computes targets as they are needed: a step takes seconds, they take milliseconds."""
+    """Computes targets as they are needed, which takes milliseconds; a step takes seconds."""
 
     def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
         shape, recipe = configuration.shape, configuration.recipe
@@ -43,7 +43,7 @@ class NafLearner:
         self._trainable = np.flatnonzero(~responses.held_out)
 
     def prepare(self, progress: Progress) -> None:
-        """Nothing to do."""
+        """Does nothing: there are no stored targets."""
 
     @property
     def prepared_s(self) -> float:
@@ -51,7 +51,8 @@ class NafLearner:
 
     @torch.no_grad()
     def initialise(self, rows: Rows, seed: int) -> None:
-        """Mean and three standard deviations of every point over responses and ears, and mean interaural coherence."""
+        """Sets mean and spread (three standard deviations) of every point over responses and ears, and the mean
+        interaural coherence."""
         field = self.field
         sample = np.random.default_rng([seed, 4]).permutation(rows)[:_STATISTICS_ROWS]
         count, total, squares = 0, np.zeros(()), np.zeros(())
@@ -66,22 +67,25 @@ class NafLearner:
                 cross += spectrogram[0] * np.conj(spectrogram[1])
                 power += np.abs(spectrogram) ** 2
         mean = total / count
+        # guard: rounding leaves no variance below zero
         sigma = np.sqrt(np.maximum(squares / count - mean**2, 0))
         if field.shape.domain == "time":
-            # A waveform has no mean, and its level is a smooth function of time.
+            # A waveform has zero mean, and its level is a smooth function of time.
             mean, envelope = 0 * mean, np.sqrt(uniform_filter1d(squares / count, _ENVELOPE_SAMPLES, axis=0))
             sigma = np.maximum(envelope, 1e-4 * envelope.max())
         else:
-            # Bins that hardly vary (silence before the onset) would turn rounding into targets.
+            # Otherwise bins that hardly vary (silence before the onset) would make rounding errors large targets.
+            # guard: a spread of zero is not divided by
             sigma = np.maximum(sigma, _LEAST_SIGMA)
         field.mean.copy_(torch.from_numpy(mean))
         field.spread.copy_(torch.from_numpy(_SIGMAS * sigma))
         if hasattr(field, "coherence"):
+            # guard: ears in silence have no mean coherence
             coherence = cross / np.maximum(np.sqrt(power[0] * power[1]), 1e-20)
             field.coherence.copy_(torch.from_numpy(np.stack([coherence.real, coherence.imag])))
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Only what the grids hold decays."""
+        """Only the features of the grids have weight decay."""
         grids = [grid.features for grid in self.field.grids]
         others = [part for part in self.field.parameters() if not any(part is held for held in grids)]
         groups: list[dict[str, Any]] = [{"params": others, "weight_decay": 0.0}]
@@ -91,7 +95,7 @@ class NafLearner:
         return decay_to_a_tenth(fraction)
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
-        """Every pair once, in a random orientation."""
+        """Every pair once, at a random orientation."""
         shuffled = rng.permutation(rows)
         _, first = np.unique(self.responses.pair[self._trainable[shuffled]], return_index=True)
         return shuffled[np.sort(first)]
@@ -108,7 +112,7 @@ class NafLearner:
         for number, row in enumerate(chosen):
             *across, frames = field.axes
             padded = validating or rng.random() < recipe.padding
-            reach = frames if padded else min(frames, self._sounding(row))
+            reach = frames if padded else min(frames, self._recorded_length(row))
             points = [rng.integers(0, size, recipe.points) for size in (*across, reach)]
             indices[:, number] = points
             of_ears: Any = self._values(self._aligned(row))
@@ -130,7 +134,7 @@ class NafLearner:
         return {"magnitude": squared[..., 0].mean(), "phase": self.recipe.phase_weight * squared[..., 1].mean()}
 
     def finish(self, rows: Rows) -> None:
-        """Nothing to do."""
+        """Does nothing."""
 
     def _aligned(self, row: int) -> npt.NDArray[np.float64]:
         """(ear, sample)"""
@@ -142,16 +146,18 @@ class NafLearner:
             return aligned[..., None]
         return np.stack(self.codec.encode(aligned), axis=-1)
 
-    def _sounding(self, row: int) -> int:
-        """Frames, or samples, before an aligned response ends in silence because the recording did."""
+    def _recorded_length(self, row: int) -> int:
+        """The number of frames (or samples) of an aligned response until the end of the recording; silence follows."""
         left = self.responses.samples - delay_samples(self.responses, row)
         if self.field.shape.domain == "time":
             return max(1, int(left))
+        # guard: a response that ends before sound arrives has a frame
         return max(1, int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left)))
 
 
 def _whole(responses: ResponseSet) -> WholeResponses:
-    """Raises RecipeError for measured ones."""
+    """The responses with direct sound and first reflections. Raises RecipeError for measured responses, which have them
+    already."""
     if not isinstance(responses, SimulatedResponses):
         raise RecipeError("field: measured responses are whole as they are; train naf in place of naf-whole")
     return WholeResponses(responses.dataset)

@@ -1,7 +1,7 @@
-"""Data parallel training: as many processes as `torchrun` started, or one.
+"""Data-parallel training in as many processes as `torchrun` started, or in one.
 
-Every process computes an equal share of each batch, and gradients are averaged. The first one alone reads and writes
-the run folder beyond its targets, and decides what the clock decides.
+Each process computes an equal share of every batch, and gradients are averaged. Only the first process reads and writes
+the run folder (all read the targets), and it makes the decisions that depend on time.
 """
 
 import os
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Processes:
-    """`rank` of this process among `count`, and the device it computes on."""
+    """The `rank` of this process among `count`, and the device that it computes on."""
 
     rank: int
     count: int
@@ -25,7 +25,7 @@ class Processes:
     @classmethod
     @contextmanager
     def joined(cls) -> Iterator["Processes"]:
-        """This process among those that torchrun started, until the end of the block."""
+        """This process, as one of those that torchrun started, until the end of the block."""
         rank, count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
         gpu = torch.cuda.is_available()
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if gpu else torch.device("cpu")
@@ -43,14 +43,14 @@ class Processes:
         return self.rank == 0
 
     def parallel(self, field: nn.Module) -> nn.Module:
-        """The field with gradients averaged over all processes."""
+        """The field, with gradients averaged over all processes."""
         if self.count == 1:
             return field
         ids = [self.device.index] if self.device.type == "cuda" else None
         return nn.parallel.DistributedDataParallel(field, device_ids=ids)
 
-    def agreed(self, *values: float) -> list[float]:
-        """What the first process says, in every process."""
+    def broadcast(self, *values: float) -> list[float]:
+        """The values of the first process, in every process."""
         if self.count == 1:
             return list(values)
         tensor = torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -65,6 +65,6 @@ class Processes:
         return total / self.count
 
     def wait(self) -> None:
-        """Until all processes are here."""
+        """Waits until all processes have come here."""
         if self.count > 1:
             dist.barrier()

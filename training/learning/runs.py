@@ -1,6 +1,5 @@
-"""The run folder: `run.json` (configuration), `dataset.json` (what the data are and where they lie), `checkpoint.pt`
-(everything needed to go on), `log.csv` and `tensorboard/`.
-"""
+"""The run folder: `run.json` (configuration), `dataset.json` (which data, and where), `checkpoint.pt` (everything
+needed to resume), `log.csv` and `tensorboard/`."""
 
 import csv
 import dataclasses
@@ -19,26 +18,29 @@ from training.models.naf import NafShape
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "log.csv"
+_FIELD_NAMES = {"lessons": "distilled_poses"}
+"""Fields of a recipe that have another name in `run.json`."""
 
 
 class RunError(NafirError):
-    """A run folder that holds another configuration, or no trained field."""
+    """A run folder holds another configuration, or no trained field."""
 
 
 class RecipeError(NafirError):
-    """A way of training that does not fit the data."""
+    """The training options do not fit the data."""
 
 
 @dataclass(frozen=True)
 class FactorisedRecipe:
-    """How a factorised field is trained. Those that are off did not pay where they were measured.
+    """How a factorised field is trained. Options that are off by default did not improve errors where that was
+    measured.
 
-    `fine_frames` are predicted bin by bin, later ones in cells; `level_correction` adds what a mean of logarithms lacks
-    to a mean of powers; `energy_weight` is that of the error in energies (`training.learning.energies`); `swap` also
-    shows every response with its ends exchanged, which is the same response where both are omnidirectional: one channel
-    only; `expected` trains on what is expected of a simulated response in place of what was drawn (measured ones are
-    what they are). `teacher` is the run folder of a `naf` that is asked for the levels of responses at `lessons` poses
-    of its own.
+    `fine_frames`: number of frames that are predicted bin by bin, before cells. `level_correction`: correct the gap
+    between a mean of logarithms and the logarithm of a mean power. `energy_weight`: weight of the error of energies
+    (`training.learning.energies`). `swap`: also train on responses with listener and emitter exchanged, which are the
+    same if both are omnidirectional (one channel only). `expected`: train on expected values in place of random draws
+    (simulated responses only). `teacher`: run folder of a `naf` whose predicted levels are distilled, at
+    `distilled_poses` poses between the measured ones.
     """
 
     fine_frames: int = 24
@@ -47,15 +49,16 @@ class FactorisedRecipe:
     swap: bool = False
     expected: bool = True
     teacher: str | None = None
-    lessons: int = 256
+    distilled_poses: int = 256
 
 
 @dataclass(frozen=True)
 class NafRecipe:
-    """How the paper's network is trained: `points` of each response per step, positions shaken by `noise_m` (standard
-    deviation), silence after a response's end shown with probability `padding`, and `phase_weight` (the paper's alpha,
-    which it does not state) of the error in instantaneous frequency. `whole` are, as in the
-    paper, responses of simulated scenes with the direct sound and the first reflections, else left to geometry."""
+    """How the paper's network is trained. `points`: points of each response per step. `noise_m`: standard deviation of
+    noise that is added to positions. `padding`: probability that the silence after a response's end is trained on.
+    `phase_weight`: weight of the error of instantaneous frequency (the paper's alpha, whose value it does not state).
+    `whole`: train on responses with the direct sound and first reflections, as the paper does, not on late
+    reverberation only (simulated scenes)."""
 
     points: int = 2000
     noise_m: float = 0.1
@@ -66,11 +69,12 @@ class NafRecipe:
 
 @dataclass(frozen=True)
 class Configuration:
-    """All that decides a run's outcome besides the dataset.
+    """Everything besides the dataset that decides the result of a run.
 
-    Trained for `minutes` of computing if given, else for `epochs`. With `patience` training stops after so many rounds
-    (an epoch, or a twentieth of the time) without a smaller error on what is held back, and the field of the smallest
-    is kept; without, the last one, for which learning rates are scheduled. `share` is that of the training pairs used.
+    Training lasts for `minutes` of computing if given, else for `epochs`. With `patience` it stops after this many
+    rounds (epochs, or twentieths of the time) without a smaller validation error, and the field with the smallest error
+    is kept. Without it the last field is kept, for which the learning rate is scheduled. `share` is the share of the
+    training pairs that is used.
     """
 
     seed: int = 0
@@ -85,7 +89,7 @@ class Configuration:
 
     @classmethod
     def naf(cls, shape: NafShape, recipe: NafRecipe | None = None, **changes: Any) -> "Configuration":
-        """The paper's: 200 epochs of 20 responses a step."""
+        """The paper's settings: 200 epochs, 20 responses per step."""
         settings = {"epochs": 200, "batch": 20, "learning_rate": 5e-4, **changes}
         return cls(shape=shape, recipe=recipe or NafRecipe(), **settings)
 
@@ -95,7 +99,7 @@ class Configuration:
 
     @property
     def name(self) -> str:
-        """The kind and variant as the command line says it."""
+        """Kind and variant, as on the command line."""
         if not isinstance(self.shape, NafShape):
             return self.kind
         if self.shape.domain == "time":
@@ -111,13 +115,17 @@ class Configuration:
         try:
             naf = values.pop("kind") == "naf"
             shape = (NafShape if naf else FieldShape)(**values.pop("shape"))
-            recipe = (NafRecipe if naf else FactorisedRecipe)(**values.pop("recipe"))
+            recipe_values = {_FIELD_NAMES.get(name, name): value for name, value in values.pop("recipe").items()}
+            recipe = (NafRecipe if naf else FactorisedRecipe)(**recipe_values)
             return cls(**values, shape=shape, recipe=recipe)
         except (KeyError, TypeError) as exc:
             raise RunError(f"{run / 'run.json'}: not a configuration: {exc}") from exc
 
     def write(self, run: Path) -> None:
-        _write_whole(run / "run.json", {"kind": self.kind, **asdict(self)})
+        values = asdict(self)
+        stored = {field: name for name, field in _FIELD_NAMES.items()}
+        values["recipe"] = {stored.get(name, name): value for name, value in values["recipe"].items()}
+        _write_whole(run / "run.json", {"kind": self.kind, **values})
 
 
 _NAFS = {
@@ -139,9 +147,9 @@ def configure(
     teacher: Path | None = None,
     **changes: Any,
 ) -> Configuration:
-    """The usual configuration of a field by its name on the command line, changed as said.
+    """The default configuration of the field with this name on the command line, with changes.
 
-    Raises RunError for another name, or for an option that this field has not.
+    Raises RunError for an unknown name, or for an option that this field does not have.
     """
     if field not in FIELDS:
         raise RunError(f"field: there is no {field!r}, but {', '.join(FIELDS)}")
@@ -162,12 +170,12 @@ def configure(
 
 
 def dataset_folder(run: Path) -> Path:
-    """The dataset a run was trained on. Raises RunError if the folder holds no run."""
+    """The folder of the dataset that a run was trained on. Raises RunError if the folder holds no run."""
     return Path(read_json(run, "dataset.json")["folder"])
 
 
 def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> None:
-    """Makes the folder this configuration's run on these data, if it is not already.
+    """Makes the folder a run of this configuration on these data, if it is not one already.
 
     Raises RunError if the folder holds a run of another configuration or on other data.
     """
@@ -182,7 +190,7 @@ def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> No
 
 
 def require_same_data(responses: ResponseSet, run: Path) -> None:
-    """Raises RunError if the run was trained on others."""
+    """Raises RunError if the run was trained on other data."""
     recorded = read_json(run, "dataset.json")
     identity = _identity(responses)
     if {name: recorded.get(name) for name in identity} != identity:
@@ -199,14 +207,15 @@ def read_json(run: Path, name: str) -> dict[str, Any]:
 
 
 def save_checkpoint(run: Path, state: dict[str, Any]) -> None:
-    """An interrupt in the middle of writing leaves the previous checkpoint whole."""
+    """Writes the checkpoint so that an interruption leaves the previous one whole."""
+    # guard: checkpoints are written whole
     partial = run / "checkpoint.partial"
     torch.save(state, partial)
     partial.replace(run / CHECKPOINT)
 
 
 def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
-    """Raises RunError if there is none."""
+    """Raises RunError if there is no checkpoint."""
     try:
         return dict(torch.load(run / CHECKPOINT, map_location=device, weights_only=True))
     except OSError as exc:
@@ -214,8 +223,10 @@ def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
 
 
 def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> None:
-    """Gives the field what a finished run learned. Raises RunError if the run is unfinished, or of another network."""
+    """Loads the parameters of a finished run into the field. Raises RunError if the run is unfinished, or of another
+    network."""
     state = load_checkpoint(run, torch.device("cpu"))
+    # guard: an unfinished run is no field
     if not state["finished"]:
         length = (
             f"{state['epochs']:.3g} of {configuration.epochs} epochs"
@@ -231,7 +242,7 @@ def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> 
 
 
 def minutes_of(run: Path) -> float:
-    """How long a finished run took, preparing included. Raises RunError if it is unfinished."""
+    """Minutes that a finished run took, preparation included. Raises RunError if it is unfinished."""
     state = load_checkpoint(run, torch.device("cpu"))
     if not state["finished"]:
         raise RunError(f"{run}: is not finished; run train again")
@@ -239,7 +250,7 @@ def minutes_of(run: Path) -> float:
 
 
 def keep_log(run: Path, rounds: int) -> None:
-    """The first rounds of the log, as many as the checkpoint knows: what was written after it will be again."""
+    """Cuts the log to the `rounds` that the checkpoint has; later rounds will be written again."""
     path = run / LOG
     if not rounds:
         path.unlink(missing_ok=True)
@@ -260,14 +271,15 @@ def append_log(run: Path, row: dict[str, float]) -> None:
 
 
 def _write_whole(path: Path, document: dict[str, Any]) -> None:
-    """An interrupt in the middle of writing leaves what was there before."""
+    """Writes the file so that an interruption leaves the previous one whole."""
+    # guard: what a run is, is written whole
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(document, indent=2) + "\n")
     partial.replace(path)
 
 
 def _identity(responses: ResponseSet) -> dict[str, Any]:
-    """What makes data the same wherever they lie."""
+    """Facts that identify the data, wherever they are stored."""
     if isinstance(responses, SimulatedResponses):
         return {"seed": responses.dataset.seed, "scene": responses.dataset.scene.model_dump(mode="json")}
     ends = np.concatenate([responses.listener, responses.emitter, responses.yaw[:, None]], axis=1)

@@ -1,4 +1,4 @@
-"""Learning rates as functions of the fraction of the training that is done, be it counted in steps or in minutes."""
+"""Learning rates as functions of the fraction of training that is done, counted in steps or in time."""
 
 import math
 
@@ -8,8 +8,9 @@ _BETA, _LEAST_BETA = 0.95, 0.85
 
 
 def one_cycle(fraction: float) -> tuple[float, float]:
-    """First beta and share of the learning rate: up in a tenth of the time, then down to nothing, along cosines; the
-    momentum does the opposite (Smith and Topin, Super-convergence, 2018; the numbers are PyTorch's)."""
+    """Adam's first beta, and the share of the learning rate, which rises for a tenth of the time and then falls to
+    almost zero, along cosines. The momentum does the opposite (Smith and Topin, Super-convergence, 2018; the numbers
+    are PyTorch's defaults)."""
     if fraction < _WARM_SHARE:
         eased = _eased(fraction / _WARM_SHARE)
         return _between(_BETA, _LEAST_BETA, eased), _between(_FIRST_SHARE, 1, eased)
@@ -18,7 +19,7 @@ def one_cycle(fraction: float) -> tuple[float, float]:
 
 
 def decay_to_a_tenth(fraction: float) -> tuple[float, float]:
-    """First beta and share of the learning rate of the paper: exponential."""
+    """Adam's first beta, and the share of the learning rate: an exponential decay, as in the paper."""
     return 0.9, 0.1**fraction
 
 

@@ -1,8 +1,8 @@
-"""The one training loop: for every kind of field, on one processor or several, on a GPU where there is one.
+"""The training loop for every kind of field, in one process or several, on a GPU if there is one.
 
-A run can be interrupted anywhere and goes on when it is started again; with the same seed and number of threads it ends
-at the same field as one that was not, where its length is given in epochs. Given in minutes, the length counts time
-spent computing, over all pieces: steps and looks at what is held back, the last of which may end later.
+A run can be interrupted at any time and continues when it is started again. If its length is given in epochs, then with
+the same seed and number of threads the result is the same as without interruption. If it is given in minutes, it counts
+the time spent on steps and validation, over all parts of the run; the last validation may end later.
 """
 
 import dataclasses
@@ -46,18 +46,19 @@ _BATCHES_AHEAD = 2
 _PROBE_ROWS = 2
 _LARGEST_GRADIENT = 1.0
 _EXPLODED = 1000.0
-"""Times the first loss, or one where that is less: normalised targets have errors of about one to begin with."""
+"""A loss is implausible above this many times the first loss, or above this number if the first loss is below one.
+Normalised targets have errors of about one at first."""
 
 
 class DivergedError(NafirError):
-    """A loss or gradient that is not finite, or far above what it was at first."""
+    """A loss or gradient that is not finite, or far above its first value."""
 
 
 def train(responses: ResponseSet, run: Path, configuration: Configuration, progress: Progress) -> None:
-    """Trains to the end, from where it was if the run was interrupted. Under `torchrun`, all processes together.
+    """Trains to the end, and resumes an interrupted run. Under `torchrun`, all processes train together.
 
     Raises RunError if the folder holds a run of another configuration or on other data, RecipeError if the
-    configuration does not fit the data, and DivergedError if the loss stops being finite; the last checkpoint stays.
+    configuration does not fit the data, and DivergedError if the loss becomes implausible; the last checkpoint stays.
     """
     with Processes.joined() as processes:
         if processes.first:
@@ -65,7 +66,7 @@ def train(responses: ResponseSet, run: Path, configuration: Configuration, progr
         processes.wait()
         torch.manual_seed(configuration.seed)
         learner = learner_of(responses, configuration)
-        # The first process computes what is missing, the others find it.
+        # The first process computes missing targets, which the others then load.
         if processes.first:
             learner.prepare(progress)
         processes.wait()
@@ -79,8 +80,8 @@ def train(responses: ResponseSet, run: Path, configuration: Configuration, progr
 
 
 def load_learner(responses: ResponseSet, run: Path) -> Learner:
-    """The learner of a finished run, its trained field on the CPU. Raises RunError if the run is missing, unfinished or
-    of other data."""
+    """The learner of a finished run, with its trained field on the CPU. Raises RunError if the run is missing,
+    unfinished or of other data."""
     configuration = Configuration.read(run)
     require_same_data(responses, run)
     learner = learner_of(responses, configuration)
@@ -90,9 +91,9 @@ def load_learner(responses: ResponseSet, run: Path) -> Learner:
 
 @dataclass
 class _State:
-    """Where a run is: steps taken, seconds that they and validation took and, at the end, those of preparing; what the
-    current round's losses add up to, the smallest error on what is held back with the rounds since, and the field to
-    keep so far."""
+    """The state of a run: steps and epochs done, seconds that steps and validation took, seconds of preparation (at the
+    end), sum of the current round's losses, least validation error, rounds since it (`stale`), and the parameters to
+    keep."""
 
     step: int = 0
     epochs: float = 0.0
@@ -119,23 +120,27 @@ class _Loop:
         rows: tuple[Rows, Rows],
     ) -> None:
         self._learner, self._run, self._configuration, self._processes = learner, run, configuration, processes
-        self._rows, held_back = rows
-        self._held_back = learner.validation(held_back)
+        self._rows, validation_rows = rows
+        self._validation_rows = learner.validation(validation_rows)
         self._optimiser = torch.optim.AdamW(learner.parameter_groups(), configuration.learning_rate, fused=True)
         visited = len(self._order(0))
-        # Small scenes have fewer rows than a batch; processes have equal shares of one.
+        # A small scene has fewer rows than a batch; processes have equal shares of a batch.
         size = min(configuration.batch, visited)
         self._batch = max(size - size % processes.count, processes.count)
         self._steps_per_epoch = max(1, visited // self._batch)
+        # guard: a run goes on from its checkpoint and not from its beginning
         if (run / CHECKPOINT).exists():
             state = load_checkpoint(run, processes.device)
             learner.field.load_state_dict(state.pop("field"))
+            # guard: an optimiser goes on as it was
             self._optimiser.load_state_dict(state.pop("optimiser"))
             self._state = _State(**state)
             if processes.first and not self._state.finished:
+                # guard: the log goes no further than the checkpoint
                 keep_log(run, self._state.rounds)
         else:
             if processes.first:
+                # guard: a log begins anew with its run
                 keep_log(run, 0)
             learner.initialise(self._rows, configuration.seed)
             self._state = _State(bfloat16=self._choose_precision())
@@ -156,7 +161,7 @@ class _Loop:
                 due = state.seconds - saved_s > _CHECKPOINT_S
                 self._step(parallel, *next(batches), save=due)
                 saved_s = state.seconds if due else saved_s
-                (state.seconds,) = self._processes.agreed(state.seconds + time.perf_counter() - start)
+                (state.seconds,) = self._processes.broadcast(state.seconds + time.perf_counter() - start)
                 if self._measure() >= round_ends:
                     summary = self._end_round(writer)
                     state.rounds += 1
@@ -164,7 +169,7 @@ class _Loop:
                     saved_s = state.seconds
                     round_ends = self._next_round()
                     done = math.floor(self._measure())
-                    progress.update(task, completed=done, description=f"training  held back: {summary}")
+                    progress.update(task, completed=done, description=f"training  validation: {summary}")
         finally:
             batches.close()
             if writer is not None:
@@ -172,7 +177,7 @@ class _Loop:
         self._finish()
 
     def _fraction(self) -> float:
-        """Of the training that is done."""
+        """The share of training that is done."""
         configuration, state = self._configuration, self._state
         if configuration.minutes is not None:
             return state.seconds / (60 * configuration.minutes)
@@ -183,24 +188,25 @@ class _Loop:
         return patience is not None and self._state.stale >= patience
 
     def _measure(self) -> float:
-        """How far training is, in rounds of steps or of time."""
+        """How far training is, in rounds."""
         if self._configuration.minutes is None:
             return self._state.step / self._steps_per_epoch
         return self._fraction() * _ROUNDS
 
     def _next_round(self) -> int:
-        """The measure at which the current round ends: later than now, however long the last look at what is held back
-        took, so that every round trains."""
+        """The measure at which the current round ends. It is later than now, however long the last validation took, so
+        that every round trains."""
         return min(math.floor(self._measure()) + 1, self._total())
 
     def _total(self) -> int:
-        """Rounds there are at most."""
+        """The greatest number of rounds."""
         return self._configuration.epochs if self._configuration.minutes is None else _ROUNDS
 
     def _step(
         self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, save: bool
     ) -> None:
-        """With `save`, parameters are kept as they are before the step, when their loss has shown them to be good."""
+        """One training step. With `save`, the parameters before the step are saved, after their loss has shown that
+        they are good."""
         state, configuration = self._state, self._configuration
         beta, share = self._learner.momentum_and_rate(self._fraction())
         for group in self._optimiser.param_groups:
@@ -211,6 +217,8 @@ class _Loop:
         norm = torch.nn.utils.clip_grad_norm_(self._learner.field.parameters(), _LARGEST_GRADIENT)
         mean_loss, mean_norm = (float(value) for value in self._processes.mean(torch.stack([loss.detach(), norm])))
         state.first_loss = mean_loss if state.first_loss is None else state.first_loss
+        # guard: a loss out of proportion stops training
+        # guard: a loss that is no number stops training
         if not np.isfinite(mean_norm) or not self._is_plausible(mean_loss):
             raise self._diverged(f"the loss is {mean_loss:g} and its gradient {mean_norm:g} in step {state.step + 1}")
         if save:
@@ -222,7 +230,7 @@ class _Loop:
         state.round_steps += 1
 
     def _is_plausible(self, loss: float) -> bool:
-        """Neither is one that has left all numbers behind, nor one so far above the first that nothing is learned."""
+        """Whether the loss is finite and not far above the first one."""
         first = self._state.first_loss
         return bool(np.isfinite(loss)) and (first is None or loss <= _EXPLODED * max(first, 1.0))
 
@@ -240,16 +248,18 @@ class _Loop:
         return torch.stack(list(self._learner.losses(prediction.float(), targets).values())).sum()
 
     def _end_round(self, writer: SummaryWriter | None) -> str:
-        """Looks at what is held back, remembers the field to keep, writes the logs; one line for people."""
+        """Validates, remembers the parameters to keep, and writes the logs. Returns a line that describes the
+        errors."""
         state = self._state
         start = time.perf_counter()
         parts = self._validate() if self._processes.first else {}
         seconds = state.seconds + time.perf_counter() - start
-        held_back, state.seconds = self._processes.agreed(sum(parts.values()), seconds)
-        if not self._is_plausible(held_back):  # before it is kept, and saved
-            raise self._diverged(f"the error on what is held back is {held_back:g} after step {state.step}")
-        if held_back < state.best_loss:
-            state.best_loss, state.stale = held_back, 0
+        validation_error, state.seconds = self._processes.broadcast(sum(parts.values()), seconds)
+        # guard: an error out of proportion is not kept
+        if not self._is_plausible(validation_error):  # before parameters are kept and saved
+            raise self._diverged(f"the validation error is {validation_error:g} after step {state.step}")
+        if validation_error < state.best_loss:
+            state.best_loss, state.stale = validation_error, 0
         else:
             state.stale += 1
         if self._configuration.patience is None or not state.stale:
@@ -261,7 +271,7 @@ class _Loop:
             rate = self._optimiser.param_groups[0]["lr"]
             writer.add_scalar("training/loss", training, state.step)
             writer.add_scalar("training/learning_rate", rate, state.step)
-            for name, value in {**parts, "sum": held_back}.items():
+            for name, value in {**parts, "sum": validation_error}.items():
                 writer.add_scalar(f"held_back/{name}", value, state.step)
         return " ".join(f"{name} {value:.4f}" for name, value in parts.items())
 
@@ -269,11 +279,11 @@ class _Loop:
     def _validate(self) -> dict[str, float]:
         field = self._learner.field.eval()
         totals: dict[str, float] = {}
-        for start in range(0, len(self._held_back), self._configuration.batch):
-            rows = self._held_back[start : start + self._configuration.batch]
+        for start in range(0, len(self._validation_rows), self._configuration.batch):
+            rows = self._validation_rows[start : start + self._configuration.batch]
             inputs, targets = self._on_device(*self._learner.batch(rows, None))
             for name, value in self._learner.losses(field(*inputs), targets).items():
-                totals[name] = totals.get(name, 0.0) + float(value) * len(rows) / len(self._held_back)
+                totals[name] = totals.get(name, 0.0) + float(value) * len(rows) / len(self._validation_rows)
         return totals
 
     def _finish(self) -> None:
@@ -301,7 +311,7 @@ class _Loop:
             processes.device,
         )
         self._optimiser.zero_grad(set_to_none=True)
-        return bool(processes.agreed(float(gains))[0])
+        return bool(processes.broadcast(float(gains))[0])
 
     def _order(self, epoch: int) -> Rows:
         return self._learner.epoch(self._rows, np.random.default_rng([self._configuration.seed, 5, epoch]))
@@ -313,7 +323,7 @@ class _Loop:
         return tuple(part.to(device) for part in inputs), tuple(part.to(device) for part in targets)
 
     def _batches(self, first_step: int) -> Generator[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
-        """This process's share of every batch from a step on, without end, made ready a little ahead of its use."""
+        """This process's share of every batch, from a step on, without end; computed a little ahead."""
         processes, seed = self._processes, self._configuration.seed
         orders: dict[int, Rows] = {}
 

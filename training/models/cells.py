@@ -1,8 +1,8 @@
 """Time-frequency cells: the resolution at which a field predicts, finer where the ear and the sound need it.
 
-The first frames are predicted bin by bin. Later ones are noise whose expected level is smooth, so they are pooled into
-cells that widen with time and frequency; predictions are interpolated linearly between cell centres. Pooling averages
-away the noise of one realisation, and there are six times fewer numbers to predict.
+The first frames are predicted bin by bin. Later frames are noise whose expected level is smooth, so they are pooled
+into cells that widen with time and frequency, and predictions are interpolated linearly between the centres of cells.
+Pooling averages the randomness of one realisation away, and leaves a sixth of the numbers to predict.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 
-# Widths in frames after the fine ones, then in bins: (width, count) runs, the last repeated to the end.
+# Widths of cells after the fine frames, in frames and in bins: runs of (width, count); the last run goes to the end.
 _FRAME_RUNS = ((2, 8), (4, 8), (8, None))
 _BIN_RUNS = ((1, 32), (2, 16), (4, None))
 
@@ -30,10 +30,10 @@ def _edges(total: int, runs: tuple[tuple[int, int | None], ...], start: int = 0)
 
 @dataclass(frozen=True)
 class Cells:
-    """`fine_frames` are predicted bin by bin; `known_frames` of them with phase.
+    """The first `fine_frames` are predicted bin by bin, and the first `known_frames` of them with phase.
 
-    There is hardly a phase to know: of twelve frames of reflections, without the direct sound, the network learned that
-    of none (its mean phasors explained less than half a percent). A graph has to name one frame at least.
+    There is hardly a phase to learn: of twelve frames of reflections without direct sound, a network learned the phase
+    of none (its mean phasors explained less than half a percent). But a graph needs at least one such frame.
     """
 
     codec: Codec
@@ -46,7 +46,7 @@ class Cells:
 
     @cached_property
     def all_frames(self) -> Axis:
-        """Cells over all frames, the fine ones single: for interaural coherence."""
+        """Cells over all frames, for interaural coherence; each fine frame is a cell of its own."""
         return Axis(np.concatenate([np.arange(self.fine_frames), self.late_frames.edges]))
 
     @cached_property

@@ -1,8 +1,8 @@
-"""Training targets that no draw of the noise has blurred: what is expected of a simulated response, head by head.
+"""Training targets without randomness: the expected value of each head's output over all draws of a simulated response.
 
 A cell of a simulated spectrogram is a complex Gaussian of known mean and variance (`training.simulation.expected`). So
-its expected power, the coherence of the two ears and the expected phasor are known, and a network need not average them
-out of what was drawn.
+its expected power, the coherence between the ears and the expected phasor are known, and the network need not average
+over random draws.
 """
 
 from dataclasses import replace
@@ -31,12 +31,12 @@ def expected_phasor(mean: _Complex, variance: npt.NDArray[np.floating]) -> npt.N
 
 
 def _by_yaw(products: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """(frequency, product, yaw, cell) to (yaw, product, frequency, cell)."""
+    """Reorders (frequency, product, yaw, cell) to (yaw, product, frequency, cell)."""
     return products.transpose(2, 1, 0, 3)
 
 
 class ExpectedTargets:
-    """Of a dataset whose responses were simulated."""
+    """Computes expected targets for the pairs of a simulated dataset."""
 
     def __init__(self, dataset: Dataset, cells: Cells) -> None:
         self._dataset, self._cells = dataset, cells
@@ -45,7 +45,7 @@ class ExpectedTargets:
         self._bands = cells.bands.pool().T
 
     def of_pair(self, emitter: int, listener: int) -> npt.NDArray[np.float16]:
-        """(yaw, heads.size), in the layout of flat targets. Raises DatasetError if the dataset keeps no energies."""
+        """(yaw, heads.size) flat targets. Raises DatasetError if the dataset has no energies."""
         cells, fine = self._cells, self._cells.fine_frames
         advance = self._dataset.onset_s[emitter, listener] * self._dataset.sample_rate - LEAD_SAMPLES
         diffuse = self._spectrograms.diffuse_products(emitter, listener, self._pool, advance)
@@ -57,7 +57,7 @@ class ExpectedTargets:
         pooled = np.tensordot(self._bands, products, 1)
         loudness = np.sqrt(pooled[:, 0] * pooled[:, 1])
         known = np.s_[..., : cells.known_frames]
-        # What lies beneath the codec's floor has no phase worth learning.
+        # Below the codec's floor there is no phase worth learning.
         variance = _by_yaw(diffuse[:, :2])[known] + cells.codec.log_floor**2
         phasor = expected_phasor(mean[known], variance)
         parts = (
@@ -69,11 +69,11 @@ class ExpectedTargets:
         return np.concatenate([part.reshape(len(mean), -1) for part in parts], axis=-1).astype(np.float16)
 
     def _mean(self, emitter: int, listener: int, advance: float) -> _Complex:
-        """(yaw, ear, frequency, frame) spectrogram of the aligned specular part, up to where it ends."""
+        """(yaw, ear, frequency, frame) spectrogram of the aligned specular part, up to its end."""
         codec = self._cells.codec
         response = self._spectrograms.specular(emitter, listener)
         sounding = np.flatnonzero(response.any(axis=(0, 1)))
-        # An advance by a fraction of a sample rings on, but not beyond a window.
+        # An advance by a fraction of a sample rings on for less than a window.
         ends = int(sounding[-1] + 1 if len(sounding) else 0) - int(np.floor(advance)) + codec.n_fft
         samples = min(max(ends, (self._cells.fine_frames + codec.n_fft // codec.hop) * codec.hop), codec.samples)
         aligned = align(response[..., : samples + max(0, int(np.ceil(advance)))], advance)[..., :samples]

@@ -1,12 +1,12 @@
-"""The factorised field: pose -> K coefficients -> learned time-frequency basis (a branch-trunk network).
+"""The factorised field: a pose gives K coefficients of a learned time-frequency basis (a branch-trunk network).
 
-The contract is that of every field: `listener` (B, 3), `emitter` (B, 3), `yaw` (B,) in; `log_magnitude` (B, 2,
-frequency, cell of frames), `instantaneous_frequency` and `phase_certainty` (B, 2, frequency, known frame),
-`interaural_coherence` (B, 2, frequency, cell of frames; real and imaginary) out. Everything between (geometry,
-encodings, grid, normalisation) lives in the graph.
+Inputs and outputs are those of every field. Inputs: `listener` (B, 3), `emitter` (B, 3), `yaw` (B,). Outputs:
+`log_magnitude` (B, 2, frequency, cell of frames), `instantaneous_frequency` and `phase_certainty` (B, 2, frequency,
+known frame), `interaural_coherence` (B, 2, frequency, cell of frames; real and imaginary). The graph holds everything
+between them (geometry, encodings, grid, normalisation).
 
-Inside, four heads share the coefficients: log-magnitude of the fine frames and of the late cells, mean phasors of the
-known frames, and mean interaural phasors of all cells (see `training.models.cells`). A field of one channel (a
+Four heads share the coefficients: log-magnitude of the fine frames, log-magnitude of the late cells, mean phasors of
+the known frames, and mean interaural phasors of all cells (see `training.models.cells`). A field of one channel (a
 microphone in place of a head) has no interaural head and no such output.
 """
 
@@ -24,21 +24,21 @@ from training.models.propagation import Propagation
 from training.models.site import Reach
 
 GEOMETRY = "_propagation"
-"""The name of the module whose constants are places and not weights: rounded, they would let sound through walls."""
+"""The name of the module whose constants are positions, not weights. Rounding them would let sound through walls."""
 _AZIMUTH_HARMONICS = 5
 _YAW_HARMONICS = 3
 _AFTER_SIGHT = 2 + 2 + 2 * _YAW_HARMONICS
-"""Features that follow the one that tells sight: where the path goes from either end, and the heading."""
+"""Number of features that follow the sight feature: the path's directions at both ends, and the heading."""
 _POSITION_OCTAVES = 3
 _MOST_LOG_PRECISION = 14.0
-"""A bandwidth of a millimetre."""
+"""Corresponds to a bandwidth of a millimetre."""
 _NO_LENGTH = 1e-12
-"""Of a phasor: its imaginary part is divided by no less."""
+"""The least divisor of a phasor's imaginary part."""
 
 
 @dataclass(frozen=True)
 class FieldShape:
-    """The network's whole configuration."""
+    """Sizes of the network."""
 
     rank: int = 128
     width: int = 256
@@ -48,10 +48,11 @@ class FieldShape:
 
 
 class FeatureGrid(nn.Module):
-    """Learned features on a grid in plan, read by a Gaussian Nadaraya-Watson kernel with a learned bandwidth per node.
+    """Learned features on a grid in plan, interpolated by a Gaussian Nadaraya-Watson kernel with a learned bandwidth
+    for each node.
 
-    Listener and emitter read the same grid: what is near a place is the same for both. The kernel is a softmax, so
-    that it cannot underflow to 0/0 far from every node.
+    Listener and emitter use the same grid, because the surroundings of a place are the same for both. The kernel is a
+    softmax, so it cannot underflow to 0/0 far from every node.
     """
 
     _nodes: Tensor
@@ -69,16 +70,18 @@ class FeatureGrid(nn.Module):
         """(..., 2 or 3) metres to (..., features)."""
         offset = position[..., :2, None] - self._nodes.T
         squared = torch.sum(offset * offset, dim=-2)
-        # An infinite precision would be 0 times infinity on a node.
+        # On a node, an infinite precision would give 0 times infinity.
+        # guard: a bandwidth of zero is none
         precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
+        # guard: kernel weights are a softmax
         return torch.softmax(squared * -precision, dim=-1) @ self._features
 
 
 class PoseEncoder(nn.Module):
-    """Listener, emitter and yaw to the features the trunk sees; `size` of them.
+    """Encodes listener, emitter and yaw as `size` features for the trunk.
 
-    Beyond its `reach` a network would go on as it pleases, so places are read as the nearest within it, and ends that
-    are nearer to each other as that near. Directions and sight are those of the places themselves.
+    Outside its `reach` a network extrapolates without control. So positions are moved to the nearest within reach, and
+    distances are at least the shortest within reach. Directions and sight are those of the true positions.
     """
 
     _low: Tensor
@@ -99,7 +102,7 @@ class PoseEncoder(nn.Module):
         self.register_buffer("_high", torch.tensor(reach.high, dtype=torch.float32), persistent=False)
         self._propagation = Propagation(plan)
         self.sees_all = self._propagation.sees_all
-        """Whether no pair is out of sight."""
+        """Whether all places see each other."""
         self._grid = FeatureGrid(plan, shape.grid_spacing_m, shape.grid_features)
         low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
         box = np.array([(*low, 0.0), (*high, plan.height_m)], dtype=np.float32)
@@ -124,7 +127,7 @@ class PoseEncoder(nn.Module):
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
         path = self._propagation(listener, emitter)
-        # Sines alone, cosines being those of angles a quarter turn ahead: fewer nodes.
+        # Cosines are sines of angles a quarter turn ahead: this takes fewer nodes.
         heading = torch.sin(yaw[:, None] * self._yaw_multiples + self._yaw_phases)
         distance = torch.clamp(path.length, min=self._nearest_m)
         visible = path.visible
@@ -147,7 +150,7 @@ class PoseEncoder(nn.Module):
         )
 
     def sight(self, features: Tensor) -> Tensor:
-        """(B, 1) of the features: whether the ends see each other, 1 or 0."""
+        """(B, 1) the sight feature: 1 where listener and emitter see each other, falling to 0 behind a corner."""
         return features[:, -_AFTER_SIGHT - 1 : -_AFTER_SIGHT]
 
     def _waves(self, position: Tensor) -> Tensor:
@@ -155,8 +158,8 @@ class PoseEncoder(nn.Module):
         return torch.cat([scaled, torch.sin(scaled @ self._octaves + self._octave_phases)], dim=-1)
 
     def _azimuth(self, direction: Tensor, heading: Tensor) -> Tensor:
-        """cos and sin of the first multiples of the angle of a direction in plan (B, 1, 2) as the head sees it, by
-        recurrence (no branch cut)."""
+        """Cosine and sine of the first multiples of the angle between a direction in plan (B, 1, 2) and the heading, by
+        recurrence (without a branch cut)."""
         towards = direction @ (heading @ self._turns_back).reshape(-1, 2, 2)
         harmonics = [towards]
         turning = (towards @ self._turns).reshape(-1, 2, 2)
@@ -166,7 +169,7 @@ class PoseEncoder(nn.Module):
 
 
 class Heads(nn.Module):
-    """Slices of the basis: where each head's numbers lie in the flat output."""
+    """The layout of the flat output: the slice of each head."""
 
     areas: Tensor
 
@@ -193,9 +196,9 @@ class Heads(nn.Module):
 
 
 class FactorisedField(nn.Module):
-    """Flat predictions (B, heads.size), in units of each output's spread about its mean over the training set.
+    """Flat predictions (B, heads.size), normalised by the mean and spread of each output over the training set.
 
-    `level_correction` (2, heads.size) is what predicted levels lack, of pairs out of sight and in sight
+    `level_correction` (2, heads.size) is what to add to predicted levels, of pairs out of sight and in sight
     (`training.models.level_correction`).
     """
 
@@ -206,7 +209,7 @@ class FactorisedField(nn.Module):
     def __init__(
         self, plan: FloorPlan, cells: Cells, shape: FieldShape, channels: int = 2, *, reach: Reach | None = None
     ) -> None:
-        """Learned throughout the plan where no `reach` is given."""
+        """Without `reach`, the field is valid throughout the plan."""
         super().__init__()
         self.heads = Heads(cells, channels)
         self.encoder = PoseEncoder(plan, shape, reach or Reach.throughout(plan))
@@ -220,21 +223,21 @@ class FactorisedField(nn.Module):
 
     @property
     def width(self) -> int:
-        """Of the network's layers."""
+        """Width of the network's layers."""
         return self._inputs.out_features
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
         return self.coefficients(listener, emitter, yaw) @ self.basis
 
     def coefficients(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
-        """(B, rank), of the basis."""
-        # In few digits a path goes through walls.
+        """(B, rank) coefficients of the basis."""
+        # In low precision, a path would go through walls.
         with torch.autocast(listener.device.type, enabled=False):
             features = self.encoder(listener, emitter, yaw)
         return self.coefficients_of(features)
 
     def coefficients_of(self, features: Tensor) -> Tensor:
-        """`coefficients`, of what the encoder makes of poses."""
+        """(B, rank) coefficients from the encoder's features."""
         hidden = nn.functional.gelu(self._inputs(features))
         for layer in self._hidden:
             hidden = hidden + nn.functional.gelu(layer(hidden))
@@ -243,8 +246,8 @@ class FactorisedField(nn.Module):
 
     @torch.no_grad()
     def truncated(self, rank: int, listener: Tensor, emitter: Tensor, yaw: Tensor) -> "FactorisedField":
-        """A field of lower rank: of all linear maps of this one's coefficients the one that differs least from it, in
-        the mean square over these poses (Eckart and Young, 1936). What is lost of levels is added to their correction.
+        """A field of lower rank. Of all linear maps of this field's coefficients, it has the least mean squared
+        difference over these poses (Eckart and Young, 1936). The level correction makes up for the lost power.
 
         Raises ValueError unless the rank is lower.
         """
@@ -254,7 +257,7 @@ class FactorisedField(nn.Module):
         coefficients = self.coefficients_of(features)
         root = torch.linalg.qr(coefficients / len(coefficients) ** 0.5).R
         directions = torch.linalg.svd(root @ self.basis, full_matrices=False).Vh[:rank]
-        # Coefficients of equal size, so that eight bits do for all of them together.
+        # Coefficients of equal size, so that all of them can share one eight-bit scale.
         size = (coefficients @ self.basis @ directions.T).square().mean(dim=0).sqrt().clamp(min=1e-9)
         turn = self.basis @ directions.T / size
         field = copy.deepcopy(self)
@@ -269,7 +272,7 @@ class FactorisedField(nn.Module):
             self.in_physical_units(coefficients @ turn @ field.basis)[:, levels],
             self.encoder.sight(features),
         )
-        field.level_correction[:, levels] += balance.missing()
+        field.level_correction[:, levels] += balance.deficit()
         return field
 
     def in_physical_units(self, flat: Tensor) -> Tensor:
@@ -277,10 +280,11 @@ class FactorisedField(nn.Module):
 
 
 class ExportedField(nn.Module):
-    """The contract's outputs from a trained field: cells spread to bins, phasors turned into phase and certainty. Over
-    time they stay cells, `cells.all_frames`, for whoever decodes them to spread.
+    """The outputs of the exported graph from a trained field: cells are spread to bins, and phasors become phase and
+    certainty. Along time, outputs stay cells (`cells.all_frames`), which the decoder spreads.
 
-    What is spread over frequency alike lies side by side in the basis, so that few nodes move large arrays.
+    The parts that are spread over frequency in the same way lie side by side in the basis, so that few nodes move large
+    arrays.
     """
 
     _bands: Tensor
@@ -293,12 +297,12 @@ class ExportedField(nn.Module):
         self._field = field
         heads = field.heads
         self._pooled = [name for name in ("late", "interaural") if name in heads.shapes]
-        # The first bands are bins; the others need the last of these to be spread.
+        # The first bands are single bins. Spreading the others also needs the last of these.
         self._narrow = int(np.argmax(np.append(cells.bands.widths, 2) > 1))
         wide = cells.bands.spread()[self._narrow - 1 :, self._narrow :]
         self.register_buffer("_bands", torch.tensor(np.ascontiguousarray(wide.T)), persistent=False)
         order = self._order(heads)
-        # Units and level correction cost nothing where the basis and one offset have them; sight is a row of its own.
+        # Units and level correction are part of the basis and of one offset, where they cost nothing; sight adds a row.
         out_of_sight, in_sight = field.level_correction
         basis, offset = field.basis.detach() * field.spread, field.mean + in_sight
         if not field.encoder.sees_all:
@@ -311,8 +315,9 @@ class ExportedField(nn.Module):
         self._to_frames = torch.from_numpy(cells.all_frames.spread())
 
     def _order(self, heads: Heads) -> Tensor:
-        """Of the flat output: pooled cells of all heads (channel or part, band, frames of one head after another), of
-        the bands that are bins first and then of those to be spread; the fine frames and phasors as they were."""
+        """Indices into the flat output: first the pooled cells of all heads (channel or part, band, frames of one head
+        after another), bands of single bins before bands that are spread; then fine frames and phasors in their
+        order."""
         numbers = {name: torch.arange(part.start, part.stop) for name, part in heads.slices.items()}
         pooled = torch.cat([numbers[name].reshape(heads.shapes[name]) for name in self._pooled], dim=-1)
         bins, bands = pooled[:, : self._narrow], pooled[:, self._narrow - 1 :]
@@ -334,15 +339,15 @@ class ExportedField(nn.Module):
         log_magnitude = torch.clamp(torch.cat([fine, late], dim=-1), min=self._silence)
         return log_magnitude, *self._phase(*phasor), *interaural
 
-    def of_frames(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
-        """The same of every frame."""
+    def forward_all_frames(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
+        """The same outputs, with time spread to every frame."""
         log_magnitude, frequency, certainty, *interaural = self(listener, emitter, yaw)
         return log_magnitude @ self._to_frames, frequency, certainty, *(part @ self._to_frames for part in interaural)
 
     def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
         """Instantaneous frequency and certainty of mean phasors (B, ear, frequency, frame)."""
         certainty = torch.sqrt(real * real + imaginary * imaginary)
-        # From half the angle's tangent, or its inverse: fewer nodes than the quadrants of an arc tangent.
+        # The angle follows from the tangent of its half, which takes fewer nodes than an arctangent with quadrants.
         slope = imaginary / torch.clamp(certainty + real.abs(), min=_NO_LENGTH)
         phase = 2 * torch.atan(torch.where(real < 0, 1 / slope, slope))
         certainty = torch.clamp(certainty, max=1.0)

@@ -1,9 +1,9 @@
-"""The frozen noise behind a scene's late reverberation: white, and as even as a signal can be.
+"""The frozen noise behind a scene's late reverberation: white, with as even a spectrogram as a signal can have.
 
-The spectrogram of plain white noise fluctuates by 5.6 dB (Rayleigh). Those fluctuations would be imprinted on every
-response of the scene, on top of the levels the field predicts. Griffin and Lim's iteration towards a constant
-magnitude, in the fast form of Perraudin, Balazs and Soendergaard (2013), keeps the noise random in phase and nearly
-takes them away, so a response has the levels that were asked for.
+The spectrogram of plain white noise fluctuates by 5.6 dB (Rayleigh). These fluctuations would be imprinted on every
+response of the scene, on top of the levels that the field predicts. Griffin and Lim's iteration towards a constant
+magnitude, in the fast form of Perraudin, Balazs and Soendergaard (2013), nearly removes them and keeps the phase
+random, so a response has the predicted levels.
 """
 
 import numpy as np

@@ -1,5 +1,5 @@
-"""By how much predicted levels are too low on average: a regression on the logarithm of magnitude predicts the mean of
-logarithms, 2.5 dB below the logarithm of the mean power for noise, and less or more wherever it is unsure.
+"""By how much predicted levels are too low on average. A regression on log-magnitude predicts the mean of logarithms.
+For noise, this is 2.5 dB below the logarithm of the mean power, and the gap also depends on how uncertain the field is.
 
 Axes: B pairs, n levels (natural logarithms of magnitude).
 """
@@ -12,17 +12,17 @@ from torch import Tensor, nn
 
 from training.models.cells import Cells
 
-# A level that is raised is heard in the cells beside it too: after one step a twentieth of the error of a reverberation
-# time is left, after three less than a hundredth.
+# Raising the level of one cell also raises its neighbours, by interpolation. One step leaves a twentieth of the error
+# of a reverberation time, three steps less than a hundredth.
 _STEPS = 3
 
 
-class LevelsInterpolated(nn.Module):
-    """What is heard of predicted levels, in the layout that they are predicted in.
+class InterpolatedLevels(nn.Module):
+    """Predicted levels after decoding, in the layout in which they are predicted.
 
-    A cell's level is the mean power of its frames and bins, and whoever decodes it draws straight lines from the centre
-    of one cell to that of the next. Of sound that decays by x nepers of amplitude in half a cell, the mean power lies
-    by the factor sinh(2x) / 2x above that of its centre: read as it is, late sound decays too slowly where cells widen.
+    The level of a cell is the mean power of its frames and bins, and decoding interpolates linearly between the centres
+    of cells. For sound that decays by x nepers of amplitude in half a cell, the mean power is sinh(2x) / 2x times the
+    power at the centre. Without a correction, late sound would therefore decay too slowly where cells widen.
     """
 
     _to_bins: Tensor
@@ -43,7 +43,7 @@ class LevelsInterpolated(nn.Module):
             self.register_buffer(f"_{name}", torch.tensor(matrix.copy()), persistent=False)
 
     def forward(self, levels: Tensor) -> Tensor:
-        """(B, n) levels of fine frames and of late cells, to as many."""
+        """(B, n) levels of fine frames and late cells, to the same number of decoded levels."""
         fine, late = torch.split(levels, [math.prod(self._fine), math.prod(self._late)], dim=1)
         columns = torch.cat([fine.unflatten(1, self._fine), self._to_bins @ late.unflatten(1, self._late)], dim=-1)
         power = self._of_bins @ torch.exp(2 * (columns @ self._to_frames)) @ self._of_frames
@@ -51,28 +51,29 @@ class LevelsInterpolated(nn.Module):
 
 
 class PowerBalance:
-    """The power of targets and of predictions, of pairs out of sight and of those in sight.
+    """Compares the mean power of targets and predictions, separately for pairs out of sight and in sight.
 
-    Round a corner the first frames are all but silent and hard to tell, in sight they are loud and easy: one correction
-    for both would make them too loud there. Power counts as a share of its pair's, so that a pair near its emitter
-    counts as much as one far from it, and nothing counts for being far off where it is not heard.
+    Round a corner, the first frames are almost silent and hard to predict; in sight they are loud and easy. A common
+    correction would make the former too loud. Power counts as a share of the pair's total, so that pairs near and far
+    from their emitter count alike, and errors where a response is almost silent hardly count.
     """
 
     def __init__(self, areas: Tensor) -> None:
-        """`areas` (n,): steps of time and frequency that each level stands for."""
+        """`areas` (n,): number of time-frequency bins that each level stands for."""
         self._areas = areas
         self._true, self._predicted = areas.new_zeros(2, len(areas)), areas.new_zeros(2, len(areas))
 
     def add(self, true: Tensor, predicted: Tensor, sight: Tensor) -> None:
-        """Levels (B, n) of pairs that see each other (1) or not (0), `sight` (B, 1)."""
+        """Adds levels (B, n) of pairs with `sight` (B, 1): 1 in sight, 0 out of sight."""
         kinds = torch.cat([1 - sight, sight], dim=1).T
         power = torch.exp(2 * true)
         whole = (power @ self._areas)[:, None]
         self._true += kinds @ (power / whole)
         self._predicted += kinds @ (torch.exp(2 * predicted) / whole)
 
-    def missing(self) -> Tensor:
-        """(2, n) what to add to predicted levels, out of sight and in sight; of all pairs for a kind without any."""
+    def deficit(self) -> Tensor:
+        """(2, n) what to add to predicted levels, out of sight and in sight. A kind without pairs gets the value of all
+        pairs."""
         is_there = (self._true > 0).any(dim=1, keepdim=True)
         true, predicted = (torch.where(is_there, power, power.sum(dim=0)) for power in (self._true, self._predicted))
         return 0.5 * torch.log(true / predicted)
@@ -80,19 +81,19 @@ class PowerBalance:
 
 def level_correction(
     examples: Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]],
-    heard: Callable[[Tensor], Tensor],
+    decode: Callable[[Tensor], Tensor],
     areas: Tensor,
 ) -> Tensor:
-    """(2, n) what to add to predicted levels, out of sight and in sight, so that what is `heard` of them has the power
-    of the true ones.
+    """(2, n) what to add to predicted levels, out of sight and in sight, so that the levels after `decode` have the
+    same mean power as the true ones.
 
-    examples: anew at every call the same batches of true and predicted levels (B, n) and `sight` (B, 1).
+    examples: at every call, yields the same batches of true levels and predicted levels (B, n) and `sight` (B, 1).
     """
     correction = areas.new_zeros(2, len(areas))
     for _ in range(_STEPS):
         balance = PowerBalance(areas)
         for true, predicted, sight in examples():
             corrected = predicted + torch.lerp(correction[0], correction[1], sight)
-            balance.add(true, heard(corrected), sight)
-        correction += balance.missing()
+            balance.add(true, decode(corrected), sight)
+        correction += balance.deficit()
     return correction

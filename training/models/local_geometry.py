@@ -1,6 +1,5 @@
-"""What the paper's network reads poses with: sinusoidal encodings, a grid of local geometric features, and embeddings
-of the head's orientation (Luo et al., Learning Neural Acoustic Fields, NeurIPS 2022, section 3.3 and supplement).
-"""
+"""The input encodings of the paper's network: sinusoids, a grid of local geometric features, and embeddings of the head
+orientation (Luo et al., Learning Neural Acoustic Fields, NeurIPS 2022, section 3.3 and supplement)."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,13 +8,13 @@ from torch import Tensor, nn
 
 _FREQUENCIES = 10
 ENCODED = 1 + 2 * _FREQUENCIES
-"""Numbers that encode one coordinate."""
+"""The number of values that encode one coordinate."""
 _LEAST_BANDWIDTH_M, _MOST_BANDWIDTH_M = 0.1, 0.5
 _FLOAT_M = 0.1
 
 
 def sinusoids(coordinates: Tensor, highest_octave: float) -> Tensor:
-    """(..., n) coordinates to (..., ENCODED n): themselves, then sines and cosines at ten factors from 1 to
+    """(..., n) coordinates to (..., ENCODED n): the coordinates, then their sines and cosines at ten factors from 1 to
     2**highest_octave, evenly spaced in octaves."""
     factors = 2.0 ** torch.linspace(0, highest_octave, _FREQUENCIES, dtype=coordinates.dtype, device=coordinates.device)
     angles = (coordinates[..., None] * factors).flatten(-2)
@@ -23,10 +22,10 @@ def sinusoids(coordinates: Tensor, highest_octave: float) -> Tensor:
 
 
 class GaussianGrid(nn.Module):
-    """Learned features on a grid in plan, read by a Gaussian Nadaraya-Watson kernel; each cell has its own bandwidth
-    (0.1 to 0.5 m) and may float by 0.1 m.
+    """Learned features on a grid in plan, interpolated by a Gaussian Nadaraya-Watson kernel. Each cell has its own
+    bandwidth (0.1 to 0.5 m) and may move by 0.1 m.
 
-    The weights are a softmax of the exponents: published code divides sums of exponentials, which are 0/0 farther
+    The weights are a softmax of the exponents. The published code divides sums of exponentials, which gives 0/0 farther
     than a few metres from every cell.
     """
 
@@ -48,18 +47,20 @@ class GaussianGrid(nn.Module):
     @property
     def bandwidths_m(self) -> Tensor:
         """(cell,)"""
+        # guard: a bandwidth has a least
         return _LEAST_BANDWIDTH_M + (_MOST_BANDWIDTH_M - _LEAST_BANDWIDTH_M) * torch.sigmoid(self.bandwidth_logit)
 
     def forward(self, position: Tensor) -> Tensor:
         """(B, 2 or 3) metres to (B, features)."""
         cells = self._cells + _FLOAT_M * torch.tanh(self.offset)
         squared = torch.sum((position[:, None, :2] - cells) ** 2, dim=-1)
+        # guard: kernel weights of the paper's grid are a softmax
         return torch.softmax(-squared / (2 * self.bandwidths_m**2), dim=-1) @ self.features
 
 
 class OrientationEmbedding(nn.Module):
-    """A learned vector per layer for each measured head orientation, interpolated between the two nearest: at measured
-    ones the paper's embedding, and defined at all others."""
+    """A learned vector per layer for each measured head orientation, interpolated between the two nearest. At measured
+    orientations it is the paper's embedding."""
 
     _yaws: Tensor
     _after: Tensor
@@ -76,6 +77,7 @@ class OrientationEmbedding(nn.Module):
     def forward(self, yaw: Tensor) -> Tensor:
         """(B,) radians to (B, layers, width)."""
         turn = yaw[:, None] - self._yaws
+        # guard: a heading is one within a turn
         turn = turn - 2 * np.pi * torch.floor((turn + np.pi) / (2 * np.pi))
         gap = torch.where(turn >= 0, self._after, self._before)
         weights = torch.clamp(1 - turn.abs() / gap, min=0)

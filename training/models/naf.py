@@ -1,14 +1,15 @@
-"""`naf`: the paper's network (Luo et al., Learning Neural Acoustic Fields, NeurIPS 2022), one point of one response
-at a time.
+"""`naf`: the paper's network (Luo et al., Learning Neural Acoustic Fields, NeurIPS 2022), which predicts one point of
+one response at a time.
 
-A point is a bin of the spectrogram (frequency, frame), answered with log-magnitude and instantaneous frequency, or, in
-the supplement's alternative, a sample of the waveform. Eight layers 512 wide with leaky ReLU; two more layers carry the
-inputs past the first half. Every layer but the last adds an embedding of the ear and one of the head's orientation.
+A point is a bin of the spectrogram (frequency, frame), for which the network predicts log-magnitude and instantaneous
+frequency. In the supplement's alternative, a point is a sample of the waveform. There are eight layers of width 512
+with leaky ReLU; two more layers carry the inputs past the first half. Every layer but the last adds an embedding of the
+ear and one of the head orientation.
 
-Two things differ from the paper. It learns what every field here learns from the same data, of a simulated scene what
-follows the direct sound and the first reflections, aligned to the earliest arrival, where the paper's learns whole
-responses in absolute time: an easier task, and the same for all fields compared. And positions are given in as many
-coordinates as vary in the data, where the paper's are all at one height (MeshRIR's emitters, in section 4, are not).
+Two things differ from the paper. First, this network learns what every field here learns: for a simulated scene the
+late reverberation, aligned to the earliest arrival. The paper's network learns whole responses in absolute time, which
+is a harder task; here the task is the same for all fields that are compared. Second, positions have as many coordinates
+as vary in the data. The paper's positions are all at one height (except MeshRIR's emitters, in section 4).
 
 Axes: B poses, ear, N points; metres, radians.
 """
@@ -29,7 +30,8 @@ _POSITION_OCTAVE, _POINT_OCTAVE = 7.0, 10.0
 
 @dataclass(frozen=True)
 class NafShape:
-    """The network's whole configuration. `grid`: one for both ends, one each, or none; `domain`: what a point is."""
+    """Sizes and variants of the network. `grid`: one for both ends, one for each, or none; `domain`: whether a point is
+    a bin of the spectrogram or a sample."""
 
     grid: Literal["shared", "dual", "none"] = "shared"
     domain: Literal["spectrogram", "time"] = "spectrogram"
@@ -40,13 +42,13 @@ class NafShape:
 
     @property
     def outputs(self) -> int:
-        """Numbers per point."""
+        """Number of values per point."""
         return 2 if self.domain == "spectrogram" else 1
 
 
 class Naf(nn.Module):
-    """Normalised predictions (B, ear, N, outputs) at points given by their index along each of `axes`, the sizes
-    (frequency, frame) or (sample,)."""
+    """Normalised predictions (B, ear, N, outputs) at points, which are given by their index along each of `axes`: the
+    sizes (frequency, frame) or (sample,)."""
 
     mean: Tensor
     spread: Tensor
@@ -76,7 +78,7 @@ class Naf(nn.Module):
         self.last = nn.Linear(shape.width, shape.outputs)
         self.ears = nn.Parameter(torch.randn(inner + 1, channels, shape.width) / shape.width**0.5)
         self.orientations = OrientationEmbedding(site.yaws, inner + 1, shape.width)
-        # Normalisation over the training set: (*axes, outputs), the same for both ears.
+        # Normalisation by the training set: (*axes, outputs), the same for both ears.
         self.register_buffer("mean", torch.zeros(*axes, shape.outputs))
         self.register_buffer("spread", torch.ones(*axes, shape.outputs))
         if shape.domain == "spectrogram" and channels == 2:
@@ -85,7 +87,7 @@ class Naf(nn.Module):
 
     @property
     def entries(self) -> tuple[nn.Linear, nn.Linear]:
-        """The layers that read the inputs: the first, and that which carries them past the first half."""
+        """The two layers that read the inputs: the first, and the one that carries the inputs past the first half."""
         return self.first, cast(nn.Linear, self.skip[0])
 
     def encoding(self, axis: int) -> Tensor:
@@ -94,7 +96,7 @@ class Naf(nn.Module):
         return encodings
 
     def pose_features(self, listener: Tensor, emitter: Tensor) -> Tensor:
-        """(B, features) of where the two ends are."""
+        """(B, features) encodings of the positions of listener and emitter."""
         middle, half = (self._low + self._high) / 2, torch.clamp((self._high - self._low) / 2, min=1e-3)
         ends = []
         for position, moving in zip((listener, emitter), self._moving, strict=True):
@@ -105,13 +107,13 @@ class Naf(nn.Module):
         return torch.cat(ends, dim=-1)
 
     def tables(self, layer: nn.Linear) -> list[Tensor]:
-        """A layer over concatenated inputs is a sum of layers over each: its (size, width) share of every axis, without
-        bias."""
+        """The terms (size, width) of a layer that depend on the index along each axis, without bias. A layer over
+        concatenated inputs is the sum of one layer for each input."""
         weights = torch.split(layer.weight[:, -ENCODED * len(self.axes) :], ENCODED, dim=1)
         return [self.encoding(axis) @ weight.T for axis, weight in enumerate(weights)]
 
     def of_pose(self, layer: nn.Linear, features: Tensor) -> Tensor:
-        """(B, width) share of the pose features in a layer over concatenated inputs, with its bias."""
+        """(B, width) the term of a layer that depends on the pose features, with the bias."""
         return nn.functional.linear(features, layer.weight[:, : features.shape[-1]], layer.bias)
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor, *indices: Tensor) -> Tensor:
@@ -128,8 +130,8 @@ class Naf(nn.Module):
         return values
 
     def trunk(self, first: Tensor, skipped: Tensor, orientation: Tensor, inner: nn.ModuleList) -> Tensor:
-        """From both input layers' (B, N, width), all through `inner`, the inner layers or the first of them, to
-        (B, ear, N, width); orientation (B, layers, width)."""
+        """From the outputs (B, N, width) of both input layers, through the layers `inner` (all inner layers, or the
+        first of them), to (B, ear, N, width). `orientation` is (B, layers, width)."""
         past = self.skip[1](nn.functional.leaky_relu(skipped, SLOPE))
         hidden = first[:, None] + self.embedding(orientation, 0)
         for number, layer in enumerate(inner):
@@ -139,10 +141,10 @@ class Naf(nn.Module):
         return hidden
 
     def embedding(self, orientation: Tensor, layer: int) -> Tensor:
-        """(B, ear, 1, width) of ear and orientation."""
+        """(B, ear, 1, width) sum of the embeddings of ear and orientation."""
         return (self.ears[layer] + orientation[:, layer, None])[:, :, None]
 
     def in_physical_units(self, normalised: Tensor) -> Tensor:
-        """(B, ear, all points, outputs), points in the order of `axes`, to (B, outputs, ear, *axes)."""
+        """(B, ear, all points, outputs), with points in the order of `axes`, to (B, outputs, ear, *axes)."""
         shaped = normalised.unflatten(2, self.axes) * self.spread + self.mean
         return torch.movedim(shaped, -1, 1)

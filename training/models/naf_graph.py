@@ -1,8 +1,9 @@
-"""The graphs of a trained `naf`: the paper's network as it is written, and the same function with less arithmetic.
+"""The graphs of a trained `naf`: the paper's network as written, and the same function with less arithmetic.
 
-`plain` concatenates the inputs of every point and runs all layers. `tabled` uses that a layer over concatenated inputs
-is a sum over its inputs: the shares of frequency and frame are tables, made once; that of the poses is computed once
-per pose; and two layers in a row with nothing in between are one. Both compute the same numbers up to rounding.
+`plain` concatenates the inputs of each point and runs all layers. `tabled` uses the fact that a layer over concatenated
+inputs is a sum over its inputs: the terms of frequency and frame are tables that are computed once, the term of the
+poses is computed once per pose, and two consecutive linear layers are merged into one. Both compute the same numbers up
+to rounding.
 """
 
 from typing import cast
@@ -16,11 +17,12 @@ from training.models.naf import SLOPE, Naf
 
 
 class NafGraph(nn.Module):
-    """Log-magnitude, instantaneous frequency, its certainty and the training set's interaural coherence (without it for
-    one channel); in the time domain the aligned response alone.
+    """Log-magnitude, instantaneous frequency, its certainty, and the interaural coherence of the training set (not for
+    one channel). In the time domain the only output is the aligned response.
 
-    The certainty is nothing throughout. The paper's network does not say how sure it is of a phase, and the paper's
-    own evaluation puts random phase in its place; a level that integrates the frequency does not ask."""
+    The certainty is zero throughout: the paper's network does not predict how certain a phase is, and the paper's own
+    evaluation uses random phase. A quality level that integrates the frequency does not use the certainty.
+    """
 
     _points: Tensor
     _weight: Tensor

@@ -1,7 +1,7 @@
-"""What geometry alone tells a field: sight, shortest path and directions, in torch so that they live inside the ONNX
-graph.
+"""Geometric inputs of a field: sight, shortest path and directions. They are computed in torch so that they are part of
+the ONNX graph.
 
-Agrees with `server.acoustics.geometry.FloorPlan` (tested); points are (B, 3).
+Results agree with `server.acoustics.geometry.FloorPlan` (tested); points are (B, 3).
 """
 
 from dataclasses import dataclass
@@ -16,18 +16,19 @@ from server.acoustics.geometry import FloorPlan
 _Floats = npt.NDArray[np.float64]
 
 _TOUCH = 1e-6
-"""Metres to the fourth power, of two products of sides: less is a line that grazes a corner, or rounding."""
+"""In m^4, for the product of two products of sides. Below it a line only grazes a corner, or the value is rounding."""
 _FAR = 1e4
 _PENUMBRA_M = 0.05
-"""By how much a way round a corner is longer than the straight one where sight has fallen to 1 / e: half a wavelength
-at 3 kHz. Reflected sound does not change at once where the line of sight breaks, and levels may not step there."""
+"""Sight has fallen to 1 / e where the path round a corner is this much longer than the straight line: half a wavelength
+at 3 kHz. Reflected sound does not change at once where the line of sight breaks, so predicted levels must not jump
+there."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """Shortest path from emitter to listener: `length`, by how much the emitter is higher, and sight (B, 1), 1 where
-    they see each other and falling to 0 behind a corner; unit directions in plan in which it leaves the listener and
-    the emitter (B, 2, 2)."""
+    """The shortest path from emitter to listener: its `length`, the height `rise` from listener to emitter, and
+    `visible` (B, 1), which is 1 where the two see each other and falls to 0 behind a corner. `directions` (B, 2, 2) are
+    unit vectors in plan in which the path leaves the listener and the emitter."""
 
     length: Tensor
     rise: Tensor
@@ -38,9 +39,9 @@ class Path:
 class Propagation(nn.Module):
     """Shortest paths through a floor plan, round its reflex corners.
 
-    A graph of many small nodes takes longer than what they compute, so both ends are worked on together, by products
-    and sums over whole vectors, and what is known of corners and walls is worked out beforehand; where there is nothing
-    to see round, there is nothing to compute.
+    In a graph of many small nodes, the overhead of nodes takes longer than their arithmetic. So both ends are computed
+    together by products and sums of whole arrays, constants of corners and walls are computed beforehand, and nothing
+    is computed for a plan without reflex corners.
     """
 
     _apart: Tensor
@@ -71,7 +72,7 @@ class Propagation(nn.Module):
 
     @property
     def sees_all(self) -> bool:
-        """Whether there is nothing to see round."""
+        """Whether all places see each other."""
         return self._bend_count == 0
 
     def forward(self, listener: Tensor, emitter: Tensor) -> Path:
@@ -91,9 +92,9 @@ class Propagation(nn.Module):
     def _shortest(
         self, places: Tensor, across: Tensor, straight: Tensor, other: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Length in plan, sight (B, 1), and where the path goes from either end first (B, end, 2), of places in plan
-        (B, end, 2), which are `across` (B, 2) from each other, and `straight` (B, 1); `other` are the ends
-        exchanged."""
+        """The length in plan, sight (B, 1), and the point that the path leads to first from either end. `places` (B,
+        end, 2) are in plan, `across` (B, 2) is the offset between them, `straight` (B, 1) its length, and `other` the
+        places in exchanged order."""
         corners = self._bend_count * self._wall_count
         crossings = places @ self._of_place + self._of_all_places
         sides, starts, stops, of_walls = torch.split(crossings, [corners, corners, corners, self._wall_count], dim=-1)
@@ -112,8 +113,8 @@ class Propagation(nn.Module):
         )
 
     def _is_crossed(self, start: Tensor, across: Tensor, sides: Tensor) -> Tensor:
-        """(B, 1) whether a wall crosses the line that leads `across` (B, 2) from `start` (B, 2, 1), whose ends are on
-        these `sides` (B, end, wall) of walls; one that grazes a corner does not."""
+        """(B, 1) whether a wall crosses the line from `start` (B, 2, 1) by the offset `across` (B, 2). `sides` (B, end,
+        wall) tell on which side of each wall its ends lie. A wall that only touches the line does not cross it."""
         of_line = (across @ self._turn_left)[:, None]
         starts, stops = torch.split(of_line @ (self._corners - start), self._wall_count, dim=-1)
         crossed = torch.maximum(sides.prod(dim=1, keepdim=True), starts * stops)
@@ -121,9 +122,10 @@ class Propagation(nn.Module):
 
 
 def _crossings(walls: _Floats, bends: _Floats) -> tuple[_Floats, _Floats]:
-    """(2, n) and (n,): a place times the one and with the other added has first, for each bend and wall, the product of
-    the two's sides of the wall, then of which side of the line to the bend the wall's start is and its end; then of
-    which side of each wall the place is. Where the bend is an end of the wall, their product is exactly 0."""
+    """Factors (2, n) and offsets (n,) of a linear map of a place. Its outputs are, for each bend and wall: the product
+    of the sides of the wall on which place and bend lie; the side of the line from place to bend on which the wall's
+    start lies; the same for the wall's end; and last, for each wall, the side on which the place lies. Where the bend
+    is an end of the wall, the first is exactly 0."""
     starts, stops = walls[:, 0], walls[:, 1]
     normals = _turned_left(stops - starts)
     of_start = np.sum(normals * starts, axis=-1)
@@ -138,11 +140,12 @@ def _crossings(walls: _Floats, bends: _Floats) -> tuple[_Floats, _Floats]:
 
 
 def _turned_left(offsets: npt.ArrayLike) -> _Floats:
-    """(..., 2) by a quarter of a turn: their scalar products are what others' cross products with them would be."""
+    """(..., 2) turned left by 90 degrees. The dot product with a turned vector is the cross product with the
+    original."""
     x, y = np.moveaxis(np.asarray(offsets, dtype=np.float64), -1, 0)
     return np.stack([-y, x], axis=-1)
 
 
 def _norm(offset: Tensor) -> Tensor:
-    """(..., 1) of (..., 2)."""
+    """(..., 1) lengths of vectors (..., 2)."""
     return torch.sqrt(torch.sum(offset * offset, dim=-1, keepdim=True) + 1e-12)

@@ -1,4 +1,4 @@
-"""Where responses were taken: what a field has to know of a place before it learns anything of it."""
+"""Where responses were measured: the geometry that a field is given before training."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,8 @@ _NEAREST_M = 0.25
 
 @dataclass(frozen=True)
 class Reach:
-    """How far what was learned goes: places between `low` and `high` (3,), and ends that are no nearer to each other
-    than `nearest_m`. Metres."""
+    """The poses that a field is valid for: positions between `low` and `high` (3,), and listener and emitter at least
+    `nearest_m` from each other. Metres."""
 
     low: npt.NDArray[np.float64]
     high: npt.NDArray[np.float64]
@@ -25,8 +25,8 @@ class Reach:
     @classmethod
     def of(cls, responses: ResponseSet) -> "Reach":
         listener, emitter = responses.listener[~responses.held_out], responses.emitter[~responses.held_out]
-        positions, apart_m = np.concatenate([listener, emitter]), np.linalg.norm(listener - emitter, axis=-1)
-        return cls(positions.min(axis=0), positions.max(axis=0), max(float(apart_m.min()), _NEAREST_M))
+        positions, distances_m = np.concatenate([listener, emitter]), np.linalg.norm(listener - emitter, axis=-1)
+        return cls(positions.min(axis=0), positions.max(axis=0), max(float(distances_m.min()), _NEAREST_M))
 
     @classmethod
     def throughout(cls, plan: FloorPlan) -> "Reach":
@@ -36,9 +36,10 @@ class Reach:
 
 @dataclass(frozen=True)
 class Site:
-    """`low` and `high` (3,) enclose all positions, metres; `plan` is the floor plan, or a box around them where none is
-    known, in which every two points see each other. `yaws` (yaw,) are the head orientations measured, ascending in
-    [0, 2 pi). `listener_axes` and `emitter_axes` are the coordinates in which that end moves, x and y always."""
+    """`low` and `high` (3,) enclose all positions, in metres. `plan` is the floor plan; if it is unknown, it is a box
+    around the positions, in which all points see each other. `yaws` (yaw,) are the measured head orientations,
+    ascending in [0, 2 pi). `listener_axes` and `emitter_axes` are the coordinates that vary at that end; x and y are
+    always among them."""
 
     plan: FloorPlan
     low: npt.NDArray[np.float64]
@@ -57,11 +58,13 @@ class Site:
             corners = np.asarray(plan.corners)
             low[:2], high[:2] = corners.min(axis=0), corners.max(axis=0)
         else:
+            # guard: places on a line have room around them
             (x, y), (right, top) = low[:2] - _MARGIN_M, high[:2] + _MARGIN_M
+            # guard: places on the floor have room above them
             plan = FloorPlan(((x, y), (right, y), (right, top), (x, top)), max(float(high[2]), 0.0) + _MARGIN_M)
             low[:2], high[:2] = (x, y), (right, top)
         axes = [(0, 1, 2) if np.ptp(end[:, 2]) > _MOVES_M else (0, 1) for end in ends]
-        # Rounded, so that one heading written as several floats stays one.
+        # Rounded, so that a heading that was stored as slightly different floats counts once.
         yaws = np.unique(np.round(np.remainder(responses.yaw, 2 * np.pi), 6))
         headings = np.asarray(yaws[yaws < 2 * np.pi - 1e-5], np.float64)
         return cls(plan, low, high, headings, axes[0], axes[1])

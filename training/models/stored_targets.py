@@ -1,6 +1,6 @@
-"""Targets of all responses that may be trained on, computed once and kept in a file.
+"""Computes the targets of all responses that may be trained on, once, and stores them in a file.
 
-HDF5 lets one process at a time write it; the rows, in one piece, are then read through a memory map.
+HDF5 lets one process at a time write the file. The rows lie in one piece, and are then read through a memory map.
 """
 
 import hashlib
@@ -26,8 +26,8 @@ _FLUSH_S = 10.0
 
 @dataclass(frozen=True)
 class Targets:
-    """Poses and flat targets, one row per response that is not held out; `flat` is a memory map. `seconds` is how long
-    it once took to compute them."""
+    """Poses and flat targets, one row per response that is not held out; `flat` is a memory map. `seconds` is the time
+    that their computation took."""
 
     listener: npt.NDArray[np.float32]
     emitter: npt.NDArray[np.float32]
@@ -39,11 +39,13 @@ class Targets:
 def load_targets(
     responses: ResponseSet, cells: Cells, folder: Path, progress: Progress, *, expected: bool = False
 ) -> Targets:
-    """Targets of all responses that are not held out, kept in `folder` in a file for each choice of `cells` and
-    `expected`. An interrupted computation goes on where it was; when the responses are written anew, so are they.
+    """Targets of all responses that are not held out, stored in `folder` in one file for each choice of `cells` and
+    `expected`. An interrupted computation continues where it stopped, and targets are computed again when the responses
+    have been rewritten.
 
-    With `expected`, of simulated responses only, they are what is expected over all draws of a response's noise. Raises
-    DatasetError if the dataset keeps no energies, if another process computes the same, or if the file is damaged.
+    With `expected`, for simulated responses only, targets are expected values over all draws of a response's noise.
+    Raises DatasetError if the dataset has no energies, if another process is computing the same, or if the file is
+    damaged.
     """
     choice = json.dumps({"format": _FORMAT, "cells": asdict(cells), "expected": expected})
     path = folder / f"targets-{hashlib.sha256(choice.encode()).hexdigest()[:12]}.h5"
@@ -61,7 +63,7 @@ def load_targets(
     except BlockingIOError as exc:
         raise DatasetError(f"{path}: another process is computing these targets; wait for it") from exc
     except OSError as exc:
-        raise DatasetError(f"{path}: not a file of targets; delete it, and it is computed anew ({exc})") from exc
+        raise DatasetError(f"{path}: not a file of targets; delete it, and it will be computed again ({exc})") from exc
     listener, emitter, yaw = (
         part[rows].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw)
     )
@@ -77,7 +79,7 @@ def _complete(
     *,
     expected: bool,
 ) -> None:
-    """Pair by pair, for the responses of one are stored together; `pairs` of them are there already."""
+    """Computes the pairs that the file does not have yet. Its attribute `pairs` counts those it has."""
     starts = np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))
     done = int(file.attrs["pairs"])
     if done == len(starts):
@@ -113,7 +115,7 @@ class _Drawn:
 class _Expected:
     def __init__(self, responses: ResponseSet, cells: Cells) -> None:
         if not isinstance(responses, SimulatedResponses):
-            raise DatasetError("what is expected of a response is known of simulated ones only")
+            raise DatasetError("expected targets exist for simulated responses only")
         self._responses, self._targets = responses, ExpectedTargets(responses.dataset, cells)
 
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:

@@ -1,6 +1,6 @@
-"""A codec's transform with all frames at once: several times as fast as frame by frame, and the same to rounding.
+"""A codec's transform of all frames at once: several times as fast as frame by frame, and the same up to rounding.
 
-What is served is transformed by the codec itself, whose last bits responses depend on.
+Served responses use the codec's own transform, because their last bits depend on it.
 """
 
 import numpy as np
@@ -11,8 +11,8 @@ from server.acoustics.codec import Codec
 
 
 def transform_at_once(codec: Codec, signal: npt.NDArray[np.floating]) -> npt.NDArray[np.complexfloating]:
-    """(..., sample), as many as the codec has, to (..., frequency, frame), as `Codec.transform` does, in the precision
-    of the signal."""
+    """Transforms (..., sample), of the codec's length, to (..., frequency, frame), as `Codec.transform` does, in the
+    precision of the signal."""
     shifts = codec.n_fft // codec.hop
     hops = codec.frames + shifts - 1
     padded = np.zeros((*signal.shape[:-1], hops * codec.hop), signal.dtype)

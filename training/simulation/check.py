@@ -1,6 +1,7 @@
-"""Whether a plan keeps its promise: some emitters of a scene simulated by it, and with everything on by two seeds.
+"""Checks that a plan leaves out nothing audible: a few emitters of a scene are simulated by the plan, and with every
+effect on for two seeds.
 
-The difference of the latter two is the repeatability floor: what lies within it cannot be told from another draw.
+The difference between the latter two is the repeatability floor. An error within it cannot be told from randomness.
 """
 
 from collections.abc import Callable, Iterable
@@ -31,11 +32,11 @@ _YAWS_HEARD = 4
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """`errors` of the plan against everything on and `floor` of everything on against another draw of itself, means by
-    metric in its unit. The plan draws the noise that everything on does until its shared tail sets in: before that its
-    errors are what it leaves out, and of later sound they are another draw. Seconds of one core are `everything_s` and
-    `plan_s` for the emitters simulated, and `once_s` what the plan prepares once for all `probes` that a whole
-    simulation has as emitters."""
+    """`errors` compares the plan with every effect on; `floor` compares every effect on with a second random draw. Both
+    are means by metric, in its unit. Plan and reference use the same random numbers until the plan's shared tail sets
+    in. Until then, errors are caused by what the plan leaves out; later, the random numbers differ too. `everything_s`
+    and `plan_s` are seconds of one core for the emitters that were simulated. `once_s` is what the plan prepares once
+    for all `probes` of a whole simulation."""
 
     scene: str
     emitters: int
@@ -49,7 +50,7 @@ class PlanCheck:
 
     @property
     def speedup(self) -> float:
-        """Of a whole simulation."""
+        """How many times as fast a whole simulation is by the plan."""
         everything, plan = (seconds / self.emitters * self.probes for seconds in (self.everything_s, self.plan_s))
         return everything / (plan + self.once_s)
 
@@ -66,15 +67,15 @@ def check_plan(
     seed: int,
     track: Callable[[Iterable[int]], Iterable[int]],
 ) -> PlanCheck:
-    """Second takes, as of held-out pairs, are simulated and timed too, and not compared."""
+    """Second takes, as of held-out pairs, are also simulated and timed, but not compared."""
     probes = scene.probe_positions(seed)
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
-    asked = {"everything": (everything, seed), "again": (everything, seed + 1), "plan": (plan, seed)}
+    settings = {"everything": (everything, seed), "again": (everything, seed + 1), "plan": (plan, seed)}
     simulations, once_s = {}, 0.0
-    for name, (of, drawn) in asked.items():  # the plan last: code is loaded by whoever comes first
+    for name, (of, drawn) in settings.items():  # the plan last, because the first simulation also loads code
         began = process_time()
         simulations[name] = PairSimulation.prepare(scene, probes, yaws, seed=drawn, plan=of)
-        for _ in simulations[name].own(0, np.array([1]), 0):  # makes what serves all emitters
+        for _ in simulations[name].own(0, np.array([1]), 0):  # computes what all emitters share
             pass
         once_s = process_time() - began
     seconds = dict.fromkeys(simulations, 0.0)
@@ -90,8 +91,8 @@ def check_plan(
             for _ in simulation.own(emitter, repeated, 1):
                 pass
             seconds[name] += process_time() - began
-            heard = np.stack([simulation.whole(0, each)[:: max(1, len(yaws) // _YAWS_HEARD)] for each in own]) + known
-            measured[name].append(measure(heard, scene.simulation.sample_rate))
+            whole = np.stack([simulation.whole(0, each)[:: max(1, len(yaws) // _YAWS_HEARD)] for each in own]) + known
+            measured[name].append(measure(whole, scene.simulation.sample_rate))
     return PlanCheck(
         scene=scene.id,
         emitters=len(measured["plan"]),
@@ -106,14 +107,15 @@ def check_plan(
 
 
 class GeometricResponses:
-    """What datasets leave to geometry, at the orientations that are compared."""
+    """The direct sound and the first reflections, which datasets do not store, at the orientations that are
+    compared."""
 
     def __init__(self, scene: SceneFile, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
         settings = scene.simulation
-        heard = yaws[:: max(1, len(yaws) // _YAWS_HEARD)]
+        compared = yaws[:: max(1, len(yaws) // _YAWS_HEARD)]
         samples = round(settings.duration_s * settings.sample_rate)
         directions = sphere_directions(settings.arrival_directions)
-        self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, heard, samples)
+        self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, compared, samples)
         self._probes = probes
         self._direct = DirectPaths.of(scene, plan)
         self._tracer = RoomTracer.of(scene, plan, probes, image_order=GEOMETRIC_ORDER)
@@ -122,21 +124,21 @@ class GeometricResponses:
         """(listener, yaw, ear, sample)"""
         place, reflections = self._probes[emitter], self._tracer.images(self._probes[emitter])
 
-        def heard(images: tuple[_Floats, _Floats], receiver: _Floats) -> npt.NDArray[np.float32]:
+        def response(images: tuple[_Floats, _Floats], receiver: _Floats) -> npt.NDArray[np.float32]:
             positions, amplitudes = images
             return self._synthesis.specular(positions, amplitudes, receiver)
 
         return np.stack(
             [
-                heard(self._direct.images(place, self._probes[listener]), self._probes[listener])
-                + heard(reflections[listener], self._probes[listener])
+                response(self._direct.images(place, self._probes[listener]), self._probes[listener])
+                + response(reflections[listener], self._probes[listener])
                 for listener in listeners
             ]
         )
 
 
 def _mean_errors(reference: list[RoomParameters], estimate: list[RoomParameters]) -> dict[str, float]:
-    """By metric; those that nothing could be measured of are left out."""
+    """Mean errors by metric, without metrics that could not be measured."""
     each = [parameter_errors(first, second) for first, second in zip(reference, estimate, strict=True)]
     means = {name: summarise(np.concatenate([of_one[name] for of_one in each])).mean for name in each[0]}
     return {name: mean for name, mean in means.items() if mean is not None}

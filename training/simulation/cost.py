@@ -1,4 +1,4 @@
-"""What a simulation will take on this host, predicted from short runs of its parts: seconds of one core."""
+"""Predicts how long a simulation takes on this host, in seconds of one core, from short runs of its parts."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,39 +15,39 @@ from training.simulation.size import SimulationSize
 _RAYS_TRIED = 500
 _LISTENERS_TRIED, _LISTENERS_TRACED = 4, 64
 _TIMES = 3
-# Of one core: whoever asks for a plan waits for what tells its cost.
+# Seconds of one core that a plan may take to find out its cost.
 _LONGEST_TRIAL_S = 1.0
 
 
 def predicted_s(simulation: PairSimulation) -> float:
-    """Of all emitters and pairs, and of what was prepared. A fraction of a second is spent on finding out; more where
-    something was never compiled."""
+    """Seconds of one core for all emitters and pairs, with preparation. Measuring takes a fraction of a second, or more
+    if code must be compiled first."""
     plan, probes = simulation.plan, len(simulation.probes)
     brief = replace(simulation, plan=replace(plan, rays=min(plan.rays, _RAYS_TRIED)))
     many, few = (np.arange(1, 1 + min(count, probes - 1)) for count in (_LISTENERS_TRACED, _LISTENERS_TRIED))
-    for _ in brief.own(0, few[:1], 0):  # what serves all pairs is made with the first
+    for _ in brief.own(0, few[:1], 0):  # the first pair computes what all pairs share
         pass
     many_traced_s = _seconds(lambda: brief.energies(0, many, np.random.default_rng(0)))
     few_traced_s = _seconds(lambda: brief.energies(0, few, np.random.default_rng(0)))
     taking_s = _seconds(lambda: list(brief.own(0, few, 0)))
-    # Each listener takes as long as any other.
+    # All listeners take the same time.
     per_listener_s = (many_traced_s - few_traced_s) / max(1, len(many) - len(few))
     tracing_s = many_traced_s + per_listener_s * (probes - 1 - len(many))
     pairs = probes * (probes - 1) * (1 + simulation.scene.simulation.held_out_share)
-    # The second take is of the few that are held out.
+    # The second take has the held-out listeners only.
     traced_s = probes * (tracing_s + few_traced_s) * plan.rays / max(brief.plan.rays, 1)
     return simulation.prepared_s + traced_s + pairs * max(0.0, taking_s - few_traced_s) / len(few)
 
 
 def is_brief(scene: SceneFile) -> bool:
-    """Whether short runs of the parts of its simulation are short."""
+    """Whether the short runs that predict the cost of this scene take little time."""
     size = SimulationSize(scene)
     rays = min(1.0, _RAYS_TRIED / scene.simulation.rays)
     return size.tracing_s * rays + size.images_s + _LISTENERS_TRIED * size.synthesis_s < _LONGEST_TRIAL_S
 
 
 def with_costs(simulation: PairSimulation) -> SimulationPlan:
-    """Its plan, whose decisions say what their effect takes, or saves where it is off."""
+    """The simulation's plan, with what each effect costs, or saves if it is off."""
     plan, settings = simulation.plan, simulation.scene.simulation
     takes_s = predicted_s(simulation)
     images = settings.image_order if plan.image_order == GEOMETRIC_ORDER else GEOMETRIC_ORDER
@@ -65,7 +65,7 @@ def with_costs(simulation: PairSimulation) -> SimulationPlan:
 
 
 def _seconds(work: Callable[[], object]) -> float:
-    """The least of a few times: compiling is not the work, and neither is what others do meanwhile."""
+    """The least of a few times, because compilation and other processes make some of them too long."""
     times = []
     for _ in range(_TIMES):
         began = thread_time()

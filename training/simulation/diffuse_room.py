@@ -1,6 +1,7 @@
-"""What statistical room acoustics says of a room before anything is simulated.
+"""Predictions of statistical room acoustics for a room.
 
-Metres and seconds; bands are OCTAVE_BANDS_HZ; power is squared pressure beside that of the direct sound at one metre.
+Metres and seconds; bands are OCTAVE_BANDS_HZ; power is squared pressure relative to that of the direct sound at one
+metre.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from training.simulation.rays import surface_shares
 _Floats = npt.NDArray[np.float64]
 
 _SIXTY_DB = 6 * np.log(10)
-# Nearer to none or all of it, absorption counts as this: times and powers stay finite.
+# Absorption is at least this, and at most 1 minus this, so that times and powers stay finite.
 _LEAST_SHARE = 1e-9
 _NEPERS_PER_DB = np.log(10) / 10
 _BANDWIDTHS_HZ = np.asarray(OCTAVE_BANDS_HZ) / np.sqrt(2)
@@ -25,7 +26,8 @@ _BANDWIDTHS_HZ = np.asarray(OCTAVE_BANDS_HZ) / np.sqrt(2)
 
 @dataclass(frozen=True)
 class DiffuseRoom:
-    """A room taken for one diffuse field, whatever its shape; through `air` of no loss if None."""
+    """A room whose sound field is assumed to be diffuse, whatever its shape. The air absorbs nothing if `air` is
+    None."""
 
     geometry: Geometry
     air: Air | None
@@ -33,7 +35,7 @@ class DiffuseRoom:
 
     @cached_property
     def areas_m2(self) -> _Floats:
-        """(surface,) of walls, floor and ceiling."""
+        """(surface,) areas of walls, floor and ceiling."""
         plan = self.geometry.floor_plan
         around = np.linalg.norm(plan.walls[:, 1] - plan.walls[:, 0], axis=-1).sum()
         return np.array([around * plan.height_m, plan.area_m2, plan.area_m2])
@@ -52,13 +54,13 @@ class DiffuseRoom:
 
     @cached_property
     def absorption(self) -> _Floats:
-        """(band,) mean over the surfaces."""
+        """(band,) mean absorption over the surfaces."""
         absorbed = self.areas_m2 @ (1 - surface_shares(self.geometry)[0]) / self.surface_m2
         return np.asarray(np.clip(absorbed, _LEAST_SHARE, 1 - _LEAST_SHARE))
 
     @cached_property
     def scattering(self) -> _Floats:
-        """(band,) share of what is reflected that is scattered, mean over the surfaces."""
+        """(band,) share of the reflected energy that is scattered, mean over the surfaces."""
         reflected, scattered = surface_shares(self.geometry)
         weights = self.areas_m2[:, None] * reflected
         total = weights.sum(axis=0)
@@ -67,32 +69,34 @@ class DiffuseRoom:
 
     @cached_property
     def reverberation_time_s(self) -> _Floats:
-        """(band,) by Eyring (J. Acoust. Soc. Am. 1, 1930), with the air's share (Kuttruff, Room Acoustics, 5.1)."""
+        """(band,) T60 by Eyring (J. Acoust. Soc. Am. 1, 1930), with absorption by the air (Kuttruff, Room Acoustics,
+        5.1)."""
         by_walls = -self.surface_m2 * np.log1p(-self.absorption)
         per_m = np.zeros(len(self.absorption)) if self.air is None else self.air.absorption_db_per_m * _NEPERS_PER_DB
         area = by_walls + 4 * per_m * self.volume_m3
         return np.asarray(4 * _SIXTY_DB * self.volume_m3 / (self.speed_of_sound * area))
 
     def reflected_power(self, order: int) -> _Floats:
-        """(band,) of everything that was reflected so many times or more: the geometric series whose sum, from one
-        reflection on, is the reverberant power 16 pi (1 - a) / (S a) (Kuttruff, 5.5)."""
+        """(band,) power of all sound that was reflected at least `order` times. It is a geometric series; its sum from
+        one reflection on is the reverberant power 16 pi (1 - a) / (S a) (Kuttruff, 5.5)."""
         return np.asarray(16 * np.pi / self.surface_m2 * (1 - self.absorption) ** order / self.absorption)
 
     @property
     def mixing_time_s(self) -> float:
-        """From when after the direct sound on 95 % of listeners cannot tell one place's late sound from another's:
-        Lindau, Kosanke and Weinzierl, "Perceptual evaluation of model- and signal-based predictors of the mixing time
-        in binaural room impulse responses", J. Audio Eng. Soc. 60(11), 2012; of rooms that are nearly boxes."""
+        """From this time after the direct sound on, 95 % of listeners cannot tell the late sound of different places
+        apart: Lindau, Kosanke and Weinzierl, "Perceptual evaluation of model- and signal-based predictors of the mixing
+        time in binaural room impulse responses", J. Audio Eng. Soc. 60(11), 2012. The formula is for nearly rectangular
+        rooms."""
         return 0.0117e-3 * self.volume_m3 + 50.1e-3
 
     def images_per_s(self, time_s: float) -> float:
-        """How many image sources a box has that are heard at a time (Kuttruff, 4.1)."""
+        """Number of image sources per second that are heard `time_s` after emission in a rectangular room (Kuttruff,
+        4.1)."""
         return 4 * np.pi * self.speed_of_sound**3 * time_s**2 / self.volume_m3
 
     def clarity_spread_db(self, early_s: float) -> float:
-        """Standard deviation of the early-to-late ratio of reverberation that is drawn from noise, over draws: energy
-        in a band of width B varies by one over sqrt(B T), T the time it lasts for (Lubman, J. Acoust. Soc. Am. 44,
-        1968)."""
+        """Standard deviation of the early-to-late ratio over random draws of noise-like reverberation: the energy in a
+        band of width B that lasts for T varies by 1 / sqrt(B T) (Lubman, J. Acoust. Soc. Am. 44, 1968)."""
         decay_per_s = _SIXTY_DB / self.reverberation_time_s
         power = self.reflected_power(1)
         bandwidth_hz = (power @ _BANDWIDTHS_HZ) ** 2 / (power**2 @ _BANDWIDTHS_HZ)

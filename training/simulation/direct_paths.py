@@ -1,7 +1,7 @@
-"""The direct sound of a pair, as a renderer has it: straight in sight, else round the walls' corners, and through walls
-where those are thin.
+"""The direct sound of a pair, as the renderer computes it: a straight path in sight, otherwise a path round corners,
+and a path through thin walls.
 
-Each path is an image, (image, xyz) as a receiver takes it to be from, with (image, band) pressure there.
+Each path is given as an image source: (image, xyz) apparent positions and (image, band) pressures at the receiver.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,8 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DirectPaths:
-    """`finder` is None where sound does not bend, `wall_loss_db` (band,) None where nothing goes through walls."""
+    """Finds the direct sound of pairs. `finder` is None without diffraction; `wall_loss_db` (band,) is None without
+    transmission."""
 
     floor_plan: FloorPlan
     air: Air | None

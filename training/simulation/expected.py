@@ -1,7 +1,9 @@
-"""What a simulated response is on average, over all draws of its noise: training targets that one draw does not blur.
+"""The expected spectrogram of a simulated response over all draws of its noise, for training targets without
+randomness.
 
 A response is a specular part, which is the same in every draw, and a diffuse part, which is Gaussian noise of known
-energy. A cell of its spectrogram is then a complex Gaussian of mean m, the specular part's cell, and variance v.
+energy. So a cell of its spectrogram is a complex Gaussian, whose mean m is the specular part's cell and whose variance
+v follows from the energy.
 """
 
 from functools import cached_property
@@ -23,12 +25,12 @@ _STEPS_PER_HOP = 4
 
 
 class ExpectedSpectrograms:
-    """Of the reflected sound of a dataset's pairs, in a codec's frames."""
+    """Expected spectrograms of a dataset's late reverberation, in the frames of a codec."""
 
     def __init__(self, dataset: Dataset, codec: Codec) -> None:
-        """Raises ValueError for a codec of another sample rate."""
+        """Raises ValueError if the codec has another sample rate than the dataset."""
         if codec.sample_rate != dataset.sample_rate:
-            raise ValueError(f"the codec is of {codec.sample_rate} Hz, the dataset of {dataset.sample_rate} Hz")
+            raise ValueError(f"the codec has {codec.sample_rate} Hz, the dataset {dataset.sample_rate} Hz")
         self._dataset = dataset
         self._codec = codec
         directions = sphere_directions(dataset.scene.simulation.arrival_directions)
@@ -41,12 +43,13 @@ class ExpectedSpectrograms:
         return RoomTracer.of(dataset.scene, dataset.effects, dataset.probes, least_order=GEOMETRIC_ORDER + 1)
 
     @cached_property
-    def _heard(self) -> _Singles:
+    def _arrival_products(self) -> _Singles:
         return self._synthesis.arrival_products(self._codec.bins)
 
     @cached_property
     def _times_s(self) -> _Floats:
-        """(frame, step): a window of the codec sees what varies within it, on a grid much finer than the window."""
+        """(frame, step) times on a grid that is much finer than the codec's window, so that it resolves changes within
+        the window."""
         codec = self._codec
         step = codec.hop // _STEPS_PER_HOP
         around = np.arange(-codec.n_fft // 2, codec.n_fft // 2, step) + step / 2
@@ -59,23 +62,23 @@ class ExpectedSpectrograms:
         return np.asarray(self._codec.window_energy * window / window.sum(), dtype=np.float32)
 
     def specular(self, emitter: int, listener: int) -> _Singles:
-        """(yaw, ear, sample) the part of the stored response that is the same in every draw."""
+        """(yaw, ear, sample) the specular part of the stored response, which is the same in every draw."""
         if self._images is None or self._images[0] != emitter:
-            # Those of all listeners take as long as those of one, and pairs come in order of their emitters.
+            # The images for all listeners take as long as those for one, and pairs come in the order of emitters.
             self._images = emitter, self._tracer.images(self._dataset.probes[emitter])
         positions, amplitudes = self._images[1][listener]
         return self._synthesis.specular(positions, amplitudes, self._dataset.probes[listener])
 
     def diffuse_products(self, emitter: int, listener: int, pool: _Singles, advance_samples: float = 0.0) -> _Singles:
-        """(frequency, product, yaw, cell) expected products of the ears' spectra, of the diffuse part of the stored
-        response: the squared magnitudes of left and right, and left times conjugate right, real and imaginary. Frames
-        are summed to cells with (frame, cell) `pool`; `advance_samples` is how much earlier than emission a response
-        begins that was aligned.
+        """(frequency, product, yaw, cell) expected products of the ears' spectra, for the diffuse part of the stored
+        response: squared magnitudes of left and right, then real and imaginary parts of left times conjugate right.
+        Frames are summed to cells with `pool` (frame, cell). An aligned response begins `advance_samples` after the
+        emission.
 
-        Raises DatasetError if the dataset keeps no energies.
+        Raises DatasetError if the dataset has no energies.
         """
         (energy,) = self._dataset.read_energy(np.array([[emitter, listener]]))
         times_s = (self._times_s + advance_samples / self._codec.sample_rate).ravel()
         weights = (pool[:, None, :] * self._window[:, None]).reshape(len(times_s), -1)
         onset_s = self._dataset.onset_s[emitter, listener]
-        return self._synthesis.late_covariance(energy, onset_s, times_s, weights, self._heard)
+        return self._synthesis.late_covariance(energy, onset_s, times_s, weights, self._arrival_products)

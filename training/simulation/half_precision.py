@@ -1,7 +1,7 @@
-"""Single to half precision, rounded as IEEE 754 asks (to nearest, ties to even).
+"""Converts single to half precision with IEEE 754 rounding (to nearest, ties to even).
 
-NumPy's own conversion takes tens of nanoseconds for each subnormal number, which the ends of decays are made of: longer
-than it takes to simulate them.
+NumPy's own conversion takes tens of nanoseconds for each subnormal number. The ends of decays consist of such numbers,
+and their conversion would take longer than their simulation.
 """
 
 from typing import Any
@@ -17,13 +17,14 @@ _EXPONENT_SHIFT = np.uint32((127 - 15) << 23)
 _SMALLEST_NORMAL = np.uint32((127 - 14) << 23)
 _BEYOND_LARGEST = np.uint32((127 + 16) << 23)
 _INFINITE = np.uint32(0x7F800000)
-# Beside it the last place of a single is that of a subnormal half.
+# Adding this aligns the last bit of a single with that of a subnormal half.
 _ALIGNING = np.float32(0.5)
 _ALIGNING_BITS = _ALIGNING.view(np.uint32)
 
 
 def to_half(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float16]:
-    """The same numbers as `values.astype(np.float16)`; beyond the largest they are infinite, without a warning."""
+    """The same numbers as `values.astype(np.float16)`, but numbers that are too large become infinite without a
+    warning."""
     single = np.ascontiguousarray(values, dtype=np.float32)
     half = np.empty(single.shape, dtype=np.float16)
     _round(single.reshape(-1), half.reshape(-1).view(np.uint16))
@@ -43,7 +44,7 @@ def _round(values, half):
     for index in range(len(values)):
         magnitude = abs(values[index])
         size, sign = _bits(magnitude), (_bits(values[index]) >> np.uint32(16)) & np.uint32(0x8000)
-        # Beyond the middle, or right on it where the last digit kept is odd, is rounded up.
+        # Rounds up beyond the middle, or at the middle if the last remaining bit is odd.
         rounded = (size - _EXPONENT_SHIFT + np.uint32(0xFFF) + ((size >> np.uint32(13)) & np.uint32(1))) >> np.uint32(
             13
         )

@@ -1,8 +1,8 @@
-"""What a wave from some direction is at the ears of a level head, as spectra: minimum phase and a delay per ear, and
-the gains in octave bands of what it met on its way, as a minimum-phase filter too.
+"""Spectra of a wave at the ears, from each direction: minimum phase and a delay per ear. The band gains of the wave's
+path are applied as a minimum-phase filter, too.
 
-Logarithms are interpolated between measured directions and added up, so every wave takes an exponential and a sine per
-bin, which are computed eight bins at a time.
+Logarithms of spectra are interpolated between measured directions and added. So each wave takes one exponential and one
+sine per bin, computed eight bins at a time.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,8 @@ _Spectra = npt.NDArray[np.complex64]
 
 
 def band_weights(frequencies_hz: _Floats) -> _Floats:
-    """(band, frequency) interpolation between octave bands, linear over log frequency; columns sum to one."""
+    """(band, frequency) weights that interpolate between octave bands linearly over log frequency; columns add up to
+    one."""
     octave = np.log2(np.maximum(frequencies_hz, 1.0) / OCTAVE_BANDS_HZ[0])
     position = np.clip(octave, 0, len(OCTAVE_BANDS_HZ) - 1)
     return np.maximum(0.0, 1 - np.abs(position - np.arange(len(OCTAVE_BANDS_HZ))[:, None]))
@@ -41,7 +42,7 @@ def band_weights(frequencies_hz: _Floats) -> _Floats:
 
 @dataclass(frozen=True)
 class HeadSpectra:
-    """Of a head, at the frequencies of a transform of `n_fft` samples."""
+    """Spectra of a head at the frequencies of a transform of `n_fft` samples."""
 
     head: HeadFilters
     n_fft: int
@@ -51,16 +52,16 @@ class HeadSpectra:
         return self.n_fft // 2 + 1
 
     def arriving(self, directions: _Floats) -> _Spectra:
-        """(..., ear, bin) for (..., xyz) as seen by the head."""
+        """(..., ear, bin) spectra of waves from directions (..., xyz) relative to the head."""
         flat = np.ascontiguousarray(directions.reshape(-1, 3))
-        nothing_met = np.ones((len(flat), len(OCTAVE_BANDS_HZ)))
-        return self.specular(flat[:, None], nothing_met, np.zeros(len(flat))).reshape(
+        unit_gains = np.ones((len(flat), len(OCTAVE_BANDS_HZ)))
+        return self.specular(flat[:, None], unit_gains, np.zeros(len(flat))).reshape(
             *directions.shape[:-1], 2, self.bins
         )
 
     def specular(self, directions: _Floats, amplitudes: _Floats, delays: _Floats) -> _Spectra:
-        """(wave, yaw, ear, bin) for (wave, yaw, xyz) as seen by the head, with (wave, band) gains and (wave,) delays in
-        samples to the middle of the head."""
+        """(wave, yaw, ear, bin) spectra of waves from directions (wave, yaw, xyz) relative to the head, with gains
+        (wave, band) and delays (wave,) in samples to the middle of the head."""
         waves, yaws, _ = directions.shape
         mesh = self.head.triangulation
         flat = np.ascontiguousarray(directions.reshape(-1, 3))
@@ -69,13 +70,13 @@ class HeadSpectra:
         later = np.einsum("dc,dce->de", shares, self.head.delays_s[corners]) * self.head.sample_rate
         later += np.repeat(delays, yaws)[:, None]
         gains = np.log(np.maximum(amplitudes, 1e-12)).astype(np.float32)
-        met = gains @ self._band_logs.reshape(len(gains.T), -1)
+        path_logs = gains @ self._band_logs.reshape(len(gains.T), -1)
         spectra = np.empty((waves, yaws, 2, self.bins), np.complex64)
         _spectra(
             corners,
             shares.astype(np.float32),
             (later * (-2 * np.pi / self.n_fft)).astype(np.float32),
-            met.reshape(waves, *self._band_logs.shape[1:]),
+            path_logs.reshape(waves, *self._band_logs.shape[1:]),
             self._logs,
             np.arange(self._logs.shape[-1], dtype=np.float32),
             spectra.reshape(waves, yaws, 2 * self.bins),
@@ -84,13 +85,13 @@ class HeadSpectra:
 
     @cached_property
     def _logs(self) -> _Singles:
-        """(measured direction, ear, part, bin and room for whole vectors) logarithms of the head's filters."""
+        """(measured direction, ear, part, bin) log spectra of the head's filters; bins are padded to whole vectors."""
         return self._in_parts(np.fft.rfft(self.head.cepstra, self.n_fft))
 
     @cached_property
     def _band_logs(self) -> _Singles:
-        """(band, part, bin and room) logarithms of minimum-phase filters that are e in one band: times ln gains, those
-        of what was met."""
+        """(band, part, bin) log spectra of minimum-phase filters with gain e in one band; bins are padded. Multiplied
+        by the logarithms of a wave's gains, they give the filter of its path."""
         weights = band_weights(np.asarray(np.fft.rfftfreq(self.n_fft, 1 / self.head.sample_rate), np.float64))
         return self._in_parts(np.fft.rfft(folded_cepstrum(weights), self.n_fft))
 
@@ -101,9 +102,9 @@ class HeadSpectra:
 
 
 @numba.njit(cache=True, nogil=True)
-def _spectra(corners, shares, turns, met, logs, numbers, spectra):
-    """Fills (wave, yaw, ear and bin) `spectra`; (direction, ear) `turns` are radians per bin, and a direction is a wave
-    at a yaw."""
+def _spectra(corners, shares, turns, path_logs, logs, numbers, spectra):
+    """Fills `spectra` (wave, yaw, ear and bin). `turns` (direction, ear) are radians per bin; a direction is a wave at
+    a yaw."""
     waves, yaws, _ = spectra.shape
     padded = logs.shape[-1]
     bins = spectra.shape[2] // 2
@@ -115,7 +116,8 @@ def _spectra(corners, shares, turns, met, logs, numbers, spectra):
             for ear in range(2):
                 turn = broadcast(turns[direction, ear])
                 for first in range(0, padded, 8):
-                    size, phase = load(met[wave, 0].ctypes.data, first), load(met[wave, 1].ctypes.data, first)
+                    size = load(path_logs[wave, 0].ctypes.data, first)
+                    phase = load(path_logs[wave, 1].ctypes.data, first)
                     for corner in range(3):
                         share = broadcast(shares[direction, corner])
                         of_corner = logs[corners[direction, corner], ear]
@@ -132,7 +134,7 @@ def _spectra(corners, shares, turns, met, logs, numbers, spectra):
 
 @numba.njit(cache=True, nogil=True)
 def _triangles_around(across, inverses, directions):
-    """(direction,) triangle that holds each, and (direction, 3) shares of its corners."""
+    """(direction,) the triangle that contains each direction, and (direction, 3) the weights of its corners."""
     triangles, shares = np.empty(len(directions), np.int64), np.empty((len(directions), 3))
     triangle = 0
     for index in range(len(directions)):

@@ -1,8 +1,9 @@
-"""Exact mirrored reflections: image sources in a floor plan extruded to a height, each tested for every receiver.
+"""Exact specular reflections: image sources in a floor plan with a height, each tested for visibility from every
+receiver.
 
-Walls are vertical, floor and ceiling level, so a mirrored path is one in plan and one in height, each by itself
-(Borish, "Extension of the image model to arbitrary polyhedra", JASA 75(6), 1984, in two dimensions; Allen & Berkley,
-JASA 65(4), 1979, in one). Metres.
+Walls are vertical, floor and ceiling level, so a specular path is an independent combination of a path in plan and one
+in height (Borish, "Extension of the image model to arbitrary polyhedra", JASA 75(6), 1984, in two dimensions; Allen &
+Berkley, JASA 65(4), 1979, in one). Metres.
 """
 
 import numba
@@ -14,14 +15,14 @@ from server.acoustics.geometry import FloorPlan
 _Floats = npt.NDArray[np.float64]
 _Counts = npt.NDArray[np.int64]
 
-# Nearer than this to the end of a wall, a path does not count as beyond it.
+# A path that misses the end of a wall by less than this still hits the wall.
 _GRAZING = 1e-9
 _SAME_PLACE_DIGITS = 6
 
 
 def images_in_height(z: float, height_m: float, order: int) -> tuple[_Floats, _Counts]:
-    """(image,) heights of an emitter at `z` in up to `order` mirrors, itself first, and (image, surface) how often the
-    floor and the ceiling reflect it."""
+    """(image,) heights of an emitter at `z` and its images of up to `order` reflections, and (image, surface) the
+    number of reflections from the floor and from the ceiling."""
     heights, counts = [z], [(0, 0)]
     for reflections in range(1, order + 1):
         for first_is_ceiling in (False, True):
@@ -38,11 +39,11 @@ def images_in_height(z: float, height_m: float, order: int) -> tuple[_Floats, _C
 def images_in_plan(
     plan: FloorPlan, emitter: _Floats, receivers: _Floats, order: int
 ) -> tuple[_Counts, _Floats, _Counts]:
-    """What receivers (receiver, 2) see of an emitter (2,), itself included: (path,) receivers, (path, 2) images and
-    (path,) numbers of walls that reflect them. A path that grazes a corner counts."""
+    """The images of an emitter (2,) that each receiver (receiver, 2) sees, with the emitter itself: (path,) receivers,
+    (path, 2) image positions, and (path,) numbers of reflecting walls. A path that touches a corner is valid."""
     corners = np.asarray(plan.corners, dtype=np.float64)
     paths = _see(corners, emitter.astype(np.float64), np.ascontiguousarray(receivers, dtype=np.float64), order)
-    # A path right into a corner is found by way of both of its walls.
+    # A path through a corner is found twice, once for each of the corner's walls.
     _, once = np.unique(np.column_stack(paths[:2]).round(_SAME_PLACE_DIGITS), axis=0, return_index=True)
     once.sort()
     return paths[0][once], paths[1][once], paths[2][once]
@@ -50,7 +51,8 @@ def images_in_plan(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _is_blocked(corners, ax, ay, bx, by, first, second):
-    """Whether a wall stands between a and b, other than the two that these points are on (or -1)."""
+    """Whether a wall stands between a and b. The walls `first` and `second`, on which a and b lie, are left out (-1 for
+    none)."""
     for wall in range(len(corners)):
         if wall in (first, second):
             continue
@@ -69,7 +71,8 @@ def _is_blocked(corners, ax, ay, bx, by, first, second):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _is_seen(corners, walls, images, depth, receiver):
-    """Whether the path of an image in `walls[:depth]` reaches the receiver; `images[k]` is mirrored in k of them."""
+    """Whether the path of the image in `walls[:depth]` reaches the receiver. `images[k]` is the emitter mirrored in the
+    first k walls."""
     x, y, last = receiver[0], receiver[1], -1
     for level in range(depth, 0, -1):
         wall = walls[level - 1]
@@ -110,14 +113,14 @@ def _see(corners, emitter, receivers, order):
                     reflections = np.concatenate((reflections, np.empty_like(reflections)))
                 seen_by[found], seen[found], reflections[found] = receiver, images[depth], depth
                 found += 1
-        # The next sequence of walls: one wall more, or another last one.
+        # The next sequence of walls has one wall more, or another last wall.
         if depth < order:
             depth += 1
             walls[depth - 1] = -1
         while depth > 0:
             wall = walls[depth - 1] + 1
             while wall < count:
-                # An image is mirrored only in walls that it is in front of.
+                # An image is mirrored only in a wall whose front side it is on.
                 cx, cy = corners[wall, 0], corners[wall, 1]
                 following = (wall + 1) % count
                 ex, ey = corners[following, 0] - cx, corners[following, 1] - cy

@@ -1,7 +1,7 @@
-"""Responses between the probes of a scene, emitter by emitter, by the plan of what its simulation calls for.
+"""Simulates responses between the probes of a scene, emitter by emitter, by a simulation plan.
 
-Axes: energy (direction, band, bin), responses (yaw, ear, sample), sample 0 is emission. The same seed and plan give the
-same numbers, in whatever order and process emitters are simulated.
+Axes: energy (direction, band, bin), responses (yaw, ear, sample); sample 0 is the emission. The same seed and plan give
+the same numbers, in whatever order and process emitters are simulated.
 """
 
 from collections.abc import Iterator
@@ -27,14 +27,15 @@ from training.simulation.tracing import RoomTracer
 _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
 
-# So many tell how late sound decays, and where it comes from.
+# The shared tail's decay and directions are measured between this many probes.
 _TAIL_PROBES = 8
 
 
 @dataclass(frozen=True)
 class PairSimulation:
-    """`probes` (probe, 3) and `yaws` (yaw,), radians; `tail` is the late sound that all receivers share, None where
-    each has its own. `prepare` makes it, in `prepared_s` seconds of one core. Threads may share a simulation."""
+    """Simulates pairs of `probes` (probe, 3) at `yaws` (yaw,), in radians. `tail` is the tail that all receivers share,
+    or None if each has its own. `prepare` makes a simulation, in `prepared_s` seconds of one core. Several threads may
+    use one."""
 
     scene: SceneFile
     probes: _Floats
@@ -55,7 +56,8 @@ class PairSimulation:
         plan: SimulationPlan,
         most_tail_rays: int | None = None,
     ) -> "PairSimulation":
-        """With `most_tail_rays` a tail is told from no more rays than that, to find out what all of them would take."""
+        """With `most_tail_rays`, the tail is traced with at most this many rays, to predict how long all of them would
+        take."""
         began_s = process_time()
         simulation = cls(scene, probes, yaws, seed, plan)
         if plan.tail_start_s is None:
@@ -64,7 +66,7 @@ class PairSimulation:
         with ThreadPoolExecutor(len(TAKES)) as pool:
             rays = min(plan.tail_rays, most_tail_rays or plan.tail_rays)
             traced = pool.map(partial(_tail_energy, scene, probes, replace(plan, tail_rays=rays)), generators)
-            synthesis = simulation._synthesis  # reads a head meanwhile
+            synthesis = simulation._synthesis  # reads the head meanwhile
             energies, seconds = zip(*traced, strict=True)
         noise = np.random.default_rng([seed, 4])
         tail = draw_tail(synthesis, np.stack(energies), start_s=plan.tail_start_s, rng=noise)
@@ -74,14 +76,13 @@ class PairSimulation:
     def take(
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
     ) -> Iterator[tuple[int, _Singles, _Singles]]:
-        """Each listener with the energy that its diffuse sound is drawn from, and its response without what is left to
-        geometry."""
+        """Yields each listener, the energy that its diffuse sound is drawn from, and its late reverberation."""
         for listener, energy, own in self.own(emitter, listeners, take):
             joined = energy if self.tail is None else self.tail.join(take, energy)
             yield listener, joined, self.whole(take, own)
 
     def whole(self, take: int, own: OwnResponse) -> _Singles:
-        """A response with what is shared."""
+        """The response with the shared tail."""
         if self.tail is None:
             return own.samples.astype(np.float32)
         return self.tail.extend(take, own.samples, own.tail_begin)
@@ -89,10 +90,11 @@ class PairSimulation:
     def own(
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
     ) -> Iterator[tuple[int, _Singles, OwnResponse]]:
-        """Each listener with what is its own of energy and response: all of both, or what comes before a shared tail.
+        """Yields each listener with its own energy and response: all of both, or the part before the shared tail.
 
-        The TAKES takes are independent. The noise is that of the pair and the take, whatever the plan, until a shared
-        tail sets in: what a plan changes there is told from its own doing, and not from two draws."""
+        The TAKES are independent. Until a shared tail sets in, the noise depends on pair and take but not on the plan.
+        So responses of two plans differ there only by what the plans change.
+        """
         place, receivers = self.probes[emitter], self.probes[listeners]
         images = self._tracer(receivers).images(place)
         energies = self.energies(emitter, listeners, np.random.default_rng([self.seed, 2, emitter, take]))
@@ -110,7 +112,7 @@ class PairSimulation:
     def energies(
         self, emitter: int, listeners: npt.NDArray[np.integer], rng: np.random.Generator
     ) -> npt.NDArray[np.float32]:
-        """(listener, direction, band, bin) of the diffuse sound that is each listener's own."""
+        """(listener, direction, band, bin) energies of each listener's own diffuse sound."""
         tracer = self._tracer(self.probes[listeners], self._own_s)
         return tracer.energy(self.probes[emitter], rays=self.plan.rays, rng=rng)
 
@@ -135,7 +137,7 @@ class PairSimulation:
 
     @cached_property
     def _own_amplitude(self) -> _Singles:
-        """(sample,) one until the shared tail sets in."""
+        """(sample,) the fade-out at the start of the shared tail; one before it."""
         times_s = np.arange(self._own_synthesis.samples) / self.scene.simulation.sample_rate
         if self.plan.tail_start_s is None:
             return np.ones(len(times_s), dtype=np.float32)
@@ -145,7 +147,8 @@ class PairSimulation:
 def _tail_energy(
     scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator
 ) -> tuple[_Floats, float]:
-    """(direction, band, bin) mean over pairs of probes all over the room, and how many seconds of a core it took."""
+    """(direction, band, bin) mean energy between pairs of probes all over the room, and the seconds of one core that it
+    took."""
     began_s = thread_time()
     some = probes[np.unique(np.linspace(0, len(probes) - 1, _TAIL_PROBES).astype(int))]
     rays = -(-plan.tail_rays // len(some))

@@ -1,19 +1,20 @@
-"""Reflected energy by ray tracing: one pass of the rays of an emitter serves all receivers and all octave bands.
+"""Reflected energy by ray tracing. One pass of an emitter's rays serves all receivers and all octave bands.
 
-Axes: (receiver, direction, band, bin). Metres and seconds; energy is squared pressure where the emitter makes unit
-pressure at one metre. Surfaces are numbered walls 0, floor 1, ceiling 2.
+Axes: (receiver, direction, band, bin). Metres and seconds; energy is squared pressure for an emitter of unit pressure
+at one metre. Surfaces are numbered: walls 0, floor 1, ceiling 2.
 
-Where a ray hits, the scattered share of its energy is sent to every receiver in sight by Lambert's law ("diffuse
-rain": Schroeder, "Physically based real-time auralization of interactive virtual environments", 2011, sec. 5.3.3), and
-the ray goes on either way: mirrored with probability 1 - s, or scattered with probability s. Mirrored energy is
-counted where a ray crosses a sphere around the receiver, by the length of its way through it.
+At each reflection, the scattered share of a ray's energy is sent to every receiver in sight by Lambert's law ("diffuse
+rain": Schroeder, "Physically based real-time auralization of interactive virtual environments", 2011, sec. 5.3.3). The
+ray then continues: mirrored with probability 1 - s, or scattered with probability s. Mirrored energy is counted where a
+ray crosses a sphere around a receiver, by the length of its path inside.
 
-Scattering differs between bands, and so does the chance of every way. Each ray is drawn for one band and counts in all,
-weighted by the balance heuristic over the bands it might have been drawn for (Wilkie et al., "Hero wavelength spectral
-sampling", 2014): no band is biased, and no weight exceeds the number of bands.
+Scattering differs between bands, and so does the probability of each path. Each ray is drawn for one band and counts in
+all bands, weighted by the balance heuristic over the bands that it could have been drawn for (Wilkie et al., "Hero
+wavelength spectral sampling", 2014). No band is biased, and no weight exceeds the number of bands.
 """
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -29,11 +30,11 @@ _Floats = npt.NDArray[np.float64]
 
 _BANDS = len(OCTAVE_BANDS_HZ)
 _LARGEST_RADIUS_M = 0.4
-# Of two crossings this near to each other the one is of the wall that the ray comes from.
+# A crossing nearer than this to the start of a ray is one with the wall that it comes from.
 _OVERLAP = 1e-9
-# Fewer rays are followed as their energy falls, each for more: their number falls with this power of the energy.
+# As energy falls, fewer rays are followed and each counts for more: their number falls with this power of the energy.
 _THINNING = 0.1
-# Every hit rains on one receiver of so many, by chance on which: of hits there are plenty, of crossings few.
+# Each reflection sends diffuse rain to a random sixth of the receivers: reflections are many, crossings of spheres few.
 _EVERY = 6
 _TABLE = 64
 
@@ -48,21 +49,53 @@ def sphere_directions(count: int) -> _Floats:
 
 
 def surface_shares(geometry: Geometry) -> tuple[_Floats, _Floats]:
-    """(surface, band) energy that is reflected, and of that the share that is scattered."""
+    """(surface, band) share of the energy that is reflected, and the share of the reflected energy that is
+    scattered."""
     surfaces = (geometry.materials.walls, geometry.materials.floor, geometry.materials.ceiling)
     reflected = 1 - np.array([surface.absorption for surface in surfaces])
     return reflected, np.array([surface.scattering for surface in surfaces])
 
 
 def receiver_radii(plan: FloorPlan, receivers: _Floats) -> _Floats:
-    """(receiver,) of the spheres that count rays: one that reached into a wall would miss a part of them."""
+    """(receiver,) radii of the spheres that count rays. Spheres must not reach into a wall, where no ray would cross
+    them."""
     heights = receivers[:, 2]
     clearance = np.minimum(plan.wall_distance_m(receivers), np.minimum(heights, plan.height_m - heights))
     return np.asarray(np.minimum(clearance, _LARGEST_RADIUS_M))
 
 
+class _Room(NamedTuple):
+    """The surfaces that rays meet. `edge_x` and `edge_y` (wall,) lead from each corner of the plan to the next one;
+    `reflected` and `scattered` are (surface, band)."""
+
+    corners: _Floats
+    edge_x: _Floats
+    edge_y: _Floats
+    height_m: float
+    is_convex: bool
+    reflected: _Floats
+    scattered: _Floats
+
+
+class _Receivers(NamedTuple):
+    """Positions (receiver, xyz) and radii of the spheres that count rays. `sides` (receiver, wall) tells by its sign on
+    which side of a wall's line a receiver is. `nearest` is the number of the nearest arrival direction, by `_cell`."""
+
+    positions: _Floats
+    radii: _Floats
+    sides: _Floats
+    nearest: npt.NDArray[np.int32]
+
+
+class _Histogram(NamedTuple):
+    """Energies (receiver, bin, direction, band), in bins that sound travels `bin_m` in."""
+
+    energy: npt.NDArray[np.float32]
+    bin_m: float
+
+
 class RayTracer:
-    """Traces from any emitter to a fixed set of receivers (receiver, xyz). Stateless between traces."""
+    """Traces from any emitter to a fixed set of receivers (receiver, xyz). It has no state between traces."""
 
     def __init__(
         self,
@@ -73,17 +106,21 @@ class RayTracer:
         image_order: int,
         arrival_directions: _Floats,
     ) -> None:
-        """Mirrored paths of up to `image_order` reflections, the direct one among them, are left to image sources."""
+        """Direct sound and specular paths of up to `image_order` reflections are left to image sources."""
         plan = geometry.floor_plan
-        self._corners = np.asarray(plan.corners, dtype=np.float64)
-        self._height_m = plan.height_m
-        self._blocking = not _is_convex(plan)
-        self._reflected, self._scattered = surface_shares(geometry)
-        self._receivers = np.ascontiguousarray(receivers, dtype=np.float64)
-        self._radii = receiver_radii(plan, self._receivers)
+        corners = np.asarray(plan.corners, dtype=np.float64)
+        edge_x, edge_y = np.ascontiguousarray((np.roll(corners, -1, axis=0) - corners).T)
+        is_convex = len(plan.bend_corners) == 0
+        self._room = _Room(corners, edge_x, edge_y, float(plan.height_m), is_convex, *surface_shares(geometry))
+        positions = np.ascontiguousarray(receivers, dtype=np.float64)
+        self._receivers = _Receivers(
+            positions,
+            receiver_radii(plan, positions),
+            edge_x * (positions[:, None, 1] - corners[:, 1]) - edge_y * (positions[:, None, 0] - corners[:, 0]),
+            _nearest_directions(arrival_directions),
+        )
         self._image_order = image_order
         self._directions = len(arrival_directions)
-        self._nearest = _nearest_directions(arrival_directions)
         self._bins = round(duration_s / HISTOGRAM_BIN_S)
 
     @property
@@ -92,47 +129,39 @@ class RayTracer:
         return self._directions, _BANDS, self._bins
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
-        """(receiver, direction, band, bin) energy; the air takes nothing here."""
+        """(receiver, direction, band, bin) energies, without absorption by the air."""
         turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-        energy = np.zeros((len(self._receivers), self._bins, self._directions, _BANDS), dtype=np.float32)
+        energy = np.zeros((len(self._receivers.positions), self._bins, self._directions, _BANDS), dtype=np.float32)
         _trace(
-            self._corners,
-            self._height_m,
-            self._blocking,
-            self._reflected,
-            self._scattered,
+            self._room,
+            self._receivers,
             np.asarray(emitter, dtype=np.float64),
             sphere_directions(rays) @ turn,
-            self._receivers,
-            self._radii,
-            self._nearest,
-            HISTOGRAM_BIN_S * SPEED_OF_SOUND,
             self._image_order,
             rng,
-            energy,
+            _Histogram(energy, HISTOGRAM_BIN_S * SPEED_OF_SOUND),
         )
         return np.ascontiguousarray(energy.transpose(0, 2, 3, 1))
 
 
-def _is_convex(plan: FloorPlan) -> bool:
-    return len(plan.bend_corners) == 0
-
-
 def _nearest_directions(directions: _Floats) -> npt.NDArray[np.int32]:
-    """(row, column) nearest of `directions`, by the octahedral map of the sphere onto a square."""
+    """(row, column) index of the nearest of `directions`, on an octahedral map of the sphere to a square."""
     across = (np.arange(_TABLE) + 0.5) / _TABLE * 2 - 1
     u, v = np.meshgrid(across, across, indexing="ij")
     z = 1 - np.abs(u) - np.abs(v)
     x = np.where(z < 0, (1 - np.abs(v)) * np.sign(u), u)
     y = np.where(z < 0, (1 - np.abs(u)) * np.sign(v), v)
     points = np.stack([x, y, z], axis=-1)
-    # The nearest is that of the greatest dot product, whatever the length of the point.
+    # The nearest direction has the greatest dot product, whatever the length of the point.
     return np.asarray(np.argmax(points @ directions.T, axis=-1), dtype=np.int32)
+
+
+_FAST_MATH = {"contract", "arcp", "reassoc", "nsz"}
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cell(x, y, z):
-    """Row and column of `_nearest_directions` for a direction of any length."""
+    """Row and column in `_nearest_directions` of a direction of any length."""
     scale = 1 / (abs(x) + abs(y) + abs(z))
     u, v = x * scale, y * scale
     if z < 0:
@@ -141,167 +170,198 @@ def _cell(x, y, z):
     return min(int((u + 1) * half), _TABLE - 1), min(int((v + 1) * half), _TABLE - 1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "reassoc", "nsz"})
-def _trace(
-    corners,
-    height_m,
-    blocking,
-    reflected,
-    scattered,
-    emitter,
-    directions,
-    receivers,
-    radii,
-    nearest,
-    bin_m,
-    image_order,
-    rng,
-    energy,
-):
-    walls, rays, bins = len(corners), len(directions), energy.shape[1]
-    end_m = bins * bin_m
-    edge_x, edge_y = np.empty(walls), np.empty(walls)
-    for wall in range(walls):
-        following = (wall + 1) % walls
-        edge_x[wall] = corners[following, 0] - corners[wall, 0]
-        edge_y[wall] = corners[following, 1] - corners[wall, 1]
-    # On which side of a wall's line a receiver is, and where the ray hits: (receiver, wall) and (wall,).
-    receiver_side = np.empty((len(receivers), walls))
-    for receiver in range(len(receivers)):
-        for wall in range(walls):
-            receiver_side[receiver, wall] = edge_x[wall] * (receivers[receiver, 1] - corners[wall, 1]) - edge_y[
-                wall
-            ] * (receivers[receiver, 0] - corners[wall, 0])
-    hit_side, offset_x, offset_y = np.empty(walls), np.empty(walls + 1), np.empty(walls + 1)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH)
+def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
+    """Adds the energy of all rays to the histogram."""
+    walls, rays = len(room.corners), len(directions)
+    end_m = histogram.energy.shape[1] * histogram.bin_m
+    offsets = np.empty((3, walls + 1))
     kept, chance, weight = np.empty(_BANDS), np.empty(_BANDS), np.empty(_BANDS)
     scale = 1.0 / rays
-
     for ray in range(rays):
-        px, py, pz = emitter[0], emitter[1], emitter[2]
-        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        kept[:] = 1.0  # of the energy in each band, by all surfaces so far
-        chance[:] = 1.0  # of this way, had the ray been drawn for each band; common factors left out
+        position = emitter[0], emitter[1], emitter[2]
+        direction = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        kept[:] = 1.0
+        chance[:] = 1.0
         weight[:] = scale
-        thinned, travelled_m, reflections, last = 1.0, 0.0, 0, -1
-        was_scattered, is_mirrored = False, True  # at any reflection; at the last one
+        share, travelled_m, reflections, wall = 1.0, 0.0, 0, -1  # the share of such rays that is still followed
+        was_scattered, is_mirrored = False, True  # at any reflection so far; at the last one
         while True:
-            # The nearest wall that faces the ray, or the floor or the ceiling.
-            length, surface, hit = np.inf, -1, -1
-            for wall in range(walls):
-                into = dx * edge_y[wall] - dy * edge_x[wall]
-                if into <= 0.0 or wall == last:
-                    continue
-                to_x, to_y = corners[wall, 0] - px, corners[wall, 1] - py
-                along = (to_x * dy - to_y * dx) / into
-                if along < -_OVERLAP or along > 1.0 + _OVERLAP:
-                    continue
-                distance = (to_x * edge_y[wall] - to_y * edge_x[wall]) / into
-                if -_OVERLAP < distance < length:
-                    length, surface, hit = distance, 0, wall
-            if dz < 0.0 and -pz / dz < length:
-                length, surface, hit = -pz / dz, 1, -1
-            if dz > 0.0 and (height_m - pz) / dz < length:
-                length, surface, hit = (height_m - pz) / dz, 2, -1
+            length, hit = _next_surface(room, position, direction, wall)
+            surface, wall = hit
             if surface < 0:
-                break  # out through a corner, by rounding
-
-            # Receivers have had scattered energy when it was scattered, images are to bring the first mirrored paths.
+                break  # rounding let it out through a corner
+            # Scattered energy reaches receivers as diffuse rain, and image sources account for the first reflections.
             if is_mirrored and (was_scattered or reflections > image_order):
-                for receiver in range(len(receivers)):
-                    to_x, to_y, to_z = (
-                        receivers[receiver, 0] - px,
-                        receivers[receiver, 1] - py,
-                        receivers[receiver, 2] - pz,
-                    )
-                    closest = to_x * dx + to_y * dy + to_z * dz
-                    beside = to_x * to_x + to_y * to_y + to_z * to_z - closest * closest
-                    radius = radii[receiver]
-                    if beside < radius * radius and 0.0 < closest < length:
-                        into_bin = int((travelled_m + closest) / bin_m)
-                        if into_bin < bins:
-                            chord = 2 * math.sqrt(radius * radius - beside)
-                            # 4 pi r**2 at one metre, times the chord over the volume of the sphere.
-                            gain = 3 * chord / (radius * radius * radius)
-                            row, column = _cell(-dx, -dy, -dz)
-                            target = energy[receiver, into_bin, nearest[row, column]]
-                            for band in range(_BANDS):
-                                target[band] += gain * weight[band]
-
-            px, py, pz = px + length * dx, py + length * dy, pz + length * dz
+                _add_crossings(receivers, position, direction, length, travelled_m, weight, histogram)
+            px, py, pz = position
+            dx, dy, dz = direction
+            position = px + length * dx, py + length * dy, pz + length * dz
             travelled_m += length
             if travelled_m >= end_m:
                 break
             reflections += 1
-            last = hit
-            nx, ny, nz = 0.0, 0.0, 1.0 if surface == 1 else -1.0
-            if surface == 0:
-                norm = math.hypot(edge_x[hit], edge_y[hit])
-                nx, ny, nz = -edge_y[hit] / norm, edge_x[hit] / norm, 0.0
-
-            if blocking:
-                for wall in range(walls):
-                    offset_x[wall], offset_y[wall] = corners[wall, 0] - px, corners[wall, 1] - py
-                    hit_side[wall] = edge_y[wall] * offset_x[wall] - edge_x[wall] * offset_y[wall]
-                offset_x[walls], offset_y[walls] = offset_x[0], offset_y[0]
-                if hit >= 0:
-                    hit_side[hit] = 0.0
+            normal = _normal(room, surface, wall)
             for band in range(_BANDS):
-                weight[band] *= reflected[surface, band]
-            for receiver in range(int(rng.random() * _EVERY), len(receivers), _EVERY):
-                to_x, to_y, to_z = receivers[receiver, 0] - px, receivers[receiver, 1] - py, receivers[receiver, 2] - pz
-                out = to_x * nx + to_y * ny + to_z * nz
-                if out <= 0.0:
-                    continue
-                square = to_x * to_x + to_y * to_y + to_z * to_z
-                distance = math.sqrt(square)
-                into_bin = int((travelled_m + distance) / bin_m)
-                if into_bin >= bins:
-                    continue
-                if blocking:
-                    crossings = 0
-                    for wall in range(walls):
-                        before = to_x * offset_y[wall] - to_y * offset_x[wall]
-                        after = to_x * offset_y[wall + 1] - to_y * offset_x[wall + 1]
-                        crossings += (before * after < 0.0) & (hit_side[wall] * receiver_side[receiver, wall] < 0.0)
-                    if crossings > 0:
-                        continue
-                gain = 4 * _EVERY * out / (distance * square)
-                row, column = _cell(-to_x, -to_y, -to_z)
-                target = energy[receiver, into_bin, nearest[row, column]]
-                for band in range(_BANDS):
-                    target[band] += gain * weight[band] * scattered[surface, band]
-
-            is_scattered = rng.random() < scattered[surface, ray % _BANDS]
-            total = 0.0
-            for band in range(_BANDS):
-                kept[band] *= reflected[surface, band]
-                chance[band] *= scattered[surface, band] if is_scattered else 1.0 - scattered[surface, band]
-                total += chance[band]
-            loudest = 0.0
-            for band in range(_BANDS):
-                chance[band] *= _BANDS / total
-                weight[band] = kept[band] * chance[band]
-                loudest = max(loudest, weight[band])
+                weight[band] *= room.reflected[surface, band]
+            first = int(rng.random() * _EVERY)
+            _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight, offsets, histogram)
+            is_scattered = rng.random() < room.scattered[surface, ray % _BANDS]
+            loudest = _weigh(room, surface, is_scattered, kept, chance, weight)
             if loudest <= 0.0:
                 break
             wanted = loudest**_THINNING
-            if wanted < thinned:
-                if rng.random() * thinned >= wanted:
+            if wanted < share:
+                if rng.random() * share >= wanted:
                     break
-                thinned = wanted
+                share = wanted
             for band in range(_BANDS):
-                weight[band] *= scale / thinned
-
+                weight[band] *= scale / share
             is_mirrored = not is_scattered
             if is_scattered:
                 was_scattered = True
-                share, azimuth = rng.random(), 2 * math.pi * rng.random()
-                out, side = math.sqrt(1.0 - share), math.sqrt(share)
-                a, b = side * math.cos(azimuth), side * math.sin(azimuth)
-                if surface == 0:
-                    dx, dy, dz = out * nx - a * ny, out * ny + a * nx, b
-                else:
-                    dx, dy, dz = a, b, out * nz
+                direction = _scattered_direction(surface, normal, rng.random(), rng.random())
             else:
-                into = dx * nx + dy * ny + dz * nz
-                dx, dy, dz = dx - 2 * into * nx, dy - 2 * into * ny, dz - 2 * into * nz
+                direction = _mirrored_direction(direction, normal)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+def _next_surface(room, position, direction, last):
+    """The distance, surface and wall (-1 if none) that a ray meets next; the surface is -1 if it meets none. `last` is
+    the wall that the ray comes from."""
+    px, py, pz = position
+    dx, dy, dz = direction
+    length, surface, hit = np.inf, -1, -1
+    for wall in range(len(room.corners)):
+        into = dx * room.edge_y[wall] - dy * room.edge_x[wall]
+        if into <= 0.0 or wall == last:
+            continue  # it sees the wall from behind
+        to_x, to_y = room.corners[wall, 0] - px, room.corners[wall, 1] - py
+        along = (to_x * dy - to_y * dx) / into
+        if along < -_OVERLAP or along > 1.0 + _OVERLAP:
+            continue
+        distance = (to_x * room.edge_y[wall] - to_y * room.edge_x[wall]) / into
+        if -_OVERLAP < distance < length:
+            length, surface, hit = distance, 0, wall
+    if dz < 0.0 and -pz / dz < length:
+        length, surface, hit = -pz / dz, 1, -1
+    if dz > 0.0 and (room.height_m - pz) / dz < length:
+        length, surface, hit = (room.height_m - pz) / dz, 2, -1
+    return length, (surface, hit)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+def _normal(room, surface, wall):
+    """The unit vector from a surface into the room."""
+    if surface == 0:
+        norm = math.hypot(room.edge_x[wall], room.edge_y[wall])
+        return -room.edge_y[wall] / norm, room.edge_x[wall] / norm, 0.0
+    return 0.0, 0.0, 1.0 if surface == 1 else -1.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+def _add_crossings(receivers, position, direction, length, travelled_m, weight, histogram):
+    """Adds the energy of a ray to every receiver whose sphere it crosses within `length`."""
+    px, py, pz = position
+    dx, dy, dz = direction
+    for receiver in range(len(receivers.positions)):
+        to_x, to_y, to_z = (
+            receivers.positions[receiver, 0] - px,
+            receivers.positions[receiver, 1] - py,
+            receivers.positions[receiver, 2] - pz,
+        )
+        closest = to_x * dx + to_y * dy + to_z * dz
+        beside = to_x * to_x + to_y * to_y + to_z * to_z - closest * closest
+        radius = receivers.radii[receiver]
+        if beside < radius * radius and 0.0 < closest < length:
+            into_bin = int((travelled_m + closest) / histogram.bin_m)
+            if into_bin < histogram.energy.shape[1]:
+                chord = 2 * math.sqrt(radius * radius - beside)
+                # 4 pi r**2 at one metre, times the chord over the volume of the sphere.
+                gain = 3 * chord / (radius * radius * radius)
+                row, column = _cell(-dx, -dy, -dz)
+                target = histogram.energy[receiver, into_bin, receivers.nearest[row, column]]
+                for band in range(_BANDS):
+                    target[band] += gain * weight[band]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight, offsets, histogram):
+    """Adds the scattered energy of a reflection to receivers in sight of it: every `_EVERY`th one, from `first` on."""
+    walls = len(room.corners)
+    surface, wall = hit
+    px, py, pz = position
+    nx, ny, nz = normal
+    offset_x, offset_y, hit_side = offsets
+    if not room.is_convex:
+        for other in range(walls):
+            offset_x[other], offset_y[other] = room.corners[other, 0] - px, room.corners[other, 1] - py
+            hit_side[other] = room.edge_y[other] * offset_x[other] - room.edge_x[other] * offset_y[other]
+        offset_x[walls], offset_y[walls] = offset_x[0], offset_y[0]
+        if wall >= 0:
+            hit_side[wall] = 0.0
+    for receiver in range(first, len(receivers.positions), _EVERY):
+        to_x, to_y, to_z = (
+            receivers.positions[receiver, 0] - px,
+            receivers.positions[receiver, 1] - py,
+            receivers.positions[receiver, 2] - pz,
+        )
+        out = to_x * nx + to_y * ny + to_z * nz
+        if out <= 0.0:
+            continue
+        square = to_x * to_x + to_y * to_y + to_z * to_z
+        distance = math.sqrt(square)
+        into_bin = int((travelled_m + distance) / histogram.bin_m)
+        if into_bin >= histogram.energy.shape[1]:
+            continue
+        if not room.is_convex:
+            crossings = 0
+            for other in range(walls):
+                before = to_x * offset_y[other] - to_y * offset_x[other]
+                after = to_x * offset_y[other + 1] - to_y * offset_x[other + 1]
+                crossings += (before * after < 0.0) & (hit_side[other] * receivers.sides[receiver, other] < 0.0)
+            if crossings > 0:
+                continue
+        gain = 4 * _EVERY * out / (distance * square)
+        row, column = _cell(-to_x, -to_y, -to_z)
+        target = histogram.energy[receiver, into_bin, receivers.nearest[row, column]]
+        for band in range(_BANDS):
+            target[band] += gain * weight[band] * room.scattered[surface, band]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+def _weigh(room, surface, is_scattered, kept, chance, weight):
+    """Sets the weight of each band after a reflection, and returns the largest one. `kept` is the share of energy that
+    all surfaces so far have reflected. `chance` is the probability of the path if the ray had been drawn for this band,
+    up to a common factor."""
+    total = 0.0
+    for band in range(_BANDS):
+        kept[band] *= room.reflected[surface, band]
+        chance[band] *= room.scattered[surface, band] if is_scattered else 1.0 - room.scattered[surface, band]
+        total += chance[band]
+    loudest = 0.0
+    for band in range(_BANDS):
+        chance[band] *= _BANDS / total
+        weight[band] = kept[band] * chance[band]
+        loudest = max(loudest, weight[band])
+    return loudest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+def _scattered_direction(surface, normal, share, turn):
+    """A direction by Lambert's law, from two uniform random numbers."""
+    nx, ny, nz = normal
+    azimuth = 2 * math.pi * turn
+    out, side = math.sqrt(1.0 - share), math.sqrt(share)
+    a, b = side * math.cos(azimuth), side * math.sin(azimuth)
+    if surface == 0:
+        return out * nx - a * ny, out * ny + a * nx, b
+    return a, b, out * nz
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+def _mirrored_direction(direction, normal):
+    dx, dy, dz = direction
+    nx, ny, nz = normal
+    into = dx * nx + dy * ny + dz * nz
+    return dx - 2 * into * nx, dy - 2 * into * ny, dz - 2 * into * nz

@@ -1,7 +1,7 @@
-"""Whole simulated responses: the stored reflected sound of a pair, its direct sound and its first reflections.
+"""Whole simulated responses: the stored late reverberation of a pair, its direct sound and its first reflections.
 
-The last two are not stored. They follow from geometry alone, by the synthesis that the rest of the mirrored reflections
-went through.
+Direct sound and first reflections are not stored. They follow from geometry alone, by the same synthesis as the other
+specular reflections.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,8 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GeometricSound:
-    """What a dataset leaves to geometry, simulated for every pair of probes."""
+    """Simulates the direct sound and the first reflections, which a dataset does not store, for every pair of
+    probes."""
 
     dataset: Dataset
 
@@ -41,13 +42,14 @@ class GeometricSound:
 
     @cached_property
     def _images(self) -> list[list[tuple[_Floats, _Floats]]]:
-        """By emitter and listener, positions and amplitudes of the first reflections."""
+        """Positions and amplitudes of the first reflections, by emitter and listener."""
         dataset = self.dataset
         tracer = RoomTracer.of(dataset.scene, dataset.effects, dataset.probes, image_order=GEOMETRIC_ORDER)
         return [tracer.images(emitter) for emitter in dataset.probes]
 
     def direct(self, emitter: int, listener: int) -> _Responses:
-        """(yaw, ear, sample); round corners, or silent behind walls where the plan has no diffraction."""
+        """(yaw, ear, sample) direct sound. Behind walls it bends round corners, or is silent if the plan has no
+        diffraction."""
         ends = self.dataset.probes[emitter], self.dataset.probes[listener]
         return self._synthesis.specular(*self._direct_paths.images(*ends), ends[1])
 
@@ -55,27 +57,27 @@ class GeometricSound:
         """(yaw, ear, sample)"""
         return self._synthesis.specular(*self._images[emitter][listener], self.dataset.probes[listener])
 
-    def complete(self, emitter: int, listener: int, reflected: _Responses) -> _Responses:
-        """(yaw, ear, sample) the whole of what is stored `reflected` of."""
-        return reflected + self.direct(emitter, listener) + self.first_reflections(emitter, listener)
+    def complete(self, emitter: int, listener: int, stored: _Responses) -> _Responses:
+        """(yaw, ear, sample) the whole response, from the stored late reverberation."""
+        return stored + self.direct(emitter, listener) + self.first_reflections(emitter, listener)
 
 
 class References:
-    """Whole responses of an open dataset by flat pair index, emitter-major; `take` is one of the TAKES."""
+    """Whole responses of an open dataset, by the flat index emitter * probes + listener; `take` is one of the TAKES."""
 
     def __init__(self, dataset: Dataset, file: h5py.File, take: str = "reflected") -> None:
-        self._reflected = StoredResponses(dataset, file, take)
+        self._stored = StoredResponses(dataset, file, take)
         self._geometric = GeometricSound(dataset)
         self._probes = len(dataset.probes)
 
     def __getitem__(self, pair: int) -> _Responses:
         """(yaw, ear, sample)"""
         emitter, listener = divmod(int(pair), self._probes)
-        return self._geometric.complete(emitter, listener, self._reflected[emitter, listener])
+        return self._geometric.complete(emitter, listener, self._stored[emitter, listener])
 
 
 class WholeResponses(SimulatedResponses):
-    """A simulated dataset's responses with the direct sound and the first reflections, as measured ones have them."""
+    """A simulated dataset's responses with direct sound and first reflections, like measured ones."""
 
     def __init__(self, dataset: Dataset) -> None:
         super().__init__(dataset)

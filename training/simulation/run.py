@@ -1,7 +1,7 @@
-"""Simulation of what follows the direct sound and the first reflections, between all pairs of probes of a scene:
-resumable emitter by emitter, the same for the same seed.
+"""Simulates the late reverberation between all pairs of probes of a scene. A simulation can be resumed emitter by
+emitter, and gives the same result for the same seed.
 
-Emitters are simulated in threads: what takes long is compiled, and leaves the interpreter to others.
+Emitters are simulated in threads; the compiled code releases the interpreter's lock.
 """
 
 import threading
@@ -21,7 +21,8 @@ from training.simulation.planner import planner_of
 
 
 def prepared(scene: SceneFile, *, seed: int, plan: SimulationPlan, most_tail_rays: int | None = None) -> PairSimulation:
-    """The simulation of all pairs of the probes that a dataset of this seed has; `most_tail_rays` as in `prepare`."""
+    """The simulation of all pairs of probes in a dataset of this seed; `most_tail_rays` as in
+    `PairSimulation.prepare`."""
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
     probes = scene.probe_positions(seed)
     return PairSimulation.prepare(scene, probes, yaws, seed=seed, plan=plan, most_tail_rays=most_tail_rays)
@@ -36,8 +37,8 @@ def simulate(
     progress: Progress,
     simulation: PairSimulation | None = None,
 ) -> Dataset:
-    """Fills the dataset folder by a simulation that was prepared for it, or by one of what the scene calls for, going
-    on where an earlier run stopped.
+    """Fills the dataset folder, and resumes an earlier run. Without a prepared `simulation`, it simulates what the
+    scene calls for.
 
     Raises SceneFileError for a bad scene file, and DatasetError for a folder that holds another scene.
     """
@@ -63,7 +64,7 @@ def simulate(
                 dataset.write(*future.result())
                 progress.advance(task)
         except BaseException:
-            # Neither an interrupt nor a full disk waits for emitters under way.
+            # An interrupt or a full disk does not wait for the emitters in progress.
             is_over.set()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -73,19 +74,19 @@ def simulate(
 def _simulate_emitter(
     simulation: PairSimulation, emitter: int, repeated: npt.NDArray[np.int64], is_over: threading.Event
 ) -> tuple[int, list[dict[int, OwnResponse]], npt.NDArray[np.float16]]:
-    """The emitter, its takes by listener, of the second those that are to be `repeated`, and logarithms of the energies
-    that the first were drawn from. Raises CancelledError once it `is_over`."""
+    """The emitter, its responses by take and listener (the second take has the `repeated` listeners only), and the log
+    energies that the first take was drawn from. Raises CancelledError once `is_over` is set."""
     listeners = np.flatnonzero(np.arange(len(simulation.probes)) != emitter)
     takes: list[dict[int, OwnResponse]] = []
     logarithms = {}
-    for number, asked in enumerate((listeners, repeated)):
+    for number, wanted in enumerate((listeners, repeated)):
         takes.append({})
-        for listener, energy, response in simulation.own(emitter, asked, number):
+        for listener, energy, response in simulation.own(emitter, wanted, number):
             if is_over.is_set():
                 raise CancelledError
             takes[number][listener] = response
             if number == 0:
-                with np.errstate(divide="ignore"):  # where no ray came by
+                with np.errstate(divide="ignore"):  # where no ray arrived
                     logarithms[listener] = to_half(np.log(energy))
     log_energy = np.full((len(simulation.probes), *next(iter(logarithms.values())).shape), -np.inf, np.float16)
     log_energy[list(logarithms)] = list(logarithms.values())

@@ -1,5 +1,5 @@
-"""How much a scene file asks for, told from its numbers alone: what nobody can wait for, or keep, is refused before
-anything is allocated."""
+"""The size of a simulation, from the numbers of its scene file: a scene that would take too much time or memory is
+refused before anything is allocated."""
 
 import math
 from dataclasses import dataclass
@@ -10,34 +10,34 @@ from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.scene_file import SceneFile, SceneFileError
 
 MOST_PROBES = 2_000
-"""Each is heard from every other: four million pairs."""
+"""Each probe is heard from every other: four million pairs."""
 MOST_CELLS = 100_000
-"""Of the grid around the floor plan, most of which may lie outside of it."""
+"""Cells of the grid around the floor plan, most of which may lie outside the walls."""
 MOST_DATASET_GB = 200.0
 MOST_MEMORY_GB = 8.0
-"""Of one emitter under way; there are as many at a time as workers."""
+"""Memory for one emitter; each worker simulates one at a time."""
 MOST_CORE_MINUTES = 14 * 24 * 60.0
 MOST_WALL_SEQUENCES = 3_000_000
-"""Of walls that might mirror a path one after the other; each is tried for every emitter."""
+"""Sequences of walls that may mirror a path one after the other; each is tried for every emitter."""
 
-# Of a core of 2.5 GHz, measured; good to a factor of three, which is all that a refusal needs.
+# Measured on a core of 2.5 GHz. They are right to a factor of three, which is enough to refuse a scene.
 _HIT_S, _WALL_S, _RECEIVER_S = 60e-9, 3e-9, 5e-9
 _SEQUENCE_S = 40e-9
 _SAMPLE_S, _HEADING_S = 12e-9, 2.5e-9
-# Beyond this, or this much absorption, numbers are likely in another unit.
+# Larger values are probably in another unit.
 _LARGE_M = 100.0
 _LONG_S = 20.0
 
 
 @dataclass(frozen=True)
 class SimulationSize:
-    """Of everything that the scene file allows; a plan mostly gets along with less."""
+    """The size of a simulation of everything that the scene file allows. A plan usually needs less."""
 
     scene: SceneFile
 
     @cached_property
     def probes(self) -> int:
-        """About."""
+        """The approximate number of probes."""
         across = self.scene.geometry.floor_plan
         box_m2 = math.prod(self.scene.plan_extent_m)
         return max(3, round(self.scene.grid_cells * across.area_m2 / box_m2) + len(self.scene.geometry.openings))
@@ -52,7 +52,7 @@ class SimulationSize:
 
     @property
     def _histogram(self) -> int:
-        """Energies of one pair."""
+        """The number of energies of one pair."""
         settings = self.scene.simulation
         return settings.arrival_directions * len(OCTAVE_BANDS_HZ) * settings.histogram_bins
 
@@ -64,7 +64,8 @@ class SimulationSize:
 
     @property
     def memory_gb(self) -> float:
-        """Of one emitter: energies twice in single precision, responses in half, and the synthesis of one response."""
+        """Memory for one emitter: energies twice in single precision, responses in half precision, and the synthesis of
+        one response."""
         settings = self.scene.simulation
         ears = 2 * settings.yaws * self.samples
         of_pair = 10 * self._histogram + 2 * ears
@@ -72,13 +73,14 @@ class SimulationSize:
         return (self.probes * of_pair + synthesis + 24 * settings.rays) / 1e9
 
     def sequences_of(self, order: int) -> float:
-        """Of up to so many walls that might mirror a path one after the other; an image is in front of half of them."""
+        """The number of sequences of up to `order` walls that may mirror a path. On average an image is in front of
+        half of the walls."""
         walls = len(self.scene.geometry.corners)
         return float(sum(walls * ((walls - 1) / 2) ** (reflections - 1) for reflections in range(1, order + 1)))
 
     @property
     def wall_sequences(self) -> float:
-        """Of all images of an emitter."""
+        """The number of sequences of walls for all images of an emitter."""
         return self.sequences_of(self.scene.simulation.image_order)
 
     @property
@@ -87,32 +89,32 @@ class SimulationSize:
 
     @property
     def tracing_s(self) -> float:
-        """Of one emitter."""
+        """Seconds of one core to trace the rays of one emitter."""
         settings, geometry = self.scene.simulation, self.scene.geometry
         hits = settings.rays * settings.duration_s * SPEED_OF_SOUND / self.mean_free_path_m
         return hits * (_HIT_S + _WALL_S * len(geometry.corners) + _RECEIVER_S * self.probes)
 
     @property
     def images_s(self) -> float:
-        """Of one emitter."""
+        """Seconds of one core to find the images of one emitter."""
         return self.wall_sequences * self.probes * _SEQUENCE_S * (self.scene.simulation.image_order > GEOMETRIC_ORDER)
 
     @property
     def synthesis_s(self) -> float:
-        """Of one pair."""
+        """Seconds of one core to synthesise the response of one pair."""
         settings = self.scene.simulation
         return settings.arrival_directions * self.samples * (_SAMPLE_S + _HEADING_S * settings.yaws)
 
     @property
     def mean_free_path_m(self) -> float:
-        """Four times volume over surface."""
+        """Four times the volume over the surface."""
         plan = self.scene.geometry.floor_plan
         around_m = sum(math.dist(*wall) for wall in plan.walls.tolist())
         return 4 * plan.area_m2 * plan.height_m / (2 * plan.area_m2 + around_m * plan.height_m)
 
     @property
     def extent(self) -> str:
-        """In words, without time."""
+        """A description of probes, pairs, data and memory."""
         return (
             f"about {self.probes:,} probes, {self.pairs:,} pairs, {_rounded(self.dataset_gb)} GB of data and "
             f"{_rounded(self.memory_gb)} GB of memory per worker"
@@ -124,7 +126,7 @@ class SimulationSize:
         return f"{self.extent}, and up to {takes} of one core"
 
     def require_reasonable(self) -> None:
-        """Raises SceneFileError for what is too much, with what would make it less."""
+        """Raises SceneFileError, with the field to change, if the scene is too large."""
         checks = (
             (self.scene.grid_cells > MOST_CELLS, f"at most {MOST_CELLS:,} cells of a grid", "probes.spacing_m"),
             (self.probes > MOST_PROBES, f"at most {MOST_PROBES:,} probes", "probes.spacing_m"),
@@ -143,19 +145,19 @@ class SimulationSize:
 
     @property
     def _largest(self) -> str:
-        """The field that most of the data, or memory, is owed to."""
+        """The field that contributes most to the amount of data and memory."""
         settings = self.scene.simulation
-        asked = {
+        relative_sizes = {
             "probes.spacing_m": self.probes / 100,
             "simulation.yaws": settings.yaws / 12,
             "simulation.arrival_directions": settings.arrival_directions / 24,
             "simulation.duration_s": settings.duration_s,
         }
-        return max(asked, key=lambda name: asked[name])
+        return max(relative_sizes, key=lambda name: relative_sizes[name])
 
     @property
     def _longest(self) -> str:
-        """The field that most of the time is owed to."""
+        """The field that contributes most to the time."""
         parts = {"simulation.rays": self.tracing_s, "simulation.image_order": self.images_s}
         longest = max(parts, key=lambda name: parts[name])
         return longest if parts[longest] > self.probes * self.synthesis_s else self._largest
@@ -172,5 +174,5 @@ class SimulationSize:
 
 
 def _rounded(value: float) -> str:
-    """To two digits, and no finer than hundredths."""
+    """Rounded to two digits, and not finer than hundredths."""
     return f"{max(value, 0.01):.2g}" if value < 10 else f"{value:,.0f}"

@@ -1,14 +1,14 @@
-"""Binaural impulse responses: of the direct sound from geometry, and from traced arrivals of what follows it.
+"""Synthesises binaural impulse responses from image sources and traced energies.
 
-Specular paths are exact: each is its own delayed, filtered head-related impulse response. What rays bring is noise
-shaped in time, frequency and direction by their energy, heard through the head from each direction of arrival
-(Schroeder, "Physically based real-time auralization of interactive virtual environments", 2011, ch. 5). One noise
-serves all head orientations of a pair, so turning the head changes the ears and not the room.
+Specular paths are exact: each is a delayed and filtered head-related impulse response. The diffuse part is noise, which
+is shaped in time, frequency and direction by the energy of rays, and filtered by the head for each direction of arrival
+(Schroeder, "Physically based real-time auralization of interactive virtual environments", 2011, ch. 5). All head
+orientations of a pair share one noise, so that turning the head changes the ears' signals and not the room's.
 
-The head is the one that direct paths are rendered through: minimum phase and a delay per ear. What a measurement has
-beside these is mostly the phase of its loudspeaker.
+The head is the one of the renderer: minimum phase and a delay per ear. What else a measured head has is mostly the
+phase of the loudspeaker.
 
-Axes: (yaw, ear, sample) responses in single precision; spectra have bins last.
+Axes: responses (yaw, ear, sample) in single precision; spectra have bins last.
 """
 
 from dataclasses import dataclass
@@ -33,19 +33,20 @@ _Singles = npt.NDArray[np.float32]
 
 _WINDOW_S = 0.010
 _DIFFUSE_RISE_S = 0.002
-# Ears may hear before a wave passes the head's centre, and a delay by a fraction of a sample rings on either side.
+# A wave may reach an ear before the head's centre, and a delay by a fraction of a sample rings on both sides.
 _LEAD_S = 0.001
 
 
 def rotate_into_head(directions: _Floats, yaws: _Floats) -> _Floats:
-    """(direction, yaw, xyz) world directions as seen by a level head turned counter-clockwise by each yaw (radians)."""
+    """(direction, yaw, xyz) world directions relative to a level head that is turned counter-clockwise by each yaw
+    (radians)."""
     x, y, z = (directions[:, None, axis] for axis in range(3))
     cos, sin = np.cos(yaws), np.sin(yaws)
     return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(yaws)))], axis=-1)
 
 
 def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
-    """(..., bin) energy of a histogram to (..., time) energy per second, linear between the middles of its bins."""
+    """(..., bin) energies of a histogram to (..., time) energies per second, linear between the middles of its bins."""
     position = np.clip(times_s / HISTOGRAM_BIN_S - 0.5, 0, energy.shape[-1] - 1)
     before = np.minimum(position.astype(int), energy.shape[-1] - 2)
     share = (position - before).astype(np.float32)
@@ -53,8 +54,8 @@ def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
 
 
 def _unit_noise(shape: tuple[int, ...], rng: np.random.Generator) -> _Singles:
-    """Uniform, of unit power: sums of a window's samples are as Gaussian as need be, and it takes a quarter as long to
-    draw as what is Gaussian already."""
+    """Uniform noise of unit power. It is drawn in a quarter of the time of Gaussian noise, and sums over a window are
+    nearly Gaussian anyway."""
     noise = rng.random(shape, dtype=np.float32)
     noise -= np.float32(0.5)
     noise *= np.float32(np.sqrt(12))
@@ -63,8 +64,8 @@ def _unit_noise(shape: tuple[int, ...], rng: np.random.Generator) -> _Singles:
 
 @dataclass(frozen=True)
 class BinauralSynthesis:
-    """Renders arrivals to `samples` samples at the rate of `head`; `arrival_directions` are those of the traced
-    energy."""
+    """Renders arrivals to responses of `samples` samples at the rate of `head`; `arrival_directions` are the directions
+    of the traced energy."""
 
     head: HeadFilters
     arrival_directions: _Floats
@@ -72,36 +73,36 @@ class BinauralSynthesis:
     samples: int
 
     def render(self, arrivals: Arrivals, receiver: _Floats, onset_s: float, rng: np.random.Generator) -> _Singles:
-        """Reflected sound; sample 0 is emission. Nothing diffuse is heard before `onset_s`."""
+        """The response to all arrivals; sample 0 is the emission. The diffuse part begins at `onset_s`."""
         response = self.late(arrivals.energy, onset_s, rng)
         self._add_specular(arrivals.image_positions, arrivals.image_amplitudes, receiver, response)
         return response
 
     def specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats) -> _Singles:
-        """What is heard of images alone: (image, xyz), with (image, band) pressure at the receiver."""
+        """The response to images alone: positions (image, xyz), with pressures (image, band) at the receiver."""
         response = np.zeros((len(self.yaws), 2, self.samples), dtype=np.float32)
         self._add_specular(positions, amplitudes, receiver, response)
         return response
 
     def direct(self, emitter: _Floats, receiver: _Floats, air: Air) -> _Singles:
-        """Direct sound of an emitter in sight; sample 0 is emission."""
+        """The direct sound of an emitter in sight; sample 0 is the emission."""
         amplitude = free_field_amplitude(np.array([np.linalg.norm(emitter - receiver)]), air)
         return self.specular(emitter[None], amplitude, receiver)
 
     def late_covariance(
-        self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles, heard: _Singles
+        self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles, products: _Singles
     ) -> _Singles:
-        """(bin, product, yaw, cell) expected products per sample of what the ears hear of the diffuse part of `render`,
-        summed over (time,) `times_s` with (time, cell) `weights`; none outside the response. `heard` is that of
-        `arrival_products`."""
+        """(bin, product, yaw, cell) expected products per sample of the ears' spectra, for the diffuse part of
+        `render`. They are summed over `times_s` (time,) with `weights` (time, cell); times outside the response add
+        nothing. `products` is the result of `arrival_products`."""
         step_s = self._n_fft // 2 / self._sample_rate
         frames = -(-self.samples // (self._n_fft // 2)) + 1
         per_sample = power_at(np.asarray(np.arange(frames) * step_s, np.float64), energy) / np.float32(
             self._sample_rate
         )
-        frequencies_hz = np.linspace(0, self._sample_rate / 2, heard.shape[0])
+        frequencies_hz = np.linspace(0, self._sample_rate / 2, products.shape[0])
         power = np.einsum("dbt,bn->ndt", per_sample, band_weights(frequencies_hz).astype(np.float32), optimize=True)
-        # Windows overlap on the same noise: their amplitudes add up, and neighbours have a product too.
+        # Overlapping windows shape the same noise: their amplitudes add up, so neighbours have a product, too.
         position = np.clip(times_s / step_s, 0, frames - 1)
         before = np.minimum(position.astype(int), frames - 2)
         share = np.sin(np.pi / 2 * (position - before)) ** 2
@@ -116,13 +117,13 @@ class BinauralSynthesis:
         own_weights, shared_weights = ((part.T @ weights).astype(np.float32) for part in (own, shared))
         neighbours = np.sqrt(power[..., :-1] * power[..., 1:])
         over_cells = np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
-        # Not matmul: for a stack of small matrices, threads of linear algebra mostly wait for each other.
-        return np.einsum("bpyd,bdc->bpyc", heard, over_cells)
+        # Einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
+        return np.einsum("bpyd,bdc->bpyc", products, over_cells)
 
     def arrival_products(self, bins: int) -> _Singles:
-        """(bin, product, yaw, direction) of the spectra of a wave from each direction at the ears, at frequencies from
-        0 to half the sample rate: the squared magnitudes of left and right, and left times conjugate right, real and
-        imaginary."""
+        """(bin, product, yaw, direction) products of the ears' spectra for a wave from each direction, at frequencies
+        from 0 to half the sample rate: squared magnitudes of left and right, then real and imaginary parts of left
+        times conjugate right."""
         own = self._arrival_spectra.reshape(self._n_fft // 2 + 1, len(self.arrival_directions), len(self.yaws), 2)
         left, right = own[..., 0], own[..., 1]
         cross = left * np.conj(right)
@@ -134,13 +135,13 @@ class BinauralSynthesis:
         return np.ascontiguousarray(products.transpose(0, 1, 3, 2), dtype=np.float32)
 
     def diffuse_noise(self, directional: _Floats, samples: int, rng: np.random.Generator) -> _Singles:
-        """(band, yaw, ear, sample) noise without beginning or end, rounded down to whole windows: in each octave band
-        of unit power per sample, divided between directions of arrival by (direction, band) shares. Bands are
-        independent of each other where they overlap, so that their powers add up, whatever they are multiplied by."""
+        """(band, yaw, ear, sample) circular noise, whose length is rounded down to whole windows. In each octave band
+        it has unit power per sample, divided between directions of arrival by the shares `directional` (direction,
+        band). Overlapping bands are independent, so that their powers add up for any gains of the bands."""
         step = self._n_fft // 2
         frames = samples // step
-        heard = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
-        for neighbours in (0, 1):  # only bands next to each other overlap
+        at_ears = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
+        for neighbours in (0, 1):  # only neighbouring bands overlap
             noise = _unit_noise((len(directional), frames, step), rng)
             sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
             sections *= self._window
@@ -158,8 +159,8 @@ class BinauralSynthesis:
                 sections = irfft(shaped, self._n_fft)
                 sections *= self._window
                 later = np.roll(sections[..., step:], 1, axis=1)
-                heard[band] = (sections[..., :step] + later).reshape(len(sections), -1)
-        return heard.reshape(len(heard), len(self.yaws), 2, -1)
+                at_ears[band] = (sections[..., :step] + later).reshape(len(sections), -1)
+        return at_ears.reshape(len(at_ears), len(self.yaws), 2, -1)
 
     @property
     def _sample_rate(self) -> int:
@@ -167,7 +168,7 @@ class BinauralSynthesis:
 
     @property
     def _n_fft(self) -> int:
-        """Long enough for a head-related impulse response behind the filter of a wall."""
+        """Long enough for a head-related impulse response after the filter of a wall."""
         return 2 ** int(np.ceil(np.log2(_WINDOW_S * self._sample_rate)))
 
     @cached_property
@@ -183,7 +184,7 @@ class BinauralSynthesis:
 
     @cached_property
     def _window(self) -> _Singles:
-        """Before the transform and after it: its square, at steps of half its length, adds up to one."""
+        """The window before and after the transform. Its squares, at steps of half its length, add up to one."""
         return np.sin(np.pi * (np.arange(self._n_fft) + 0.5) / self._n_fft).astype(np.float32)
 
     @cached_property
@@ -193,10 +194,10 @@ class BinauralSynthesis:
         return np.ascontiguousarray(np.moveaxis(spectra.reshape(len(spectra), -1, spectra.shape[-1]), -1, 0))
 
     def late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
-        """(yaw, ear, sample) diffuse sound of (direction, band, bin) energy; nothing is heard before `onset_s`."""
+        """(yaw, ear, sample) diffuse sound of `energy` (direction, band, bin), which begins at `onset_s`."""
         step = self._n_fft // 2
         frames = -(-self.samples // step) + 1  # the first begins one step before sample 0
-        # Frame by frame, so that a longer response begins with the same noise.
+        # Drawn frame by frame, so that a longer response begins with the same noise.
         noise = _unit_noise((frames + 1, len(energy), step), rng)
         sections = np.concatenate([noise[:-1], noise[1:]], axis=-1)
         sections *= self._window
@@ -204,12 +205,12 @@ class BinauralSynthesis:
         times_s = np.arange(frames) * step / self._sample_rate
         per_sample = np.moveaxis(power_at(times_s, energy), -1, 0) / np.float32(self._sample_rate)
         spectra *= np.sqrt(np.ascontiguousarray(per_sample) @ self._band_weights)
-        heard = np.matmul(np.ascontiguousarray(np.moveaxis(spectra, -1, 0)), self._arrival_spectra)
-        sections = irfft(np.ascontiguousarray(heard.transpose(2, 1, 0)), self._n_fft)
+        at_ears = np.matmul(np.ascontiguousarray(np.moveaxis(spectra, -1, 0)), self._arrival_spectra)
+        sections = irfft(np.ascontiguousarray(at_ears.transpose(2, 1, 0)), self._n_fft)
         sections *= self._window
         late = sections[:, :-1, step:] + sections[:, 1:, :step]
         response = late.reshape(len(self.yaws), 2, -1)[..., : self.samples]
-        # Windows smear energy to before the direct sound, where nothing scattered can be.
+        # Windows smear energy to before the direct sound, when no scattered sound can arrive.
         begins, risen = (round(time_s * self._sample_rate) for time_s in (onset_s, onset_s + _DIFFUSE_RISE_S))
         response[..., :begins] = 0
         rise = np.sin(np.pi / 2 * np.linspace(0, 1, risen - begins, endpoint=False)) ** 2
@@ -220,18 +221,19 @@ class BinauralSynthesis:
     def _add_specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats, response: _Singles) -> None:
         offset = positions - receiver
         distance = np.linalg.norm(offset, axis=-1)
-        heard = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
+        directions = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
         delay = distance / SPEED_OF_SOUND * self._sample_rate
         start = np.floor(delay).astype(int)
         lead = round(_LEAD_S * self._sample_rate)
-        spectra = self._ears.specular(heard, amplitudes, lead + delay - start)
+        spectra = self._ears.specular(directions, amplitudes, lead + delay - start)
         taps = irfft(spectra, self._n_fft).reshape(len(spectra), 2 * len(self.yaws), self._n_fft)
         _add_at(start - lead, taps, response.reshape(-1, self.samples))
 
 
 @numba.njit(cache=True, nogil=True)
 def _add_at(starts, taps, response):
-    """Adds (wave, channel, tap) to (channel, sample) from each wave's start on, as far as there are samples."""
+    """Adds the `taps` (wave, channel, tap) to the response (channel, sample) from each wave's start on, and cuts them
+    at both ends of the response."""
     samples, size = response.shape[1], taps.shape[2]
     for wave in range(len(starts)):
         first, last = max(0, -starts[wave]), min(size, samples - starts[wave])

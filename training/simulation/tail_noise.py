@@ -1,23 +1,23 @@
-"""The noise of a shared tail: drawn once for all receivers of all emitters."""
+"""The noise of a shared tail. It is drawn once, for all receivers of all emitters."""
 
 import numpy as np
 import numpy.typing as npt
 
 from training.data.scene_file import HISTOGRAM_BIN_S
-from training.data.shared_tail import BANDS_AT_ONCE, SharedTail, shared_power
+from training.data.shared_tail import BAND_GROUP, SharedTail, shared_power
 from training.simulation.synthesis import BinauralSynthesis, power_at
 
 _NOISE_S = 2.0
-# Steps of the noise's quantisation in the root mean square of a band's loudest channel: reading it is what adding a
-# tail waits for, and what responses have of their own is stored with fewer digits.
+# Quantisation steps of the noise in the root mean square of a band's loudest channel. Sixteen bits halve the memory
+# traffic, which limits the speed, and are finer than the half precision of stored responses.
 _STEPS = 4096
 
 
 def draw_tail(
     synthesis: BinauralSynthesis, energies: npt.NDArray[np.float64], *, start_s: float, rng: np.random.Generator
 ) -> SharedTail:
-    """Late sound of (take, direction, band, bin) `energies`, of which the part before `start_s` is not used; the noise
-    is quantised band by band."""
+    """The shared tail for (take, direction, band, bin) `energies`, of which the part before `start_s` is not used. The
+    noise is quantised band by band."""
     sample_rate = synthesis.head.sample_rate
     late = energies[..., int(start_s / HISTOGRAM_BIN_S) :].sum(axis=(0, -1))
     total = late.sum(axis=0)
@@ -34,7 +34,7 @@ def draw_tail(
     noise /= step[..., None]
     limits = np.iinfo(np.int16)
     np.clip(np.rint(noise, out=noise), limits.min, limits.max, out=noise)
-    silent = -len(noise) % BANDS_AT_ONCE
+    silent = -len(noise) % BAND_GROUP
     quantised = np.zeros((len(noise) + silent, *noise.shape[1:]), np.int16)
     quantised[: len(noise)] = noise
     return SharedTail(

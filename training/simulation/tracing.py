@@ -1,4 +1,4 @@
-"""What arrives where: image sources and rays, one emitter and all its receivers at a time."""
+"""The sound that arrives from one emitter at all receivers: image sources and rays."""
 
 from dataclasses import dataclass
 
@@ -20,12 +20,12 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Arrivals:
-    """What the room sends from one emitter to one receiver, at unit pressure one metre from the emitter: all but the
-    direct sound and the images that were left out.
+    """The room's response to an emitter of unit pressure at one metre, at one receiver, without the direct sound and
+    the images that were left out.
 
-    `image_positions` (image, xyz) are apparent emitter positions of the specular reflections that reach the receiver,
-    none where every path is blocked; `image_amplitudes` (image, band) is their pressure there. `energy` (direction,
-    band, bin) is the squared pressure that rays bring per bin of HISTOGRAM_BIN_S, by direction of arrival.
+    `image_positions` (image, xyz) are apparent positions of the specular reflections that reach the receiver, and
+    `image_amplitudes` (image, band) their pressures there. `energy` (direction, band, bin) is the squared pressure of
+    rays per bin of HISTOGRAM_BIN_S, by direction of arrival.
     """
 
     image_positions: _Floats
@@ -34,8 +34,8 @@ class Arrivals:
 
 
 def free_field_amplitude(distance_m: _Floats, air: Air | None) -> _Floats:
-    """(..., band) pressure at (...,) distances from an emitter of unit pressure at one metre: its wave spreads, and the
-    air, if there is any to speak of, takes its share."""
+    """(..., band) pressures at distances (...,) from an emitter of unit pressure at one metre, after spherical
+    spreading and absorption by the air (none if `air` is None)."""
     distance = np.asarray(distance_m)[..., None]
     return np.asarray(db_to_amplitude(-distance * _absorption_db_per_m(air)) / distance)
 
@@ -45,7 +45,7 @@ def _absorption_db_per_m(air: Air | None) -> _Floats:
 
 
 class RoomTracer:
-    """Traces from any emitter to a fixed set of receivers (receiver, xyz). Stateless between traces."""
+    """Traces from any emitter to a fixed set of receivers (receiver, xyz). It has no state between traces."""
 
     def __init__(
         self,
@@ -58,15 +58,16 @@ class RoomTracer:
         arrival_directions: _Floats,
         least_order: int = 1,
     ) -> None:
-        """Mirrored paths of up to `image_order` reflections are images, and those of fewer than `least_order` are left
-        out."""
+        """Specular paths of up to `image_order` reflections are found as images; those of fewer than `least_order` are
+        left out."""
         self._plan = geometry.floor_plan
         self._air = air
         self._receivers = np.asarray(receivers, dtype=np.float64)
         self._duration_s = duration_s
         self._image_order = image_order
         self._least_order = least_order
-        self._mirrored = np.sqrt(np.prod([surface_shares(geometry)[0], 1 - surface_shares(geometry)[1]], axis=0))
+        reflected, scattered = surface_shares(geometry)
+        self._specular_amplitudes = np.sqrt(np.prod([reflected, 1 - scattered], axis=0))
         self._rays = RayTracer(
             geometry,
             self._receivers,
@@ -86,7 +87,7 @@ class RoomTracer:
         image_order: int | None = None,
         least_order: int = 1,
     ) -> "RoomTracer":
-        """What the plan has of the scene; for its whole duration and up to its image order if none is given."""
+        """A tracer for the scene, with the effects of the plan. Duration and image order default to the plan's."""
         settings = scene.simulation
         return cls(
             scene.geometry if plan.scattering else scene.geometry.without_scattering(),
@@ -99,12 +100,12 @@ class RoomTracer:
         )
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> list[Arrivals]:
-        """One entry per receiver. The same numbers from `rng` give the same arrivals."""
+        """One entry per receiver. The result depends only on the emitter and the random numbers of `rng`."""
         energy = self.energy(emitter, rays=rays, rng=rng)
         return [Arrivals(*images, late) for images, late in zip(self.images(emitter), energy, strict=True)]
 
     def energy(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
-        """(receiver, direction, band, bin) squared pressure that rays bring; none without rays."""
+        """(receiver, direction, band, bin) squared pressures of rays; zero for no rays."""
         if not rays:
             return np.zeros((len(self._receivers), *self._rays.shape), dtype=np.float32)
         energy = self._rays.trace(emitter, rays=rays, rng=rng)
@@ -113,8 +114,8 @@ class RoomTracer:
         return energy
 
     def images(self, emitter: _Floats) -> list[tuple[_Floats, _Floats]]:
-        """Image positions (image, xyz) and amplitudes (image, band) per receiver, those that are heard within the
-        duration."""
+        """Image positions (image, xyz) and amplitudes (image, band) for each receiver. Images that are heard after the
+        duration are left out."""
         order = self._image_order
         heights, level = images_in_height(float(emitter[2]), self._plan.height_m, order)
         receiver, plan, walls = images_in_plan(self._plan, emitter[:2], self._receivers[:, :2], order)
@@ -124,7 +125,7 @@ class RoomTracer:
         positions = np.column_stack([plan[path], heights[height]])
         distance = np.linalg.norm(positions - self._receivers[receiver], axis=-1)
         times = np.column_stack([walls[path], level[height]])
-        damping = np.prod(self._mirrored ** times[..., None], axis=1)
+        damping = np.prod(self._specular_amplitudes ** times[..., None], axis=1)
         amplitudes = damping * free_field_amplitude(distance, self._air)
         heard = distance < self._duration_s * SPEED_OF_SOUND
         of_each = [np.flatnonzero((receiver == index) & heard) for index in range(len(self._receivers))]

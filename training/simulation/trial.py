@@ -1,16 +1,17 @@
-"""A short simulation of a few pairs of a scene, ahead of the whole one: how the energy that rays and first reflections
-bring decays, and what would change of that.
+"""A short trial simulation of a few pairs of a scene, before the whole one: how the energy of rays and first
+reflections decays, and how effects change that.
 
-Formulas of statistical acoustics take a diffuse field for granted, and many rooms have none: between smooth walls sound
-goes to and fro for long, and under an absorbent ceiling level sound outlives all other, so that how much is scattered
-decides how fast all of it decays (Hodgson, "Evidence of diffuse surface reflections in rooms", J. Acoust. Soc. Am. 89,
-1991). Rays tell, and for decays that many pairs have in common few of them do. In long or flat rooms the late sound is
-that of the rare rays that run level for long: few rays hold none of them, and reverberation seems to be half of what it
-is. So there are four times as many until the reverberation times stay.
+Formulas of statistical acoustics assume a diffuse field, which many rooms do not have. Between smooth walls sound
+travels back and forth for long. Under an absorbent ceiling, horizontal sound outlives all other, so that scattering
+decides how fast the whole field decays (Hodgson, "Evidence of diffuse surface reflections in rooms", J. Acoust. Soc.
+Am. 89, 1991). Rays show this, and a few of them suffice for decays that many pairs have in common. But in long or flat
+rooms, late sound comes from the rare rays that stay horizontal for long. Too few rays include none of them, and the
+reverberation time comes out at half its value. So the number of rays is multiplied by four until the reverberation
+times no longer change.
 
 Axes: (take, pair, band, bin) energies relative to that of the direct sound at one metre, in bins of HISTOGRAM_BIN_S
-after emission. Takes are independent: what they agree on is no chance, so that the product of a change in one and the
-same in the other is, on average, the square of what changes.
+after emission. The takes are independent. So the product of a change in one take and the same change in the other is,
+on average, the square of the true change, without the random part.
 """
 
 import math
@@ -36,29 +37,30 @@ _Floats = npt.NDArray[np.float64]
 
 _TAKES = 2
 _EMITTERS, _RECEIVERS = 6, 12
-# Of all pairs of a take, in each band.
+# Bins of all pairs of a take together, in each band.
 _MOST_BINS = 100_000
-# Reflections of all rays of an emitter and a take, at first and at most; ten million of them take about a second.
+# Total reflections of an emitter's rays in a take: at first, growth factor, and at most. Ten million take a second.
 _FIRST_HITS, _MORE, _MOST_HITS = 400_000, 4, 6_400_000
-# Of a reverberation time from one number of rays to the next: a just-noticeable difference.
+# A reverberation time counts as unchanged within this share, which is a just-noticeable difference.
 _SAME_SHARE = 0.05
-# With more of them, each takes longer.
+# With more walls than this, each reflection takes longer.
 _FEW_WALLS = 20
-# Of the first number of reflections.
+# Fewest and most rays at the first number of reflections.
 _FEWEST_RAYS, _MOST_RAYS = 50, 2_000
 _EARLY_S = 0.050
-# Of the room's reverberation time by Eyring; smooth rooms take longer, and are tried for longer.
+# First duration in reverberation times by Eyring's formula, and growth factor: smooth rooms decay more slowly.
 _LASTING, _LONGER, _LONGEST_S = 1.2, 2.5, 30.0
 _SHORTEST_S = 0.2
 _DECAY_DB = (-5.0, -35.0)
 _SILENCE = 1e-14
 MOST_JND = 100.0
-"""Where something is missing altogether."""
+"""The change where a parameter exists only with the effect or only without it."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """Root mean square over pairs, in the band in which it is greatest, in JND of the parameter that changes most."""
+    """The change of the parameter that changes most, in JND: root mean square over pairs, in the band in which it is
+    greatest."""
 
     jnd: float
     parameter: str
@@ -66,8 +68,8 @@ class Change:
 
 @dataclass(frozen=True)
 class Energies:
-    """`direct` and `first`, the first reflections, (pair, band, bin), the same in all takes, and `late` (take, pair,
-    band, bin); `onset` (pair,) is the bin of the direct sound."""
+    """`direct` and `first` (first reflections) are (pair, band, bin), the same in all takes; `late` is (take, pair,
+    band, bin). `onset` (pair,) is the bin of the direct sound."""
 
     direct: _Floats
     first: _Floats
@@ -81,14 +83,14 @@ class Energies:
 
 @dataclass(frozen=True)
 class Trial:
-    """Of a scene and its probes (probe, xyz)."""
+    """A trial simulation of a scene and its probes (probe, xyz)."""
 
     scene: SceneFile
     probes: _Floats
 
     @cached_property
     def pairs(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
-        """A few emitters, each with receivers all over the place."""
+        """A few emitters, each with receivers that are spread over the scene."""
         count, bins = len(self.probes), self.duration_s / HISTOGRAM_BIN_S
         receivers = int(np.clip(_MOST_BINS / (_EMITTERS * bins), 2, _RECEIVERS))
         emitters = np.unique(np.linspace(0, count - 1, _EMITTERS).astype(int)).tolist()
@@ -101,7 +103,7 @@ class Trial:
 
     @cached_property
     def duration_s(self) -> float:
-        """Until it has decayed as far as reverberation times ask for, without scattering too."""
+        """The time in which sound decays as far as reverberation times require, with and without scattering."""
         room = DiffuseRoom(self.scene.geometry, self.scene.air, SPEED_OF_SOUND)
         audible = bands_within(self.scene.simulation.sample_rate)
         onset_s = float(np.ptp(self.probes, axis=0).sum()) / SPEED_OF_SOUND
@@ -113,7 +115,7 @@ class Trial:
         return duration_s
 
     def _has_decayed(self, duration_s: float) -> bool:
-        """Of one emitter's sound, at most of the receivers."""
+        """Whether one emitter's sound, without scattering, has decayed at the median receiver."""
         receivers = tuple(range(1, min(len(self.probes), 1 + _RECEIVERS)))
         geometry = self.scene.geometry.without_scattering()
         energy = self._traced(geometry, 0, receivers, duration_s, np.random.default_rng(0), _MORE * _FIRST_HITS)
@@ -124,27 +126,28 @@ class Trial:
 
     @property
     def scattered(self) -> Energies:
-        """As the scene is; no air yet."""
+        """Energies of the scene as it is, without absorption by the air."""
         return self._settled[1]
 
     @cached_property
     def mirrored(self) -> Energies:
-        """Where nothing scatters; no air yet."""
+        """Energies without scattering, and without absorption by the air."""
         return self._energies(self.scene.geometry.without_scattering(), self._settled[0])
 
     @cached_property
     def _settled(self) -> tuple[int, Energies]:
-        """As many reflections as reverberation times need to stay, and the energies of so many."""
+        """The number of reflections from which on reverberation times no longer change, and the energies with that
+        number."""
         hits = _FIRST_HITS
         energies = self._energies(self.scene.geometry, hits)
         while hits < _MOST_HITS:
             hits, fewer = hits * _MORE, energies
             energies = self._energies(self.scene.geometry, hits)
-            if self._rings_alike(fewer, energies):
+            if self._same_decay(fewer, energies):
                 break
         return hits, energies
 
-    def _rings_alike(self, fewer: Energies, more: Energies) -> bool:
+    def _same_decay(self, fewer: Energies, more: Energies) -> bool:
         audible = bands_within(self.scene.simulation.sample_rate)
         before_s, after_s = (self._times_s(each)[:audible] for each in (fewer, more))
         is_same = np.abs(after_s - before_s) <= _SAME_SHARE * after_s
@@ -152,16 +155,16 @@ class Trial:
 
     @cached_property
     def reverberation_time_s(self) -> _Floats:
-        """(band,) T30 of the scene, median over pairs; NaN where it cannot be told of most of them."""
+        """(band,) T30 of the scene, median over pairs; NaN where most pairs have none."""
         return self._times_s(self.scattered)
 
     def _times_s(self, energies: Energies) -> _Floats:
         times = decay_times_s(self.in_air(energies).whole, energies.onset, *_DECAY_DB)
         by_band = np.moveaxis(times, -1, 0).reshape(times.shape[-1], -1)
-        told = np.isfinite(by_band).sum(axis=-1) > by_band.shape[-1] / 2
-        # An even number of pairs would have a middle between a time and none.
+        is_known = np.isfinite(by_band).sum(axis=-1) > by_band.shape[-1] / 2
+        # With an even number of pairs, a usual median might average a time and a missing one.
         middle = np.sort(np.nan_to_num(by_band, nan=np.inf), axis=-1)[:, by_band.shape[-1] // 2]
-        return np.where(told & np.isfinite(middle), middle, np.nan)
+        return np.where(is_known & np.isfinite(middle), middle, np.nan)
 
     def in_air(self, energies: Energies) -> Energies:
         bins_m = (np.arange(energies.late.shape[-1]) + 0.5) * HISTOGRAM_BIN_S * SPEED_OF_SOUND
@@ -172,7 +175,8 @@ class Trial:
         return self.change(self.in_air(self.scattered), self.in_air(self.mirrored))
 
     def without_air(self, *, has_rays: bool, scatters: bool) -> Change:
-        """Of a plan that has rays or none: where it has none, of direct sound and first reflections alone."""
+        """The change without absorption by the air. In a plan without rays, only direct sound and first reflections
+        count."""
         dry = self.scattered if scatters else self.mirrored
         if not has_rays:
             dry = Energies(dry.direct, dry.first, np.zeros_like(dry.late), dry.onset)
@@ -183,30 +187,29 @@ class Trial:
         return self.change(whole, Energies(whole.direct, whole.first, np.zeros_like(whole.late), whole.onset))
 
     def with_one_tail(self, start_s: float) -> Change:
-        """Where all places share their mean late sound from some time after emission on."""
+        """The change if, from `start_s` after emission on, all places share their mean late sound."""
         own = self.in_air(self.scattered)
         late = own.late.copy()
         first = self._bins_before(start_s)
-        # Of the other take: what places differ by must not be what rays do.
+        # The mean is that of the other take, so that random errors of rays do not look like differences between places.
         late[..., first:] = own.late[::-1, :, :, first:].mean(axis=1, keepdims=True)
         return self.change(own, Energies(own.direct, own.first, late, own.onset))
 
     def tail_rays(self, start_s: float, share: float) -> float:
-        """How many rays it takes to know the reverberation time of a tail that all places share, which begins `start_s`
-        after emission, with a standard error of such a `share` of it. In the median of octave bands; NaN where no band
-        has a reverberation time. The variance is taken to be inversely proportional to the number of rays.
-        """
+        """The number of rays that gives the reverberation time of a shared tail, which begins `start_s` after emission,
+        with a relative standard error of `share`, in the median octave band. NaN if no band has a reverberation time.
+        The variance is assumed to be inversely proportional to the number of rays."""
         hits, energies = self._settled
         audible = bands_within(self.scene.simulation.sample_rate)
         late = self.in_air(energies).late[..., :audible, self._bins_before(start_s) :]
         ends = np.cumsum([len(receivers) for _, receivers in self.pairs])
         of_emitters = np.stack([part.mean(axis=1) for part in np.split(late, ends[:-1], axis=1)], axis=1)
         times_s = decay_times_s(of_emitters, np.zeros(len(ends), np.int64), *_DECAY_DB)
-        told = np.isfinite(times_s).all(axis=0)
-        one_s, other_s = np.where(told, times_s, 1.0)
-        # On average, the square of what two takes differ by is twice the variance of one.
-        squares = np.where(told, ((one_s - other_s) / (one_s + other_s)) ** 2 * 2, np.nan)
-        known = told.any(axis=0)
+        has_time = np.isfinite(times_s).all(axis=0)
+        one_s, other_s = np.where(has_time, times_s, 1.0)
+        # On average, the squared difference of two takes is twice the variance of one.
+        squares = np.where(has_time, ((one_s - other_s) / (one_s + other_s)) ** 2 * 2, np.nan)
+        known = has_time.any(axis=0)
         if not known.any():
             return math.nan
         variance = float(np.median(np.nanmean(squares[:, known], axis=0)))
@@ -216,7 +219,8 @@ class Trial:
         return min(math.ceil(start_s / HISTOGRAM_BIN_S), round(self.duration_s / HISTOGRAM_BIN_S))
 
     def change(self, reference: Energies, other: Energies) -> Change:
-        """Of level, clarity, early and late decay; those that neither has do not change."""
+        """The greatest change of level, clarity, early and late decay. A parameter that neither of the two has does not
+        change."""
         audible = bands_within(self.scene.simulation.sample_rate)
         before, after = (parameters(each) for each in (reference, other))
         found = Change(0.0, "level")
@@ -231,7 +235,7 @@ class Trial:
         return found
 
     def _energies(self, geometry: Geometry, reflections: int) -> Energies:
-        """Through no air."""
+        """Energies without absorption by the air."""
         plan = SimulationPlan(GEOMETRIC_ORDER, 1, None, 0, True, False, True, False)
         scene = self.scene.model_copy(update={"geometry": geometry})
         paths, bins = DirectPaths.of(scene, plan), round(self.duration_s / HISTOGRAM_BIN_S)
@@ -266,7 +270,7 @@ class Trial:
         rng: np.random.Generator,
         reflections: int,
     ) -> _Floats:
-        """(receiver, band, bin), by rays that are reflected so many times, all together."""
+        """(receiver, band, bin) energies of rays with `reflections` reflections in total."""
         tracer = RoomTracer(
             geometry,
             None,
@@ -280,7 +284,7 @@ class Trial:
 
 
 def _rays(geometry: Geometry, duration_s: float, reflections: int) -> int:
-    """Of an emitter, that are reflected so many times, all together."""
+    """The number of rays of an emitter that have `reflections` reflections in total."""
     room = DiffuseRoom(geometry, None, SPEED_OF_SOUND)
     hits = duration_s * SPEED_OF_SOUND / room.mean_free_path_m * max(1, len(geometry.corners) / _FEW_WALLS)
     return int(np.clip(_FIRST_HITS / hits, _FEWEST_RAYS, _MOST_RAYS) * reflections / _FIRST_HITS)
@@ -291,7 +295,7 @@ def _bin_of(length_m: _Floats) -> npt.NDArray[np.int64]:
 
 
 def parameters(energies: Energies) -> dict[str, _Floats]:
-    """(take, pair, band) level in dB, C50 in JND, EDT and T60 in seconds, NaN where there is none."""
+    """(take, pair, band) level in dB, C50 in JND, EDT and T60 in seconds; NaN where there is none."""
     whole, bins = energies.whole, energies.late.shape[-1]
     early = np.arange(bins) <= energies.onset[:, None] + round(_EARLY_S / HISTOGRAM_BIN_S)
     early_energy = np.sum(whole * early[:, None], axis=-1) + _SILENCE
@@ -305,8 +309,9 @@ def parameters(energies: Energies) -> dict[str, _Floats]:
 
 
 def decay_times_s(energy: _Floats, onset: npt.NDArray[np.int64], from_db: float, to_db: float) -> _Floats:
-    """(take, pair, band) least squares line through the decay curve, extrapolated to 60 dB; NaN where the curve does
-    not reach so far before the last tenth of the time, or in fewer than three bins."""
+    """(take, pair, band) times of a 60 dB decay, by a least-squares line through the decay curve from `from_db` to
+    `to_db`. NaN where the curve does not reach `to_db` before the last tenth of the duration, or has fewer than three
+    bins within the range."""
     to_come = np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1]
     curve_db = power_to_db((to_come + _SILENCE**2) / (to_come[..., :1] + _SILENCE**2))
     bins = energy.shape[-1]
@@ -320,20 +325,22 @@ def decay_times_s(energy: _Floats, onset: npt.NDArray[np.int64], from_db: float,
         off = np.where(within, time_s - middle[..., None], 0.0)
         slope = (off * level).sum(axis=-1) / (off**2).sum(axis=-1)
         reaches = curve_db[..., -max(1, bins // 10)] < to_db
-        told = (count >= 3) & reaches & (slope < 0)
-        return np.where(told, -60 / slope, np.nan)
+        is_valid = (count >= 3) & reaches & (slope < 0)
+        return np.where(is_valid, -60 / slope, np.nan)
 
 
 def _root_mean_square(difference: _Floats) -> _Floats:
-    """(band,) over pairs of (take, pair, band), without what chance alone makes; pairs that cannot be told are left
-    out.
+    """(band,) root mean square over pairs of differences (take, pair, band), without the random part. Pairs without a
+    value are left out.
 
-    What all pairs have in common is told well; what they differ by counts as far as it is beyond its standard error:
-    of few pairs and rays, products of two takes are as often positive by chance."""
-    told = np.isfinite(difference).all(axis=0)
-    count = np.maximum(1, told.sum(axis=0))
-    common = np.where(told, difference, 0.0).sum(axis=1) / count
-    own = np.where(told, difference - common[:, None], 0.0).prod(axis=0)
+    The common difference of all pairs is known well. The differences between pairs count only as far as they exceed
+    their standard error, because for few pairs and rays, chance makes the product of two takes positive as often as
+    negative.
+    """
+    is_known = np.isfinite(difference).all(axis=0)
+    count = np.maximum(1, is_known.sum(axis=0))
+    common = np.where(is_known, difference, 0.0).sum(axis=1) / count
+    own = np.where(is_known, difference - common[:, None], 0.0).prod(axis=0)
     variance = own.sum(axis=0) / count
-    error = np.sqrt(np.where(told, (own - variance) ** 2, 0.0).sum(axis=0)) / count
+    error = np.sqrt(np.where(is_known, (own - variance) ** 2, 0.0).sum(axis=0)) / count
     return np.asarray(np.sqrt(np.maximum(0.0, common.prod(axis=0)) + np.maximum(0.0, variance - error)))

@@ -1,12 +1,12 @@
-"""How long a bundle's field reverberates beside the data that it was trained on: what reaches a listener in the end.
+"""Compares the reverberation times of a bundle's field with those of its training data, in whole responses as a
+listener hears them.
 
-Whole responses of held-out pairs, in octave bands that a filter cuts out: `training.trials.reverberation` fits a line
-to the energies of all pairs, orientations and ears together, as it does to those of its rays. Data have both takes of a
-pair.
+Responses of held-out pairs are filtered into octave bands. As for the energies of rays, `training.trials.reverberation`
+fits a line to the summed energies of all pairs, orientations and ears. Data include both takes of a pair.
 
-A field is a spectrogram, and knows what its window tells apart: of a decay that ends within a few windows it has only a
-few values. In frequency a window of 256 samples at 24 kHz has lines 94 Hz apart, of which the octave of 125 Hz holds
-one: it rings a little as the octave above does.
+A field predicts a spectrogram, so its window limits the resolution. A decay that ends within a few windows is described
+by a few values. In frequency, a window of 256 samples at 24 kHz has lines 94 Hz apart, of which only one lies in the
+octave of 125 Hz; that octave therefore decays a little like the octave above.
 """
 
 from collections.abc import Sequence
@@ -31,15 +31,15 @@ MOST_FROM_DATA = 0.10
 _MOST_PAIRS = 32
 _FEWEST_WINDOWS = 10
 _FILTER_ORDER = 4
-# A filter needs some room below half the sample rate.
+# A band's upper edge must stay below half the sample rate.
 _HIGHEST_SHARE = 0.49
 
 
 @dataclass(frozen=True)
 class FieldDecay:
-    """(band,) reverberation times of a bundle's default level and of its data, at the same held-out pairs; NaN for
-    octave bands above half the sample rate, and where sound does not fall by 35 dB. `window_s` is of the field's
-    spectrogram."""
+    """(band,) reverberation times of a bundle's default level and of its data, at the same held-out pairs. NaN for
+    octave bands above half the sample rate, and where sound does not decay by 35 dB. `window_s` is the window of the
+    field's spectrogram."""
 
     field_s: Sequence[float]
     data_s: Sequence[float]
@@ -47,16 +47,16 @@ class FieldDecay:
 
     @property
     def differences(self) -> _Floats:
-        """(band,) relative."""
+        """(band,) relative differences."""
         return np.asarray(np.asarray(self.field_s) / np.asarray(self.data_s) - 1)
 
     @property
     def is_judged(self) -> npt.NDArray[np.bool_]:
-        """(band,) where the data's decay lasts for ten windows or more."""
+        """(band,) whether the data's decay lasts for ten windows or more."""
         return np.asarray(self.data_s) >= _FEWEST_WINDOWS * self.window_s
 
     def beyond(self) -> list[str]:
-        """Which limit it is beyond, if any. A field that does not decay where its data do is."""
+        """The limit that the field exceeds, if any. A field that does not decay where its data do exceeds it."""
         judged = self.differences[self.is_judged]
         if (np.abs(judged) <= MOST_FROM_DATA).all():
             return []
@@ -64,7 +64,7 @@ class FieldDecay:
 
 
 def field_decay(bundle: Path, data: Path) -> FieldDecay:
-    """Raises DatasetError, EvaluationError or BundleError where either is none, or they do not belong together."""
+    """Raises DatasetError, EvaluationError or BundleError if either is missing, or if they do not belong together."""
     field = FieldsByLevel.load(Bundle.load(bundle)).default
     with open_held_out(data) as all_held_out:
         held_out = all_held_out.sample(pairs=_MOST_PAIRS, yaws=None, seed=0)
@@ -72,7 +72,7 @@ def field_decay(bundle: Path, data: Path) -> FieldDecay:
         bins = int(held_out.samples / (HISTOGRAM_BIN_S * held_out.sample_rate))
         learned, simulated = np.zeros((2, len(OCTAVE_BANDS_HZ), bins))
         for index in range(len(held_out)):
-            responses = answer(index, held_out.heard)
+            responses = answer(index, held_out.yaw_indices)
             assert responses is not None  # a field answers everywhere
             learned += band_energy(responses, held_out.sample_rate, bins)
             for take in _takes(held_out, index):
@@ -84,17 +84,17 @@ def field_decay(bundle: Path, data: Path) -> FieldDecay:
 
 
 def _takes(held_out: HeldOut, index: int) -> list[Responses]:
-    """Of a pair. Where late sound is that of few rays, two takes ring for times that differ by a tenth; both together
-    are nearer to what is expected, which is what a field learns."""
+    """The takes of a pair. Where few rays decide the late sound, the reverberation times of two takes differ by a
+    tenth. Both together are nearer to the expected decay, which is what a field learns."""
     takes = [held_out.reference(index)]
     if held_out.repeats is not None:
-        takes.append(held_out.repeats[int(held_out.held_out[index])][held_out.heard])
+        takes.append(held_out.repeats[int(held_out.held_out[index])][held_out.yaw_indices])
     return takes
 
 
 def band_energy(responses: npt.ArrayLike, sample_rate: int, bins: int) -> _Floats:
-    """(band, bin) energy of responses (..., sample), all added up, in bins of HISTOGRAM_BIN_S; none in octave bands
-    above half the sample rate."""
+    """(band, bin) summed energies of responses (..., sample), in bins of HISTOGRAM_BIN_S; zero in octave bands above
+    half the sample rate."""
     responses = np.asarray(responses, np.float64)
     edges = np.round(np.arange(bins) * HISTOGRAM_BIN_S * sample_rate).astype(int)
     last = round(bins * HISTOGRAM_BIN_S * sample_rate)

@@ -1,9 +1,9 @@
-"""Scenes of many kinds, from their files to checked bundles with default settings, and how long they reverberate beside
-what others say: `python -m training.trials.own_scenes FOLDER [SCENE.toml ...]`, `make own-scenes`.
+"""Makes bundles of scenes of many kinds, from their files with default settings, and compares reverberation times with
+other programs: `python -m training.trials.own_scenes FOLDER [SCENE.toml ...]`, `make own-scenes`.
 
-A scene that is finished is kept as `report.json` in its folder, and gone on with where an earlier run stopped. At the
-end one table is printed, and written to FOLDER.md. Exit code 1 where a scene has no bundle, or a reverberation time is
-beyond a limit.
+A finished scene is stored as `report.json` in its folder, and an interrupted run can be resumed. At the end, a table is
+printed and written to FOLDER.md. The exit code is 1 if a scene has no bundle, or if a reverberation time is beyond a
+limit.
 """
 
 import hashlib
@@ -30,8 +30,8 @@ _CHECK = "import sys; from server.cli.main import main; sys.argv[0] = 'nafir'; m
 
 @dataclass(frozen=True)
 class Report:
-    """Of one scene. `minutes` of the wall clock for each step; `problem` is what stopped it, if anything did, and then
-    there is neither a comparison of its rooms nor one of its field."""
+    """The results of one scene. `minutes` are wall-clock times by step. `problem` is what stopped it, if anything did;
+    then `comparison` and `field` are None."""
 
     scene: str
     minutes: dict[str, float]
@@ -44,14 +44,14 @@ class Report:
         return not self.faults()
 
     def faults(self) -> list[str]:
-        """What stopped it, or which limits it is beyond."""
+        """What stopped the scene, or the limits that it exceeds."""
         if self.comparison is None or self.field is None:
             return [self.problem or "not compared"]
         return self.comparison.beyond() + self.field.beyond()
 
 
 def make(scene: Path, folder: Path) -> Report:
-    """All steps of one scene, with the settings that a command has by default; those that are finished are kept."""
+    """Runs all steps of one scene with default settings; finished scenes are not run again."""
     digest = hashlib.sha256(scene.read_bytes()).hexdigest()
     kept = folder / "report.json"
     if kept.is_file():
@@ -76,7 +76,7 @@ def make(scene: Path, folder: Path) -> Report:
         )
         minutes[step] = round((time.monotonic() - began_s) / 60, 2)
         if done.returncode:
-            # Not kept: whoever mends it runs this again.
+            # Not stored, so that the next run tries again.
             return Report(scene.stem, minutes, f"{step} failed with exit code {done.returncode}")
     comparison, field = compare(SceneFile.read(scene)), field_decay(Path(bundle), Path(data))
     report = Report(scene.stem, minutes, None, comparison, field)
@@ -89,14 +89,14 @@ def _with_tuples(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def table(reports: Sequence[Report]) -> str:
-    """As Markdown."""
+    """The table as Markdown."""
     bands = " | ".join(f"{hz / 1000:g}k" if hz >= 1000 else f"{hz:g}" for hz in OCTAVE_BANDS_HZ)
     lines = [
         "Reverberation times of our simulation by octave band, and by how much they differ from the median of several "
         "simulations by pyroomacoustics, with the scattering of the scene (others), with mirrors only, and where all "
         "is scattered (rough), and from Eyring's formula; and by how much the bundle's field differs from its data. "
-        "Each in the band where it is most. Brackets: told, and not judged (see training/trials/reverberation.py, and "
-        "of the field training/trials/field_decay.py).",
+        "Each in the band where it is greatest. Brackets: shown, but not judged (see training/trials/reverberation.py, "
+        "and of the field training/trials/field_decay.py).",
         "",
         f"| scene | minutes | {bands} | others | mirrors | rough | Eyring | field | |",
         f"| --- | --- |{' --- |' * (len(OCTAVE_BANDS_HZ) + 6)}",
@@ -126,12 +126,12 @@ def _percent(shares: npt.ArrayLike, *, judged: bool) -> str:
 
 
 def _of_field(field: FieldDecay) -> str:
-    """Of the bands that are judged, and of the others where those differ more."""
+    """The worst judged band, and another band if that differs more."""
     judged, others = (field.differences[which] for which in (field.is_judged, ~field.is_judged))
-    told = [_percent(judged, judged=True)] if field.is_judged.any() else []
-    if not told or worst_of(others) > worst_of(judged):
-        told.append(_percent(others, judged=False))
-    return " ".join(told)
+    shown = [_percent(judged, judged=True)] if field.is_judged.any() else []
+    if not shown or worst_of(others) > worst_of(judged):
+        shown.append(_percent(others, judged=False))
+    return " ".join(shown)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -1,21 +1,21 @@
-"""How long a scene reverberates: by our rays, by those of pyroomacoustics, and by Eyring's formula.
+"""Compares the reverberation times of a scene: by our rays, by pyroomacoustics, and by Eyring's formula.
 
 Both simulations have the same walls, air, emitters and receivers, and the same estimator: the energies of all pairs are
-added up by octave band, integrated backwards (Schroeder), and a line is fitted from -5 to -35 dB (ISO 3382-2:2008,
+summed by octave band, integrated backwards (Schroeder), and a line is fitted from -5 to -35 dB (ISO 3382-2:2008,
 ensemble averages of decay curves, 8.2).
 
-The two mean different things by a scattering coefficient s between 0 and 1. Ours is that of ISO 17497-1: the share s of
-the energy leaves by Lambert's law, and the rest is mirrored exactly. pyroomacoustics turns every ray a little instead:
-its new direction is s times a Lambertian one plus 1 - s times the mirrored one, with the mean of s over the octaves
-(`simul_ray` in its `room.cpp`, version 0.10.1). So a part of the sound that runs level along a corridor, under an
-absorbent ceiling, stays level here and lives long; there all of it is turned upwards soon. That this is the whole
-difference was tried: our tracer with their rule gives their times within 2 % in the booth, the corridors and the
-courtyard of `training/scenes/own`, where the two rules are 7 to 23 % apart.
+The two define a scattering coefficient s between 0 and 1 differently. Ours is that of ISO 17497-1: the share s of the
+energy leaves by Lambert's law, and the rest is mirrored exactly. pyroomacoustics changes the direction of every ray a
+little: the new direction is s times a Lambertian one plus 1 - s times the mirrored one, with the mean of s over the
+octaves (`simul_ray` in its `room.cpp`, version 0.10.1). So in ours, a part of the horizontal sound in a corridor with
+an absorbent ceiling stays horizontal and decays slowly; in theirs, all of it is soon directed upwards. An experiment
+showed that this is the whole difference: our tracer with their rule gives their times within 2 % in the booth, the
+corridors and the courtyard of `training/scenes/own`, where the two rules differ by 7 to 23 %.
 
-At both ends the definitions agree: with s = 0 all is mirrored, and with s = 1 every new direction is Lambertian. Both
-ends are judged in every scene, with its own geometry and absorption. The scene's own scattering is judged where the
-field is diffuse however its walls scatter, and where s is the same in all octaves; elsewhere it is told in brackets.
-Eyring's formula is judged where the field is diffuse.
+At both ends the definitions agree: for s = 0 all is mirrored, and for s = 1 every new direction is Lambertian. Both
+ends are judged in every scene, with its own geometry and absorption. The scene's own scattering is judged if the field
+is diffuse for any scattering of the walls, and s is the same in all octaves; otherwise the result is shown in brackets.
+Eyring's formula is judged if the field is diffuse.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,32 +37,32 @@ _Floats = npt.NDArray[np.float64]
 MOST_FROM_OTHERS = 0.05
 MOST_FROM_EYRING = 0.10
 _EMITTERS, _RECEIVERS = 1, 5
-# Of the median of several runs. Where late sound is that of few rays, more of them are sent until the runs agree.
+# Times are medians of several runs. The number of rays is increased until the runs agree.
 _RUNS, _RAYS, _MOST_RAYS, _MORE = 5, 10_000, 160_000, 4
 _SURE = 0.01
 _FITTED_DB = -5.0, -35.0
 _RADIUS_M = 0.4
-# Below a third, surfaces that scatter by share and such that turn every ray are two different rooms.
+# With less scattering than a third, the two definitions describe different rooms.
 _ALIKE_SCATTERING = 1 / 3
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """By octave band: reverberation times of our rays in seconds, and relative differences."""
+    """Reverberation times of our rays by octave band in seconds, and relative differences."""
 
     ours_s: Sequence[float]
     from_others: Sequence[float]
     """From the median of pyroomacoustics, with the scene's own scattering."""
     from_mirrors: Sequence[float]
-    """The same where nothing scatters, in both."""
+    """The same without scattering in both."""
     from_rough: Sequence[float]
-    """The same where everything is scattered, in both."""
+    """The same with scattering 1 in both."""
     from_eyring: Sequence[float]
     judges_others: bool
     is_diffuse: bool
 
     def beyond(self) -> list[str]:
-        """Which limits it is beyond."""
+        """The limits that the comparison exceeds."""
         judged = (
             ("pyroomacoustics", self.from_others, MOST_FROM_OTHERS, self.judges_others),
             ("pyroomacoustics, mirrors only", self.from_mirrors, MOST_FROM_OTHERS, True),
@@ -77,7 +77,7 @@ class Comparison:
 
 
 def worst_of(shares: npt.ArrayLike) -> float:
-    """The greatest of the bands in which sound falls far enough to have a reverberation time, in both; NaN of none."""
+    """The greatest difference over the bands in which both have a reverberation time; NaN if there is none."""
     known = np.abs(shares)[np.isfinite(shares)]
     return float(np.max(known)) if len(known) else np.nan
 
@@ -103,7 +103,8 @@ def compare(scene: SceneFile) -> Comparison:
 
 
 def reverberation_time_s(energy: npt.ArrayLike) -> _Floats:
-    """(band,) of (band, bin) energy in bins of HISTOGRAM_BIN_S; NaN where it does not fall by 35 dB."""
+    """(band,) reverberation times of (band, bin) energies in bins of HISTOGRAM_BIN_S; NaN where energy does not fall by
+    35 dB."""
     remaining = np.cumsum(np.asarray(energy, np.float64)[:, ::-1], axis=-1)[:, ::-1]
     upper_db, lower_db = _FITTED_DB
     times = np.full(len(remaining), np.nan)
@@ -118,9 +119,10 @@ def reverberation_time_s(energy: npt.ArrayLike) -> _Floats:
 
 
 def is_diffuse(geometry: Geometry) -> bool:
-    """Whether Eyring's formula may be expected to hold within a tenth: one convex room, no side of which is more than
-    three times another (Kuttruff, Room Acoustics, 5.5), whose surfaces absorb alike, within a factor of four, and no
-    more than a third (paths of different lengths count there), and scatter a third of what they reflect, at least."""
+    """Whether Eyring's formula should hold within a tenth. The room must be convex, with no side more than three times
+    another (Kuttruff, Room Acoustics, 5.5). The absorption of its surfaces must differ by at most a factor of four, and
+    be at most a third (above, differences of path lengths matter). At least a third of the reflected energy must be
+    scattered."""
     plan, materials = geometry.floor_plan, geometry.materials
     sides = *np.ptp(np.asarray(geometry.corners), axis=0), geometry.height_m
     surfaces = (materials.walls, materials.floor, materials.ceiling)
@@ -163,8 +165,8 @@ def median_of_runs(times_s: Callable[[int, int], _Floats]) -> _Floats:
     rays = _RAYS
     while True:
         times = np.array([times_s(run, rays) for run in range(_RUNS)])
-        told = np.isfinite(times).all(axis=0)
-        errors = times[:, told].std(axis=0, ddof=1) / times[:, told].mean(axis=0) / np.sqrt(_RUNS)
+        is_known = np.isfinite(times).all(axis=0)
+        errors = times[:, is_known].std(axis=0, ddof=1) / times[:, is_known].mean(axis=0) / np.sqrt(_RUNS)
         if (errors <= _SURE).all() or rays >= _MOST_RAYS:
             return np.asarray(np.median(times, axis=0))
         rays *= _MORE

@@ -1,10 +1,11 @@
-"""Whether plans are right: what leaving an effect out was predicted to change, beside what it does change of responses,
-in rooms of extreme absorption, volume and shape. `make predictions` prints the table.
+"""Tests predictions of plans: for rooms of extreme absorption, volume and shape, it compares the predicted change
+without an effect with the change in simulated responses. `make predictions` prints the table.
 
-A prediction comes from energies of few rays. The responses it is compared with are whole and binaural, of many rays and
-of noise, and are read as measured ones are, in octave bands that a filter of their own cuts out. Both simulations of a
-pair draw the same noise. What they differ by in a parameter is averaged over pairs with its sign, where chance cancels:
-of a parameter that is as often higher as lower, the root mean square less that of two draws of the same.
+A prediction comes from the energies of a few rays. The responses it is compared with are whole and binaural, from many
+rays and noise. Their parameters are measured like those of real responses, in octave bands of a separate filter. Both
+simulations of a pair use the same noise. Differences of a parameter are averaged over pairs with their sign, so that
+chance cancels out. For a parameter that is as often higher as lower, the root mean square counts, minus that of two
+random draws of the same simulation.
 """
 
 import sys
@@ -43,13 +44,13 @@ _TRIED = (
     SimulatedEffect.TRANSMISSION,
 )
 AUDIBLE_JND = 1.0
-# Standard errors; of two dozen parameters and bands the one that differs most is looked at.
+# In standard errors. It is large because the greatest of two dozen differences counts.
 _ERRORS = 2.5
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One effect in one room, in JND: as predicted, and as simulated beyond what chance makes."""
+    """One effect in one room, in JND: the predicted change, and the simulated change without what chance explains."""
 
     room: str
     effect: SimulatedEffect
@@ -60,7 +61,7 @@ class Compared:
 
     @property
     def is_wrong(self) -> bool:
-        """Off, and heard where it is left out."""
+        """Whether the effect is off although leaving it out is audible."""
         return not self.is_on and self.simulated >= AUDIBLE_JND
 
 
@@ -82,7 +83,7 @@ def _room(
     openings: tuple[Opening, ...] = (),
     places: tuple[tuple[float, float], tuple[float, float]] | None = None,
 ) -> SceneFile:
-    """`walls`, `floor` and `ceiling` are (absorption, scattering) of all bands alike."""
+    """`walls`, `floor` and `ceiling` are (absorption, scattering), the same for all bands."""
 
     def material(shares: tuple[float, float], mass: float | None = None) -> Material:
         absorption, scattering = ((share,) * _BANDS for share in shares)
@@ -159,10 +160,11 @@ def rooms() -> tuple[SceneFile, ...]:
 
 
 def compare(scene: SceneFile, *, emitters: int, rays: int, seed: int = 0) -> Iterator[Compared]:
-    """Each effect that the scene could have, left out of everything."""
+    """Compares, for each effect that the scene could have, the simulation without it with the one that has every
+    effect."""
     scene = scene.model_copy(update={"simulation": scene.simulation.model_copy(update={"rays": rays})})
     planner = planner_of(scene, seed)
-    told = {each.name: each for each in planner.plan({}).decisions}
+    decided = {each.name: each for each in planner.plan({}).decisions}
     everything, tail = planner.everything, planner.plan({SimulatedEffect.PER_SOURCE_TAIL: False})
     responses = partial(_responses, scene, emitters)
     whole, again = responses(everything, seed), responses(everything, seed + 1)
@@ -171,11 +173,11 @@ def compare(scene: SceneFile, *, emitters: int, rays: int, seed: int = 0) -> Ite
         if without is None:
             continue
         jnd, parameter = _difference(whole, responses(without, seed), again, scene.simulation.sample_rate)
-        yield Compared(scene.id, effect, told[effect].called_for, told[effect].change_jnd, jnd, parameter)
+        yield Compared(scene.id, effect, decided[effect].called_for, decided[effect].change_jnd, jnd, parameter)
 
 
 def _without(plan: SimulationPlan, tail: SimulationPlan, effect: SimulatedEffect) -> SimulationPlan | None:
-    """None where there is nothing to leave out."""
+    """The plan without the effect; None if the scene does not have the effect."""
     match effect:
         case SimulatedEffect.LATE_REVERBERATION:
             return replace(plan, rays=0)
@@ -195,7 +197,7 @@ def _without(plan: SimulationPlan, tail: SimulationPlan, effect: SimulatedEffect
 
 
 def _responses(scene: SceneFile, emitters: int, plan: SimulationPlan, seed: int) -> _Floats:
-    """(pair, ear, sample) between the probes of seed 0, whatever is drawn."""
+    """(pair, ear, sample) responses between the probes of seed 0, for any seed of the simulation."""
     probes, yaws = scene.probe_positions(0), np.zeros(1)
     simulation = PairSimulation.prepare(scene, probes, yaws, seed=seed, plan=plan)
     geometric = GeometricResponses(scene, plan, probes, yaws)
@@ -208,9 +210,9 @@ def _responses(scene: SceneFile, emitters: int, plan: SimulationPlan, seed: int)
 
 
 def _difference(whole: _Floats, other: _Floats, again: _Floats, sample_rate: int) -> tuple[float, str]:
-    """In JND of the parameter and the octave band in which it is greatest."""
+    """The greatest difference in JND over parameters and octave bands, and its parameter."""
     largest, which = 0.0, "level"
-    for centre_hz in OCTAVE_BANDS_HZ[1:]:  # in the lowest a room has too few modes for one draw to tell
+    for centre_hz in OCTAVE_BANDS_HZ[1:]:  # in the lowest band, a room has too few modes
         edges_hz = np.clip([centre_hz / np.sqrt(2), centre_hz * np.sqrt(2)], 1, 0.49 * sample_rate)
         octave = butter(3, edges_hz, "bandpass", fs=sample_rate, output="sos")
         reference, left, drawn = (
@@ -218,13 +220,13 @@ def _difference(whole: _Floats, other: _Floats, again: _Floats, sample_rate: int
         )
         for name, values in reference.items():
             changed, chance = left[name] - values, drawn[name] - values
-            told = np.isfinite(changed) & np.isfinite(chance)
-            if told.sum() < 6:
+            is_known = np.isfinite(changed) & np.isfinite(chance)
+            if is_known.sum() < 6:
                 continue
-            # Two ears of a pair hear nearly the same.
-            share = _ERRORS / np.sqrt(told.sum() / 2)
-            bias = abs(float(changed[told].mean())) - share * float(changed[told].std())
-            squares, by_chance = changed[told] ** 2, chance[told] ** 2
+            # The two ears of a pair are not independent.
+            share = _ERRORS / np.sqrt(is_known.sum() / 2)
+            bias = abs(float(changed[is_known].mean())) - share * float(changed[is_known].std())
+            squares, by_chance = changed[is_known] ** 2, chance[is_known] ** 2
             beyond = squares.mean() - by_chance.mean() - share * np.hypot(squares.std(), by_chance.std())
             jnd = max(bias, float(np.sqrt(max(0.0, beyond))))
             if jnd > largest:
@@ -233,7 +235,7 @@ def _difference(whole: _Floats, other: _Floats, again: _Floats, sample_rate: int
 
 
 def _in_jnd(measured: RoomParameters) -> dict[str, _Floats]:
-    """(pair, ear) of each parameter on a scale whose unit is one JND."""
+    """(pair, ear) values of each parameter on a scale whose unit is one JND."""
 
     def percent(seconds: _Floats, name: str) -> _Floats:
         return 100 * np.log(seconds) / JND_THRESHOLDS[name].amount
@@ -260,7 +262,7 @@ def table(rows: list[Compared]) -> Table:
 
 
 def main() -> int:
-    """1 where an effect is off that is heard."""
+    """The exit code: 1 if an audible effect is off."""
     rows: list[Compared] = []
     began_s, progress = process_time(), Console(stderr=True)
     for scene in rooms():

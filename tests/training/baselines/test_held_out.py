@@ -70,7 +70,7 @@ def test_the_nearest_answer_is_one_that_was_trained_on(held_out, dataset, refere
     known = [references[emitter * len(dataset.probes) + listener] for emitter, listener in pairs]
     (nearest,) = method_columns(["nearest"], held_out)
     for index in range(len(held_out)):
-        answer = np.asarray(nearest.source(index, held_out.heard))
+        answer = np.asarray(nearest.source(index, held_out.yaw_indices))
         assert any(np.array_equal(answer, response) for response in known)
 
 

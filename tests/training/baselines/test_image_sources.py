@@ -73,12 +73,12 @@ def test_a_shoebox_sounds_like_its_simulation(dataset):
     with open_held_out(dataset.folder) as held_out:
         (column,) = method_columns(["image-sources"], held_out)
         pairs = range(len(held_out))
-        ours = np.stack([column.source(index, held_out.heard) for index in pairs])
+        ours = np.stack([column.source(index, held_out.yaw_indices) for index in pairs])
         theirs = np.stack([held_out.reference(index) for index in pairs])
         estimated, reference = (measure(responses, held_out.sample_rate) for responses in (ours, theirs))
         assert np.abs(estimated.level_db - reference.level_db).mean() < 1.5
         ratio = np.nanmean(estimated.reverberation_time_s) / np.nanmean(reference.reverberation_time_s)
         assert ratio == pytest.approx(1, abs=0.15)
         np.testing.assert_allclose(estimated.onset_s, reference.onset_s, atol=2e-4)
-        one = column.source(0, held_out.heard[[2]])
+        one = column.source(0, held_out.yaw_indices[[2]])
         np.testing.assert_allclose(one[0], ours[0, 2], atol=1e-6)

@@ -7,10 +7,10 @@ import pytest
 from server.acoustics.decibels import power_to_db
 from tests.training.measured_room import RATE, SAMPLES, Room
 from training.baselines.baselines import TrainingPairs, nearest
-from training.baselines.shaped import ShapedNearest, bands, moved, stretches
+from training.baselines.shaped import ShapedNearest, bands, delay_responses, stretches
 from training.bundling.export import export
 from training.data.dataset import SPEED_OF_SOUND
-from training.data.importers.conditioning import Conditioning, conditioned
+from training.data.importers.conditioning import Conditioning, condition
 from training.data.importers.meshrir import read
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset
@@ -46,11 +46,11 @@ def test_a_moved_sound_arrives_that_much_later(later):
     pulse = np.exp(-(((time - 0.018) / 4e-4) ** 2)) * np.cos(2 * np.pi * 3000 * (time - 0.018))
     shifted_time = time - later / RATE
     expected = np.exp(-(((shifted_time - 0.018) / 4e-4) ** 2)) * np.cos(2 * np.pi * 3000 * (shifted_time - 0.018))
-    np.testing.assert_allclose(moved(pulse[None], np.array([later]))[0], expected, atol=1e-3)
+    np.testing.assert_allclose(delay_responses(pulse[None], np.array([later]))[0], expected, atol=1e-3)
 
 
 def test_an_offset_does_not_ring_when_moved():
-    np.testing.assert_allclose(moved(np.full((1, 300), 0.1), np.array([40.4])), 0.1, atol=1e-4)
+    np.testing.assert_allclose(delay_responses(np.full((1, 300), 0.1), np.array([40.4])), 0.1, atol=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_it_is_the_best_answer_on_the_measured_office(tmp_path, held_out_share):
     if not office:
         pytest.skip("MEASURED_OFFICE names no folder")
     report = ImportReport()
-    rows = conditioned(read(Path(office), report), Conditioning(), report)
+    rows = condition(read(Path(office), report), Conditioning(), report)
     ImportedDataset.write(tmp_path, rows, report, layout="meshrir", source=office, held_out_share=held_out_share)
     others = ("nearest", "linear", "linear-aligned")
     bundle = export(ImportedDataset.open(tmp_path), [tmp_path], tmp_path / "bundle")

@@ -6,7 +6,7 @@ import pytest
 from server.health import laws
 from server.health.energies import Windows
 from tests.conftest import MANIFEST
-from training.bundling.data_reference import DataHealth, health_of, reference_of, shifted, window_energies
+from training.bundling.data_reference import DataHealth, advance, health_of, reference_of, window_energies
 from training.data.responses import SimulatedResponses
 from training.models.targets import LEAD_SAMPLES, codec_of
 
@@ -78,7 +78,7 @@ def test_shifting_moves_and_fills_with_silence(samples):
     for index in range(8):
         if 0 <= index + samples < 8:
             expected[index] = given[index + samples]
-    np.testing.assert_array_equal(shifted(given, samples), expected)
+    np.testing.assert_array_equal(advance(given, samples), expected)
 
 
 def test_data_that_decay_leave_nothing_to_say():
@@ -92,7 +92,7 @@ def test_data_that_rise_are_told_with_how_much_and_when():
 
 
 def test_late_sound_that_hangs_on_few_rays_is_told_with_what_to_do():
-    health = DataHealth(0.5, 1.0, 0.0, unsure_from_s=0.3)
+    health = DataHealth(0.5, 1.0, 0.0, uncertain_from_s=0.3)
     (line,) = health.lines(rays=8000)
     assert "from 0.30 s on" in line
     assert "simulation.rays = 32000" in line
@@ -110,7 +110,7 @@ def test_two_takes_that_differ_are_found(dataset):
         return found
 
     responses.dataset = _Reading(dataset, read)
-    found = health_of(responses).unsure_from_s
+    found = health_of(responses).uncertain_from_s
     assert found is not None
     assert 0.05 < found < 0.16
 

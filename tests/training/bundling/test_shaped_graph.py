@@ -6,7 +6,7 @@ import torch
 
 from tests.training.measured_room import RATE, SAMPLES, Room
 from training.baselines.baselines import TrainingPairs
-from training.baselines.shaped import ShapedNearest, moved
+from training.baselines.shaped import ShapedNearest, delay_responses
 from training.bundling.shaped_graph import ShapedNearestGraph
 
 LEAD = 40
@@ -58,7 +58,7 @@ def test_it_answers_as_the_method_does_at_the_nearest_orientation(room, shaped, 
         found = answer(graph, room.listeners[room.listener[pair]], room.emitters[room.emitter[pair]], yaw)
         assert found.shape == (1, 1, SAMPLES)
         delay = room.delays_s[pair] * RATE
-        expected = moved(shaped.response(pair)[turn], np.full(1, LEAD - delay))
+        expected = delay_responses(shaped.response(pair)[turn], np.full(1, LEAD - delay))
         heard = slice(LEAD - 8, SAMPLES - round(delay) - 64)
         # Kept in half precision, and moved twice: what that loses at the highest frequencies leaks into all others.
         assert band_energy((found[0] - expected)[0, heard]) < 1e-3 * band_energy(expected[0, heard])

@@ -24,7 +24,7 @@ class Oracle(torch.nn.Module):
         super().__init__()
         self._codec = cells.codec
 
-    def of_frames(self, listener, emitter, yaw):
+    def forward_all_frames(self, listener, emitter, yaw):
         responses, found = self.responses, []
         for pose in zip(listener.numpy(), emitter.numpy(), yaw.numpy(), strict=True):
             asked = np.concatenate([pose[0], pose[1], [pose[2]]])
@@ -49,7 +49,7 @@ def test_errors_are_in_the_units_they_say(dataset, configuration, monkeypatch, l
     assert decay == pytest.approx(0, abs=0.05)
 
 
-def test_each_lever_moves_alone(dataset):
+def test_each_factor_varies_alone(dataset):
     base = configure("factorised")
     moved = variants(base, SimulatedResponses(dataset), None)
     assert moved.pop("as it is") == base
@@ -57,9 +57,9 @@ def test_each_lever_moves_alone(dataset):
     for name, configuration in moved.items():
         assert dataclasses.replace(configuration, recipe=base.recipe) == base
         recipe = dataclasses.asdict(configuration.recipe)
-        assert sum(recipe[lever] != usual[lever] for lever in usual) == 1, name
+        assert sum(recipe[factor] != usual[factor] for factor in usual) == 1, name
     assert "swapped ends" not in moved
-    with pytest.raises(AblationError, match="levers"):
+    with pytest.raises(AblationError, match="factors"):
         variants(configure("naf"), SimulatedResponses(dataset), None)
 
 
@@ -76,7 +76,7 @@ def test_an_ablation_is_measured_on_what_is_held_out_and_goes_on_where_it_was(da
     assert again == rows
     after = [(tmp_path / name / "checkpoint.pt").read_bytes() for name in ("as-it-is", "no-level-correction")]
     assert after == checkpoints
-    assert [line[0] for line in table(rows)] == ["lever", "as it is", "no level correction"]
+    assert [line[0] for line in table(rows)] == ["factor", "as it is", "no level correction"]
     # Means of logarithms are too low: without correction the spectrum is nearer, the level farther.
     assert rows[1].level_db > rows[0].level_db
 

@@ -83,7 +83,7 @@ def test_what_was_drawn_is_kept_and_what_was_cut_off_goes_on(folder, held_out, m
     few = held_out.sample(pairs=1, yaws=1, seed=0)
     (of_one,) = median_parameters(few, DRAWS)
     index = held_out.held_out.tolist().index(few.held_out[0])
-    np.testing.assert_array_equal(of_one.clarity_db, medians[index].clarity_db[few.heard])
+    np.testing.assert_array_equal(of_one.clarity_db, medians[index].clarity_db[few.yaw_indices])
 
 
 def test_what_fewer_than_half_of_the_draws_have_is_missing(held_out, monkeypatch):

@@ -155,7 +155,7 @@ def test_a_sample_is_a_subset_and_the_same_for_the_same_seed(held_out) -> None:
     np.testing.assert_array_equal(first.held_out, again.held_out)
     assert set(first.held_out) < set(held_out.held_out)
     assert len(first) == 3
-    assert list(first.heard) == [0, 1]
+    assert list(first.yaw_indices) == [0, 1]
     for index, pair in enumerate(first.held_out):
         assert first.visible[index] == VISIBLE[HELD_OUT.index(pair)]
         np.testing.assert_array_equal(first.reference(index), reference(pair)[[0, 1]].astype(np.float32))

@@ -55,7 +55,7 @@ def draw(held_out, columns):
             references=held_out.reference,
             reference_name="measured response",
             columns={each.name: each.source for each in columns if each.name in {LEVEL, "nearest"}},
-            turn=np.array([0]),
+            yaw_index=np.array([0]),
             examples=[(0, "in sight, 1.5 m"), (1, "in sight, 3.5 m"), (2, "round the corner, 12.5 m")],
             sample_rate=RATE,
         )
@@ -159,7 +159,7 @@ def test_it_is_written_as_a_picture(held_out, columns, tmp_path):
         references=held_out.reference,
         reference_name="measured response",
         columns={LEVEL: columns[0].source},
-        turn=np.array([0]),
+        yaw_index=np.array([0]),
         examples=[(0, "in sight")],
         sample_rate=RATE,
     )

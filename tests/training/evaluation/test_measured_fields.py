@@ -9,7 +9,7 @@ from server.acoustics.phase import FrozenNoise
 from training.baselines.held_out import EvaluationError
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset, Measurement
-from training.evaluation.measured_fields import decoded, moved_later
+from training.evaluation.measured_fields import decoded, undo_alignment
 from training.evaluation.run import evaluate_bundles
 from training.learning.train import train
 from training.models.frozen_noise import even_noise
@@ -71,7 +71,7 @@ def test_moving_later_undoes_aligning(delay):
     """A pulse away from both ends, of a band that fractional delays can move."""
     at = np.arange(SAMPLES) - 1900.0
     pulse = (np.exp(-0.5 * (at / 12) ** 2) * np.cos(0.3 * at))[None, None]
-    np.testing.assert_allclose(moved_later(align(pulse, delay).astype(np.float32), delay), pulse, atol=1e-5)
+    np.testing.assert_allclose(undo_alignment(align(pulse, delay).astype(np.float32), delay), pulse, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

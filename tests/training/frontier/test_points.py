@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from server.scene.manifest import Accuracy, Cost, QualityLevel
-from training.frontier.points import OFFERED_APART, Point, default_point, offered_points, pareto
+from training.frontier.points import LEAST_COST_RATIO, Point, default_point, offered_points, pareto
 
 PAIRS = 50
 
@@ -96,9 +96,9 @@ def test_a_few_are_offered_from_the_default_on_down_and_up_each_much_cheaper_or_
     assert first is best[default]
     costs = sorted(each.cost.ms_mean for each in offered)
     assert len(set(costs)) == len(offered)
-    assert np.min(np.diff(np.log(costs))) >= np.log(OFFERED_APART) - 1e-9
+    assert np.min(np.diff(np.log(costs))) >= np.log(LEAST_COST_RATIO) - 1e-9
     # No room is left for another.
-    assert np.max(np.diff(np.log(costs))) < 2 * np.log(OFFERED_APART)
-    assert costs[0] < OFFERED_APART * times[0]
-    assert costs[-1] > times[-1] / OFFERED_APART
+    assert np.max(np.diff(np.log(costs))) < 2 * np.log(LEAST_COST_RATIO)
+    assert costs[0] < LEAST_COST_RATIO * times[0]
+    assert costs[-1] > times[-1] / LEAST_COST_RATIO
     assert others or len(best) == 1

@@ -7,8 +7,8 @@ from rich.progress import Progress
 
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset, Measurement, SimulatedResponses
+from training.learning.distillation import distillation_targets
 from training.learning.factorised import FactorisedLearner
-from training.learning.lessons import lessons_of
 from training.learning.pairs import split
 from training.learning.runs import Configuration, FactorisedRecipe, NafRecipe, RecipeError, configure
 from training.learning.train import load_learner, train
@@ -59,7 +59,7 @@ def test_what_a_microphone_heard_is_learned(measured, mono_run):
         torch.from_numpy(part[rows].astype(np.float32)) for part in (measured.listener, measured.emitter, measured.yaw)
     )
     with torch.no_grad():
-        log_magnitude, frequency, certainty = (output.numpy() for output in field.of_frames(*poses))
+        log_magnitude, frequency, certainty = (output.numpy() for output in field.forward_all_frames(*poses))
     codec = learner.cells.codec
     assert log_magnitude.shape == (len(rows), 1, codec.bins, codec.frames)
     # Two frames whose windows have the click near their middle.
@@ -110,24 +110,24 @@ def teacher(dataset, tmp_path_factory):
     return folder
 
 
-def test_lessons_are_what_the_teacher_says_inside_the_room(dataset, configuration, teacher):
+def test_distillation_targets_are_what_the_teacher_predicts_inside_the_room(dataset, configuration, teacher):
     responses = SimulatedResponses(dataset)
     naf = load_learner(responses, teacher)
     learner = FactorisedLearner(responses, configuration)
-    lessons = lessons_of(naf, learner.cells, 12, seed=0)
-    assert all(dataset.plan.contains(point) for point in (*lessons.listener, *lessons.emitter))
+    targets = distillation_targets(naf, learner.cells, 12, seed=0)
+    assert all(dataset.plan.contains(point) for point in (*targets.listener, *targets.emitter))
     seen = {tuple(np.round(end, 3)) for end in responses.listener.astype(np.float32)}
-    assert not all(tuple(np.round(end, 3)) in seen for end in lessons.listener)
-    # An untrained network says the mean of the training set everywhere, more or less: so do its lessons.
+    assert not all(tuple(np.round(end, 3)) in seen for end in targets.listener)
+    # An untrained network says the mean of the training set everywhere, more or less: so do its targets.
     learner.prepare(SILENT)
     part = learner.field.heads.slices["late"]
     drawn = learner.targets.flat[:, part].astype(float).mean()
-    assert abs(lessons.flat[:, part].astype(float).mean() - drawn) < 0.7
+    assert abs(targets.flat[:, part].astype(float).mean() - drawn) < 0.7
 
 
-def test_lessons_teach_levels_only(dataset, configuration, teacher):
+def test_distillation_targets_count_for_levels_only(dataset, configuration, teacher):
     responses = SimulatedResponses(dataset)
-    recipe = FactorisedRecipe(teacher=str(teacher), lessons=6)
+    recipe = FactorisedRecipe(teacher=str(teacher), distilled_poses=6)
     learner = FactorisedLearner(responses, dataclasses.replace(configuration, recipe=recipe))
     learner.prepare(SILENT)
     rows, _ = split(responses, share=1.0, seed=0)

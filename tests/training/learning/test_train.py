@@ -33,7 +33,7 @@ from training.learning.runs import (
 )
 from training.learning.train import DivergedError, load_learner, train
 from training.models.cells import Cells
-from training.models.level_correction import LevelsInterpolated, PowerBalance
+from training.models.level_correction import InterpolatedLevels, PowerBalance
 from training.models.naf import NafShape
 from training.models.stored_targets import load_targets
 from training.models.targets import codec_of
@@ -121,7 +121,7 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configura
         predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
         correction = field.level_correction[field.encoder.sight(features)[:, 0].long()]
     levels, part = field.heads.levels, field.heads.slices["late"]
-    heard = LevelsInterpolated(learner.cells, responses.channels)
+    heard = InterpolatedLevels(learner.cells, responses.channels)
     raw, corrected, true = (
         level[:, part].double().mul(2).exp().sum()
         for level in (heard(predicted[:, levels]), heard((predicted + correction)[:, levels]), flat)
@@ -132,12 +132,12 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configura
     of_cells = PowerBalance(field.heads.areas)
     sight = field.encoder.sight(features)
     of_cells.add(flat[:, levels], predicted[:, levels], sight)
-    uncorrected = predicted[:, levels] + of_cells.missing()[sight[:, 0].long()]
+    uncorrected = predicted[:, levels] + of_cells.deficit()[sight[:, 0].long()]
     errors = []
     for corrected in (uncorrected, (predicted + correction)[:, levels]):
         balance = PowerBalance(field.heads.areas)
         balance.add(flat[:, levels], heard(corrected), sight)
-        errors.append(float(balance.missing()[:, part].square().mean()))
+        errors.append(float(balance.deficit()[:, part].square().mean()))
     assert errors[1] < 0.5 * errors[0]
     for name in ("phasor", "interaural"):
         assert not field.level_correction[:, field.heads.slices[name]].any()
@@ -192,7 +192,9 @@ def test_what_is_no_run_says_so(tmp_path, content):
 
 def test_configuration_survives_its_file(run, configuration):
     assert Configuration.read(run) == configuration
-    assert json.loads((run / "run.json").read_text())["shape"]["rank"] == configuration.shape.rank
+    stored = json.loads((run / "run.json").read_text())
+    assert stored["shape"]["rank"] == configuration.shape.rank
+    assert stored["recipe"]["lessons"] == configuration.recipe.distilled_poses  # the name that earlier runs have
 
 
 def test_targets_are_of_the_codec_of_the_data(dataset):

@@ -6,7 +6,7 @@ import torch
 
 from server.acoustics.codec import Codec
 from training.models.cells import Cells
-from training.models.level_correction import LevelsInterpolated, PowerBalance, level_correction
+from training.models.level_correction import InterpolatedLevels, PowerBalance, level_correction
 
 IN_SIGHT, OUT_OF_SIGHT = torch.ones(4, 1), torch.zeros(4, 1)
 LOUD = torch.tensor([[0.0, -1.0], [0.5, -0.5], [-0.3, -0.7], [0.1, -1.2]])
@@ -15,7 +15,7 @@ LOUD = torch.tensor([[0.0, -1.0], [0.5, -0.5], [-0.3, -0.7], [0.1, -1.2]])
 def test_what_all_predictions_lack_is_missing():
     balance = PowerBalance(torch.ones(2))
     balance.add(LOUD, LOUD - torch.tensor([0.3, 0.1]), IN_SIGHT)
-    torch.testing.assert_close(balance.missing()[1], torch.tensor([0.3, 0.1]))
+    torch.testing.assert_close(balance.deficit()[1], torch.tensor([0.3, 0.1]))
 
 
 def test_a_logarithm_of_noise_lacks_half_of_eulers_constant():
@@ -27,14 +27,14 @@ def test_a_logarithm_of_noise_lacks_half_of_eulers_constant():
     predicted = levels.mean(dim=0).expand_as(levels)
     balance = PowerBalance(torch.ones(2))
     balance.add(levels, predicted, torch.ones(len(levels), 1))
-    assert float(balance.missing()[1, 0]) == pytest.approx(0.5772 / 2, abs=0.01)
+    assert float(balance.deficit()[1, 0]) == pytest.approx(0.5772 / 2, abs=0.01)
 
 
 def test_pairs_in_sight_are_not_corrected_for_those_round_a_corner():
     balance = PowerBalance(torch.ones(2))
     balance.add(LOUD, LOUD, IN_SIGHT)
     balance.add(LOUD, LOUD - 2.0, OUT_OF_SIGHT)
-    torch.testing.assert_close(balance.missing(), torch.tensor([[2.0, 2.0], [0.0, 0.0]]))
+    torch.testing.assert_close(balance.deficit(), torch.tensor([[2.0, 2.0], [0.0, 0.0]]))
 
 
 def test_what_is_all_but_silent_does_not_count_for_being_far_off():
@@ -42,7 +42,7 @@ def test_what_is_all_but_silent_does_not_count_for_being_far_off():
     true[0, 0], predicted[0, 0] = -10.0, -15.0
     balance = PowerBalance(torch.ones(2))
     balance.add(true, predicted, IN_SIGHT)
-    assert balance.missing().abs().max() < 0.01
+    assert balance.deficit().abs().max() < 0.01
 
 
 def test_far_pairs_count_as_much_as_near_ones():
@@ -51,13 +51,13 @@ def test_far_pairs_count_as_much_as_near_ones():
     balance = PowerBalance(torch.ones(2))
     balance.add(level, level - lacks, torch.ones(2, 1))
     expected = -0.5 * math.log((1 + math.exp(-0.8)) / 2)
-    torch.testing.assert_close(balance.missing()[1], torch.full((2,), expected))
+    torch.testing.assert_close(balance.deficit()[1], torch.full((2,), expected))
 
 
 def test_where_no_pair_is_out_of_sight_both_kinds_are_corrected_alike():
     balance = PowerBalance(torch.ones(2))
     balance.add(LOUD, LOUD - 0.2, IN_SIGHT)
-    torch.testing.assert_close(balance.missing(), torch.full((2, 2), 0.2))
+    torch.testing.assert_close(balance.deficit(), torch.full((2, 2), 0.2))
 
 
 CELLS = Cells(Codec(sample_rate=24_000, n_fft=256, hop=64, samples=19_200, log_floor=1e-5))
@@ -86,24 +86,24 @@ def reverberation_time_s(levels: torch.Tensor) -> float:
 
 def test_sound_that_does_not_decay_is_heard_as_it_is_predicted():
     levels = torch.full_like(levels_of_decay(1.0), -1.5)
-    torch.testing.assert_close(LevelsInterpolated(CELLS, 1)(levels), levels)
+    torch.testing.assert_close(InterpolatedLevels(CELLS, 1)(levels), levels)
 
 
 def test_more_is_heard_of_a_cell_than_its_level_says_where_sound_decays():
     """By the factor sinh(2x) / 2x of power, x nepers being what amplitude loses in half a cell; here of eight frames,
     between others of eight, whose sum is not quite that integral."""
     levels = levels_of_decay(0.4)
-    excess = (LevelsInterpolated(CELLS, 1)(levels) - levels)[0, CELLS.codec.bins * CELLS.fine_frames :]
+    excess = (InterpolatedLevels(CELLS, 1)(levels) - levels)[0, CELLS.codec.bins * CELLS.fine_frames :]
     x = 8 / 2 * 64 / 24_000 * 3 * math.log(10) / 0.4
     assert float(excess[25]) == pytest.approx(0.5 * math.log(math.sinh(2 * x) / (2 * x)), rel=0.03)
     single = levels[:, : CELLS.codec.bins * CELLS.fine_frames]
-    torch.testing.assert_close(LevelsInterpolated(CELLS, 1)(levels)[:, : single.shape[1]], single)
+    torch.testing.assert_close(InterpolatedLevels(CELLS, 1)(levels)[:, : single.shape[1]], single)
 
 
 @pytest.mark.parametrize("t60_s", [0.3, 0.4, 0.5])
 def test_sound_decays_as_fast_as_it_should_once_corrected(t60_s):
     levels = levels_of_decay(t60_s)
-    heard = LevelsInterpolated(CELLS, 1)
+    heard = InterpolatedLevels(CELLS, 1)
     correction = level_correction(lambda: [(levels, levels, torch.ones(1, 1))], heard, torch.ones(levels.shape[1]))
     before, after = (reverberation_time_s(each) / t60_s - 1 for each in (levels, levels + correction[1]))
     assert before > 0.001

@@ -112,7 +112,7 @@ def test_two_processes_do_not_write_the_same_targets(dataset, tmp_path):
 
 def test_measured_responses_have_no_expectation(tmp_path):
     measured = imported(tmp_path / "data", 0.1)
-    with pytest.raises(DatasetError, match="simulated ones only"):
+    with pytest.raises(DatasetError, match="simulated responses only"):
         load_targets(measured, Cells(codec_of(measured), known_frames=12), tmp_path, SILENT, expected=True)
 
 

@@ -1,4 +1,4 @@
-"""Responses in audio files."""
+"""Reads responses from audio files."""
 
 from pathlib import Path
 
@@ -10,12 +10,16 @@ from training.data.importers.report import ImportReport
 
 
 class UnreadableError(Exception):
-    """A file that stands for a missing response; says what is wrong in a word or two."""
+    """A file whose response cannot be read. The message says what is wrong in a few words."""
 
 
 def read_response(path: Path, channels: int, report: ImportReport) -> tuple[npt.NDArray[np.float32], int]:
-    """(channel, sample) and the rate. Raises UnreadableError, also for a file whose end is missing: the rest of its
-    decay would be learned as silence. Of a header that tells of less than the file holds, the report has a note."""
+    """Returns (channel, sample) and the sample rate.
+
+    Raises UnreadableError, also for a file whose end is missing, because training would learn the missing part of the
+    decay as silence. If the header announces less sound than the file holds, all of it is read and the report gets a
+    note.
+    """
     if not path.is_file():
         raise UnreadableError("no such file")
     if path.stat().st_size == 0:
@@ -29,5 +33,5 @@ def read_response(path: Path, channels: int, report: ImportReport) -> tuple[npt.
     if recording.samples.shape[1] != channels:
         raise UnreadableError(f"not {channels} channel{'s' if channels > 1 else ''}")
     if recording.finding:
-        report.note("some headers do not tell how much sound follows; all that does was read")
+        report.note("some headers do not say how much sound follows; everything that follows was read")
     return recording.samples.T, recording.sample_rate

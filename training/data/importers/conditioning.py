@@ -1,4 +1,4 @@
-"""What is done to every response on its way in, whatever its layout, and what is found out about it.
+"""Conditions imported responses, in the same way for every layout, and checks them.
 
 Responses are `(channel, sample)`.
 """
@@ -13,18 +13,18 @@ import soxr
 
 from server.core.errors import NafirError
 from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
-from training.data.importers.evidence import ContradictionError, Evidence, ears_exchanged
+from training.data.importers.evidence import ContradictionError, Evidence, swap_ears
 from training.data.importers.report import ImportReport
 from training.data.responses import Measurement
 
 NEAREST_M = 0.01
-"""Closer, and an emitter is where the listener is: no field is asked for that."""
+"""A response is skipped if its emitter is closer to the listener than this: no field is asked for such a pair."""
 
 _Place = tuple[float, float, float]
 
 
 class SourceError(NafirError):
-    """A source that an importer cannot read at all; names the file and the field at fault."""
+    """A source that an importer cannot read at all. The message names the file and the field at fault."""
 
     def __init__(self, path: object, field: str, problem: str) -> None:
         super().__init__(f"{path}: {field}: {problem}")
@@ -32,10 +32,14 @@ class SourceError(NafirError):
 
 @dataclass(frozen=True)
 class Conditioning:
-    """latency_samples: delay of the measuring equipment at the source's rate, taken off the start (zeros are put
-    before the start where it is negative). sample_rate: to resample to; None keeps the source's. duration_s: where
-    to end. position_scale: metres in the source's unit of length. mirror: the axis whose coordinates change sign.
-    swap_ears: the source's second channel is the left ear. accept_ears: ears may contradict positions."""
+    """How to change responses and positions on import.
+
+    latency_samples: delay of the measuring equipment at the source's rate, removed from the start (if negative, zeros
+    are put before the start). sample_rate: rate to resample to; None keeps the source's. duration_s: where responses
+    end. position_scale: metres per unit of length in the source. mirror: the axis whose coordinates change sign.
+    swap_ears: the source's second channel is the left ear. accept_ears: import even if the ears contradict the
+    positions.
+    """
 
     latency_samples: int = 0
     sample_rate: int | None = None
@@ -45,18 +49,18 @@ class Conditioning:
     swap_ears: bool = False
     accept_ears: bool = False
 
-    def applied(self, measurement: Measurement) -> Measurement:
+    def apply(self, measurement: Measurement) -> Measurement:
         if self.swap_ears:
-            measurement = ears_exchanged(measurement)
+            measurement = swap_ears(measurement)
         response, rate = measurement.response, measurement.sample_rate
         if self.latency_samples >= 0:
             response = response[:, self.latency_samples :]
         else:
             response = np.pad(response, ((0, 0), (-self.latency_samples, 0)))
         if self.sample_rate is not None and rate != self.sample_rate and response.shape[1] > 0:
-            # In float64: soxr then keeps what lies below -100 dB, where decays end.
+            # In float64, because soxr then keeps the end of the decay, below -100 dB.
             resampled = soxr.resample(response.T.astype(np.float64), rate, self.sample_rate, quality="VHQ")
-            # An impulse response samples a filter: at another rate the same filter needs another scale.
+            # An impulse response is a sampled filter: the same filter at another rate needs another scale.
             response, rate = resampled.T * (rate / self.sample_rate), self.sample_rate
         if self.duration_s is not None:
             response = response[:, : round(self.duration_s * rate)]
@@ -75,22 +79,22 @@ class Conditioning:
         return (-x if self.mirror == "x" else x), (-y if self.mirror == "y" else y), z
 
 
-def conditioned(
+def condition(
     named: Iterable[tuple[str, Measurement]],
     conditioning: Conditioning,
     report: ImportReport,
     *,
     source: object = "source",
 ) -> Iterator[Measurement]:
-    """Measurements fit to be stored; those that are not are skipped with their name.
+    """Yields the conditioned measurements; those that cannot be stored are skipped and named in the report.
 
-    When all are through, the report tells what they say of their positions (`training.data.importers.evidence`); raises
-    SourceError where the two contradict each other.
+    At the end, the report says how far the responses agree with their positions (`training.data.importers.evidence`).
+    Raises SourceError if they contradict each other.
     """
     evidence = Evidence(conditioning.latency_samples, conditioning.accept_ears)
     for name, raw in named:
-        measurement = conditioning.applied(raw)
-        reason = _unfit(measurement)
+        measurement = conditioning.apply(raw)
+        reason = _reason_to_skip(measurement)
         if reason is not None:
             report.skip(name, reason)
             continue
@@ -103,8 +107,8 @@ def conditioned(
 
 
 def within_limits(measurements: Iterable[Measurement], source: object) -> Iterator[Measurement]:
-    """The measurements, as long as a bundle could hold them. Raises SourceError at the first that it could not, and at
-    the end where all are too short."""
+    """Yields the measurements. Raises SourceError at the first that a bundle could not hold, and at the end if all are
+    too short."""
     longest = 0
     for measurement in measurements:
         samples, rate = measurement.response.shape[1], measurement.sample_rate
@@ -122,8 +126,8 @@ def within_limits(measurements: Iterable[Measurement], source: object) -> Iterat
         raise SourceError(source, "responses", f"{problem}: give a longer --duration-s, or a higher --sample-rate")
 
 
-def _unfit(measurement: Measurement) -> str | None:
-    """Why a measurement cannot be stored, if it cannot."""
+def _reason_to_skip(measurement: Measurement) -> str | None:
+    """Why a measurement cannot be stored; None if it can."""
     response = measurement.response
     if not np.isfinite([*measurement.listener, *measurement.emitter, measurement.yaw]).all():
         return "pose not finite"
@@ -147,7 +151,7 @@ def _require_rate(source: object, rate: int) -> None:
 
 
 def positions(path: object, field: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """(point, 3) checked; raises SourceError for another shape or type."""
+    """(point, 3) float64. Raises SourceError for another shape or type."""
     array = np.asarray(values)
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
         raise SourceError(path, field, f"is {array.dtype} of shape {array.shape}, not (points, 3) numbers")

@@ -1,8 +1,8 @@
-"""MeshRIR's npy layout: one room, microphones on a mesh, several loudspeakers, no heads.
+"""Reads MeshRIR's npy layout: one room, microphones on a mesh, several loudspeakers, no heads.
 
-`pos_mic.npy` (microphone, 3) and `pos_src.npy` (loudspeaker, 3) in metres, z up; `ir_<microphone>.npy` (loudspeaker,
-sample). Koyama et al., "MeshRIR: a dataset of room impulse responses on meshed grid points" (WASPAA 2021);
-https://www.sh01.org/MeshRIR/. The files say nothing of the rate, 48 kHz in the published sets.
+`pos_mic.npy` (microphone, 3) and `pos_src.npy` (loudspeaker, 3) are in metres, z up; `ir_<microphone>.npy` is
+(loudspeaker, sample). Koyama et al., "MeshRIR: a dataset of room impulse responses on meshed grid points" (WASPAA
+2021); https://www.sh01.org/MeshRIR/. The files do not contain the sample rate; the published sets have 48 kHz.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -25,7 +25,11 @@ def read(
     source_rate: int = 48_000,
     track: Callable[[list[int]], Iterable[int]] = iter,
 ) -> Generator[tuple[str, Measurement]]:
-    """Raises SourceError where the positions cannot be read; a microphone without a readable file is skipped."""
+    """Yields a name and a measurement for each microphone and loudspeaker. A microphone without a readable file is
+    skipped.
+
+    Raises SourceError if the positions cannot be read.
+    """
     microphones = positions(folder / "pos_mic.npy", "positions", _array(folder / "pos_mic.npy"))
     loudspeakers = positions(folder / "pos_src.npy", "positions", _array(folder / "pos_src.npy"))
     for microphone in track(list(range(len(microphones)))):

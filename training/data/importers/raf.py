@@ -1,9 +1,10 @@
-"""Real Acoustic Fields: a room measured with an array of omnidirectional microphones and a tracked loudspeaker.
+"""Reads Real Acoustic Fields: rooms measured with an array of omnidirectional microphones and a tracked loudspeaker.
 
-Each folder of `data/` holds a response: `rir.wav`; `rx_pos.txt` "x,y,z" of the microphone; `tx_pos.txt`
-"qx,qy,qz,qw,x,y,z", orientation and then position of the loudspeaker, the quaternion's real part last. Metres.
-(README of https://github.com/facebookresearch/real-acoustic-fields, Chen et al., CVPR 2024.) The axes are x ahead,
-y up, z left, a left-handed frame; x, z, y is the right-handed one used here, as in AVR's loader of these data.
+Each folder of `data/` holds one response: `rir.wav`; `rx_pos.txt`, the microphone's "x,y,z"; `tx_pos.txt`, the
+loudspeaker's "qx,qy,qz,qw,x,y,z", orientation and then position, with the quaternion's real part last. Metres. (README
+of https://github.com/facebookresearch/real-acoustic-fields, Chen et al., CVPR 2024.) Their axes are x ahead, y up, z
+left, a left-handed frame. Reordered to x, z, y they are the right-handed frame used here, as in AVR's loader of these
+data.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -25,10 +26,10 @@ _SAME_WAY = 0.999  # cosine of half the angle between orientations: 5 degrees
 def read(
     folder: Path, report: ImportReport, *, track: Callable[[list[Path]], Iterable[Path]] = iter
 ) -> Generator[tuple[str, Measurement]]:
-    """Reads a room's folder, or its `data` folder.
+    """Yields a name and a measurement for each response in a room's folder or its `data` folder.
 
-    Fields know no orientation of emitters: of several that a loudspeaker had at one place, the first is kept.
-    Raises SourceError for a folder without responses.
+    Fields do not take the orientation of an emitter as an input. If a loudspeaker had several orientations at one
+    place, only the first is kept. Raises SourceError for a folder without responses.
     """
     inside = folder / "data" if (folder / "data").is_dir() else folder
     entries = sorted(inside.iterdir())
@@ -54,7 +55,7 @@ def read(
         place = tuple(round(coordinate / SAME_POINT_M) for coordinate in emitter)
         kept = first_orientation.setdefault(place, quaternion)
         if abs(kept @ quaternion) < _SAME_WAY * np.linalg.norm(kept) * np.linalg.norm(quaternion):
-            report.skip(path.name, "loudspeaker turned another way than at first")
+            report.skip(path.name, "loudspeaker has another orientation than at first")
             continue
         yield path.name, Measurement(listener, emitter, response, rate)
 
@@ -65,7 +66,7 @@ def _position(values: tuple[float, ...]) -> _Vector:
 
 
 def _numbers(path: Path, count: int) -> tuple[float, ...]:
-    """Raises UnreadableError for anything but `count` finite numbers."""
+    """Raises UnreadableError if the file does not hold exactly `count` finite numbers."""
     try:
         words = path.read_text(encoding="utf-8").replace(",", " ").split()
     except (OSError, UnicodeDecodeError) as exc:

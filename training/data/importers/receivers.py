@@ -1,10 +1,10 @@
-"""What the receivers of a measurement are."""
+"""The kinds of receivers that a measurement can have."""
 
 from enum import StrEnum
 
 
 class Receivers(StrEnum):
     EARS = "ears"
-    """Two, the channels of one binaural response."""
+    """Two receivers, which are the channels of one binaural response."""
     MICROPHONES = "microphones"
-    """Any number, a response of one channel each."""
+    """Any number of receivers; each gives a response of one channel."""

@@ -1,4 +1,4 @@
-"""What an importer read, and what it left out and why."""
+"""What an importer read, what it skipped, and why."""
 
 import json
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ EXAMPLES = 3
 
 @dataclass
 class Skipped:
-    """How many were left out for one reason, and the first few of them by name."""
+    """How many responses were skipped for one reason, and the names of the first few."""
 
     count: int = 0
     examples: list[str] = field(default_factory=list)
@@ -18,9 +18,9 @@ class Skipped:
 
 @dataclass
 class ImportReport:
-    """Counts responses, or what stands for one in the layout: a file, a row of a table.
+    """Counts responses, or what stands for one in the layout: a file, or a row of a table.
 
-    `notes` are findings about the whole source, such as ears found swapped.
+    `notes` are findings about the whole source, such as swapped ears.
     """
 
     read: int = 0
@@ -43,7 +43,7 @@ class ImportReport:
 
     @classmethod
     def parse(cls, text: str) -> "ImportReport":
-        """Raises ValueError, KeyError or TypeError for text that `to_json` cannot have given."""
+        """Raises ValueError, KeyError or TypeError for text that `to_json` does not produce."""
         content = json.loads(text)
         skipped = {reason: Skipped(int(s["count"]), list(s["examples"])) for reason, s in content["skipped"].items()}
         return cls(int(content["read"]), skipped, [str(note) for note in content["notes"]])

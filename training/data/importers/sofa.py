@@ -1,10 +1,10 @@
-"""SOFA files (AES69) of rooms: SingleRoomSRIR, MultiSpeakerBRIR, SimpleFreeFieldHRIR that hold binaural room responses,
-and SingleRoomMIMOSRIR.
+"""Reads SOFA files (AES69) of rooms: SingleRoomSRIR, MultiSpeakerBRIR, SingleRoomMIMOSRIR, and SimpleFreeFieldHRIR
+files that hold binaural room responses.
 
-Positions of listener and source are in the room's frame, x ahead, y left, z up; those of receivers and emitters in
-that of the listener or source they belong to, turned by its View and Up. Type and Units are read for every variable:
-published files differ from their convention's defaults. Which channel is the left ear is asked of the sound, since
-published files have it, or the sense of azimuth, wrong.
+Positions of listener and source are in the room's frame: x ahead, y left, z up. Positions of receivers and emitters are
+relative to their listener or source, rotated by its View and Up. Type and Units are read for every variable, because
+published files differ from the defaults of their convention. Some published files also have the ears or the sense of
+azimuth the wrong way round, so the sound decides which channel is the left ear.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from server.rendering.sofa_file import SofaError, SofaFile, delay_rows
 from training.data.importers.conditioning import SourceError
-from training.data.importers.evidence import ears_agree, ears_exchanged, remedy
+from training.data.importers.evidence import ears_agree, remedy, swap_ears
 from training.data.importers.receivers import Receivers
 from training.data.importers.report import ImportReport
 from training.data.responses import Measurement
@@ -37,7 +37,7 @@ _CONVENTIONS = {
 
 @dataclass(frozen=True)
 class _Room:
-    """What a file holds. `head` (measurement, xyz, axis); `origin` (measurement, 3); `emitter_at`, `receiver_at`
+    """The contents of a file. `head` (measurement, xyz, axis); `origin` (measurement, 3); `emitter_at`, `receiver_at`
     (measurement, emitter or receiver, 3); `responses` (measurement, receiver, emitter, sample)."""
 
     sample_rate: int
@@ -45,7 +45,7 @@ class _Room:
     origin: _Floats
     emitter_at: _Floats
     receiver_at: _Floats | None
-    """None where receivers are ears."""
+    """None if the receivers are ears."""
     responses: npt.NDArray[np.float32]
 
 
@@ -54,13 +54,13 @@ def read(
     report: ImportReport,
     *,
     receivers: Receivers | None = None,
-    asks_ears: bool = True,
+    checks_ears: bool = True,
     track: Callable[[list[int]], Iterable[int]] = iter,
 ) -> Generator[tuple[str, Measurement]]:
-    """receivers: instead of what the convention has them be. asks_ears: whether ears that are the wrong way round are
-    exchanged.
+    """Yields a name and a measurement for each response. `receivers` overrides the kind of receivers that the
+    convention has. `checks_ears`: swap ears if the sound shows that they are the wrong way round.
 
-    Raises SourceError for another convention, or variables that do not fit it.
+    Raises SourceError for another convention, or for variables that do not fit it.
     """
     try:
         room = _room(SofaFile.open(path), receivers)
@@ -79,8 +79,8 @@ def read(
             for m, yaw in enumerate(np.arctan2(room.head[:, 1, 0], room.head[:, 0, 0]))
             for e in range(emitters)
         ]
-        if asks_ears and _swapped(path, [row for *_, row in rows], report):
-            rows = [(m, e, ears_exchanged(row)) for m, e, row in rows]
+        if checks_ears and _are_ears_swapped(path, [row for *_, row in rows], report):
+            rows = [(m, e, swap_ears(row)) for m, e, row in rows]
         pitch = np.arcsin(np.clip(room.head[:, 2, 0], -1.0, 1.0))
         for index in track(list(range(len(rows)))):
             m, e, row = rows[index]
@@ -123,27 +123,28 @@ def _room(sofa: SofaFile, receivers: Receivers | None) -> _Room:
     return _Room(int(rate), head, origin, emitter_at, receiver_at, responses)
 
 
-def _swapped(path: Path, rows: list[Measurement], report: ImportReport) -> bool:
-    """Raises SourceError where the ears contradict each other."""
+def _are_ears_swapped(path: Path, rows: list[Measurement], report: ImportReport) -> bool:
+    """Whether the first channel is the right ear, judged by the direct sound. Raises SourceError if responses disagree
+    about it."""
     rows = [row for row in rows if np.isfinite(row.response).all()]
     agreeing = [agrees for row in rows if (agrees := ears_agree(row)) is not None]
     if not agreeing:
-        report.note("ears not told apart: no emitter to the side")
+        report.note("ears not checked: no emitter to the side")
         return False
     share = float(np.mean(agreeing))
     if 0.25 < share < 0.75:
-        told = "its channels are not those of ears: neither is louder on its side"
-        raise SourceError(path, "Data.IR", f"{told}; {remedy(rows)}")
+        problem = "its channels are not those of ears: neither is louder on its side"
+        raise SourceError(path, "Data.IR", f"{problem}; {remedy(rows)}")
     if share < 0.5:
-        report.note("receivers exchanged: the first sounds like the right ear (or azimuth is stored clockwise)")
+        report.note("receivers swapped: the first sounds like the right ear (or azimuth is stored clockwise)")
     return share < 0.5
 
 
 def _responses(sofa: SofaFile) -> npt.NDArray[np.float32]:
-    """(measurement, receiver, emitter, sample), `Data.Delay` applied."""
+    """(measurement, receiver, emitter, sample), with `Data.Delay` applied."""
     responses = sofa.numbers("Data_IR")
     kind = sofa.text("GLOBAL_DataType").upper()
-    if kind == "FIR-E":  # of the standard; FIRE, of its drafts, has emitters before samples
+    if kind == "FIR-E":  # as in the standard; its drafts have FIRE, with emitters before samples
         responses = np.swapaxes(responses, -1, -2) if responses.ndim == 4 else responses
     elif kind == "FIR":
         responses = responses[:, :, np.newaxis] if responses.ndim == 3 else responses

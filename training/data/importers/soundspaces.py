@@ -1,11 +1,11 @@
-"""SoundSpaces 1.0: binaural responses between the points of a scene, heads turned to a few azimuths.
+"""Reads SoundSpaces 1.0: binaural responses between the points of a scene, at a few head orientations.
 
 A scene's `points.txt` has a row "index, x, y, z" for each point, in the mesh's coordinates: metres, x right, y forward,
-z up, the height that of the ears. (Habitat's y-up coordinates are derived from them, and not used here.)
+z up, at ear height. (Habitat's y-up coordinates are derived from them, and not used here.)
 `<azimuth>/<receiver>_<source>.wav` are the responses. The azimuth is the heading in degrees, 0 along +y and clockwise
-seen from above, so 90 is +x: yaw = 90 degrees - azimuth. Files that are empty or cannot be read stand for zeros there
-(Chen et al., "SoundSpaces: audio-visual navigation in 3D environments", ECCV 2020; `azimuth_angle` and
-`load_metadata` in https://github.com/facebookresearch/sound-spaces); here they are missing.
+seen from above, so 90 is +x: yaw = 90 degrees - azimuth. In SoundSpaces, a file that is empty or cannot be read stands
+for zeros; here it counts as missing (Chen et al., "SoundSpaces: audio-visual navigation in 3D environments", ECCV 2020;
+`azimuth_angle` and `load_metadata` in https://github.com/facebookresearch/sound-spaces).
 """
 
 import math
@@ -30,10 +30,11 @@ def read(
     points: Path | None = None,
     track: Callable[[list[Path]], Iterable[Path]] = iter,
 ) -> Generator[tuple[str, Measurement]]:
-    """Reads the scene folder that holds the azimuths. Without `points`, points.txt is looked for in it, and in the
-    place it has in a SoundSpaces download (`metadata` beside `binaural_rirs`).
+    """Yields a name and a measurement for each response of the scene folder that holds the azimuths. Without `points`,
+    points.txt is looked for in that folder, and where a SoundSpaces download has it (`metadata` beside
+    `binaural_rirs`).
 
-    Raises SourceError for missing or malformed points, or a folder without azimuths.
+    Raises SourceError for missing or malformed points, or for a folder without azimuths.
     """
     positions = read_points(points or _points_file(folder))
     azimuths = _azimuths(folder, report)
@@ -43,7 +44,7 @@ def read(
         by_azimuth[azimuth] = {name for name in names if _PAIR.fullmatch(name)}
         for name in sorted(names - by_azimuth[azimuth]):
             report.skip(f"{azimuth.name}/{name}", "not named <receiver>_<source>.wav")
-        for name in _doubled(by_azimuth[azimuth]):
+        for name in _duplicates(by_azimuth[azimuth]):
             by_azimuth[azimuth].remove(name)
             report.skip(f"{azimuth.name}/{name}", "a pair that another file is named by too")
     everywhere = set().union(*by_azimuth.values())
@@ -66,12 +67,12 @@ def read(
 
 
 def heading_to_yaw(azimuth_deg: float) -> float:
-    """Clockwise from +y in degrees to counter-clockwise from +x in radians, within [-pi, pi)."""
+    """Converts degrees clockwise from +y to radians counter-clockwise from +x, within [-pi, pi)."""
     return math.radians((90.0 - azimuth_deg + 180.0) % 360.0 - 180.0)
 
 
 def read_points(path: Path) -> dict[int, _Point]:
-    """Positions by index. Raises SourceError naming the line."""
+    """Positions by index. Raises SourceError naming the line at fault."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as exc:
@@ -94,8 +95,11 @@ def read_points(path: Path) -> dict[int, _Point]:
 
 
 def _azimuths(folder: Path, report: ImportReport) -> list[Path]:
-    """Folders that are named by a heading in degrees, in its order, counted from 0 to 360. What else there is, the
-    report lists. Raises SourceError for no such folder, or two of one heading."""
+    """The folders that are named by a heading in degrees, ordered by heading from 0 to 360. The report lists everything
+    else.
+
+    Raises SourceError if there is no such folder, or if two have the same heading.
+    """
     found: dict[float, Path] = {}
     for path in sorted(folder.iterdir()):
         if not path.is_dir():
@@ -117,20 +121,20 @@ def _azimuths(folder: Path, report: ImportReport) -> list[Path]:
     return [found[azimuth] for azimuth in sorted(found)]
 
 
-def _doubled(names: set[str]) -> list[str]:
-    """Names of pairs that a shorter name stands for already: `00_1.wav` beside `0_1.wav`."""
+def _duplicates(names: set[str]) -> list[str]:
+    """File names whose pair has a shorter name already, as `00_1.wav` beside `0_1.wav`."""
     pairs: set[tuple[int, ...]] = set()
-    doubled = []
+    duplicates = []
     for name in sorted(names, key=lambda each: (len(each), each)):
         pair = tuple(int(index) for index in name.removesuffix(".wav").split("_"))
         if pair in pairs:
-            doubled.append(name)
+            duplicates.append(name)
         pairs.add(pair)
-    return doubled
+    return duplicates
 
 
 def _azimuth(folder: Path) -> float:
-    """In degrees, from 0 up to 360. Raises ValueError."""
+    """Degrees, from 0 to below 360. Raises ValueError for a folder that is not named by a number."""
     return parse_decimal(folder.name) % 360.0
 
 

@@ -8,7 +8,7 @@ import soundfile
 from scipy.signal import freqz
 
 from tests.training.data.importers.conftest import RATE, wave
-from training.data.importers.conditioning import Conditioning, conditioned
+from training.data.importers.conditioning import Conditioning, condition
 from training.data.importers.evidence import ears_agree
 from training.data.importers.report import ImportReport
 from training.data.responses import Measurement
@@ -24,7 +24,7 @@ def measured(response, rate=RATE, yaw=0.0):
 def let_through(*rows, conditioning=None):
     report = ImportReport()
     named = ((f"row {index}", row) for index, row in enumerate(rows))
-    return list(conditioned(named, conditioning or Conditioning(), report)), report
+    return list(condition(named, conditioning or Conditioning(), report)), report
 
 
 def test_nothing_asked_for_changes_no_sample():

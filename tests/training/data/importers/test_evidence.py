@@ -141,7 +141,7 @@ def test_what_agrees_with_its_positions_is_imported(imported, layout):
     code, out, _ = imported(layout, "--json")
     assert code == 0
     assert not any("warning" in note for note in notes(out))
-    tells = "louder one in 100%" if layout in BINAURAL else "no ears tell whether coordinates are mirrored"
+    tells = "louder one in 100%" if layout in BINAURAL else "without ears, mirrored coordinates cannot be detected"
     assert any(tells in note for note in notes(out))
 
 
@@ -200,7 +200,7 @@ def test_too_much_latency_taken_off_is_suspected(imported):
 def test_mirrored_coordinates_are_refused_with_the_axis_to_try(imported, tmp_path, layout, axis, mirror):
     code, _, told = imported(layout, mirror=mirror)
     assert code == 2
-    assert f"with --mirror {axis} it would be 100%" in told
+    assert f"with --mirror {axis} they agree in 100%" in told
     assert not (tmp_path / "data").exists()
     code, out, _ = imported(layout, "--mirror", axis, "--json", mirror=mirror)
     assert code == 0
@@ -210,7 +210,7 @@ def test_mirrored_coordinates_are_refused_with_the_axis_to_try(imported, tmp_pat
 def test_exchanged_ears_are_refused_with_the_option_to_try(imported):
     code, _, told = imported("soundspaces", swap=True)
     assert code == 2
-    assert "with --swap-ears it would be 100%" in told
+    assert "with --swap-ears they agree in 100%" in told
     assert imported("soundspaces", "--swap-ears", swap=True)[0] == 0
 
 

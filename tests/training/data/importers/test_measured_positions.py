@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.decay import onset_sample
-from training.data.importers.conditioning import Conditioning, conditioned
+from training.data.importers.conditioning import Conditioning, condition
 from training.data.importers.meshrir import read
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset
@@ -28,7 +28,7 @@ def imported(room, tmp_path_factory):
     for index, response in enumerate(room["responses"]):
         np.save(source / f"ir_{index}.npy", response[np.newaxis])
     report = ImportReport()
-    measurements = conditioned(read(source, report), Conditioning(), report)
+    measurements = condition(read(source, report), Conditioning(), report)
     return ImportedDataset.write(folder, measurements, report, layout="meshrir", source=str(source))
 
 

@@ -4,7 +4,7 @@ import pytest
 from server.acoustics.decay import onset_sample
 from tests.training.data.importers.conftest import RATE, wave
 from training.data.dataset import SPEED_OF_SOUND
-from training.data.importers.conditioning import Conditioning, SourceError, conditioned
+from training.data.importers.conditioning import Conditioning, SourceError, condition
 from training.data.importers.meshrir import read
 from training.data.importers.report import ImportReport
 
@@ -25,7 +25,7 @@ def folder(tmp_path):
 def imported(folder, **conditioning):
     report = ImportReport()
     named = read(folder, report, source_rate=RATE)
-    return list(conditioned(named, Conditioning(**conditioning), report)), report
+    return list(condition(named, Conditioning(**conditioning), report)), report
 
 
 def test_each_response_has_the_positions_it_was_measured_at(folder):
@@ -92,7 +92,7 @@ def test_positions_that_cannot_be_read_are_named(folder, name, content, field):
 
 def test_sound_of_the_measured_office_arrives_when_geometry_says(measured_office):
     report = ImportReport()
-    rows = list(conditioned(read(measured_office, report), Conditioning(), report))
+    rows = list(condition(read(measured_office, report), Conditioning(), report))
     assert len(rows) == 192
     assert not report.skipped
     distance = np.array([np.linalg.norm(np.subtract(row.emitter, row.listener)) for row in rows])

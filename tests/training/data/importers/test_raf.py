@@ -3,7 +3,7 @@ import pytest
 import soundfile
 
 from tests.training.data.importers.conftest import RATE, wave
-from training.data.importers.conditioning import Conditioning, SourceError, conditioned
+from training.data.importers.conditioning import Conditioning, SourceError, condition
 from training.data.importers.raf import read
 from training.data.importers.report import ImportReport
 
@@ -32,7 +32,7 @@ def room(tmp_path):
 
 def imported(folder):
     report = ImportReport()
-    return list(conditioned(read(folder, report), Conditioning(), report)), report
+    return list(condition(read(folder, report), Conditioning(), report)), report
 
 
 def test_up_is_the_second_number(room):
@@ -58,7 +58,7 @@ def test_a_loudspeaker_is_kept_the_way_it_first_faced(room):
     place(room, 5, (0.0, 1.0, 0.0), LOUDSPEAKERS[0], tuple(-value for value in FACING["ahead"]))  # the same rotation
     rows, report = imported(room)
     assert len(rows) == 5
-    assert report.skipped["loudspeaker turned another way than at first"].examples == ["000004"]
+    assert report.skipped["loudspeaker has another orientation than at first"].examples == ["000004"]
 
 
 @pytest.mark.parametrize(

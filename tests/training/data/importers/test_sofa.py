@@ -6,7 +6,7 @@ import pytest
 
 from server.acoustics.room_parameters import interaural_time_difference_s
 from tests.training.data.importers.conftest import RATE, wave
-from training.data.importers.conditioning import Conditioning, SourceError, conditioned
+from training.data.importers.conditioning import Conditioning, SourceError, condition
 from training.data.importers.receivers import Receivers
 from training.data.importers.report import ImportReport
 from training.data.importers.sofa import read
@@ -72,7 +72,7 @@ def brirs(path, responses, **changed):
 
 def imported(path, **options):
     report = ImportReport()
-    return list(conditioned(read(path, report, **options), Conditioning(), report)), report
+    return list(condition(read(path, report, **options), Conditioning(), report)), report
 
 
 def test_a_rate_in_kilohertz_and_a_type_of_any_spelling_are_read(tmp_path):
@@ -96,7 +96,7 @@ def test_type_and_units_are_read(tmp_path, stored):
     for row, emitter in zip(rows, EMITTERS, strict=True):
         np.testing.assert_allclose(row.response, wave(HEAD, emitter, 0.0), atol=1e-7)
     assert any("100%" in note for note in report.notes)
-    assert not any("exchanged" in note for note in report.notes)
+    assert not any("swapped" in note for note in report.notes)
 
 
 @pytest.mark.parametrize("stored", ["cartesian", "spherical"])
@@ -124,7 +124,7 @@ def test_ears_follow_the_sound_and_not_the_file(tmp_path, wrong):
     else:
         path = brirs(tmp_path / "wrong.sofa", responses, SourcePosition=at(mirrored))
     rows, report = imported(path)
-    assert any("exchanged" in note for note in report.notes)
+    assert any("swapped" in note for note in report.notes)
     # Either way the world that comes out is whole: the original or its mirror image.
     for row in rows:
         np.testing.assert_allclose(row.response, wave(HEAD, row.emitter, 0.0), atol=1e-7)
@@ -265,7 +265,7 @@ def test_other_conventions_and_files_are_refused(tmp_path):
 def test_a_measured_file_whose_azimuth_grows_clockwise():
     rows, report = imported(MEASURED / "iosr_anechoic.sofa")
     assert len(rows) == 37
-    assert any("exchanged" in note for note in report.notes)
+    assert any("swapped" in note for note in report.notes)
     azimuth = np.degrees([np.arctan2(row.emitter[1], row.emitter[0]) for row in rows])
     np.testing.assert_allclose(np.sort(azimuth), np.arange(-90.0, 91.0, 5.0), atol=1e-6)
     np.testing.assert_allclose([np.linalg.norm(row.emitter) for row in rows], 1.5)

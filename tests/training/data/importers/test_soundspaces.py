@@ -3,7 +3,7 @@ import pytest
 import soundfile
 
 from tests.training.data.importers.conftest import RATE, wave
-from training.data.importers.conditioning import Conditioning, SourceError, conditioned
+from training.data.importers.conditioning import Conditioning, SourceError, condition
 from training.data.importers.report import ImportReport
 from training.data.importers.soundspaces import heading_to_yaw, read, read_points
 
@@ -30,7 +30,7 @@ def scene(tmp_path):
 
 def imported(folder, **options):
     report = ImportReport()
-    return list(conditioned(read(folder, report, **options), Conditioning(), report)), report
+    return list(condition(read(folder, report, **options), Conditioning(), report)), report
 
 
 @pytest.mark.parametrize("azimuth", AHEAD)

@@ -1,0 +1,148 @@
+"""Plots of results, and of the history of benchmarks. Each takes what it draws and gives a figure."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from benchmarks.record import Result, Table
+from server.bench.history import Run
+from server.planning.plan_figure import figure_of
+from server.planning.plan_query import PlanDocument
+
+_FIRST, _OTHER, _FLOOR, _TEXT = "#0b6e99", "#aeb9c1", "#8d6a9f", "#2b3a42"
+_METHODS: Final = {
+    "naf-whole": ("v", "#edae49", "the paper's network, whole responses (naf-whole)"),
+    "naf": ("^", "#d1495b", "the same network, reflected sound (naf)"),
+    "nearest": ("s", "#66a182", "nearest pair"),
+    "one simulation": ("x", "#8d6a9f", "one simulation"),
+    "default level": ("o", _FIRST, "default level"),
+}
+"""Marker, colour and label; the last is drawn on top."""
+_ERRORS: Final = (
+    "spectral loss (ln)", "T60 (%)", "EDT (ms)", "C50 (dB)", "DRR (dB)", "IACC", "level (dB)", "ITD (us)",
+)  # fmt: skip
+
+
+def plan_of_effects(result: Result) -> Figure:
+    """What leaving out each effect of a plan would change, beside what it costs."""
+    return figure_of(PlanDocument.model_validate(result.values["plan"]))
+
+
+def error_over_time(result: Result) -> Figure:
+    """Mean error of every level over its mean time, the levels that are offered filled, the floor a line."""
+    table = result.tables["levels"]
+    names = [str(row[0]) for row in table.rows]
+    times, errors = table.column("mean ms"), table.column("mean error, JND")
+    middle, slowest = table.column("p50 ms"), table.column("p99 ms")
+    figure, axes = _one_panel(9.0, 5.2)
+    for name, time_ms, error, p50, p99 in zip(names, times, errors, middle, slowest, strict=True):
+        if error is None:
+            continue
+        if time_ms is None:
+            axes.axhline(error, color=_FLOOR, linestyle="--", linewidth=1.2, label="the same simulated twice (floor)")
+            continue
+        is_offered = "(o" in name
+        if p50 is not None and p99 is not None:
+            axes.hlines(error, p50, p99, color="#bfdbe6", linewidth=3, zorder=1)
+        axes.scatter(time_ms, error, s=40, facecolors=_FIRST if is_offered else "white", edgecolors=_FIRST, zorder=3)
+        if is_offered:
+            said = name.split("`")[1] + (" (default)" if "default" in name else "")
+            axes.annotate(said, (time_ms, error), xytext=(8, 6), textcoords="offset points", fontsize=9, color=_TEXT)
+    axes.set_xscale("log")
+    axes.set_ylim(bottom=0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.set(
+        xlabel="milliseconds per pose of a walk; points at the mean, bars from the median to the slowest of a hundred",
+        ylabel="mean error, just-noticeable differences",
+    )
+    axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def times_floor(result: Result) -> Figure:
+    """A panel per metric, scenes from left to right, mean errors over the floor's mean error upwards."""
+    by_scene = _rows_by_scene(result.tables["errors"])
+    figure = Figure(figsize=(11.5, 6.8), layout="constrained", facecolor="white")
+    panels = figure.subplots(2, len(_ERRORS) // 2, sharex=True, sharey=True).ravel()
+    for axes, metric in zip(panels, _ERRORS, strict=True):
+        axes.axhline(1.0, color=_FLOOR, linestyle="--", linewidth=1.2, label="two simulations of a pair (floor)")
+        for method, (marker, colour, label) in _METHODS.items():
+            ratios = [_ratio(rows, method, metric) for rows in by_scene.values()]
+            axes.plot(ratios, marker=marker, markersize=6, color=colour, linewidth=1.0, label=label)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.set_title(metric.partition(" (")[0], fontsize=11, color=_TEXT)
+        axes.set_xticks(range(len(by_scene)), list(by_scene), rotation=30, ha="right", fontsize=9)
+        _bare(axes)
+    for axes in panels[:: len(_ERRORS) // 2]:
+        axes.set_ylabel("mean error, times the floor", color=_TEXT)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles[::-1], labels[::-1], loc="outside upper left", ncols=3, frameon=False, fontsize=10)
+    return figure
+
+
+def _rows_by_scene(table: Table) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Numbers by scene, method and column, without the means. A scene's first row is its default level."""
+    found: dict[str, dict[str, dict[str, float | None]]] = {}
+    columns = {column.title: table.column(column.title) for column in table.columns}
+    scene = ""
+    for at, row in enumerate(table.rows):
+        method = str(row[1])
+        if row[0]:
+            scene, method = str(row[0]).strip("[").partition("]")[0], "default level"
+        found.setdefault(scene, {})[method] = {title: numbers[at] for title, numbers in columns.items()}
+    del found["mean"]
+    return found
+
+
+def _ratio(rows: Mapping[str, Mapping[str, float | None]], method: str, metric: str) -> float:
+    error, floor = rows[method][metric], rows["floor"][metric]
+    return np.nan if error is None or not floor else error / floor
+
+
+def history(runs: Sequence[Run]) -> Figure:
+    """Every figure of a bench over its runs, in units of the figure's median, hosts apart by their marker."""
+    names = list(dict.fromkeys(name for run in runs for name in run.figures))
+    hosts = list(dict.fromkeys(run.host.name for run in runs))
+    figure, axes = _one_panel(7.5, 2.4 + 0.12 * len(names))
+    for name in names:
+        known = [(at, run, value) for at, run in enumerate(runs) if (value := run.figures.get(name)) is not None]
+        middle = float(np.median([value for _, _, value in known])) if known else 0.0
+        if not middle:
+            continue
+        (line,) = axes.plot([at for at, _, _ in known], [value / middle for _, _, value in known], label=name)
+        for host, points in groupby(known, key=lambda point: point[1].host.name):
+            marker = "osv^Dx+*"[hosts.index(host) % 8]
+            for at, run, value in points:
+                face = line.get_color() if not run.failures else "white"
+                axes.plot(at, value / middle, marker=marker, color=line.get_color(), markerfacecolor=face)
+    axes.set_xticks(range(len(runs)), [f"{run.date:%Y-%m-%d}\n{run.commit[:7]}" for run in runs], fontsize=8)
+    axes.set_xlim(-0.5, len(runs) - 0.5)
+    axes.set_ylabel("times the median")
+    axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def _one_panel(width: float, height: float) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    axes = figure.subplots()
+    _bare(axes)
+    return figure, axes
+
+
+def _bare(axes: Axes) -> None:
+    axes.grid(axis="y", alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+PLOTS: Final[Mapping[str, Callable[[Result], Figure]]] = {
+    each.__name__: each for each in (plan_of_effects, error_over_time, times_floor)
+}
+"""By the name that a result gives."""

@@ -1,0 +1,136 @@
+"""The form of `benchmarks/results/*.json`: what was measured, where, when, of which commit, and by which command.
+
+What nobody wrote down is "unknown". Numbers keep the digits that were written: 1.40 is not 1.4.
+"""
+
+import json
+from collections.abc import Mapping
+from datetime import date
+from decimal import Decimal
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+FOLDER = Path(__file__).with_name("results")
+Unknown = Literal["unknown"]
+UNKNOWN: Unknown = "unknown"
+
+
+def _of_days(text: str) -> str:
+    for part in text.split("/"):
+        date.fromisoformat(part)
+    return text
+
+
+Days = Annotated[str, AfterValidator(_of_days)]
+"""A day, or the first and the last with a stroke between them."""
+Commit = Annotated[str, Field(pattern=r"^[0-9a-f]{7,40}(\+changes)?$")]
+
+
+class _Form(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Host(_Form):
+    """`cores` are those the command could use."""
+
+    processor: str
+    instruction_set: str
+    cores: int | Unknown
+    note: str = ""
+
+    def __str__(self) -> str:
+        known = [self.processor, self.instruction_set, *([] if self.cores == UNKNOWN else [_cores(self.cores)])]
+        said = [part for part in (*known, self.note) if part and part != UNKNOWN]
+        return "; ".join(said) or UNKNOWN
+
+
+def _cores(number: int) -> str:
+    return "one core" if number == 1 else f"{number} cores"
+
+
+class Value(_Form):
+    """A number with its unit, where the column has none; `is_best` of its row or column; `note` stands in brackets."""
+
+    value: Decimal
+    unit: str = ""
+    is_best: bool = False
+    note: str = ""
+
+    def __str__(self) -> str:
+        text = f"{self.value} {self.unit}".strip()
+        return (f"**{text}**" if self.is_best else text) + (f" ({self.note})" if self.note else "")
+
+
+Cell = Value | int | Decimal | str | None
+"""None where nothing was measured; text may have Markdown."""
+
+
+class Column(_Form):
+    title: str
+    is_number: bool = False
+
+
+class Table(_Form):
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def markdown(self) -> str:
+        """Raises ValueError where a row has not one cell for each column."""
+        heading = [column.title for column in self.columns]
+        rule = ["---:" if column.is_number else "---" for column in self.columns]
+        rows = [["" if cell is None else str(cell) for cell in row] for row in self.rows]
+        return markdown_table([heading, rule, *rows])
+
+    def column(self, title: str) -> list[float | None]:
+        """The numbers of a column; None for a cell that is none."""
+        at = [column.title for column in self.columns].index(title)
+        return [_number(row[at]) for row in self.rows]
+
+
+def _number(cell: Cell) -> float | None:
+    cell = cell.value if isinstance(cell, Value) else cell
+    return None if cell is None or isinstance(cell, str) else float(cell)
+
+
+class Result(_Form):
+    """One run of a command. `facts` say what else one has to know; `tables` by the names that pages give."""
+
+    host: Host
+    date: Days
+    commit: Commit | Unknown
+    command: str
+    facts: Mapping[str, str] = {}
+    tables: Mapping[str, Table] = {}
+    plots: Mapping[str, str] = {}
+    """How each is drawn, a name in `benchmarks.plots`, by its file below `docs/results/`."""
+    values: Mapping[str, object] = {}
+    """What a plot needs beside tables."""
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        return cls.model_validate(json.loads(path.read_text(encoding="utf-8"), parse_float=Decimal))
+
+    def provenance(self) -> str:
+        rows = {
+            "Host": str(self.host),
+            "Recorded": self.date.replace("/", " to "),
+            "Commit": self.commit,
+            "Command": self.command,
+            **self.facts,
+        }
+        return markdown_table([["", ""], ["---", "---"], *([name, text] for name, text in rows.items())])
+
+
+def markdown_table(rows: list[list[str]]) -> str:
+    """Raises ValueError where rows are of different lengths."""
+    if len({len(row) for row in rows}) > 1:
+        raise ValueError(f"a table of rows of {sorted({len(row) for row in rows})} cells")
+    cells = ([f" {cell} ".replace("|", "\\|") if cell else " " for cell in row] for row in rows)
+    return "".join(f"|{'|'.join(row)}|\n" for row in cells)
+
+
+def read_results() -> dict[str, Result]:
+    """By the name of the file."""
+    return {path.stem: Result.read(path) for path in sorted(FOLDER.glob("*.json"))}

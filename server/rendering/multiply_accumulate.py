@@ -1,0 +1,210 @@
+"""The innermost loops of the compiled convolver: products of spectra and filters, summed over partitions.
+
+`stage` is a STAGE record, and layouts are as in `server.rendering.convolver_kernel`. Memory is what limits them: it is
+read in order and asked for ahead, by few streams at a time; a mix is read once for a group of sources, and sums stay in
+registers.
+
+Eight complex numbers are one vector of sixteen lanes, real parts in its first half and imaginary ones in the second, so
+that a product takes two steps: by the real parts of one factor twice, and by its imaginary parts crosswise, with
+opposed signs. Such a vector is one register with AVX-512 and two elsewhere, which is for loops alone that load more
+than they keep: two of each would not fit into the registers.
+"""
+
+import numpy as np
+from numba import carray
+
+from server.kernels.cache_lines import LINE_BYTES
+from server.kernels.compiled import compiled
+from server.kernels.simd import (
+    add,
+    lanes,
+    load_int,
+    multiply,
+    multiply_add,
+    pointer,
+    prefetch,
+    store,
+    swap_halves,
+)
+from server.rendering.partitions import NEAR, TURNS
+
+_wide = lanes(16)
+load, broadcast, load_twice, load_opposed = _wide.load, _wide.broadcast, _wide.load_twice, _wide.load_opposed
+
+COLUMNS = TURNS + 1
+"""Of a mix: windows, by their number modulo TURNS, and what the IRs that are faded from add to the one at work."""
+SURPLUS = TURNS
+GROUP = 2
+"""Sources that are multiplied together at the most: the mix is read once for all of them, while each of them reads a
+few streams of its own. Four at a time take longer: those are too many streams."""
+_SPECTRUM_AHEAD, _FILTER_AHEAD = 6 * LINE_BYTES, 16 * LINE_BYTES
+
+
+@compiled
+def mix_offset(channels, tile, channel, column) -> int:
+    """Where the real parts of a tile are in a mix; the imaginary ones follow."""
+    return 16 * (COLUMNS * (channels * tile + channel) + column)
+
+
+@compiled
+def spectrum_stride(size) -> int:
+    """From a spectrum of a ring to the next: one line further than it is long, since lines a power of two apart would
+    drive each other out of a cache."""
+    return 2 * size + 16
+
+
+@compiled
+def filter_offset(channels, tiles, count, tile, partition) -> int:
+    """Where a tile is in a filter of `count` partitions: real and imaginary parts of the first channel, then of the
+    second."""
+    near = min(NEAR, count)
+    if partition < near:
+        return 16 * channels * (tiles * partition + tile)
+    return 16 * channels * (tiles * near + tile * (count - near) + partition - near)
+
+
+@compiled
+def enter_member(stage, member, filters, count, ring) -> None:
+    """Have a source be in the group that is multiplied next: the address of its filter, of how many partitions, and of
+    its ring."""
+    group = carray(pointer(stage.group), (GROUP, 3), np.int64)
+    group[member, 0], group[member, 1], group[member, 2] = filters, count, ring
+
+
+@compiled
+def member_of(stage, member):
+    """What was entered."""
+    at = 3 * member
+    return load_int(stage.group, at), load_int(stage.group, at + 1), load_int(stage.group, at + 2)
+
+
+@compiled
+def _multiply_add(total, real, opposed, filters, h):
+    """The sum of eight complex numbers, and of the product of eight others and what is in a filter."""
+    taps = load(filters, h)
+    return multiply_add(opposed, swap_halves(taps), multiply_add(real, taps, total))
+
+
+@compiled
+def _add_to(mix, at, sums) -> None:
+    """Only sums meet the mix: added one by one to what is large already, products of many sources would lose more."""
+    store(mix, at, add(load(mix, at), sums))
+
+
+@compiled
+def _fetch_filter(filters, h) -> None:
+    """Have what a few tiles on are multiplied by come near. There are more streams than a processor follows by
+    itself, and with many listeners all of it lies in main memory."""
+    prefetch(filters + 4 * h + _FILTER_AHEAD)
+    prefetch(filters + 4 * h + _FILTER_AHEAD + LINE_BYTES)
+
+
+@compiled
+def _step(near, tiles, channels, count, tile, partition) -> int:
+    """From a tile of a partition to that of the next one."""
+    if partition + 1 == near:
+        return filter_offset(channels, tiles, count, tile, near) - filter_offset(channels, tiles, count, tile, near - 1)
+    return 16 * channels * (tiles if partition + 1 < near else 1)
+
+
+@compiled
+def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
+    """Add the products of the newest spectra of a group, in slot `newest` of their rings, to the mix of the window at
+    work, and of the `ahead` - 1 that follow it: with the first partition of their filters, the second and so on."""
+    mix, tiles, start = stage.mix, stage.size // 8, spectrum_stride(stage.size) * newest
+    zero = broadcast(np.float32(0))
+    for tile in range(first, last):
+        x = start + 16 * tile
+        for partition in range(ahead):
+            h = 16 * channels * (tiles * partition + tile)
+            left = mix_offset(channels, tile, 0, (stage.window + partition) % TURNS)
+            right = left + 16 * COLUMNS * (channels - 1)
+            left_sum, right_sum = zero, zero
+            for member in range(members):
+                filters, count, ring = member_of(stage, member)
+                if partition < count:
+                    real, opposed = load_twice(ring, x), load_opposed(ring, x + 8)
+                    _fetch_filter(filters, h)
+                    left_sum = _multiply_add(left_sum, real, opposed, filters, h)
+                    right_sum = _multiply_add(right_sum, real, opposed, filters, h + 16 * (channels - 1))
+            if channels == 2:
+                _add_to(mix, right, right_sum)
+            _add_to(mix, left, left_sum)
+
+
+@compiled
+def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, column, first, last, sign) -> None:
+    """Add partitions `begin` to `end` of a filter, times `sign` and the spectra in the ring, to a column of the mix,
+    which is that of a window `ahead` of the one whose spectrum is in slot `newest`."""
+    mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast(sign)
+    spectrum = spectrum_stride(stage.size)
+    zero = broadcast(np.float32(0))
+    near = min(NEAR, count)
+    start = (newest + begin - ahead) % slots
+    for tile in range(first, last):
+        left, right = mix_offset(channels, tile, 0, column), mix_offset(channels, tile, channels - 1, column)
+        left_sum, right_sum = zero, zero
+        slot = start
+        h = filter_offset(channels, tiles, count, tile, begin)
+        for partition in range(begin, end):
+            x = spectrum * slot + 16 * tile
+            real, opposed = multiply(load_twice(ring, x), factor), multiply(load_opposed(ring, x + 8), factor)
+            left_sum = _multiply_add(left_sum, real, opposed, filters, h)
+            right_sum = _multiply_add(right_sum, real, opposed, filters, h + 16 * (channels - 1))
+            h += _step(near, tiles, channels, count, tile, partition)
+            slot = slot + 1 if slot + 1 < slots else 0
+        _add_to(mix, left, left_sum)
+        if channels == 2:
+            _add_to(mix, right, right_sum)
+
+
+@compiled
+def add_turn(stage, channels, members, newest, first, last) -> None:
+    """Add all partitions of a group's filters, times the spectra in their rings from slot `newest` on, to the mix of
+    the window at work, and to those of the three that follow it what is known of them by now: from the first, second
+    and third partition on."""
+    mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
+    spectrum = spectrum_stride(stage.size)
+    other = 16 * COLUMNS * (channels - 1)  # from one channel to the other, which is the same if there is only one
+    zero = broadcast(np.float32(0))
+    for tile in range(first, last):
+        a = mix_offset(channels, tile, 0, stage.window % TURNS)
+        b = mix_offset(channels, tile, 0, (stage.window + 1) % TURNS)
+        c = mix_offset(channels, tile, 0, (stage.window + 2) % TURNS)
+        d = mix_offset(channels, tile, 0, (stage.window + 3) % TURNS)
+        l_a, l_b, l_c, l_d = zero, zero, zero, zero
+        r_a, r_b, r_c, r_d = zero, zero, zero, zero
+        for member in range(members):
+            filters, count, ring = member_of(stage, member)
+            near = min(NEAR, count)
+            real_b, real_c, real_d = zero, zero, zero
+            opposed_b, opposed_c, opposed_d = zero, zero, zero
+            slot = newest
+            h = 16 * channels * tile
+            for partition in range(count):
+                x = spectrum * slot + 16 * tile
+                real_a, opposed_a = load_twice(ring, x), load_opposed(ring, x + 8)
+                prefetch(ring + 4 * x + _SPECTRUM_AHEAD)
+                _fetch_filter(filters, h)
+                l_a = _multiply_add(l_a, real_a, opposed_a, filters, h)
+                l_b = _multiply_add(l_b, real_b, opposed_b, filters, h)
+                l_c = _multiply_add(l_c, real_c, opposed_c, filters, h)
+                l_d = _multiply_add(l_d, real_d, opposed_d, filters, h)
+                if channels == 2:
+                    r_a = _multiply_add(r_a, real_a, opposed_a, filters, h + 16)
+                    r_b = _multiply_add(r_b, real_b, opposed_b, filters, h + 16)
+                    r_c = _multiply_add(r_c, real_c, opposed_c, filters, h + 16)
+                    r_d = _multiply_add(r_d, real_d, opposed_d, filters, h + 16)
+                real_b, real_c, real_d = real_a, real_b, real_c
+                opposed_b, opposed_c, opposed_d = opposed_a, opposed_b, opposed_c
+                h += _step(near, tiles, channels, count, tile, partition)
+                slot = slot + 1 if slot + 1 < slots else 0
+        if channels == 2:
+            _add_to(mix, a + other, r_a)
+            _add_to(mix, b + other, r_b)
+            _add_to(mix, c + other, r_c)
+            _add_to(mix, d + other, r_d)
+        _add_to(mix, a, l_a)
+        _add_to(mix, b, l_b)
+        _add_to(mix, c, l_c)
+        _add_to(mix, d, l_d)

@@ -1,0 +1,61 @@
+"""`requirements.lock` has what the image installs: the base install, exact, with digests, and no name of a host."""
+
+import re
+import tomllib
+from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "requirements.lock").read_text()
+BASE = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+ENTRY = re.compile(
+    r"^([a-z0-9-]+)==(\S+)(?: ; [^\\\n]+)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.MULTILINE
+)
+LOCKED = {canonicalize_name(name): version for name, version, _ in ENTRY.findall(TEXT)}
+
+
+@pytest.mark.parametrize("line", BASE)
+def test_every_base_dependency_is_locked_within_its_bounds(line: str) -> None:
+    requirement = Requirement(line)
+    version = LOCKED.get(canonicalize_name(requirement.name))
+    assert version is not None, f"{requirement.name} is not in requirements.lock: run `make lock`"
+    assert requirement.specifier.contains(version), f"{version} is not {line}: run `make lock`"
+
+
+def test_every_line_is_a_pin_with_digests_or_says_why() -> None:
+    rest = [line for line in ENTRY.sub("", TEXT).splitlines() if not line.lstrip().startswith("#")]
+    assert rest == []
+    assert len(LOCKED) > len(BASE)
+
+
+def test_what_base_dependencies_need_is_locked_too() -> None:
+    """As the versions installed here say it: with `--require-hashes` pip refuses what is not in the file."""
+    for name in LOCKED:
+        try:
+            needed = [Requirement(line) for line in requires(name) or ()]
+        except PackageNotFoundError:
+            continue
+        for requirement in needed:
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                assert canonicalize_name(requirement.name) in LOCKED, (
+                    f"{name} needs {requirement.name}: run `make lock`"
+                )
+
+
+def test_nothing_of_the_training_side_is_in_the_image() -> None:
+    assert not {"torch", "matplotlib", "onnx", "pytest"} & LOCKED.keys()
+
+
+def test_no_host_is_named() -> None:
+    assert not re.search(r"https?:|--(?:extra-)?index-url|--find-links|--trusted-host|file:", TEXT)
+
+
+def test_the_image_installs_from_the_lock_file_alone() -> None:
+    lines = re.findall(r"pip --python .*install.*", (ROOT / "Dockerfile").read_text())
+    assert len(lines) == 2
+    assert all("--require-hashes" in line or "--no-deps" in line for line in lines)
+    assert "!requirements.lock" in (ROOT / ".dockerignore").read_text().splitlines()
