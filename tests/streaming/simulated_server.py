@@ -27,11 +27,13 @@ from server.rendering.output import Rendered
 from server.scene.manifest import QualityLevel, Reuse
 from server.streaming import audio_engine
 from server.streaming.audio_engine import AudioEngine
+from server.streaming.inbox import ComputedResponse
 from server.streaming.load_policy import Ladder
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.pacing import SendWindow
 from server.streaming.quality_steps import Offer
-from server.streaming.stream import Stream, TimedBlock, _Computed
+from server.streaming.response_scheduler import Scope
+from server.streaming.stream import Stream, TimedBlock
 
 BLOCK_S = 1_024 / 48_000
 """Long blocks, since many minutes are simulated."""
@@ -271,12 +273,12 @@ class SimulatedSession:
         self.newest_pose_id = message.pose_id
         return []
 
-    def take_request(self, *, only_first: bool = False) -> _Request | None:
+    def take_request(self, scope: Scope) -> _Request | None:
         self._is_held = False
         is_outdated = self.newest_pose_id > self.asked_pose_id or self.wanted.level != self.quality.level
         if self._in_flight or not is_outdated:
             return None
-        if self._has_asked and (only_first or self.clock_s < self._next_s):
+        if self._has_asked and (scope is Scope.FIRST or self.clock_s < self._next_s):
             self._is_held = True
             return None
         is_first, self._has_asked, self._in_flight = not self._has_asked, True, True
@@ -478,7 +480,7 @@ class SimulatedServer:
         self._compute(
             future,
             cost_s,
-            _Computed(request, cost_s, cost_s),
+            ComputedResponse(request, cost_s, cost_s),
             is_urgent=is_urgent,
             note=lambda: self._note_answer(client),
         )
