@@ -98,12 +98,19 @@ class Ladder:
 
 @dataclass(frozen=True)
 class RenderAhead:
-    """How many blocks of a stream a thread renders at once, and its mean busy share over so many `periods` since that
-    changed."""
+    """How many blocks of a stream a thread renders at once, and its mean busy share over the last of so many `periods`
+    since that changed.
+
+    `caution` multiplies how long the `long_mean` reaches back that calls for fewer blocks. `periods_since_fewer` counts
+    from when they became fewer, as long as that may turn out to have been too early.
+    """
 
     blocks: int = 1
     mean_busy: float = 0.0
     periods: int = 0
+    long_mean: float = 0.0
+    caution: int = 1
+    periods_since_fewer: int | None = None
 
 
 @dataclass(frozen=True)
@@ -168,17 +175,43 @@ def decide(
 
 def render_ahead(thresholds: Thresholds, ahead: RenderAhead, *, busy: float, lateness: float) -> RenderAhead:
     """After a period in which a thread rendered for the share `busy`, and a block was late by `lateness` at worst."""
-    periods = ahead.periods + 1
-    mean = ahead.mean_busy + max(1 / periods, thresholds.newest_weight) * (busy - ahead.mean_busy)
+    ahead = _average(thresholds, ahead, busy)
     numbers = thresholds.blocks_at_once
     at = numbers.index(ahead.blocks)
-    has_mean = periods >= thresholds.mean_periods
+    has_mean = ahead.periods >= thresholds.mean_periods
+    has_long_mean = ahead.periods >= thresholds.mean_periods * ahead.caution
     falls_behind = busy > thresholds.behind_busy and lateness > thresholds.behind_lateness
-    if at + 1 < len(numbers) and (falls_behind or (has_mean and mean > thresholds.more_blocks_above[at])):
-        return RenderAhead(numbers[at + 1], mean)
-    if at > 0 and has_mean and mean / (1 - thresholds.saved_by_doubling) < thresholds.more_blocks_above[at - 1]:
-        return RenderAhead(numbers[at - 1], mean)
-    return RenderAhead(ahead.blocks, mean, periods)
+    is_full = at + 1 < len(numbers) and has_mean and ahead.mean_busy > thresholds.more_blocks_above[at]
+    if is_full or (at + 1 < len(numbers) and falls_behind):
+        has_relapsed = is_full and ahead.periods_since_fewer is not None  # a moment's load says nothing of the number
+        caution = min(thresholds.most_caution, 2 * ahead.caution) if has_relapsed else ahead.caution
+        return RenderAhead(numbers[at + 1], caution=caution)
+    if at == 0:
+        return ahead
+    left = 1 - thresholds.saved_by_doubling
+    would_do = has_long_mean and ahead.long_mean / left < thresholds.more_blocks_above[at - 1]
+    # Where even a quarter of the blocks would do, half of them surely do.
+    if would_do or (has_mean and ahead.mean_busy / left**2 < thresholds.more_blocks_above[at - 1]):
+        return RenderAhead(numbers[at - 1], caution=ahead.caution, periods_since_fewer=0)
+    return ahead
+
+
+def _average(thresholds: Thresholds, ahead: RenderAhead, busy: float) -> RenderAhead:
+    """With one more period in its means, and less caution where fewer blocks have done for long enough."""
+    periods, since, caution = ahead.periods + 1, ahead.periods_since_fewer, ahead.caution
+    if since is not None:
+        since += 1
+        if since * thresholds.period_s > thresholds.relapse_s * caution:
+            since, caution = None, max(1, caution // 2)
+    newest, newest_of_long = (max(1 / periods, thresholds.newest_weight / times) for times in (1, ahead.caution))
+    return RenderAhead(
+        ahead.blocks,
+        ahead.mean_busy + newest * (busy - ahead.mean_busy),
+        periods,
+        ahead.long_mean + newest_of_long * (busy - ahead.long_mean),
+        caution,
+        since,
+    )
 
 
 def ir_share(thresholds: Thresholds, *, busy: float) -> float:
@@ -234,7 +267,7 @@ def _judge_stream(thresholds: Thresholds, ladder: Ladder, sample: LoadSample, no
         overloaded_periods=ladder.overloaded_periods + 1 if is_overloaded else 0,
         well_since_s=_since(ladder.well_since_s, now_s, is_so=would_be_well and not is_overloaded),
     )
-    if ladder.rose_s is not None and now_s - ladder.rose_s > thresholds.relapse_s:
+    if ladder.rose_s is not None and now_s - ladder.rose_s > thresholds.relapse_s * ladder.caution:
         return replace(judged, rose_s=None, caution=max(1, ladder.caution // 2))
     return judged
 

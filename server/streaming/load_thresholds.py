@@ -41,11 +41,12 @@ class Thresholds:
     clear_s: float = 4.0
     """Seconds in which all has to be well before a stream steps up: a change of quality every few seconds would be
     heard."""
-    relapse_s: float = 10.0
-    """Seconds after a step up in which a step down means that it was too early."""
+    relapse_s: float = 20.0
+    """Seconds, times the caution, after a step up in which a step down means that it was too early. With 10 s, whatever
+    the caution, a dozen streams at the limit of the workers went up and down in turns for ever."""
     most_caution: int = 16
     """Times `clear_s` that a stream waits at the most. Each relapse doubles the wait, each step up that lasts halves
-    it: at a limit a stream tries again about once a minute."""
+    it: at a limit a stream tries again about once a minute. The same goes for rendering fewer blocks at once."""
 
     patience_s: float = 0.15
     """Seconds that responses may take from being asked for: a reverberation that follows later is heard to lag."""

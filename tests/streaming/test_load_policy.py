@@ -304,6 +304,19 @@ def test_a_steady_load_keeps_its_number(saves):
         assert len(set(core.run(demand))) == 1, demand
 
 
+def test_near_a_limit_the_number_of_blocks_at_once_settles_though_load_fluctuates():
+    """And becomes one at once when the load goes."""
+    rng = np.random.default_rng(2)
+    core, counts = Core(), []
+    for _ in range(1_200):
+        counts.append(core.ahead.blocks)
+        core.look({4: 0.845, 8: 0.735}.get(core.ahead.blocks, 0.9) + 0.1 * rng.standard_normal(), lateness=0.1)
+    changes = [before != after for before, after in itertools.pairwise(counts)]
+    assert sum(changes[:200]) > 4
+    assert sum(changes[-600:]) <= 6
+    assert core.run(0.3, periods=13)[-1] == 1
+
+
 def test_the_thresholds_stand_in_an_order_that_leaves_room_between_up_and_down():
     one = THRESHOLDS
     assert one.easy < one.tight < one.late
