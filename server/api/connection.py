@@ -36,8 +36,8 @@ from server.assets.clips import ClipLibrary, DecodeError
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.cost import Costs
 from server.planning.places import place_of
-from server.planning.planner import Costs
 from server.planning.scene_acoustics import SceneAcoustics
 from server.protocol.blocks import Encoding
 from server.protocol.client_messages import AddEmitter, ClientMessage, Hello, Ping, parse_client_message

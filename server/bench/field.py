@@ -53,7 +53,7 @@ def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[st
 
 
 def _fill_node_cache(levels: FieldsByLevel) -> None:
-    """Fill the cache of responses with those of the level that has the most nodes."""
+    """Fill the cache with responses of the level that has the most nodes."""
     reusing = [field for field in levels.values() if field.kind.reuses_responses]
     if not reusing:
         return

@@ -19,7 +19,8 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.field.kinds.every_pose import ComputedResponses
-from server.responses.full_response import diffuse_energy, kemar
+from server.rendering.hrtf import kemar
+from server.responses.full_response import diffuse_energy
 from server.scene.bundle import Bundle
 from server.scene.geometry import Geometry, Material, Materials
 from server.scene.manifest import (

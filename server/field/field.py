@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import irfft, next_fast_len, rfft
 
+from server.acoustics.fast_length import next_fast_length
 from server.acoustics.geometry import Vector3
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
@@ -245,10 +245,12 @@ class AcousticField:
 
     def _placed(self, coded: Float32, aligned: Floats) -> Float32:
         """Responses whose first sample belongs at `aligned`: later by whole samples and a fraction of one."""
+        from scipy.fft import rfft  # a third of a second; NumPy's gives other bits in single precision
+
         start = np.floor(aligned).astype(int)
-        size = next_fast_len(coded.shape[-1] + 1, real=True)
+        size = next_fast_length(coded.shape[-1] + 1)
         turns = -2j * np.pi * np.arange(size // 2 + 1) / size * (aligned - start)[:, None, None]
-        shifted = irfft(rfft(coded, size) * np.exp(turns).astype(np.complex64), size)[..., : coded.shape[-1]]
+        shifted = np.fft.irfft(rfft(coded, size) * np.exp(turns).astype(np.complex64), size)[..., : coded.shape[-1]]
         responses = np.zeros((len(coded), self.channels, self.ir_samples), dtype=np.float32)
         for response, part, at in zip(responses, shifted, start, strict=True):
             add_from(part, response, at)

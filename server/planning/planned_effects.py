@@ -7,17 +7,19 @@ than their share of time. Clocks are seconds of sound.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from server.acoustics.geometry import Pose
+from server.planning.catalogue import emitter_effects, shared_effects
+from server.planning.cost import Costs
 from server.planning.motion import Motion
-from server.planning.planner import Costs, make_plan
+from server.planning.plan import Plan, RenderingDecision
+from server.planning.planner import make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Output, SceneAcoustics, Situation
 from server.responses.effect_flags import EmitterEffects, SharedEffects
 from server.responses.emitter_state import EmitterState
 from server.scene.effects import EffectName, Overrides
-from server.scene.plan import Decision, Plan
 
 PERIOD_S = 0.5
 _EMITTERS_PER_PERIOD, _MOST_PERIODS = 8, 2
@@ -89,7 +91,7 @@ class PlannedEffects:
         """Without a plan, whether there is a head is told from the output."""
         if self.plan is None or not self.plan.shared:
             return SharedEffects(head=self.overrides.get(EffectName.HRTF, self.output == "headphones"))
-        return SharedEffects.of(self.plan)
+        return shared_effects(self.plan)
 
     def wish(self, wishes: Mapping[EffectName, bool | None], output: Output | None) -> None:
         """On, off, or, with None, as the plan or the scene has it."""
@@ -165,11 +167,11 @@ class PlannedEffects:
         """No plan came of the request: what is on stays on."""
         self._in_flight = False
 
-    def of_emitter(self, name: str, clock_s: float, *, has_early: bool, has_late: bool) -> EmitterEffects | None:
-        """None of one that came after the plan was asked for."""
+    def of_emitter(self, name: str, clock_s: float, *, lacking: Collection[EffectName]) -> EmitterEffects | None:
+        """Without those that the scene is `lacking`. None of an emitter that came after the plan was asked for."""
         if self.plan is None or name not in self.plan.by_emitter:
             return None
-        effects = EmitterEffects.of(self.plan, name, has_early=has_early, has_late=has_late)
+        effects = emitter_effects(self.plan.on(name) - set(lacking))
         holds_still = self.overrides.get(EffectName.PROPAGATION_DELAY) is False
         # It may have begun to move since the plan was asked for.
         follows = effects.propagation_delay or (self._is_under_way(name, clock_s) and not holds_still)
@@ -213,7 +215,7 @@ def _switched_on(plan: Plan) -> frozenset[tuple[str | None, EffectName, bool, bo
 def _explained(plan: Plan, reasons: Mapping[EffectName, str]) -> Plan:
     """With other reasons for some effects than that somebody wished for them."""
 
-    def explain(decisions: Mapping[EffectName, Decision]) -> dict[EffectName, Decision]:
+    def explain(decisions: Mapping[EffectName, RenderingDecision]) -> dict[EffectName, RenderingDecision]:
         return {
             name: dataclasses.replace(each, reason=reasons[name], overridden=False)
             if name in reasons and each.overridden

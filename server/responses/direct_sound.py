@@ -55,15 +55,23 @@ class PathBatch(Generic[Key]):
         self._beaming = [
             (row, emitter) for row, (_, emitter) in enumerate(emitters) if emitter.directivity is not OMNIDIRECTIONAL
         ]
+        gains = dict.fromkeys(gain for _, emitter in emitters for gain in emitter.effects.path_gains)
+        self._gains = [
+            (gain, [row for row, (_, emitter) in enumerate(emitters) if gain in emitter.effects.path_gains])
+            for gain in gains
+        ]
 
     def find(self, listener: Pose) -> FoundPaths:
         """The paths to a listener, in the order of `keys`; good until the next are found."""
         paths = self._finder.find(np.array(listener.position), self._places, self._paths)
+        more_db = [(rows, gain_of(paths)[rows]) for gain_of, rows in self._gains]
         gain_db = paths.screen_db
         for row in self._unbent:
             gain_db[row] = 0.0 if paths.in_sight[row] else _SILENT_DB
         for row, emitter in self._beaming:
             gain_db[row] += departure_gain_db(emitter, paths.departure[row])
+        for rows, row_db in more_db:
+            gain_db[rows] += row_db
         return FoundPaths(paths.length_m, paths.arrival, gain_db)
 
 

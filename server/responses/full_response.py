@@ -4,7 +4,7 @@ leaves them out, and what follows from the field; or all of it from the field, w
 Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians.
 """
 
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
-from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.hrtf import HeadFilters, kemar
 from server.rendering.sphere import solid_angles
 from server.rendering.still_paths import StillPaths
 from server.responses.early_reflections import EarlyReflections
@@ -24,12 +24,6 @@ from server.responses.node_reflections import add_first_reflections
 from server.scene.bundle import Bundle
 
 _N_FFT = 512
-
-
-@cache
-def kemar(sample_rate: int) -> HeadFilters:
-    """The head of single responses, of maps, and of simulations."""
-    return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
 
 
 class FullResponse:

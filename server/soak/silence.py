@@ -10,11 +10,11 @@ import numpy as np
 
 from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
+from server.rendering.hrtf import kemar
 from server.rendering.ingest import DryAudio
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
 from server.responses.emitter_state import EmitterState
-from server.responses.full_response import kemar
 from server.streaming.direct_path_tracker import DirectPathTracker
 from server.streaming.emitters import StreamedEmitter
 

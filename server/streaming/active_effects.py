@@ -1,17 +1,18 @@
 """Has a renderer make what a session's effects call for, and nothing else.
 
-Direct sound that stands still is *baked*: it is part of the impulse response (IR), and the renderer does no more for
-it than keep the delay line. The IR without it is kept, so that it follows with the next block when something moves.
+Direct sound that stands still is *baked*: it is part of the impulse response (IR), and the renderer does no more for it
+than keep the delay line. The IR without it is kept, so that it follows with the next block when something moves.
 """
 
 import dataclasses
 from collections.abc import Mapping
 
 from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.planning.catalogue import ENERGY_EFFECTS, emitter_effects
 from server.planning.planned_effects import PlannedEffects
 from server.rendering.convolver import PartitionedIr
 from server.rendering.renderer import Renderer
-from server.responses.effect_flags import PARTS, EmitterEffects, SharedEffects
+from server.responses.effect_flags import EmitterEffects, SharedEffects
 from server.responses.emitter_state import EmitterState
 from server.responses.radiation import reverberation_gain
 from server.scene.effects import EffectName
@@ -29,7 +30,8 @@ class ActiveEffects:
         self.shared = SharedEffects() if planned is None else planned.shared
         self._renderer = renderer
         self._sample_rate = sample_rate
-        self._has_early, self._has_late = has_early, has_late
+        has = {EffectName.EARLY_REFLECTIONS: has_early, EffectName.LATE_REVERBERATION: has_late}
+        self._lacking = frozenset(name for name, is_there in has.items() if not is_there)
 
     @property
     def clock_s(self) -> float:
@@ -59,7 +61,7 @@ class ActiveEffects:
         self.shared = self.planned.shared
         begin = []
         for name, emitter in emitters.items():
-            effects = self.planned.of_emitter(name, self.clock_s, has_early=self._has_early, has_late=self._has_late)
+            effects = self.planned.of_emitter(name, self.clock_s, lacking=self._lacking)
             if effects is None:
                 continue
             if not emitter.is_decided and not effects.has_response:
@@ -74,10 +76,9 @@ class ActiveEffects:
         """What would be on if all were but what was switched off by hand, and whether that has a head."""
         assert self.planned is not None
         off = {name for name, is_on in self.planned.overrides.items() if not is_on}
-        parts = {part: name not in off for name, part in PARTS.items()}
-        parts["early"] &= self._has_early
-        parts["late"] &= self._has_late
-        return EmitterEffects(**parts), self.planned.output == "headphones" and EffectName.HRTF not in off
+        told = {effect.name for effect in ENERGY_EFFECTS} - off - self._lacking
+        whole = emitter_effects(told | {EffectName.PROPAGATION_DELAY})
+        return whole, self.planned.output == "headphones" and EffectName.HRTF not in off
 
     def share_tail(self, is_shared: bool, emitters: Mapping[str, StreamedEmitter]) -> None:
         """Have emitters share a late tail where a quality level does, or none would be told from its own."""
@@ -100,10 +101,10 @@ class ActiveEffects:
             if emitter.is_outdated and not emitter.effects.holds_still:
                 return False
             self._renderer.set_ir(name, ir, token=token)
-            self._renderer_hears(name, emitter, bakes_direct=True)
+            self._set_direct(name, emitter, bakes_direct=True)
         else:
             self._renderer.set_ir(name, ir, token=token)
-            self._renderer_hears(name, emitter, bakes_direct=False)
+            self._set_direct(name, emitter, bakes_direct=False)
             emitter.heard.without_direct = ir
         emitter.heard.token = token
         return True
@@ -115,14 +116,14 @@ class ActiveEffects:
             return
         if heard.without_direct is not None and heard.without_direct.channels == self._renderer.channels:
             self._renderer.set_ir(name, heard.without_direct, token=heard.token)
-            self._renderer_hears(name, emitter, bakes_direct=False)
+            self._set_direct(name, emitter, bakes_direct=False)
 
     def _switch(self, name: str, emitter: StreamedEmitter, effects: EmitterEffects) -> None:
         before = emitter.effects
         emitter.set_effects(effects)
         if before == effects and emitter.is_decided:
             return
-        if _aim(before) != _aim(effects):
+        if before.path != effects.path:
             emitter.is_displaced = True
         if before.directivity != effects.directivity and emitter.state.pattern != OMNIDIRECTIONAL:
             self._renderer.set_reverberation_gain(name, reverberation_gain(emitter.state.directivity))
@@ -136,9 +137,9 @@ class ActiveEffects:
             self.unbake(name, emitter)
             if emitter.heard.bakes_direct:  # in a response that nothing stands for
                 emitter.discard_response()
-        self._renderer_hears(name, emitter, bakes_direct=emitter.heard.bakes_direct)
+        self._set_direct(name, emitter, bakes_direct=emitter.heard.bakes_direct)
 
-    def _renderer_hears(self, name: str, emitter: StreamedEmitter, *, bakes_direct: bool) -> None:
+    def _set_direct(self, name: str, emitter: StreamedEmitter, *, bakes_direct: bool) -> None:
         emitter.heard.bakes_direct = bakes_direct
         effects = emitter.effects
         self._renderer.enable_direct(
@@ -149,13 +150,8 @@ class ActiveEffects:
         )
 
 
-def _aim(effects: EmitterEffects) -> tuple[bool, ...]:
-    """What the path of the direct sound depends on."""
-    return effects.occlusion, effects.diffraction, effects.directivity
-
-
 def as_asked(emitter: StreamedEmitter) -> EmitterState:
-    """What to ask for an IR of: where the direct sound is to be baked, but there is no IR of the pose, that first."""
+    """The state to ask for an IR of. Before the direct sound is baked, there has to be an IR of the pose without it."""
     effects = emitter.effects
     if not effects.bakes_direct or emitter.wants_baking or effects.holds_still:
         return emitter.state

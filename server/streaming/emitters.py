@@ -8,6 +8,7 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.core.errors import RequestError
 from server.field.lattice import Neighbourhood
+from server.planning.catalogue import EVERYTHING
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import AddEmitter, MoveEmitter
 from server.protocol.server_messages import LiveStatus
@@ -77,7 +78,7 @@ class StreamedEmitter:
         cls, message: AddEmitter, serial: int, live: "LiveInput | None", stage: Stage = Stage.DECIDED
     ) -> "StreamedEmitter":
         pattern = OMNIDIRECTIONAL if message.directivity is None else message.directivity.directivity
-        return cls(serial, EmitterState(message.pose, pattern, gain_db=message.gain_db), live, stage)
+        return cls(serial, EmitterState(message.pose, pattern, EVERYTHING, message.gain_db), live, stage)
 
     @property
     def effects(self) -> EmitterEffects:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
+from server.planning.plan import Plan
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose
 from server.responses.ir_request import IrRequest, IrResponse
-from server.scene.plan import Plan
 from server.streaming.plan_audit import Regret
 
 MAX_WAITING_MESSAGES = 256

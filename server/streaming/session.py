@@ -18,8 +18,9 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.cost import Costs
+from server.planning.plan import Plan
 from server.planning.planned_effects import PlannedEffects, PlanRequest
-from server.planning.planner import Costs
 from server.planning.scene_acoustics import SceneAcoustics
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import (
@@ -45,7 +46,6 @@ from server.responses.ir_request import IrRequest, IrResponse
 from server.responses.radiation import reverberation_gain
 from server.scene.bundle import Bundle
 from server.scene.effects import read_overrides, require_effect
-from server.scene.plan import Plan
 from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
 from server.streaming.emitters import LiveInput, Stage, StreamedEmitter

@@ -15,6 +15,7 @@ from functools import partial
 
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.plan import Plan
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
@@ -22,7 +23,6 @@ from server.protocol.server_messages import Durations, Error, LevelReason, Serve
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
-from server.scene.plan import Plan
 from server.streaming.inbox import ComputedResponse, Inbox, PendingWork
 from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock

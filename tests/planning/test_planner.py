@@ -10,9 +10,11 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.directivity import CARDIOID
 from server.acoustics.geometry import FloorPlan, Pose
 from server.core.errors import RequestError
-from server.planning.planner import ENTER_JND, Cost, make_plan
+from server.planning.catalogue import CATALOGUE
+from server.planning.cost import Cost
+from server.planning.planner import THRESHOLD, make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Reverberation, SceneAcoustics, Situation
-from server.scene.effects import CATALOGUE, EffectName, read_overrides
+from server.scene.effects import EffectName, read_overrides
 from server.scene.geometry import Material, Materials
 
 BANDS = len(OCTAVE_BANDS_HZ)
@@ -209,7 +211,7 @@ def test_inaudible_alone_but_audible_together_is_on():
     assert len(on(plan) & effects) == 1
     (decision,) = [each for each in plan.decisions if each.name in effects and each.called_for]
     assert "air absorption" in decision.reason
-    assert decision.change_jnd > ENTER_JND
+    assert decision.change_jnd > THRESHOLD.enter_jnd
 
 
 def test_decisions_do_not_flutter_about_a_threshold():

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from server.acoustics.directivity import CARDIOID
 from server.acoustics.geometry import FloorPlan, Pose
+from server.acoustics.sound_path import SoundPathFinder
 from server.rendering.hrtf import NoHead
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import ALL_ON
@@ -104,3 +105,25 @@ def test_nothing_is_aimed_where_fields_hold_the_direct_sound():
     paths = Paths()
     DirectPathTracker(whole, paths, emitters_at(*PLACES)).follow(Pose(PLACES[0]))
     assert paths.asked == 0
+
+
+def test_a_gain_that_is_handed_over_is_of_those_alone_whose_effects_have_it(sound):
+    """Told from the path as it was found, whatever else is on the way."""
+
+    def gain_db(paths):
+        return paths.length_m[:, None] * np.arange(7.0) - paths.screen_db / 2
+
+    def found_db(*with_gain):
+        emitters = emitters_at(*PLACES)
+        emitters["3"].pattern = CARDIOID
+        for name in with_gain:
+            emitters[name].effects = replace(ALL_ON, path_gains=(gain_db,))
+        (ways,) = sound.ways_from(emitters.items())
+        return ways.find(Pose((7.5, 0.5, 1.5))).gain_db.copy()
+
+    plain, changed = found_db(), found_db("2", "3")
+    paths = SoundPathFinder(CORNER, 343.0).find(np.array((7.5, 0.5, 1.5)), np.array(PLACES))
+    assert paths.screen_db[2].min() < -10
+    expected = gain_db(paths)
+    np.testing.assert_array_equal(changed[[0, 1, 4]], plain[[0, 1, 4]])
+    np.testing.assert_allclose(changed[[2, 3]] - plain[[2, 3]], expected[[2, 3]], atol=1e-12)

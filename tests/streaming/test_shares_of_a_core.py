@@ -4,8 +4,8 @@ import time
 
 import pytest
 
+from server.planning.plan import Plan
 from server.protocol.client_messages import AddEmitter, ListenerPose
-from server.scene.plan import Plan
 from server.streaming import audio_engine
 from server.streaming.load_policy import decide
 from server.streaming.load_thresholds import THRESHOLDS

@@ -18,8 +18,7 @@ from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
-from server.rendering.hrtf import HeadFilters
-from server.responses.full_response import kemar
+from server.rendering.hrtf import HeadFilters, kemar
 from server.scene.bundle import Bundle
 from server.scene.manifest import Cost, QualityLevel
 from server.streaming.calibration import Listener

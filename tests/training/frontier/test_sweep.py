@@ -12,7 +12,7 @@ from server.core.errors import BundleError
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Phase, QualityLevel, Reuse
 from server.streaming.calibration import Listener
