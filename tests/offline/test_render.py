@@ -34,7 +34,7 @@ class NoiseField:
     level = QualityLevel(name="noise", field="noise")
     kind = kind_of(level)
 
-    def impulse_responses(self, listeners, emitters, yaws):
+    def impulse_responses(self, listeners, emitters, yaws, *, remember=False):  # noqa: ARG002  there is no phase
         return np.stack([self.one(*poses) for poses in zip(listeners, emitters, yaws, strict=True)])
 
     def one(self, listener, emitter, yaw):
