@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import irfft, rfft
+from numpy.fft import irfft, rfft
 
 Array = npt.NDArray[np.floating]
 

@@ -152,12 +152,7 @@ class FloorPlan:
         bends = self.bend_corners
         points = np.concatenate([bends, np.zeros((len(bends), 1))], axis=-1)
         distance = np.linalg.norm(bends[:, None] - bends[None], axis=-1)
-        direct = np.where(self.is_visible(points[:, None], points[None]), distance, np.inf)
-        if not len(bends):
-            return direct
-        from scipy.sparse.csgraph import shortest_path  # takes a tenth of a second, which convex rooms need not spend
-
-        return np.asarray(shortest_path(direct, method="D", directed=False))
+        return _shortest(np.where(self.is_visible(points[:, None], points[None]), distance, np.inf))
 
     def contains(self, points: Points) -> npt.NDArray[np.bool_]:
         """(...,) whether each point is inside the room or on its surfaces."""
@@ -241,3 +236,20 @@ class FloorPlan:
         bent = np.hypot(np.min(to_last + reach(b), axis=-1), a[..., 2] - b[..., 2])
         # guard: a path into a wall is as long as the straight line
         return np.asarray(np.where(self.is_visible(a, b) | ~np.isfinite(bent), straight, bent))
+
+
+def _shortest(direct: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(n, n) lengths of the shortest ways over steps of lengths `direct` (n, n), infinite where there is none.
+
+    Dijkstra's algorithm from all points at once. `scipy.sparse.csgraph` takes a tenth of a second to import.
+    """
+    steps = np.minimum(direct, direct.T)
+    start = np.arange(len(steps))
+    lengths = np.full_like(steps, np.inf)
+    lengths[start, start] = 0.0
+    is_open = np.ones(steps.shape, np.bool)
+    for _ in range(len(steps)):
+        nearest = np.argmin(np.where(is_open, lengths, np.inf), axis=-1)
+        is_open[start, nearest] = False
+        lengths = np.minimum(lengths, lengths[start, nearest, None] + steps[nearest])
+    return lengths

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 
 from server.acoustics.decay import ONSET_THRESHOLD_DB, EnergyDecay, energy_decay, onset_sample
 from server.acoustics.decibels import power_to_db
+from server.acoustics.fast_length import next_fast_length
 
 __all__ = [
     "ONSET_THRESHOLD_DB",
@@ -301,9 +301,9 @@ def _iacc(
         energies = np.square(segment).sum(axis=-1)
         if segment.shape[-1] == 0 or energies.min() <= 0.0:
             continue
-        size = scipy.fft.next_fast_len(segment.shape[-1] + lags, real=True)
-        left, right = scipy.fft.rfft(segment, size, axis=-1)
-        correlation = scipy.fft.irfft(np.conj(left) * right, size)
+        size = next_fast_length(segment.shape[-1] + lags)
+        left, right = np.fft.rfft(segment, size, axis=-1)
+        correlation = np.fft.irfft(np.conj(left) * right, size)
         within = np.concatenate([correlation[: lags + 1], correlation[-lags:]])
         values[row] = min(float(np.abs(within).max() / np.sqrt(energies[0] * energies[1])), 1.0)
     return values.reshape(onset.shape[:-1])
@@ -314,7 +314,7 @@ def _itd_s(responses: npt.NDArray[np.generic], direct_at: _Integers, sample_rate
     peaks = direct_at.reshape(-1, 2)
     lead, lags = round(_DIRECT_LEAD_S * sample_rate), round(_LAG_LIMIT_S * sample_rate)
     length = lead + round(_BETWEEN_EARS_S * sample_rate) + lags
-    size = scipy.fft.next_fast_len(length + lags, real=True)
+    size = next_fast_length(length + lags)
     frequencies = np.fft.rfftfreq(size, 1.0 / sample_rate)
     # The low-pass falls as a raised cosine over an octave. A steep one would ring for longer than the window.
     lowpass = 0.5 + 0.5 * np.cos(np.pi * np.clip(frequencies / _LOWPASS_HZ - 1.0, 0.0, 1.0))
@@ -325,11 +325,11 @@ def _itd_s(responses: npt.NDArray[np.generic], direct_at: _Integers, sample_rate
         # The louder ear is the nearer one, and its peak is the more reliable of the two.
         nearer = int(np.argmax(np.abs(ears[row, [0, 1], arrivals])))
         start = max(int(arrivals[nearer]) - lead, 0)
-        left, right = scipy.fft.rfft(ears[row, :, start : start + length].astype(np.float64), size, axis=-1) * lowpass
+        left, right = np.fft.rfft(ears[row, :, start : start + length].astype(np.float64), size, axis=-1) * lowpass
         spectrum = np.conj(left) * right
         if not np.abs(spectrum).max() > 0.0:
             continue
-        correlation = scipy.fft.irfft(spectrum, size * _UPSAMPLING)
+        correlation = np.fft.irfft(spectrum, size * _UPSAMPLING)
         reach = lags * _UPSAMPLING
         within = np.concatenate([correlation[-reach:], correlation[: reach + 1]])
         values[row] = (int(np.argmax(within)) - reach) / (sample_rate * _UPSAMPLING)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from server.assets.names import named_by_stem
 from server.core.errors import RequestError
-from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.hrtf import HeadFilters, Hrtf, kemar
 
 DEFAULT_HRTF = "kemar"
 
@@ -25,13 +25,11 @@ class HrtfLibrary:
         named = named_by_stem(files)
         if DEFAULT_HRTF in named:
             _logger.warning("warning: %s takes the place of the bundled head %r", named[DEFAULT_HRTF], DEFAULT_HRTF)
-        paths = {DEFAULT_HRTF: KEMAR, **named}
-        self._filters = {
-            (name, rate): HeadFilters.from_hrtf(Hrtf.read(path, rate))
-            for rate in set(sample_rates)
-            for name, path in paths.items()
-        }
-        self.names = tuple(sorted(paths))
+        rates = set(sample_rates)
+        self._filters = {(DEFAULT_HRTF, rate): kemar(rate) for rate in rates if DEFAULT_HRTF not in named}
+        for name, path in named.items():
+            self._filters |= {(name, rate): HeadFilters.from_hrtf(Hrtf.read(path, rate)) for rate in rates}
+        self.names = tuple(sorted({DEFAULT_HRTF, *named}))
 
     def filters(self, name: str, sample_rate: int) -> HeadFilters:
         """Raises RequestError unknown_hrtf."""

@@ -5,7 +5,6 @@ a goal of the run is not reached, with a line on standard error that says why. A
 history.
 """
 
-import asyncio
 import shlex
 import sys
 import time
@@ -17,7 +16,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from server.bench.report import (
     Judgement,
@@ -194,6 +192,8 @@ def listen(
     from server.bench.machine import describe_machine
 
     try:
+        import asyncio
+
         measured = asyncio.run(one_stream.listen(url, scene, emitters, duration_s, poses_per_second))
     except (OSError, WebSocketException) as exc:
         raise NafirError(f"{url}: {exc}") from exc
@@ -210,6 +210,8 @@ def _steps_told() -> Callable[[str], None]:
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[str], None]]:
     """A progress bar that is redrawn only between measurements, since a thread that redraws would affect them."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
         task = progress.add_task("", total=total)

@@ -13,9 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import Progress
 
 from server.bench import cli as bench
 from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
@@ -50,6 +47,9 @@ def main() -> None:
     try:
         app()
     except NafirError as exc:
+        from rich.console import Console
+        from rich.markup import escape
+
         Console(stderr=True, soft_wrap=True).print(f"[bold red]error:[/] {escape(str(exc))}", highlight=False)
         sys.exit(2)
 
@@ -73,6 +73,7 @@ def serve(
     """
     import uvicorn
     from pydantic import ValidationError
+    from rich.console import Console
 
     from server.api import serving
     from server.api.app import create_app
@@ -193,6 +194,8 @@ def render(
 ) -> None:
     """Render to a file what a listener hears along a path."""
     import scipy.io.wavfile
+    from rich.console import Console
+    from rich.progress import Progress
 
     from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
     from server.field.fields_by_level import FieldsByLevel
@@ -353,4 +356,4 @@ def _report(as_json: bool, sentence: str, document: dict[str, object]) -> None:
     if as_json:
         typer.echo(json.dumps(document))
     else:
-        Console(soft_wrap=True).print(escape(sentence), highlight=False)
+        typer.echo(sentence)

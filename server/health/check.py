@@ -39,7 +39,8 @@ from server.health.findings import (
     Law,
 )
 from server.health.poses import EMITTER, LISTENER, YAW, Poses, corners, scattered
-from server.responses.full_response import FullResponse, kemar
+from server.rendering.hrtf import kemar
+from server.responses.full_response import FullResponse
 from server.scene.bundle import Bundle
 from server.scene.manifest import Manifest
 

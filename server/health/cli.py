@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import track
 
 from server.core.command_line import figure_file
 
@@ -25,6 +24,8 @@ def check(
     The exit code is 1 if a law is broken, unless the scene was exported with a reason to accept that. Slow fields are
     checked at fewer poses, for about 15 seconds each.
     """
+    from rich.progress import track
+
     from server.health.check import check as check_bundle
     from server.health.report import reasons, table, to_json
     from server.scene.bundle import Bundle, find_bundle

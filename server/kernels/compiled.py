@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
+from numba.core.runtime import rtsys
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -82,9 +83,6 @@ def _is_writable(folder: Path) -> bool:
     return True
 
 
-_look_for_no_blas()
-
-
 class _Locator(_CacheLocator):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._line = function.__code__.co_firstlineno
@@ -121,6 +119,16 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         super().__init__(function)
         # Read before anything is unpickled, which of other sources may name modules that are no more.
         self._cache_file._version = f"{self._cache_file._version} {_digest_of_sources()}"
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """As numba has it, less the rules of typing and lowering: they take a third of a second to set up, and only
+        compiling needs them, which sets them up itself."""
+        rtsys.initialize(target)  # what compiled code allocates with
+        with self._guard_against_spurious_io_errors():
+            loaded = self._load_overload(signature, target)
+        if loaded is None:
+            _look_for_no_blas()
+        return loaded
 
     def save_overload(self, signature: Any, result: Any) -> None:
         if _is_writable(Path(self.cache_path)):

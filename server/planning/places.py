@@ -10,16 +10,17 @@ from functools import cache, lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import next_fast_len
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.fast_length import next_fast_length
 from server.acoustics.geometry import Pose, Vector3
 from server.acoustics.room_parameters import UnmeasurableError, interaural_cross_correlation
 from server.field.field import AcousticField
 from server.planning.scene_acoustics import Reverberation, SceneAcoustics
 from server.rendering.direct_path import NEAR_LIMIT_M
+from server.rendering.hrtf import kemar
 from server.rendering.partitions import Partitioning
-from server.responses.full_response import diffuse_energy, kemar
+from server.responses.full_response import diffuse_energy
 from server.scene.bundle import Bundle
 
 _EARLY_S = 0.050
@@ -139,7 +140,7 @@ def _octaves(
     """(band,) energy per channel, of all bands together that of the response; and (band, channel, sample) what filters
     let through whose slopes are an octave wide, so that they ring for less time than rooms do."""
     samples = response.shape[-1]
-    size = next_fast_len(2 * samples, real=True)
+    size = next_fast_length(2 * samples)
     spectrum = np.fft.rfft(response, size)
     frequency = np.maximum(np.fft.rfftfreq(size, 1 / sample_rate), 1.0)
     away = np.log2(frequency) - np.log2(np.asarray(OCTAVE_BANDS_HZ))[:, None]

@@ -5,21 +5,28 @@ because the receiver order written in public files is not reliable.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import soxr
-from scipy.spatial import cKDTree
 
 from server.acoustics.minimum_phase import excess_delays_samples, folded_cepstrum
 from server.rendering.sofa import HeadMeasurements, HrtfError, portions, read_sofa
 from server.rendering.sphere import CoverageError, Triangulation, fill_gaps, solid_angles, triangulate
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
 _Floats = npt.NDArray[np.float64]
 
 KEMAR = Path(__file__).parent / "hrtf_data" / "mit_kemar_normal_pinna.sofa"
+PREPARED_RATE = 24_000
+"""Of the bundled scenes."""
+PREPARED_KEMAR = KEMAR.with_name(f"mit_kemar_normal_pinna_{PREPARED_RATE}_hz.npz")
+"""KEMAR's filters as `HeadFilters.save` writes them: reading the measurements and making filters of them takes a second
+of every start."""
 
 _ROWS_AT_ONCE = 32
 """Resampled together. soxr takes 120 kB for each, and for more of them at once it takes longer, too."""
@@ -70,7 +77,9 @@ class Hrtf:
         return cls(measured.directions, responses * gain, sample_rate, round(_LEAD_S * sample_rate))
 
     @cached_property
-    def _tree(self) -> cKDTree:
+    def _tree(self) -> "cKDTree":
+        from scipy.spatial import cKDTree  # a tenth of a second
+
         return cKDTree(self.directions)
 
     def spectra(self, directions: _Floats, n_fft: int) -> npt.NDArray[np.complex128]:
@@ -100,6 +109,8 @@ def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats
 
 def _resampled(measured: HeadMeasurements, sample_rate: int, part: slice, swapped: bool) -> _Floats:
     """(direction, ear, sample) of some directions, the left ear first."""
+    import soxr
+
     responses = measured.responses[part]
     count, ears, samples = responses.shape
     if measured.sample_rate != sample_rate:
@@ -155,6 +166,23 @@ class HeadFilters:
         delays_s = np.concatenate([delays_s, shares @ delays_s])
         return cls(hrtf.sample_rate, directions, cepstra.astype(np.float32), delays_s, triangulate(directions))
 
+    def save(self, path: Path) -> None:
+        np.savez(
+            path,
+            sample_rate=np.int64(self.sample_rate),
+            directions=self.directions,
+            cepstra=self.cepstra,
+            delays_s=self.delays_s,
+            **self.triangulation._asdict(),
+        )
+
+    @classmethod
+    def load(cls, path: Path) -> "HeadFilters":
+        """What was saved, to the bit."""
+        with np.load(path, allow_pickle=False) as file:
+            triangulation = Triangulation(*(file[name] for name in Triangulation._fields))
+            return cls(int(file["sample_rate"]), file["directions"], file["cepstra"], file["delays_s"], triangulation)
+
     @property
     def taps(self) -> int:
         return int(self.cepstra.shape[-1])
@@ -167,6 +195,14 @@ class HeadFilters:
     @cached_property
     def longest_delay_s(self) -> float:
         return float(max(0.0, self.delays_s.max()))
+
+
+@cache
+def kemar(sample_rate: int) -> HeadFilters:
+    """The head of whoever asks for no other: of single responses, of maps, and of simulations."""
+    if sample_rate == PREPARED_RATE:
+        return HeadFilters.load(PREPARED_KEMAR)
+    return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
 
 
 class NoHead:
@@ -201,3 +237,7 @@ def _smooth(directions: _Floats, common_s: _Floats) -> _Floats:
     restraint = _RESTRAINT * np.diag([0.0, 1, 1, 1, 1, 1])
     weights = np.linalg.solve(at_measured.T @ at_measured + restraint, at_measured.T @ values)
     return np.asarray((shapes(directions) - shapes(np.array([[1.0, 0.0, 0.0]]))) @ weights)
+
+
+if __name__ == "__main__":
+    HeadFilters.from_hrtf(Hrtf.read(KEMAR, PREPARED_RATE)).save(PREPARED_KEMAR)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from server.core.errors import NafirError
 from server.rendering.sofa_file import SofaError, SofaFile, delay_rows
@@ -104,6 +103,8 @@ def _offsets(sofa: SofaFile, measurements: int) -> _Floats:
 
 def _farthest(directions: _Floats, distance: _Floats) -> npt.NDArray[np.int64]:
     """Indices of one measurement per direction, in the order of the file."""
+    from scipy.spatial import cKDTree  # a tenth of a second
+
     # Of those that agree to rounding, which may be very many, one is left to compare with its neighbours.
     order = np.lexsort((np.arange(len(directions)), -distance))
     _, first = np.unique(np.round(directions[order] / _ROUNDING), axis=0, return_index=True)

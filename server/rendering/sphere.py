@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from server.core.errors import NafirError
 from server.kernels.compiled import compiled_in_place
@@ -103,6 +102,8 @@ def fill_gaps(measured: _Floats) -> tuple[_Floats, _Floats]:
 
 def triangulate(directions: _Floats) -> Triangulation:
     """Raises CoverageError if some direction has no triangle, or a measured one no corner."""
+    from scipy.spatial import ConvexHull, QhullError  # a tenth of a second, which a prepared head does not need
+
     try:
         hull = ConvexHull(directions)
     except QhullError as exc:
@@ -119,6 +120,8 @@ def triangulate(directions: _Floats) -> Triangulation:
 
 def solid_angles(directions: _Floats) -> _Floats:
     """(direction,) share of the sphere to which each direction is the nearest; measured grids crowd at the poles."""
+    from scipy.spatial import cKDTree  # a tenth of a second
+
     index = np.arange(_SPHERE_POINTS) + 0.5
     height = 1 - 2 * index / _SPHERE_POINTS
     azimuth = np.pi * (1 + np.sqrt(5)) * index

@@ -6,7 +6,7 @@ import numpy as np
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.rendering.direct_path import PathTarget
-from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.hrtf import kemar
 from server.rendering.limiter import CEILING
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
@@ -17,7 +17,7 @@ def warm_up(block_sizes: Iterable[int]) -> None:
     """Compile what renders, or load it from disk, and compute the constants of each block size: a renderer, or a
     response of paths at rest, made after this costs nothing more."""
     sample_rate = 24_000
-    filters = HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
+    filters = kemar(sample_rate)
     flat, ahead = np.zeros(len(OCTAVE_BANDS_HZ)), np.array([(1.0, 0.0, 0.0)])
     still = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=flat)
     still.add(np.ones(1), ahead, flat[None], (0.0, 0.0, 0.0, 1.0), np.zeros((2, 1), np.float32))

@@ -4,40 +4,26 @@ leaves them out, and what follows from the field; or all of it from the field, w
 Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians.
 """
 
-from functools import cache, cached_property
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_power
-from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
-from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.hrtf import HeadFilters, kemar
 from server.rendering.sphere import solid_angles
 from server.rendering.still_paths import StillPaths
 from server.responses.early_reflections import EarlyReflections
+from server.responses.emitter_state import EmitterState
 from server.responses.node_reflections import add_first_reflections
 from server.scene.bundle import Bundle
 
 _N_FFT = 512
-
-
-@cache
-def kemar(sample_rate: int) -> HeadFilters:
-    """The head of single responses, of maps, and of simulations."""
-    return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
-
-
-class _AllRound(NamedTuple):
-    """An emitter that radiates alike in all directions."""
-
-    pose: Pose
-    directivity: Directivity = OMNIDIRECTIONAL
 
 
 class FullResponse:
@@ -79,7 +65,9 @@ class FullResponse:
             paths = self._paths.find(listener, emitter[None])
             self._direct.add(paths.length_m, paths.arrival, paths.screen_db, head.orientation, response)
             if self._early is not None:
-                add_first_reflections(self.field, self._early, response[None], head, [_AllRound(Pose(tuple(emitter)))])
+                add_first_reflections(
+                    self.field, self._early, response[None], head, [EmitterState(Pose(tuple(emitter)))]
+                )
         return responses
 
     def path_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
-from scipy.ndimage import distance_transform_edt
 
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import Vector3
@@ -64,6 +62,9 @@ class LoudnessMap:
 
     def to_png(self) -> bytes:
         """North up, transparent outside the room; the brightest colour is the loudest, 30 dB above the darkest."""
+        from PIL import Image  # these two take a tenth of a second
+        from scipy.ndimage import distance_transform_edt
+
         outside = np.isnan(self.levels_db)
         # Cells outside take the level of the nearest inside, or they would bleed into the room in the enlarged picture.
         nearest = distance_transform_edt(outside, return_distances=False, return_indices=True)

@@ -3,8 +3,6 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 
 def soak(
@@ -21,6 +19,9 @@ def soak(
     Meanwhile a listener at rest compares every sample with an offline render in double precision. The exit code is 1 if
     any requirement is not met; standard error says which and why.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     from server.bench.report import Judgement, end_with, missed, print_json, print_judgements, print_measures
     from server.soak.run import Plan
     from server.soak.run import soak as run

@@ -17,7 +17,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.health.double_precision import DoubleFullResponse
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerStart
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from server.scene.effects import EffectName
 
 _CLIP = "man-reading"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import shortest_path
 
 from server.acoustics.geometry import FloorPlan, Pose
 
@@ -91,3 +92,16 @@ def test_path_obeys_the_triangle_inequality_in_plan(
     level = [np.array((p[0], p[1], 1.5)) for p in (a, b, c)]
     length = APARTMENT.path_length_m
     assert length(level[0], level[2]) <= length(level[0], level[1]) + length(level[1], level[2]) + 1e-6
+
+
+@pytest.mark.parametrize("corners", range(3, 12))
+def test_lengths_round_corners_are_scipys_to_the_bit(corners: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a plan whose corners see each other by chance."""
+    rng = np.random.default_rng(corners)
+    bends = rng.uniform(0, 10, (corners, 2))
+    sees = rng.uniform(size=(corners, corners)) < 0.4
+    monkeypatch.setattr(FloorPlan, "bend_corners", bends)
+    monkeypatch.setattr(FloorPlan, "is_visible", lambda *_: sees | np.eye(corners, dtype=bool))
+    direct = np.where(sees, np.linalg.norm(bends[:, None] - bends[None], axis=-1), np.inf)
+    plan = FloorPlan(((0, 0), (1, 0), (0, 1)), 2.5)
+    np.testing.assert_array_equal(plan.bend_lengths_m, shortest_path(direct, method="D", directed=False))

@@ -19,8 +19,8 @@ from server.acoustics.geometry import Pose
 from server.field.fields_by_level import FieldsByLevel
 from server.health.double_precision import DoubleFullResponse
 from server.offline.render import PathPoint, RenderedEmitter, render
+from server.rendering.hrtf import kemar
 from server.responses.direct_sound import DirectSound
-from server.responses.full_response import kemar
 from server.scene.bundle import Bundle, bundled_scenes
 
 ROOT = Path(__file__).parents[2]
@@ -45,7 +45,7 @@ from server.responses.direct_sound import DirectSound
 from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, render
 from server.scene.bundle import Bundle, find_bundle
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 
 assert hasattr(direct_path_kernel.ask, "py_func") == (sys.argv[1] == "single")
 scene, out, seconds = sys.argv[2], sys.argv[3], float(sys.argv[4])

@@ -53,6 +53,22 @@ def test_a_second_start_compiles_nothing(package):
     assert list((package / "server" / "__pycache__").glob("outer.outer-*.nbc"))
 
 
+def test_what_is_kept_runs_without_what_only_compiling_needs(package):
+    """Rules of typing and lowering, a third of a second."""
+    assert run(package) == (20, 0)
+    check = f"{RUN}; import sys; print('numba.np.arraymath' in sys.modules)"
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    output = subprocess.run(
+        [sys.executable, "-c", check],
+        cwd=package,
+        env=environment | {"PYTHONPATH": str(package)},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert output.stdout.split() == ["20", "1", "False"]
+
+
 def test_a_change_in_a_function_called_is_heeded(package):
     assert run(package) == (20, 0)
     inner = package / "server" / "inner.py"

@@ -11,7 +11,8 @@ import sofar
 from scipy.signal import butter, sosfiltfilt
 
 from server.acoustics.decibels import amplitude_to_db, power_to_db
-from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering import hrtf as hrtf_module
+from server.rendering.hrtf import KEMAR, PREPARED_RATE, HeadFilters, Hrtf
 from server.rendering.sofa import HrtfError, read_sofa
 
 HEAD_RADIUS_M = 0.0875
@@ -325,3 +326,29 @@ def test_a_head_is_resampled_in_little_memory():
     """A server does so beside streams. 1,420 responses of 4.5 ms are 2.5 MB."""
     command = [sys.executable, "-c", READING]
     assert float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) < 80
+
+
+def test_the_prepared_head_is_what_its_measurements_make(kemar):
+    """`python -m server.rendering.hrtf` prepares it anew. Processors differ in the last bits of a logarithm, and so in
+    which way four directions on a circle are cut into two triangles."""
+    prepared, made = hrtf_module.kemar(PREPARED_RATE), HeadFilters.from_hrtf(kemar)
+    for name in ("directions", "cepstra", "delays_s"):
+        np.testing.assert_allclose(getattr(prepared, name), getattr(made, name), rtol=1e-6, atol=1e-6)
+    triangles, across, inverses = prepared.triangulation
+    corners = np.swapaxes(prepared.directions[triangles], 1, 2)
+    np.testing.assert_allclose(inverses @ corners, np.broadcast_to(np.eye(3), corners.shape), atol=1e-9)
+    for corner in range(3):
+        shared = [set(a) & set(b) for a, b in zip(triangles, triangles[across[:, corner]], strict=True)]
+        assert shared == [{*row} - {row[corner]} for row in triangles]
+
+
+def test_filters_are_loaded_as_they_were_saved(kemar, tmp_path):
+    filters = HeadFilters.from_hrtf(kemar, taps=64)
+    filters.save(tmp_path / "head.npz")
+    loaded = HeadFilters.load(tmp_path / "head.npz")
+    assert loaded.sample_rate == filters.sample_rate
+    assert loaded.cepstra.dtype == np.float32
+    for name in ("directions", "cepstra", "delays_s"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(filters, name))
+    for part, saved in zip(loaded.triangulation, filters.triangulation, strict=True):
+        np.testing.assert_array_equal(part, saved)

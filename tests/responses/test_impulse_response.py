@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+import scipy.io.wavfile
 import soundfile
 from numpy.testing import assert_array_equal
 
@@ -30,6 +31,14 @@ def test_every_format_carries_the_same_samples_exactly(field, name):
     response = ImpulseResponse.compute(field, QUERY)
     assert response.samples.shape == (2, field.ir_samples)
     assert_array_equal(read(name, response.encode(name)), response.samples)
+
+
+@pytest.mark.parametrize("channels", [("left", "right"), ("centre",)])
+def test_a_wav_file_is_scipys_to_the_byte(channels):
+    samples = np.random.default_rng(0).standard_normal((len(channels), 1_001)).astype(np.float32)
+    expected = io.BytesIO()
+    scipy.io.wavfile.write(expected, 44_100, samples.T)
+    assert ImpulseResponse("flat", "full", QUERY, 44_100, channels, samples).encode("wav") == expected.getvalue()
 
 
 @pytest.mark.parametrize("name", IR_FORMATS)

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 from server.acoustics.decibels import power_to_db
-from server.rendering.hrtf import KEMAR
+from server.rendering.hrtf import KEMAR, kemar
 from server.rendering.sphere import solid_angles
-from server.responses.full_response import FullResponse, diffuse_energy, kemar
+from server.responses.full_response import FullResponse, diffuse_energy
 from server.responses.loudness import LoudnessMap, loudness_map
 
 

@@ -8,7 +8,7 @@ import pytest
 from server.core.errors import BundleError
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import Bundle, find_bundle
 from server.streaming.calibration import calibrate

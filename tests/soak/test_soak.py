@@ -18,8 +18,8 @@ from server.offline.render import PathPoint, RenderedEmitter, render
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import PROTOCOL
 from server.protocol.server_messages import Place, Pong, SceneDescription, Welcome
+from server.rendering.hrtf import kemar
 from server.responses.direct_sound import DirectSound
-from server.responses.full_response import kemar
 from server.scene.bundle import Bundle, find_bundle
 from server.soak.hostile import Hostile
 from server.soak.run import _growth, judge

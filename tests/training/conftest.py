@@ -9,8 +9,8 @@ import torch
 from rich.progress import Progress
 
 from server.health.check import Effort
+from server.rendering import hrtf
 from server.rendering.hrtf import HeadFilters
-from server.responses import full_response
 from server.scene.bundle import Bundle
 from tests.training.held_out import make_held_out  # noqa: F401  a fixture
 from training.bundling import noise
@@ -43,7 +43,7 @@ def apartment() -> SceneFile:
 
 @pytest.fixture(scope="session")
 def kemar() -> HeadFilters:
-    return full_response.kemar(24_000)
+    return hrtf.kemar(24_000)
 
 
 @pytest.fixture(scope="session")

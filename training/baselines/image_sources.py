@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import poisson
 
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from server.scene.geometry import Geometry
 from server.scene.manifest import Air
 from training.data.dataset import SPEED_OF_SOUND, Dataset

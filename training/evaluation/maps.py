@@ -19,7 +19,8 @@ from matplotlib.image import AxesImage
 
 from server.acoustics.decibels import power_to_db
 from server.field.field import AcousticField
-from server.responses.full_response import FullResponse, kemar
+from server.rendering.hrtf import kemar
+from server.responses.full_response import FullResponse
 from server.responses.loudness import LoudnessMap, loudness_map
 from training.baselines.baselines import TrainingPairs, barycentric
 from training.baselines.held_out import EvaluationError, HeldOut, require_same_scene

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from server.acoustics.metrics import parameter_errors, summarise
 from server.acoustics.room_parameters import RoomParameters, measure
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from training.data.dataset import GEOMETRIC_ORDER
 from training.data.scene_file import SceneFile
 from training.data.simulation_plan import SimulationPlan

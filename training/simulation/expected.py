@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.codec import Codec
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from training.data.dataset import GEOMETRIC_ORDER, Dataset
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis

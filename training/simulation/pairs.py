@@ -13,7 +13,7 @@ from time import process_time, thread_time
 import numpy as np
 import numpy.typing as npt
 
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND, TAKES, OwnResponse, own_duration_s
 from training.data.scene_file import SceneFile
 from training.data.shared_tail import SharedTail, shared_power

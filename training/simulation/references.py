@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from training.data.dataset import GEOMETRIC_ORDER, Dataset, StoredResponses
 from training.data.responses import SimulatedResponses
 from training.simulation.direct_paths import DirectPaths

@@ -128,7 +128,10 @@ def test_a_bundle_records_errors_from_one_simulation(nafir_train, dataset, tiny_
         (("train", "{data}", "-o", "{tmp}/run", "--field", "nerf"), "there is no 'nerf'"),
         (("train", "{data}", "-o", "{tmp}/run", "--field", "naf", "--rank", "64"), "leave it out for naf"),
         (("train", "{data}", "-o", "{tmp}/run", "--field", "naf", "--width", "64"), "leave it out for naf"),
-        (("train", "{data}", "-o", "{tmp}/run", "--teacher", "{run}", "--epochs", "1"), "only a naf that predicts spectrograms"),
+        (
+            ("train", "{data}", "-o", "{tmp}/run", "--teacher", "{run}", "--epochs", "1"),
+            "only a naf that predicts spectrograms",
+        ),
         (("export", "{run}", "{tmp}", "-o", "{tmp}/bundle"), "not a run folder"),
     ],
 )

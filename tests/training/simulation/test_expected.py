@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.codec import Codec
-from server.responses.full_response import kemar
+from server.rendering.hrtf import kemar
 from training.data.dataset import Dataset, DatasetError
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.expected import ExpectedSpectrograms

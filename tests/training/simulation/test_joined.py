@@ -15,9 +15,10 @@ from server.acoustics.geometry import Pose
 from server.acoustics.room_parameters import measure
 from server.field.field import AcousticField
 from server.offline.render import RenderedEmitter
+from server.rendering.hrtf import kemar
 from server.rendering.still_paths import StillPaths
 from server.responses.early_reflections import EarlyReflections
-from server.responses.full_response import FullResponse, kemar
+from server.responses.full_response import FullResponse
 from server.scene.bundle import BUNDLED, Bundle
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.simulation_plan import SimulationPlan

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
-from server.rendering.hrtf import KEMAR, Hrtf
-from server.responses.full_response import kemar
+from server.rendering.hrtf import KEMAR, Hrtf, kemar
 from training.data.responses import SimulatedResponses
 from training.simulation.rays import sphere_directions
 from training.simulation.references import GeometricSound, References, WholeResponses

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
-from server.responses.full_response import kemar as kemar_at
+from server.rendering.hrtf import kemar as kemar_at
 from training.data.scene_file import HISTOGRAM_BIN_S
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis, rotate_into_head
