@@ -287,8 +287,7 @@ def test_a_pose_that_is_no_number_is_refused_and_the_next_one_is_heard_at_once(a
 
 
 def test_where_no_sound_can_come_from_there_is_no_response_and_the_error_says_so(field):
-    """Inside a wall without a compiler, or so far off that the distance overflows: an endless way is an endless delay,
-    and no index of a sample."""
+    """So far off that the distance overflows: an endless way is an endless delay, and no index of a sample."""
     with pytest.raises(FieldError, match="no way leads from emitter to listener"):
         field.impulse_responses([(2.0, 2.5, 1.5)], [(1e200, 1.0, 1.5)], [0.0])
 
