@@ -19,6 +19,7 @@ from server.api.inflow import MOVES_PER_S, POSES_PER_S
 from server.api.settings import Settings
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter, TextMessage
+from server.protocol.codecs.registry import CODECS
 from server.protocol.codes import CLOSE_CODES, ERROR_CODES
 from server.protocol.exchange import EXCHANGE
 from server.protocol.message import Message
@@ -52,12 +53,12 @@ def _description() -> str:
     exchange = "\n".join(
         f"1. {'client' if step.is_of_client else 'server'}, `{step.name}`: {step.meaning}" for step in EXCHANGE
     )
+    encodings = ", ".join(f"{name} is {codec.meaning}" for name, codec in CODECS.items())
     return f"""Live audio from a place, while a listener and emitters move in it. Protocol version {PROTOCOL}.
 
 Control travels as JSON text, one object with a `type` per message; audio, and listener poses where wished, as binary
 messages whose first byte is their kind. Binary is little endian. Metres, radians, decibels, samples of the scene's
-rate; x east, y north, z up, yaw counter-clockwise from +x. f32 is IEEE 754 single with full scale 1, s16 two's
-complement with 32767 for full scale.
+rate; x east, y north, z up, yaw counter-clockwise from +x. {encodings}.
 
 **What either side does not know.** The server refuses fields and messages that this version does not have, by their
 name: ignored, a misspelt field would be a wish that nobody hears. Clients ignore unknown fields, messages and kinds of
