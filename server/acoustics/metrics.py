@@ -5,6 +5,7 @@ two ears. NaN marks a pair in which the parameter could not be measured at some 
 counts those.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,41 +26,55 @@ class Metric:
     needs_direct_sound: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class ParameterMetric(Metric):
+    """Error of a room parameter; `error` takes those of the reference and of the estimate."""
+
+    error: Callable[[RoomParameters, RoomParameters], _Floats]
+
+
+def _over_ears(parameter: str, *, scale: float = 1.0) -> Callable[[RoomParameters, RoomParameters], _Floats]:
+    """Mean of both ears' differences, in units of 1 / `scale`."""
+
+    def error(reference: RoomParameters, estimate: RoomParameters) -> _Floats:
+        difference = np.abs(getattr(estimate, parameter) - getattr(reference, parameter))
+        return scale * np.asarray(difference.mean(axis=-1))
+
+    return error
+
+
+def _between_ears(parameter: str, *, scale: float = 1.0) -> Callable[[RoomParameters, RoomParameters], _Floats]:
+    def error(reference: RoomParameters, estimate: RoomParameters) -> _Floats:
+        return np.asarray(scale * np.abs(getattr(estimate, parameter) - getattr(reference, parameter)))
+
+    return error
+
+
+def _reverberation_time_error(reference: RoomParameters, estimate: RoomParameters) -> _Floats:
+    relative = np.abs(estimate.reverberation_time_s / reference.reverberation_time_s - 1.0)
+    return np.asarray(100.0 * relative.mean(axis=-1))
+
+
 SPECTRAL_LOSS = Metric("spectral_loss", "spectral loss", "ln")
 # All errors that `parameter_errors` returns, in the order of tables.
 PARAMETER_METRICS = (
-    Metric("t60", "T60", "%"),
-    Metric("edt", "EDT", "ms"),
-    Metric("c50", "C50", "dB"),
-    Metric("drr", "DRR", "dB", needs_direct_sound=True),
-    Metric("iacc", "IACC", ""),
-    Metric("iacc_early", "IACC early", ""),
-    Metric("level", "level", "dB"),
-    Metric("itd", "ITD", "us", needs_direct_sound=True),
-    Metric("onset", "onset", "ms"),
+    ParameterMetric("t60", "T60", "%", error=_reverberation_time_error),
+    ParameterMetric("edt", "EDT", "ms", error=_over_ears("early_decay_time_s", scale=1e3)),
+    ParameterMetric("c50", "C50", "dB", error=_over_ears("clarity_db")),
+    ParameterMetric("drr", "DRR", "dB", needs_direct_sound=True, error=_over_ears("direct_to_reverberant_db")),
+    ParameterMetric("iacc", "IACC", "", error=_between_ears("interaural_cross_correlation")),
+    ParameterMetric("iacc_early", "IACC early", "", error=_between_ears("early_interaural_cross_correlation")),
+    ParameterMetric("level", "level", "dB", error=_over_ears("level_db")),
+    ParameterMetric(
+        "itd", "ITD", "us", needs_direct_sound=True, error=_between_ears("interaural_time_difference_s", scale=1e6)
+    ),
+    ParameterMetric("onset", "onset", "ms", error=_over_ears("onset_s", scale=1e3)),
 )
 
 
 def parameter_errors(reference: RoomParameters, estimate: RoomParameters) -> dict[str, _Floats]:
     """Error of each of PARAMETER_METRICS, `(...)`, in its unit."""
-
-    def over_ears(reference_values: _Floats, estimated_values: _Floats) -> _Floats:
-        return np.asarray(np.abs(estimated_values - reference_values).mean(axis=-1))
-
-    relative = np.abs(estimate.reverberation_time_s / reference.reverberation_time_s - 1.0)
-    return {
-        "t60": np.asarray(100.0 * relative.mean(axis=-1)),
-        "edt": 1e3 * over_ears(reference.early_decay_time_s, estimate.early_decay_time_s),
-        "c50": over_ears(reference.clarity_db, estimate.clarity_db),
-        "drr": over_ears(reference.direct_to_reverberant_db, estimate.direct_to_reverberant_db),
-        "iacc": np.abs(estimate.interaural_cross_correlation - reference.interaural_cross_correlation),
-        "iacc_early": np.abs(
-            estimate.early_interaural_cross_correlation - reference.early_interaural_cross_correlation
-        ),
-        "level": over_ears(reference.level_db, estimate.level_db),
-        "itd": 1e6 * np.abs(estimate.interaural_time_difference_s - reference.interaural_time_difference_s),
-        "onset": 1e3 * over_ears(reference.onset_s, estimate.onset_s),
-    }
+    return {metric.name: metric.error(reference, estimate) for metric in PARAMETER_METRICS}
 
 
 def spectral_loss(reference: npt.ArrayLike, estimate: npt.ArrayLike) -> _Floats:

@@ -19,6 +19,7 @@ from server.api.inflow import MOVES_PER_S, POSES_PER_S
 from server.api.settings import Settings
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter, TextMessage
+from server.protocol.codecs.registry import CODECS
 from server.protocol.codes import CLOSE_CODES, ERROR_CODES
 from server.protocol.exchange import EXCHANGE
 from server.protocol.message import Message
@@ -52,12 +53,12 @@ def _description() -> str:
     exchange = "\n".join(
         f"1. {'client' if step.is_of_client else 'server'}, `{step.name}`: {step.meaning}" for step in EXCHANGE
     )
+    encodings = ", ".join(f"{name} is {codec.meaning}" for name, codec in CODECS.items())
     return f"""Live audio from a scene in which a listener and emitters move. Protocol version {PROTOCOL}.
 
 Control messages are JSON text, one object with a `type` each. Audio is sent in binary messages, and listener poses may
 be; their first byte is the kind. Binary is little endian. Units are metres, radians, decibels and samples at the
-scene's rate; x is east, y north, z up, and yaw counter-clockwise from +x. f32 is IEEE 754 single precision with full
-scale 1, s16 is two's complement with 32767 for full scale.
+scene's rate; x is east, y north, z up, and yaw counter-clockwise from +x. {encodings}.
 
 **Unknown fields and messages.** The server refuses fields and messages that this version does not have, and names them.
 Otherwise a misspelt field would be ignored without notice. Clients ignore unknown fields, messages and kinds of binary

@@ -39,8 +39,8 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.cost import Costs
 from server.planning.places import place_of
 from server.planning.scene_acoustics import SceneAcoustics
-from server.protocol.blocks import Encoding
 from server.protocol.client_messages import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
+from server.protocol.codecs.registry import Encoding
 from server.protocol.codes import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, SERVICE_RESTART, TRY_AGAIN_LATER
 from server.protocol.server_messages import Error, Pong, ServerMessage, Welcome
 from server.rendering.ingest import DryAudio

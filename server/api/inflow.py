@@ -18,6 +18,7 @@ from typing import Final, Self
 
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import ListenerPose
+from server.protocol.codecs.registry import CODECS
 
 SUPERSEDED_COST: Final = 1 / 8
 READ_COST: Final = 1 / 4
@@ -28,7 +29,7 @@ _LIVE_COST: Final = 1 / 2
 _SHORTEST_BLOCK: Final = 128
 POSES_PER_S = 1_000
 MOVES_PER_S = 120
-_BYTES_PER_SAMPLE = 4
+_BYTES_PER_SAMPLE = max(codec.bytes_per_sample for codec in CODECS.values())
 _BYTES_PER_MESSAGE = 200
 """Allowance for headers, names and JSON."""
 _BURST_S = 0.25

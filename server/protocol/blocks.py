@@ -1,37 +1,19 @@
 """Audio on the wire of /v1/stream: rendered blocks from the server, dry mono blocks of live emitters from the client.
 
 Both are binary messages, little endian, at the scene's sample rate, with full scale at 1. The first byte is the kind.
-`f32` is IEEE 754 single precision, `s16` is two's complement with 32767 for full scale.
+How samples are encoded, `server.protocol.codecs` says.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal, Self
+from typing import ClassVar, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from server.core.errors import RequestError
+from server.protocol.codecs.codec import FloatArray
+from server.protocol.codecs.registry import CODECS, Encoding
 from server.protocol.layout import Layout
-
-FloatArray = npt.NDArray[np.float32]
-Encoding = Literal["f32", "s16"]
-
-_FULL_SCALE: Final = 32767
-
-
-def _encode(samples: FloatArray, encoding: Encoding) -> bytes:
-    """Bytes of the samples in C order."""
-    if encoding == "s16":
-        return np.rint(np.clip(samples, -1, 1) * _FULL_SCALE).astype("<i2").tobytes()
-    return samples.astype("<f4", copy=False).tobytes()
-
-
-def _decode(data: bytes, encoding: Encoding, offset: int) -> FloatArray:
-    """(n,) samples from byte `offset` to the end. Raises ValueError if the last sample is incomplete."""
-    if encoding == "s16":
-        return np.frombuffer(data, "<i2", offset=offset).astype(np.float32) / np.float32(_FULL_SCALE)
-    return np.frombuffer(data, "<f4", offset=offset).astype(np.float32)
 
 
 @dataclass(slots=True)
@@ -81,7 +63,7 @@ class AudioBlock:
         poses = self.pose_id, self.reverberation_pose_id
         # guard: sequences wrap round
         header = self.LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
-        return header + _encode(self.samples.T, encoding)
+        return header + CODECS[encoding].encode(self.samples.T)
 
     @classmethod
     def parse(cls, data: bytes, encoding: Encoding) -> Self:
@@ -91,7 +73,7 @@ class AudioBlock:
         _, flags, channels, sequence, sample_clock, pose_id, reverberation_pose_id, frames = cls.LAYOUT.unpack_from(
             data
         )
-        interleaved = _decode(data, encoding, cls.HEADER_BYTES)
+        interleaved = CODECS[encoding].decode(data, cls.HEADER_BYTES)
         if interleaved.size != frames * channels:
             raise ValueError(f"an audio block of {frames} frames holds {interleaved.size} samples")
         return cls(
@@ -114,7 +96,7 @@ class DryBlock:
 
     type: ClassVar[str] = "dry_block"
     KIND: ClassVar[int] = 3
-    _ENCODINGS: ClassVar[tuple[Encoding, ...]] = ("f32", "s16")
+    _ENCODINGS: ClassVar[tuple[Encoding, ...]] = tuple(CODECS)
     _LONGEST_ID: ClassVar[int] = 256
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
@@ -138,7 +120,8 @@ class DryBlock:
         _, encoding, id_bytes, sequence, frames = cls.LAYOUT.unpack_from(data)
         # guard: a dry block is of a known encoding
         if encoding >= len(cls._ENCODINGS):
-            raise _malformed(f"encoding {encoding} is neither 0 (f32) nor 1 (s16)", "encoding")
+            known = " nor ".join(f"{code} ({name})" for code, name in enumerate(cls._ENCODINGS))
+            raise _malformed(f"encoding {encoding} is neither {known}", "encoding")
         if id_bytes > cls._LONGEST_ID:
             raise _malformed(f"an id has at most {cls._LONGEST_ID} bytes, not {id_bytes}", "id")
         start = cls.LAYOUT.size + id_bytes
@@ -148,18 +131,19 @@ class DryBlock:
             # guard: an id is text
             raise _malformed("the id is not UTF-8", "id") from exc
         start += -id_bytes % 4
-        size = frames * (2 if cls._ENCODINGS[encoding] == "s16" else 4)
+        codec = CODECS[cls._ENCODINGS[encoding]]
+        size = frames * codec.bytes_per_sample
         # guard: a block is as long as it says
         if frames == 0 or len(data) != start + size:
             raise _malformed(f"{frames} frames are {size} bytes, not {max(0, len(data) - start)}", "frames")
-        return cls(identifier, sequence, _decode(data, cls._ENCODINGS[encoding], start))
+        return cls(identifier, sequence, codec.decode(data, start))
 
     def serialize(self, encoding: Encoding) -> bytes:
         identifier = self.id.encode()
         header = self.LAYOUT.pack(
             self.KIND, self._ENCODINGS.index(encoding), len(identifier), self.sequence, self.samples.size
         )
-        return header + identifier + bytes(-len(identifier) % 4) + _encode(self.samples, encoding)
+        return header + identifier + bytes(-len(identifier) % 4) + CODECS[encoding].encode(self.samples)
 
 
 def _malformed(problem: str, field: str) -> RequestError:

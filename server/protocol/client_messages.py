@@ -24,7 +24,8 @@ from server.core.errors import RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.near_names import suggestion
 from server.planning.scene_acoustics import Output
-from server.protocol.blocks import DryBlock, Encoding
+from server.protocol.blocks import DryBlock
+from server.protocol.codecs.registry import Encoding
 from server.protocol.layout import Layout
 from server.protocol.message import WHOLE, Integer, Message, Position
 

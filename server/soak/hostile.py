@@ -18,7 +18,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from server.core.errors import NafirError
-from server.protocol.blocks import AudioBlock, DryBlock, FloatArray
+from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import (
     AUTO,
     PROTOCOL,
@@ -33,6 +33,8 @@ from server.protocol.client_messages import (
     SetGain,
     SetLevel,
 )
+from server.protocol.codecs.codec import FloatArray
+from server.protocol.codecs.registry import CODECS
 from server.protocol.server_messages import Error, Pong, Welcome, parse_server_message
 from server.scene.effects import EffectName
 
@@ -101,7 +103,7 @@ class Hostile:
             protocol=PROTOCOL,
             scene=scene,
             block_size=int(rng.choice((128, 256, 512, 1024))),  # type: ignore[arg-type]
-            encoding="s16" if rng.random() < 0.3 else "f32",
+            encoding=list(CODECS)[rng.integers(len(CODECS))],
             output="mono" if rng.random() < 0.3 else "headphones",
             effects={name.value: bool(rng.integers(2)) for name in EffectName if rng.random() < 0.2},
             buffer_blocks=int(rng.integers(1, 33)),
