@@ -19,7 +19,6 @@ from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.geometry import Geometry, Material, Materials, Opening
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Reuse, Start
-from server.streaming.load import QualityStep
 
 # How long an example takes depends on what else the machine does.
 settings.register_profile("shared machine", deadline=None)
@@ -234,11 +233,6 @@ def at_nodes(bundle: Bundle, **reuse: object) -> AcousticField:
 def levels(field) -> FieldsByLevel:
     """The scene's only level, whose field is `field`."""
     return FieldsByLevel([field])
-
-
-@pytest.fixture
-def rung(field) -> QualityStep:
-    return QualityStep.full(field.level, cost_ms=1.0)
 
 
 @pytest.fixture(scope="session")

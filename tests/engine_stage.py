@@ -8,7 +8,8 @@ from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, Hello
 from server.streaming import audio_engine
 from server.streaming.audio_engine import AudioEngine
-from server.streaming.load import Offer
+from server.streaming.load_policy import Ladder
+from server.streaming.quality_steps import Offer
 from server.streaming.session import Session
 from server.streaming.stream import Stream, TimedBlock
 
@@ -52,8 +53,8 @@ class Patient:
 def open_stream(hello, field, filters, load_clip, *, lead, deliver, window=40):
     """At the top of its ladder, which has the scene's only level."""
     levels, offer = FieldsByLevel([field]), Offer((field.level,), {field.level.name: 1.0})
-    ladder = offer.ladder(hello.level, block_s=BLOCK_S)
-    session = Session(hello, levels, filters, load_clip, rung=ladder.rung, window=window)
+    ladder = Ladder(offer.steps(hello.level, block_s=BLOCK_S))
+    session = Session(hello, levels, filters, load_clip, quality=ladder.step, window=window)
     return Stream(session, levels, offer=offer, ladder=ladder, block_s=BLOCK_S, lead=lead, deliver=deliver)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from reference_commands import commands_of
+from reference_load import load_thresholds
 from reference_packages import package_matrix, packages
 from reference_schemas import manifest, settings
 from reference_services import http, metrics, problem_codes, stream, stream_codes
@@ -24,6 +25,7 @@ GENERATORS: Final[Mapping[str, Callable[[], str]]] = {
     "metrics": metrics,
     "packages": packages,
     "package-matrix": package_matrix,
+    "load-thresholds": load_thresholds,
 }
 _MARK: Final = re.compile(r"^<!-- generated: ([a-z-]+) -->$", re.MULTILINE)
 

@@ -9,12 +9,9 @@ The loss comes on top of 1 / length over the bent path. Keller's ray round a hal
 of N to within 3 dB at all angles; relative to the straight line it is not.
 """
 
-import numpy as np
-import numpy.typing as npt
+import math
 
-from server.acoustics.decibels import amplitude_to_db
-
-Numbers = npt.NDArray[np.float64]
+from server.kernels.compiled import compiled
 
 GRAZING_LOSS_DB = 5.0
 # Below this Fresnel number an edge causes no loss: x / tan(x) = 10^(-5 / 20) at x = 1.0972.
@@ -23,13 +20,15 @@ CLEAR_FRESNEL_NUMBER = -0.1915871349
 SMALL_ARGUMENT = 1e-4
 
 
-def diffraction_gain_db(fresnel_number: npt.ArrayLike) -> Numbers:
-    """(...) gain in dB, 0 or less, for Fresnel numbers (...)."""
-    number = np.asarray(fresnel_number, dtype=np.float64)
-    # guard: an edge far in sight is as one just clear
-    x = np.sqrt(2 * np.pi * np.abs(np.maximum(number, CLEAR_FRESNEL_NUMBER)))
-    safe = np.maximum(x, SMALL_ARGUMENT)
-    # guard: a screen's formula has no nought by nought
-    bent = np.where(x < SMALL_ARGUMENT, 1.0, np.where(number > 0, safe / np.tanh(safe), safe / np.tan(safe)))
+@compiled
+def diffraction_gain_db(fresnel_number: float) -> float:
+    """Gain in dB, 0 or less."""
     # guard: beyond its clearance an edge screens nothing
-    return np.where(number > CLEAR_FRESNEL_NUMBER, np.minimum(0.0, -(GRAZING_LOSS_DB + amplitude_to_db(bent))), 0.0)
+    if fresnel_number <= CLEAR_FRESNEL_NUMBER:
+        return 0.0
+    x = math.sqrt(2 * math.pi * abs(fresnel_number))
+    # guard: a screen's formula has no nought by nought
+    if x < SMALL_ARGUMENT:
+        return -GRAZING_LOSS_DB
+    bent = x / math.tanh(x) if fresnel_number > 0 else x / math.tan(x)
+    return min(0.0, -(GRAZING_LOSS_DB + 20 * math.log10(bent)))

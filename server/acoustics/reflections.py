@@ -35,7 +35,7 @@ class FirstEcho:
         self._normals = np.concatenate([inward, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]])
         offsets = -np.sum(inward[:, :2] * start, axis=-1)
         self._offsets = np.concatenate([offsets, [-plan.floor_m, plan.height_m]])
-        # Compiled here, where it may take its time, and not for the first pose.
+        # Compiles the kernel now, so that the first pose need not wait for it.
         self.length_m(np.zeros((1, 3)), np.zeros((1, 3)))
 
     def length_m(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
@@ -78,7 +78,7 @@ class ReflectionFinder:
         self._height_m = plan.height_m
         self._gains_db = np.array(gains_db, dtype=np.float64)
         self._corners = np.ascontiguousarray(plan.walls[:, 0])
-        # Compiled here, where it may take its time, and not for the first pose.
+        # Compiles the kernel now, so that the first pose need not wait for it.
         self.find(np.zeros(3), np.zeros((1, 3)))
 
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections:

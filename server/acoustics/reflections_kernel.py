@@ -1,4 +1,4 @@
-"""The compiled counterpart of ReflectionFinder's NumPy path: the same questions, one emitter after the other.
+"""The compiled part of `server.acoustics.reflections`, one emitter after the other.
 
 Points are (x, y, z) in metres; `corners` is (corner, 2), the polygon of a floor plan, wall i running from corner i to
 the next with the room on its left.

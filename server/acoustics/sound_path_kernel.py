@@ -1,4 +1,4 @@
-"""The compiled counterpart of SoundPathFinder's NumPy path: the same questions, one emitter after the other.
+"""The compiled part of `server.acoustics.sound_path`, one emitter after the other.
 
 Points are scalars (x, y in plan, metres); `corners` is (corner, 2), the polygon of a floor plan.
 """
@@ -8,7 +8,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.diffraction import CLEAR_FRESNEL_NUMBER, GRAZING_LOSS_DB, SMALL_ARGUMENT
+from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.geometry import COINCIDENT_M, TOUCH_M
 from server.kernels.compiled import compiled
 
@@ -56,20 +56,14 @@ def is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> b
 
 
 @compiled
-def _screen_gain_db(fresnel_number: float) -> float:
-    """As screen.diffraction_gain_db."""
-    if fresnel_number <= CLEAR_FRESNEL_NUMBER:
-        return 0.0
-    x = math.sqrt(2 * math.pi * abs(fresnel_number))
-    if x < SMALL_ARGUMENT:
-        return -GRAZING_LOSS_DB
-    bent = x / math.tanh(x) if fresnel_number > 0 else x / math.tan(x)
-    return min(0.0, -(GRAZING_LOSS_DB + 20 * math.log10(bent)))
-
-
-@compiled
 def _clearance_m(bends: Floats, from_listener: Floats, listener: Floats, emitter: Floats) -> float:
-    """As SoundPathFinder's, for one emitter in sight."""
+    """How much farther than the straight line it is over the nearest corner, for an emitter in sight.
+
+    Divided by the cosine of the turn at the corner: next to 1 where the line grazes it, and without end where one would
+    turn by a right angle or more, since such a corner is beside the line and screens nothing. The nearest corner
+    changes without a jump, and it is enough to ask which corners the listener sees: whatever hides one from the emitter
+    stands in the triangle of the three, so it has a corner that is nearer and that both see.
+    """
     plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
     rise = emitter[2] - listener[2]
     straight = math.hypot(plan, rise)
@@ -157,4 +151,4 @@ def find_sound_paths(
             arrival[row, 2], departure[row, 2] = rise / length, -rise / length
             detour = excess_m[row]
         for band in range(len(wavelengths_m)):
-            screen_db[row, band] = _screen_gain_db(2 * detour / wavelengths_m[band])
+            screen_db[row, band] = diffraction_gain_db(2 * detour / wavelengths_m[band])

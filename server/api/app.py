@@ -1,6 +1,7 @@
 """The ASGI application. It loads scenes, starts the audio engine, warms up, and serves."""
 
 import asyncio
+import dataclasses
 import logging
 from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import CancelledError
@@ -41,7 +42,8 @@ from server.runtime.thread_watch import ThreadWatch
 from server.runtime.workers import Workers
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
-from server.streaming.load import Offer
+from server.streaming.load_thresholds import THRESHOLDS
+from server.streaming.quality_steps import Offer
 from server.streaming.session import Session
 
 _CALIBRATION_POSES = 3
@@ -87,7 +89,7 @@ def create_app(
                 workers,
                 threads=settings.audio_threads,
                 is_real_time=settings.realtime,
-                ir_share=settings.ir_share,
+                thresholds=dataclasses.replace(THRESHOLDS, ir_share=settings.ir_share),
             )
             host = StreamHost(
                 scenes=loaded,
@@ -182,8 +184,8 @@ def _warm_up(host: StreamHost, compiler: ResponseCompiler) -> None:
         )
         clips = playable_clips(host.clips[scene])
         hello = Hello(protocol=PROTOCOL, scene=scene)
-        (rung, *_) = offer.rungs(AUTO, block_s=hello.block_size / levels.default.sample_rate)
-        session = Session(hello, levels, filters, host.clips[scene].load, rung=rung, window=100)
+        (best, *_) = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)
+        session = Session(hello, levels, filters, host.clips[scene].load, quality=best, window=100)
         start = levels.bundle.manifest.start
         clip = clips[0].name if clips else None
         session.receive(AddEmitter(id="warm-up", clip=clip, live=clip is None, position=start.emitter))

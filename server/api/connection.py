@@ -36,8 +36,8 @@ from server.assets.clips import ClipLibrary, DecodeError
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.cost import Costs
 from server.planning.places import place_of
-from server.planning.planner import Costs
 from server.planning.scene_acoustics import SceneAcoustics
 from server.protocol.blocks import Encoding
 from server.protocol.client_messages import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
@@ -47,7 +47,8 @@ from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.readiness import Readiness
 from server.streaming.audio_engine import AudioEngine
-from server.streaming.load import Offer, QualityStep
+from server.streaming.load_policy import Ladder
+from server.streaming.quality_steps import Offer, QualityStep
 from server.streaming.session import Session
 from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
@@ -228,9 +229,9 @@ class Connection:
             field = levels.default
             block_s = hello.block_size / field.sample_rate
             offer = self._host.offers[hello.scene]
-            ladder = offer.ladder(hello.level, block_s=block_s)
+            ladder = Ladder(offer.steps(hello.level, block_s=block_s))
             session = await self._host.openings.run(
-                partial(self._open_session, hello, levels, hrtf, ladder.rung, window), is_wanted=self._is_there
+                partial(self._open_session, hello, levels, hrtf, ladder.step, window), is_wanted=self._is_there
             )
         except RequestError as refusal:
             return _refused(refusal)
@@ -248,7 +249,7 @@ class Connection:
                 window=window,
                 ir_samples=field.ir_samples,
                 hrtf=hrtf,
-                level=ladder.rung.level,
+                level=ladder.step.level,
                 max_emitters=self._host.settings.max_emitters,
             )
         )
@@ -265,14 +266,16 @@ class Connection:
     def _is_there(self) -> bool:
         return self._fast_path is None or self._fast_path.is_open()
 
-    def _open_session(self, hello: Hello, levels: FieldsByLevel, hrtf: str, rung: QualityStep, window: int) -> Session:
+    def _open_session(
+        self, hello: Hello, levels: FieldsByLevel, hrtf: str, quality: QualityStep, window: int
+    ) -> Session:
         host, field = self._host, levels.default
         return Session(
             hello,
             levels,
             host.hrtfs.filters(hrtf, field.sample_rate),
             lambda name: load_clip(host.clips[hello.scene], name),
-            rung=rung,
+            quality=quality,
             max_emitters=host.settings.max_emitters,
             shared_tail=host.settings.shared_tail,
             window=window,

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 from server.acoustics.audibility import THRESHOLDS
 from server.field.fields_by_level import FieldsByLevel
-from server.scene.level_titles import LevelOfField, level_titles
+from server.field.level_titles import LevelOfField, level_titles
 from server.scene.manifest import FieldFile, Phase, QualityLevel, Reuse
 
 _RELATIVE = frozenset({"edt"})

@@ -287,7 +287,7 @@ class HttpProtocol(HttpToolsProtocol):
             self.transport.close()
         else:
             within = f"within {self._room.limits.request_timeout_s:g} s"
-            self._refuse(Refusal(408, "request_timeout", f"a request has to be whole {within}"))
+            self._refuse(Refusal(408, "request_timeout", f"a request has to be complete {within}"))
 
     def _refuse(self, refusal: Refusal) -> None:
         """Answer with an error, and end the connection once the client has had time to read it."""

@@ -40,7 +40,7 @@ def bind(host: str, port: int) -> list[socket.socket]:
     try:
         found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as exc:
-        raise NafirError(f"host: {host!r} is no address of this machine ({exc}): give another with --host") from exc
+        raise NafirError(f"host: {host!r} is not an address of this machine ({exc}): give another with --host") from exc
     listeners: list[socket.socket] = []
     for family, _, _, _, address in dict.fromkeys(found):
         chosen = listeners[0].getsockname()[1] if listeners else port

@@ -33,10 +33,10 @@ class StreamTotals:
         totals.counts["limited"] = session.blocks_limited
         totals.counts["silenced"] = session.renderer.samples_silenced
         totals.regrets.merge(stream.regrets)
-        totals.durations["render"].merge(stream.render_times)
-        totals.durations["lateness"].merge(stream.latenesses)
-        totals.durations["ir"].merge(stream.ir_times)
-        totals.durations["pose"].merge(stream.pose_times.durations)
+        totals.durations["render"].merge(stream.times.render)
+        totals.durations["lateness"].merge(stream.times.lateness)
+        totals.durations["ir"].merge(stream.times.response)
+        totals.durations["pose"].merge(stream.times.pose.durations)
         return totals
 
     def merge(self, other: "StreamTotals") -> None:

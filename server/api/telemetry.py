@@ -21,8 +21,8 @@ from server.core.durations import DurationHistogram
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
 from server.streaming.audio_engine import AudioEngine
-from server.streaming.load import Offer
 from server.streaming.plan_audit import RegretRecord
+from server.streaming.quality_steps import Offer
 from server.streaming.stream import Stream
 
 _SHORTEST_S, _LONGEST_S = 3e-5, 10.0
@@ -90,7 +90,7 @@ class ServerCollector(Collector):
         yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
 
     def _streams(self, streams: Iterable[Stream]) -> Iterator[Metric]:
-        levels = Counter((stream.scene, stream.session.rung.level) for stream in streams)
+        levels = Counter((stream.scene, stream.session.quality.level) for stream in streams)
         eased = Counter(stream.scene for stream in streams if stream.ladder.is_eased)
         by_level = GaugeMetricFamily(
             "nafir_streams", "Open streams by scene and quality level.", labels=["scene", "level"]

@@ -28,9 +28,12 @@ from server.bench.rooms import FloatArray, noise
 from server.bench.statistical_field import Room, StatisticalField, box
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.catalogue import CATALOGUE, MOTION_EFFECTS, emitter_effects, shared_effects
+from server.planning.cost import Costs
 from server.planning.effect_costs import measure_costs
 from server.planning.places import place_of_field, reverberation_of
-from server.planning.planner import Costs, make_plan
+from server.planning.plan import Plan
+from server.planning.planner import make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Output, Situation
 from server.protocol.client_messages import (
     PROTOCOL,
@@ -46,13 +49,11 @@ from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.effect_flags import EmitterEffects, SharedEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
-from server.scene.effects import CATALOGUE, EffectName, Overrides
-from server.scene.plan import Plan
-from server.streaming.emitters import Emitter as SessionEmitter
-from server.streaming.load import QualityStep
+from server.scene.effects import EffectName, Overrides
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 BLOCK_SIZE: BlockSize = 256
@@ -175,14 +176,15 @@ def heard(scenario: Scenario, plan: Plan) -> FloatArray:
     the same at both ears."""
     field = scenario.field()
     direct = _direct_sound(field)
-    shared = SharedEffects.of(plan)
+    shared = shared_effects(plan)
     channels = shared.channels
     emitters = []
     for number, place in enumerate(scenario.emitters):
-        effects = EmitterEffects.of(plan, str(number), has_early=True, has_late=bool(field.bundle.manifest.fields))
         # Delays that follow and delays that stand still are the same where nobody has moved yet.
-        effects = replace(effects, propagation_delay=True)
-        emitters.append(SessionEmitter(number, Pose(place), effects=effects))
+        on = plan.on(str(number)) | {EffectName.PROPAGATION_DELAY}
+        if not field.bundle.manifest.fields:
+            on -= {EffectName.LATE_REVERBERATION}
+        emitters.append(EmitterState(Pose(place), effects=emitter_effects(on)))
     listener = Pose(scenario.listener)
     looked_from = listener
     if not shared.head_rotation and scenario.turns:
@@ -219,9 +221,9 @@ def errors_of(scenario: Scenario, plan: Plan) -> dict[str, Any]:
 
 
 def change_without(scenario: Scenario, whole: Plan, name: EffectName, reference: FloatArray) -> float:
-    """JND that leaving out one effect changes, of the parameter that it changes most; of delays that stand still while
-    things move, in pitch or between the ears, since responses do not tell."""
-    if name == EffectName.PROPAGATION_DELAY:
+    """JND that leaving out one effect changes, of the parameter that it changes most; as predicted of what only motion
+    tells, since responses do not."""
+    if CATALOGUE[name] in MOTION_EFFECTS:
         (decision, *_) = whole.about(name)
         return decision.change_jnd
     return max(_difference(scenario, reference, heard(scenario, without(whole, name))).values())
@@ -291,7 +293,7 @@ class _Player:
             self._levels,
             kemar(field.sample_rate),
             lambda _: clip,
-            rung=QualityStep(field.level.name, None, False, 1.0),
+            quality=QualityStep(field.level.name, None, False, 1.0),
             window=10_000_000,
             place=place_of_field(field, BLOCK_SIZE),
         )

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from server.scene.effects import CATALOGUE
+from server.planning.catalogue import CATALOGUE
 
 _HEADINGS = (
     "situation",

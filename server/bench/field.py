@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.geometry import Vector3
 from server.bench.machine import describe_machine
 from server.bench.report import Goal
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES
+from server.field.node_responses import NODE_CACHE_BYTES
 
 Floats = npt.NDArray[np.float64]
 
@@ -30,7 +31,7 @@ def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[st
     affects all alike; within a round each level has the CPU caches to itself, as in a server. For levels that reuse
     responses, the store of kept responses is full from the beginning, as in a server that has run for minutes.
     """
-    _fill_kept(levels)
+    _fill_node_cache(levels)
     times_ms: dict[str, list[list[tuple[float, float]]]] = {name: [] for name in levels}
     for number in range(rounds + 1):
         walk = _walk(levels, number, poses)
@@ -51,19 +52,22 @@ def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[st
     }
 
 
-def _fill_kept(levels: FieldsByLevel) -> None:
-    """Fill the store of kept responses with those of the level that has the most nodes."""
-    by_nodes = {(reuse.spacing_m, reuse.turn_deg): field for field in levels.values() if (reuse := field.level.reuse)}
-    if not by_nodes:
+def _fill_node_cache(levels: FieldsByLevel) -> None:
+    """Fill the cache with responses of the level that has the most nodes."""
+    reusing = [field for field in levels.values() if field.kind.reuses_responses]
+    if not reusing:
         return
-    field = by_nodes[min(by_nodes)]
-    fitting = KEPT_BYTES // (np.dtype(np.float32).itemsize * field.channels * field.ir_samples)
+    fitting = NODE_CACHE_BYTES // (np.dtype(np.float32).itemsize * reusing[0].channels * reusing[0].ir_samples)
     bounds, plan = levels.bundle.manifest.bounds, levels.bundle.floor_plan
     rng = np.random.default_rng(0)
+    poses: list[tuple[Vector3, Vector3, float]] = []
     for _ in range(2 * fitting):
         listener, emitter = rng.uniform(bounds.minimum, bounds.maximum, (2, 3))
         if np.all(plan.contains(np.stack([listener, emitter]))):
-            field.impulse_responses([listener], [emitter], [rng.uniform(-math.pi, math.pi)])
+            poses.append((tuple(listener.tolist()), tuple(emitter.tolist()), rng.uniform(-math.pi, math.pi)))
+    finest = max(reusing, key=lambda field: len({field.snap(*pose).node for pose in poses}))
+    for listener, emitter, yaw in poses:
+        finest.impulse_responses([listener], [emitter], [yaw])
 
 
 def _summary(rounds: list[list[tuple[float, float]]]) -> dict[str, Any]:

@@ -60,8 +60,8 @@ class _Counts:
         self.stream = stream
         self._late, self._dropped, self._sent = self._now()
         # The audio thread finds the new histograms with the next block. Nothing else replaces them.
-        stream.render_times, stream.latenesses = DurationHistogram(), DurationHistogram()
-        stream.ir_times = DurationHistogram()
+        times = stream.times
+        times.render, times.lateness, times.response = (DurationHistogram() for _ in range(3))
 
     def _now(self) -> tuple[int, int, int]:
         session = self.stream.session
@@ -164,9 +164,9 @@ class Gauge:
         duration_s = blocks["duration_s"]
         return {
             **blocks,
-            "block_ms": merged(counts.stream.render_times for counts in self._counts),
-            "lateness_ms": merged(counts.stream.latenesses for counts in self._counts),
-            "ir_ms": merged(counts.stream.ir_times for counts in self._counts),
+            "block_ms": merged(counts.stream.times.render for counts in self._counts),
+            "lateness_ms": merged(counts.stream.times.lateness for counts in self._counts),
+            "ir_ms": merged(counts.stream.times.response for counts in self._counts),
             "pose_to_audio_ms": merged(watch.direct.times for watch in self._watches),
             "pose_to_reverberation_ms": merged(watch.reverberation.times for watch in self._watches),
             "server_load": (time.process_time() - self._began_cpu_s) / duration_s,

@@ -21,7 +21,7 @@ SAMPLE_RATE = 48_000
 IR_S = 1.0
 
 _BANK = 32
-_SPARES = ArrayPool(16 * 1024 * 1024)
+_POOL = ArrayPool(16 * 1024 * 1024)
 _LEVEL = 0.01
 _POSES_PER_M = 50.0
 _PLAIN = Material(absorption=(0.2,) * len(OCTAVE_BANDS_HZ), scattering=(0.1,) * len(OCTAVE_BANDS_HZ))
@@ -73,5 +73,5 @@ class BankField(AcousticField):
         """IRs as of `AcousticField`; poses outside of the bounds are allowed."""
         places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), np.atleast_1d(yaws)])
         entry = np.floor(places @ np.arange(1, places.shape[1] + 1) * _POSES_PER_M).astype(np.int64)
-        answer = _SPARES.floats(len(entry), *self._bank.shape[1:])
+        answer = _POOL.floats(len(entry), *self._bank.shape[1:])
         return self._bank.take(entry, axis=0, out=answer, mode="wrap")  # other modes make an additional copy

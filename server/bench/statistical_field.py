@@ -18,6 +18,7 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
+from server.field.kinds.every_pose import ComputedResponses
 from server.rendering.hrtf import kemar
 from server.responses.full_response import diffuse_energy
 from server.scene.bundle import Bundle
@@ -106,7 +107,7 @@ class StatisticalField(AcousticField):
             frozen_noise=np.zeros((2, samples), np.float32),
         )
         self.level = self.bundle.manifest.levels[0]
-        self.nodes = None
+        self.source = ComputedResponses(self.impulse_responses)
         self._paths = SoundPathFinder(self.bundle.floor_plan, self.bundle.manifest.speed_of_sound)
 
     def impulse_responses(

@@ -68,7 +68,7 @@ class NpyHeader:
         try:
             dtype = np.dtype(found["dtype"])
         except TypeError as exc:
-            raise NpyError(f"holds {found['dtype']!r}, which is no type of numbers") from exc
+            raise NpyError(f"holds {found['dtype']!r}, which is not a type of numbers") from exc
         if dtype.kind not in "biufcSU":
             raise NpyError(f"holds {dtype}, not numbers")
         shape = tuple(int(size) for size in re.findall(r"[0-9]+", found["shape"]))

@@ -29,7 +29,7 @@ from server.scene.manifest import CodecParameters, Phase
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-_SPARES = ArrayPool(16 * 1024 * 1024)
+_POOL = ArrayPool(16 * 1024 * 1024)
 """A request's responses wait for those of the next."""
 
 
@@ -87,7 +87,7 @@ class Decoder:
         near = near or [None] * len(aligned)
         if self._any_size is not None:
             return self._any_size.decode(predicted, aligned, near)
-        responses = _SPARES.floats(len(aligned), 2, self.ir_samples)
+        responses = _POOL.floats(len(aligned), 2, self.ir_samples)
         try:
             work = self._workspaces.pop()
         except IndexError:

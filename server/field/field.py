@@ -7,6 +7,8 @@ measured scenes, whose `direct_sound` is the field's, responses are whole.
 Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
 """
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 
@@ -21,9 +23,13 @@ from server.field.any_size_decoder import add_from, resized
 from server.field.decoder import Decoder
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
-from server.field.lattice import Neighbourhood, Node, Snapped
+from server.field.kinds.catalogue import kind_of
+from server.field.kinds.every_pose import ComputedResponses
+from server.field.kinds.level_kind import LevelKind
+from server.field.lattice import Neighbourhood, Snapped
+from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.field.phase_cache import PhaseCache
-from server.field.reuse import KEPT_BYTES, Kept, NodeResponses
+from server.field.response_source import ResponseSource
 from server.scene.bundle import Bundle
 from server.scene.manifest import Phase, QualityLevel
 
@@ -44,8 +50,11 @@ class AcousticField:
     """One scene's field at one quality level. Thread-safe: every call works on its own arrays.
 
     `noise` is that of the graph's codec, where somebody has it already. A level that reuses responses keeps them in
-    `kept`, shared with other levels of the scene.
+    `node_cache`, shared with other levels of the scene.
     """
+
+    source: ResponseSource
+    """Where this level has responses computed: at every pose, or at nodes that stand for many."""
 
     def __init__(
         self,
@@ -53,7 +62,7 @@ class AcousticField:
         level: QualityLevel,
         graph: FieldGraph,
         noise: FrozenNoise | None = None,
-        kept: Kept | None = None,
+        node_cache: NodeCache | None = None,
     ) -> None:
         self.bundle = bundle
         self.level = level
@@ -85,11 +94,8 @@ class AcousticField:
                 frames=level.frames,
             )
         self._cache = PhaseCache() if level.phase.warm else None
-        self.nodes: NodeResponses | None = None
-        """Where this level's responses are computed, if not at every pose."""
-        if level.reuse is not None:
-            kept = BoundedCache(KEPT_BYTES) if kept is None else kept
-            self.nodes = NodeResponses(bundle, level, self._paths, self._compute_all, kept)
+        node_cache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
+        self.source = self.kind.open(bundle, self._paths, self._compute_all, node_cache)
 
     @classmethod
     def load(cls, bundle: Bundle, *, level: str | None = None, threads: int = 1) -> "AcousticField":
@@ -103,6 +109,11 @@ class AcousticField:
             return Silence(bundle, chosen)
         session = open_graph(bundle, manifest.fields[chosen.field].file, threads=threads)
         return cls(bundle, chosen, FieldGraph(bundle, chosen.field, session))
+
+    @cached_property
+    def kind(self) -> LevelKind:
+        """What its level shares between poses, and what follows from that."""
+        return kind_of(self.level)
 
     @property
     def channels(self) -> int:
@@ -130,25 +141,18 @@ class AcousticField:
         # guard: poses that are not finite reach no field
         if not all(np.isfinite(part).all() for part in (listeners, emitters, yaws)):
             raise ValueError("listeners, emitters and yaws must be finite")
-        if self.nodes is not None:
-            return self.nodes.responses(listeners, emitters, yaws)
-        return self._compute_all(listeners, emitters, yaws, self._cache if remember else None)
+        return self.source.responses(listeners, emitters, yaws, remember=remember)
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
         """What stands for a pair of poses at this level: they themselves, unless it reuses responses."""
-        if self.nodes is None:
-            return Snapped(Node(listener, emitter, yaw), 0)
-        return self.nodes.lattice.snap(listener, emitter, yaw)
+        return self.source.snap(listener, emitter, yaw)
 
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
         """As `snap`, and for which listeners else: none for certain, unless the level reuses responses."""
-        if self.nodes is None:
-            return self.snap(listener, emitter, yaw), Neighbourhood(listener, 0.0, emitter, 0.0, 0.0, yaw, 0.0)
-        return self.nodes.lattice.find(listener, emitter, yaw)
+        return self.source.find(listener, emitter, yaw)
 
-    def _compute_all(
-        self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None = None
-    ) -> Float32:
+    def _compute_all(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
+        cache = self._cache if remember else None
         if 0 < len(yaws) <= _CHUNK:
             return self._compute(listeners, emitters, yaws, cache)
         responses = np.empty((len(yaws), self.channels, self.ir_samples), dtype=np.float32)
@@ -164,9 +168,8 @@ class AcousticField:
     def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:
         """(B, channel) sum of the squared samples of each, as predicted: without decoding where there is something
         to decode."""
-        if self.nodes is not None:
-            places = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
-            listeners, emitters, yaws = self.nodes.nodes(*places)
+        poses = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        listeners, emitters, yaws = self.source.computed_for(*poses)
         if self.graph.gives_responses:
             aligned = self.graph.impulse_responses(listeners, emitters, yaws)
             return np.asarray(np.sum(aligned.astype(np.float64) ** 2, axis=-1))
@@ -267,7 +270,7 @@ class Silence(AcousticField):
     def __init__(self, bundle: Bundle, level: QualityLevel) -> None:
         self.bundle = bundle
         self.level = level
-        self.nodes = None
+        self.source = ComputedResponses(self.impulse_responses)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
 
     def impulse_responses(

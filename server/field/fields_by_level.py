@@ -7,7 +7,7 @@ from server.core.bounded_cache import BoundedCache
 from server.core.errors import RequestError
 from server.field.field import AcousticField, Silence, frozen_noise
 from server.field.graph import FieldGraph, open_graph
-from server.field.reuse import KEPT_BYTES, Kept
+from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.field.runtime import InferenceSession
 from server.scene.bundle import Bundle
 from server.scene.manifest import CodecParameters
@@ -16,9 +16,9 @@ from server.scene.manifest import CodecParameters
 class FieldsByLevel(Mapping[str, AcousticField]):
     """Quality levels by name, in the manifest's order; the first is the default."""
 
-    def __init__(self, fields: Sequence[AcousticField], kept: Kept | None = None) -> None:
-        """`fields` of one bundle, one at least; those that reuse responses keep them in `kept`."""
-        self.kept: Kept = BoundedCache(KEPT_BYTES) if kept is None else kept
+    def __init__(self, fields: Sequence[AcousticField], node_cache: NodeCache | None = None) -> None:
+        """`fields` of one bundle, one at least; those that reuse responses keep them in `node_cache`."""
+        self.node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
         self._fields = {field.level.name: field for field in fields}
 
     @classmethod
@@ -34,14 +34,14 @@ class FieldsByLevel(Mapping[str, AcousticField]):
                 sessions[file] = open_graph(bundle, file, threads=threads)
             graphs[name] = FieldGraph(bundle, name, sessions[file])
         noises: dict[CodecParameters, FrozenNoise] = {}
-        kept: Kept = BoundedCache(KEPT_BYTES)
+        node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES)
         fields = []
         for level in bundle.manifest.levels:
             graph = graphs[level.field]
             if graph.parameters not in noises:
                 noises[graph.parameters] = frozen_noise(bundle, graph)
-            fields.append(AcousticField(bundle, level, graph, noises[graph.parameters], kept))
-        return cls(fields, kept)
+            fields.append(AcousticField(bundle, level, graph, noises[graph.parameters], node_cache))
+        return cls(fields, node_cache)
 
     def __getitem__(self, name: str) -> AcousticField:
         return self._fields[name]

@@ -26,6 +26,7 @@ of reflected sound, and every step is an exchange."""
 _ARRIVALS = 4096
 _LEAST_M, _LEAST_RAD = 1e-6, 1e-9
 """Nearer to where a number is rounded to another, nothing is certain."""
+_MOST_MOVED_M = 0.25
 
 
 class Node(NamedTuple):
@@ -82,7 +83,7 @@ class Lattice:
         turned: float = 0.0,
     ) -> None:
         manifest = bundle.manifest
-        self._paths = paths
+        self._bundle, self._reuse, self._paths = bundle, reuse, paths
         self._spacing_m = reuse.spacing_m
         self._turns = math.ceil(360 / reuse.turn_deg - 1e-9)
         self._turn_rad = math.tau / self._turns
@@ -101,6 +102,13 @@ class Lattice:
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
         """As `snap`, and for which listeners else."""
         return self._find(listener, emitter, yaw, looks_about=True)
+
+    def moved(self, rng: np.random.Generator) -> "Lattice":
+        """The same with nodes elsewhere, by up to 25 cm or half a cell, and headings turned by any angle."""
+        most_m = min(_MOST_MOVED_M, self._reuse.spacing_m / 2)
+        x, y, z = map(float, rng.uniform(-most_m, most_m, 3))
+        turned = rng.uniform(-math.pi, math.pi)
+        return Lattice(self._bundle, self._reuse, self._paths, (x, y, z), turned)
 
     def _find(
         self, listener: Vector3, emitter: Vector3, yaw: float, *, looks_about: bool

@@ -81,15 +81,15 @@ class ArrayPool:
 
 
 class _Lent:
-    """What every view of an array of spares rests on."""
+    """What every view of an array of a pool rests on."""
 
-    def __init__(self, spares: ArrayPool, array: Bytes) -> None:
-        self._spares = spares
+    def __init__(self, pool: ArrayPool, array: Bytes) -> None:
+        self._pool = pool
         self._array = array
         self.__array_interface__: dict[str, Any] = array.__array_interface__
 
     def __del__(self) -> None:
-        self._spares._keep(self._array)
+        self._pool._keep(self._array)
 
 
 def _aligned(size: int) -> Bytes:

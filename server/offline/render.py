@@ -26,12 +26,13 @@ from server.planning.scene_acoustics import Output
 from server.rendering.ingest import DryAudio, require_gain
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.ir_request import EmitterSnapshot, Field, composed_irs
+from server.responses.emitter_state import EmitterState
+from server.responses.ir_request import composed_irs
 from server.responses.radiation import reverberation_gain
 from server.scene.effects import EffectName, require_effect
 from server.streaming.active_effects import ActiveEffects, as_asked
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import Stage, StreamedEmitter
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -194,7 +195,7 @@ def _pose(values: dict[str, float], where: str) -> Pose:
 
 
 def render(
-    field: Field,
+    field: AcousticField,
     direct_sound: DirectSound,
     emitters: Sequence[RenderedEmitter],
     path: Sequence[PathPoint],
@@ -203,7 +204,7 @@ def render(
     length: int | None = None,
     progress: Callable[[float], None] | None = None,
     planned: PlannedEffects | None = None,
-    levels: Mapping[str, Field] | None = None,
+    levels: Mapping[str, AcousticField] | None = None,
 ) -> FloatArray:
     """Render at least one emitter for a listener on `path`, which has at least one point. Returns (channel, length):
     two ears, or one channel for a mono loudspeaker.
@@ -228,7 +229,7 @@ def render(
         for point, each in zip(path, fields, strict=True)
         if point.reverberation_sample is not None
     }
-    shares_tail = any(each.level.shared_tail for each in (field, *(levels or {}).values()))
+    shares_tail = any(each.kind.shares_tail for each in (field, *(levels or {}).values()))
     walk = _Walk(fields[0], direct_sound, emitters, path[0].pose, block_size, planned, ir_samples, shares_tail)
     blocks = -(-length // block_size)
     output = np.empty((walk.renderer.outputs, blocks, block_size), np.float32)
@@ -240,7 +241,9 @@ def render(
     return output.reshape(len(output), -1)[:, :length]
 
 
-def _fields(field: Field, path: Sequence[PathPoint], levels: Mapping[str, Field]) -> list[Field]:
+def _fields(
+    field: AcousticField, path: Sequence[PathPoint], levels: Mapping[str, AcousticField]
+) -> list[AcousticField]:
     """The field that computes the responses of each point; it is `field` until a point names a level."""
     fields = []
     for point in path:
@@ -271,7 +274,7 @@ class _Walk:
 
     def __init__(
         self,
-        field: Field,
+        field: AcousticField,
         direct_sound: DirectSound,
         emitters: Sequence[RenderedEmitter],
         start: Pose,
@@ -292,7 +295,7 @@ class _Walk:
             has_head=planned is None or planned.shared.head,
         )
         self._field = field
-        self.renderer.share_tail(field.level.shared_tail)
+        self.renderer.share_tail(field.kind.shares_tail)
         self._direct_sound = direct_sound
         self._effects = ActiveEffects(
             self.renderer,
@@ -303,7 +306,7 @@ class _Walk:
         )
         self._listener = start
         self._has_begun = False
-        self._emitters: dict[str, Emitter] = {}
+        self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(direct_sound, self.renderer, self._emitters)
         for number, emitter in enumerate(emitters):
             name = str(number)
@@ -311,12 +314,13 @@ class _Walk:
             if emitter.directivity != OMNIDIRECTIONAL:
                 self.renderer.set_reverberation_gain(name, reverberation_gain(emitter.directivity))
             gain_db = float(amplitude_to_db(max(emitter.gain, _LEAST_GAIN)))
-            self._emitters[name] = Emitter(number, emitter.pose, emitter.directivity, gain_db=gain_db)
-            self._emitters[name].is_decided = planned is None
+            state = EmitterState(emitter.pose, emitter.directivity, gain_db=gain_db)
+            stage = Stage.DECIDED if planned is None else Stage.UNDECIDED
+            self._emitters[name] = StreamedEmitter(number, state, stage=stage)
             if planned is not None:
                 planned.follow_emitter(name, emitter.pose, 0.0)
 
-    def go_on(self, direct: Pose | None, reverberation: tuple[Pose, Field] | None) -> None:
+    def go_on(self, direct: Pose | None, reverberation: tuple[Pose, AcousticField] | None) -> None:
         """Set the state for the next block: the pose of the direct sound, and the pose and field of the responses. None
         keeps the present one."""
         if direct is not None:
@@ -331,7 +335,7 @@ class _Walk:
             is_other, self._field = field is not self._field, field
             self._respond(pose)
             if is_other:
-                self._effects.share_tail(field.level.shared_tail, self._emitters)
+                self._effects.share_tail(field.kind.shares_tail, self._emitters)
         elif self._effects.planned is not None and self._has_begun:
             self._respond(self._listener)
 
@@ -349,31 +353,29 @@ class _Walk:
         planned = self._effects.planned
         if planned is None:
             return
-        request = planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+        states = {name: emitter.state for name, emitter in self._emitters.items()}
+        request = planned.take_request(self._listener, states, self._effects.clock_s)
         if request is not None:
             planned.accept(request.plan())
             self._effects.enforce(self._emitters)
-            self._effects.share_tail(self._field.level.shared_tail, self._emitters)
+            self._effects.share_tail(self._field.kind.shares_tail, self._emitters)
 
     def _respond(self, listener: Pose) -> None:
         """Compute the outdated responses and give them to the renderer."""
         named = {
             name: emitter
             for name, emitter in self._emitters.items()
-            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_folding)
+            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_baking)
         }
         if self._effects.awaits_ears:
             self.renderer.set_channels(self._effects.channels)
         if not named:
             return
-        snapshots = [
-            EmitterSnapshot(emitter.serial, emitter.pose, emitter.directivity, effects=as_asked(emitter))
-            for emitter in named.values()
-        ]
-        irs = composed_irs(self._field, self._direct_sound, listener, snapshots, self._effects.channels)
-        for (name, emitter), snapshot, ir in zip(named.items(), snapshots, irs, strict=True):
+        asked = [as_asked(emitter) for emitter in named.values()]
+        irs = composed_irs(self._field, self._direct_sound, listener, asked, self._effects.channels)
+        for (name, emitter), state, ir in zip(named.items(), asked, irs, strict=True):
             emitter.is_outdated = False
-            self._effects.accept_ir(name, emitter, self.renderer.prepare(ir), snapshot.effects, 0)
+            self._effects.accept_ir(name, emitter, self.renderer.prepare(ir), state.effects, 0)
 
 
 def _block_at(sample: int, block_size: int) -> int:

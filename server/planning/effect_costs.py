@@ -9,27 +9,24 @@ import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Hashable
-from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.directivity import CARDIOID, OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose
-from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
-from server.planning.planner import Cost, Costs
+from server.planning.catalogue import CATALOGUE
+from server.planning.cost import STILL, Costs, Measured, Variant, variants_of
 from server.rendering.convolver import FloatArray
 from server.rendering.hrtf import kemar
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
-from server.responses.effect_flags import ALL_ON, EmitterEffects
+from server.responses.effect_flags import EmitterEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs
-from server.responses.radiation import departure_gain_db
-from server.scene.effects import EffectName
 
 RESPONSES_PER_S = 30.0
 """Of an emitter that moves, or a listener."""
@@ -47,33 +44,14 @@ def _no_rest() -> None:
     pass
 
 
-class _Placed(NamedTuple):
-    pose: Pose
-    directivity: Directivity = OMNIDIRECTIONAL
-    effects: EmitterEffects = ALL_ON
-
-
 class _Lane:
-    """A renderer that plays emitters with some effects, of which some may be walked past."""
+    """A renderer that plays emitters as a variant has them."""
 
     def __init__(
-        self,
-        field: AcousticField,
-        block_size: int,
-        *,
-        emitters: int = _EMITTERS,
-        head: bool = True,
-        response: bool = True,
-        direct: bool = True,
-        shared_tail: bool = False,
-        moves: bool = False,
-        exchanges: bool = False,
-        distance: bool = True,
-        air: bool = True,
-        rest: Rest = _no_rest,
+        self, field: AcousticField, block_size: int, variant: Variant, *, emitters: int, rest: Rest = _no_rest
     ) -> None:
         manifest, rate = field.bundle.manifest, field.sample_rate
-        channels = 2 if head else 1
+        effects, channels = variant.effects, variant.shared.channels
         self._renderer = Renderer(
             block_size=block_size,
             ir_samples=field.ir_samples,
@@ -82,25 +60,30 @@ class _Lane:
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
             max_emitters=emitters,
-            shared_tail=shared_tail,
+            shared_tail=not variant.shared.own_tails,
             outputs=channels,
-            has_head=head,
+            has_head=variant.shared.head,
         )
         rng = np.random.default_rng(0)
         decay = 10 ** (-3 * np.arange(field.ir_samples) / field.ir_samples)
         self._names = [str(number) for number in range(emitters)]
-        self._moves, self._block = moves, 0
+        self._moves, self._block = variant.moves, 0
         self._exchanged: list[FloatArray] = []
         self._blocks_per_response = max(1, round(rate / block_size / RESPONSES_PER_S))
         for name in self._names:
             clip = rng.standard_normal(rate).astype(np.float32)
-            self._renderer.add_emitter(name, ClipPlayer(clip, loop=True), awaits_ir=response)
-            if response:
+            self._renderer.add_emitter(name, ClipPlayer(clip, loop=True), awaits_ir=effects.late)
+            if effects.late:
                 noise = (rng.standard_normal((channels, field.ir_samples)) * decay).astype(np.float32)
                 self._renderer.set_ir(name, noise)
-                if exchanges:
+                if variant.exchanges:
                     self._exchanged.append(noise)
-            self._renderer.enable_direct(name, is_heard=direct, distance=distance, air=air)
+            self._renderer.enable_direct(
+                name,
+                is_heard=effects.direct_path,
+                distance=effects.distance_attenuation,
+                air=effects.air_absorption,
+            )
             rest()
         self._walk()
 
@@ -130,81 +113,33 @@ def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
 
 
 def measure_costs(field: AcousticField, block_size: int = 256, *, rest: Rest = _no_rest) -> Costs:
-    """Of a field's scene, now: half a second of work, and longer where nothing is compiled yet."""
-    made: dict[str, dict[str, Any]] = {
-        "still": {},
-        "without direct": {"direct": False},
-        "one ear": {"head": False},
-        "moving": {"moves": True},
-        "without air": {"moves": True, "air": False},
-        "without distance": {"moves": True, "distance": False},
-    }
-    if field.bundle.manifest.fields:
-        made |= {
-            "without response": {"response": False},
-            "shared": {"shared_tail": True},
-            "exchanging": {"exchanges": True},
-        }
-    else:
-        made = {name: {**options, "response": False} for name, options in made.items()}
+    """Of a field's scene, now: half a second of work, and longer in the first run of all."""
+    has_field = bool(field.bundle.manifest.fields)
+    variants = variants_of([effect.costs_in for effect in CATALOGUE.values() if effect.costs_in], has_field=has_field)
     lanes = {
-        (name, count): _Lane(field, block_size, emitters=count, rest=rest, **options)
-        for name, options in made.items()
+        (variant, count): _Lane(field, block_size, variant, emitters=count, rest=rest)
+        for variant in variants
         for count in (1, _EMITTERS)
     }
     us = _time_in_turns({key: lane.play for key, lane in lanes.items()}, per=_BLOCKS, rest=rest)
-    responses_per_block = RESPONSES_PER_S * block_size / field.sample_rate
-    late_us, early_us = _response_us(field, meanwhile=lanes["still", _EMITTERS].play, rest=rest)
-
-    def between(more: str, less: str) -> tuple[float, float]:
-        """Of each emitter, and of there being any."""
-        one, all_ = (us[more, count] - us[less, count] for count in (1, _EMITTERS))
-        each = max(0.0, (all_ - one) / (_EMITTERS - 1))
-        return each, max(0.0, one - each)
-
-    def bytes_between(more: str, less: str) -> int:
-        most, least = (_bytes(lanes[name, _EMITTERS]) for name in (more, less))
-        return max(0, most - least) // _EMITTERS
-
-    def while_moving(more: str, less: str) -> Cost:
-        each, first = between(more, less)
-        return Cost(0.0, 0, moving_us=each, moving_first_us=first)
-
-    finding = _finders(field)
-    nothing = Cost(0.0, 0)
-    direct_us, first_direct_us = between("still", "without direct")
-    head_us, first_head_us = between("still", "one ear")
-    following = while_moving("moving", "still")
-    costs = dict.fromkeys(EffectName, nothing) | {
-        EffectName.DIRECT_PATH: Cost(direct_us, 0, first_us=first_direct_us),
-        EffectName.DISTANCE_ATTENUATION: while_moving("moving", "without distance"),
-        EffectName.PROPAGATION_DELAY: replace(
-            following, turning_us=following.moving_us, turning_first_us=following.moving_first_us
-        ),
-        EffectName.AIR_ABSORPTION: while_moving("moving", "without air"),
-        # The path that is searched tells what its edges take, too: diffraction costs nothing beside it.
-        EffectName.OCCLUSION: Cost(0.0, 0, moving_us=finding["occlusion"]),
-        EffectName.DIRECTIVITY: Cost(0.0, 0, moving_us=finding["directivity"]),
-        EffectName.HRTF: Cost(head_us, bytes_between("still", "one ear"), first_us=first_head_us),
-        EffectName.EARLY_REFLECTIONS: Cost(0.0, 0, moving_us=early_us * responses_per_block),
+    still = STILL if has_field else STILL.without_responses()
+    late_us, early_us = _response_us(field, meanwhile=lanes[still, _EMITTERS].play, rest=rest)
+    works = {
+        name: effect.per_pose(field.bundle, _EMITTERS)
+        for name, effect in CATALOGUE.items()
+        if effect.per_pose is not None
     }
-    if field.bundle.manifest.fields:
-        late, tail = between("still", "without response"), between("still", "shared")
-        exchange_us, first_exchange_us = between("exchanging", "still")
-        response_us = late_us * responses_per_block + exchange_us
-        costs |= {
-            EffectName.LATE_REVERBERATION: Cost(
-                late[0],
-                bytes_between("still", "without response"),
-                moving_us=response_us,
-                first_us=late[1],
-                moving_first_us=first_exchange_us,
-            ),
-            EffectName.PER_SOURCE_TAIL: Cost(tail[0], bytes_between("still", "shared"), first_us=tail[1]),
-            # Responses of where one walks are of where one looks.
-            EffectName.HEAD_ROTATION: Cost(0.0, 0, turning_us=response_us, turning_first_us=first_exchange_us),
-        }
-    return costs
+    measured = Measured(
+        emitters=_EMITTERS,
+        us=us,
+        memory_bytes={variant: _bytes(lanes[variant, _EMITTERS]) for variant in variants},
+        per_pose_us=_time_in_turns(works, per=_EMITTERS),
+        late_us=late_us,
+        early_us=early_us,
+        responses_per_block=RESPONSES_PER_S * block_size / field.sample_rate,
+        has_field=has_field,
+    )
+    return {name: effect.cost(measured) for name, effect in CATALOGUE.items()}
 
 
 def _bytes(thing: object, seen: set[int] | None = None) -> int:
@@ -226,20 +161,6 @@ def _bytes(thing: object, seen: set[int] | None = None) -> int:
             return 0
 
 
-def _finders(field: AcousticField) -> dict[str, float]:
-    """Microseconds per emitter of what is computed of geometry for each pose."""
-    bundle = field.bundle
-    manifest = bundle.manifest
-    listener, emitters = np.array(manifest.start.listener), np.tile(manifest.start.emitter, (_EMITTERS, 1))
-    finder = SoundPathFinder(bundle.floor_plan, manifest.speed_of_sound)
-    beam, departure = _Placed(Pose((0.0, 0.0, 0.0)), CARDIOID), np.array([0.6, 0.8, 0.0])
-    computed: dict[str, Callable[[], object]] = {
-        "occlusion": lambda: finder.find(listener, emitters),
-        "directivity": lambda: [departure_gain_db(beam, departure) for _ in range(_EMITTERS)],
-    }
-    return _time_in_turns(computed, per=_EMITTERS)
-
-
 def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: Rest) -> tuple[float, float]:
     """What one response takes before it is made ready and faded in: of what the field holds, and of the first
     reflections. Between one and the next sound is rendered, as in streams, so that caches hold something else."""
@@ -253,7 +174,7 @@ def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: R
             rest()
             meanwhile()
             started_s = time.thread_time()
-            composed_irs(field, direct, listener, [_Placed(Pose(start.emitter), effects=effects)])
+            composed_irs(field, direct, listener, [EmitterState(Pose(start.emitter), effects=effects)])
             of_it.append(1e6 * (time.thread_time() - started_s))
         if turn and sum(map(sum, times_us.values())) > 1e6 * _LONGEST_S:
             break

@@ -14,12 +14,14 @@ from pydantic import BaseModel, ConfigDict
 from server.acoustics.geometry import Pose, Vector3
 from server.core.errors import RequestError
 from server.field.field import AcousticField
+from server.planning.catalogue import CATALOGUE
+from server.planning.cost import Costs
 from server.planning.effect_costs import measured_costs
 from server.planning.places import place_of_field, reverberation_of
-from server.planning.planner import Costs, make_plan
+from server.planning.plan import Plan, RenderingDecision
+from server.planning.planner import make_plan
 from server.planning.scene_acoustics import WALKING_M_S, Emitter, Listener, Output, Situation
-from server.scene.effects import CATALOGUE, EffectName, read_overrides
-from server.scene.plan import Decision, Plan
+from server.scene.effects import EffectName, read_overrides
 
 EFFECT_PATTERN = f"^({'|'.join(EffectName)})=(on|off)$"
 """What `parse_effects` takes, as a regular expression of JSON Schema."""
@@ -47,7 +49,7 @@ class Decided(BaseModel):
     overridden: bool
 
     @classmethod
-    def of(cls, decision: Decision) -> Self:
+    def of(cls, decision: RenderingDecision) -> Self:
         return cls(title=CATALOGUE[decision.name].title, **asdict(decision))
 
 

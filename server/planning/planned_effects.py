@@ -1,50 +1,33 @@
 """When a session asks which effects its situation calls for, and what it was told last.
 
-A plan is made off the audio thread: `take_request` says what for, and whoever makes it brings it back through `accept`.
+A plan is made off the audio thread: `take_request` says what for, and the plan comes back through `accept`.
 One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, or to move faster than it
 did; while poses change, twice a second at most, once a second for many emitters, and less often where plans take more
 than their share of time. Clocks are seconds of sound.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
-from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
+from server.planning.catalogue import emitter_effects, shared_effects
+from server.planning.cost import Costs
 from server.planning.motion import Motion
-from server.planning.planner import Costs, make_plan
+from server.planning.plan import Plan, RenderingDecision
+from server.planning.planner import make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Output, SceneAcoustics, Situation
 from server.responses.effect_flags import EmitterEffects, SharedEffects
+from server.responses.emitter_state import EmitterState
 from server.scene.effects import EffectName, Overrides
-from server.scene.plan import Decision, Plan
 
 PERIOD_S = 0.5
 _EMITTERS_PER_PERIOD, _MOST_PERIODS = 8, 2
 """Plans of more take longer, and are made less often."""
 _LONGEST_S = 2.0
 """All are made well within the `HORIZON_S` that they look ahead."""
-SHARE_OF_ALL = 0.03
-"""Of a core that plans of all streams of an audio thread may take, as long as each is made every `_LONGEST_S`."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
-
-
-class Placed(Protocol):
-    """An emitter, as far as a plan is concerned; `pattern` is how it radiates, heard or not."""
-
-    @property
-    def pose(self) -> Pose: ...
-
-    @property
-    def pattern(self) -> Directivity: ...
-
-    @property
-    def gain_db(self) -> float: ...
-
-    @property
-    def is_live(self) -> bool: ...
 
 
 @dataclass(frozen=True)
@@ -108,7 +91,7 @@ class PlannedEffects:
         """Without a plan, whether there is a head is told from the output."""
         if self.plan is None or not self.plan.shared:
             return SharedEffects(head=self.overrides.get(EffectName.HRTF, self.output == "headphones"))
-        return SharedEffects.of(self.plan)
+        return shared_effects(self.plan)
 
     def wish(self, wishes: Mapping[EffectName, bool | None], output: Output | None) -> None:
         """On, off, or, with None, as the plan or the scene has it."""
@@ -153,7 +136,7 @@ class PlannedEffects:
         """Have at least so much time pass from one plan to the next while poses change, as far as plans last."""
         self._interval_s = min(interval_s, _LONGEST_S)
 
-    def take_request(self, listener: Pose, emitters: Mapping[str, Placed], clock_s: float) -> PlanRequest | None:
+    def take_request(self, listener: Pose, emitters: Mapping[str, EmitterState], clock_s: float) -> PlanRequest | None:
         """None where an earlier one is unanswered, or nothing has changed."""
         if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
             return None
@@ -184,11 +167,11 @@ class PlannedEffects:
         """No plan came of the request: what is on stays on."""
         self._in_flight = False
 
-    def of_emitter(self, name: str, clock_s: float, *, has_early: bool, has_late: bool) -> EmitterEffects | None:
-        """None of one that came after the plan was asked for."""
+    def of_emitter(self, name: str, clock_s: float, *, lacking: Collection[EffectName]) -> EmitterEffects | None:
+        """Without those that the scene is `lacking`. None of an emitter that came after the plan was asked for."""
         if self.plan is None or name not in self.plan.by_emitter:
             return None
-        effects = EmitterEffects.of(self.plan, name, has_early=has_early, has_late=has_late)
+        effects = emitter_effects(self.plan.on(name) - set(lacking))
         holds_still = self.overrides.get(EffectName.PROPAGATION_DELAY) is False
         # It may have begun to move since the plan was asked for.
         follows = effects.propagation_delay or (self._is_under_way(name, clock_s) and not holds_still)
@@ -200,15 +183,14 @@ class PlannedEffects:
         turns = listener.turns(clock_s) and self.output == "headphones"
         return self._emitters[name].moves(clock_s) or listener.moves(clock_s) or turns
 
-    def _emitter(self, name: str, emitter: Placed, clock_s: float) -> Emitter:
+    def _emitter(self, name: str, state: EmitterState, clock_s: float) -> Emitter:
         motion = self._emitters[name]
         return Emitter(
-            emitter.pose,
-            emitter.pattern,
-            emitter.gain_db,
-            motion.speed_m_s(clock_s),
-            motion.turns(clock_s),
-            emitter.is_live,
+            state.pose,
+            state.pattern,
+            gain_db=state.gain_db,
+            speed_m_s=motion.speed_m_s(clock_s),
+            turns=motion.turns(clock_s),
         )
 
 
@@ -233,7 +215,7 @@ def _switched_on(plan: Plan) -> frozenset[tuple[str | None, EffectName, bool, bo
 def _explained(plan: Plan, reasons: Mapping[EffectName, str]) -> Plan:
     """With other reasons for some effects than that somebody wished for them."""
 
-    def explain(decisions: Mapping[EffectName, Decision]) -> dict[EffectName, Decision]:
+    def explain(decisions: Mapping[EffectName, RenderingDecision]) -> dict[EffectName, RenderingDecision]:
         return {
             name: dataclasses.replace(each, reason=reasons[name], overridden=False)
             if name in reasons and each.overridden

@@ -5,49 +5,24 @@ flutters about a threshold. Each alone may be inaudible and all that is left out
 them is on.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 
-from server.planning.listening import SHARED, without_delay
-from server.planning.prediction import UNCHANGED, Change, Off, Prediction, worst
-from server.planning.reasons import reason
+from server.planning.catalogue import CATALOGUE, ENERGY_EFFECTS, MOTION_EFFECTS, SHARED_EFFECTS
+from server.planning.change import UNCHANGED, Change
+from server.planning.cost import Cost, Costs
+from server.planning.decision import Threshold
+from server.planning.effect import DIRECT_SOUND, Effect, EnergyEffect
+from server.planning.plan import Plan, RenderingDecision
+from server.planning.prediction import Off, Prediction, worst
+from server.planning.reasons import HOLDS_DIRECT_SOUND, reason
 from server.planning.scene_acoustics import Emitter, Situation
-from server.scene.effects import CATALOGUE, OF_DIRECT_SOUND, OF_RESPONSES, EffectName, Overrides
-from server.scene.plan import Decision, Plan
+from server.scene.effects import EffectName, Overrides
 
-ENTER_JND = 1.0
-LEAVE_JND = 0.7
+THRESHOLD = Threshold(enter_jnd=1.0, leave_jnd=0.7)
 
-_OF_ENERGY = (
-    EffectName.DIRECT_PATH,
-    EffectName.DISTANCE_ATTENUATION,
-    EffectName.AIR_ABSORPTION,
-    EffectName.OCCLUSION,
-    EffectName.DIRECTIVITY,
-    EffectName.EARLY_REFLECTIONS,
-    EffectName.LATE_REVERBERATION,
-    EffectName.DIFFRACTION,
-)
-_OF_EACH = tuple(name for name, effect in CATALOGUE.items() if not effect.is_shared)
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Of one emitter, where an effect is on: microseconds per block and bytes; `moving_us` more while it or the
-    listener moves, or `turning_us` while only the head turns. What it costs that there is any such emitter, all share:
-    `first_us` and so on."""
-
-    us: float
-    memory_bytes: int
-    moving_us: float = 0.0
-    turning_us: float = 0.0
-    first_us: float = 0.0
-    moving_first_us: float = 0.0
-    turning_first_us: float = 0.0
-
-
-Costs = Mapping[EffectName, Cost]
-"""As measured on this host; what is not in it was not."""
+_OF_EMITTERS = [effect for effect in CATALOGUE.values() if not effect.is_shared]
+_BY_NEED = sorted(_OF_EMITTERS, key=lambda effect: effect.needs is not None)
+"""What others need is decided before them."""
 
 
 def make_plan(
@@ -68,103 +43,101 @@ class _Planner:
         self._previous = previous
         self._overrides = overrides
         self._costs = costs
-        self._prediction = Prediction(situation) if situation.emitters else None
         self._without: dict[Off, list[Change]] = {}
         """Changes of all emitters without several effects at once: most emitters are without the same."""
 
     def plan(self) -> Plan:
-        if self._prediction is None:
+        if not self._situation.emitters:
             return Plan({}, {})
-        asked = [name for name in _OF_ENERGY if self._may_change(name)]
-        changes = worst(self._prediction.changes([frozenset({name}) for name in asked]))
+        prediction = Prediction(self._situation, ENERGY_EFFECTS)
+        asked = [effect.name for effect in ENERGY_EFFECTS if effect.may_act is None or effect.may_act(self._situation)]
+        changes = worst(prediction.changes([frozenset({name}) for name in asked]))
         by_emitter = {}
         for number, emitter in enumerate(self._situation.emitters):
             alone = {name: of_all[number] for name, of_all in zip(asked, changes, strict=True)}
-            alone[EffectName.PROPAGATION_DELAY] = without_delay(self._prediction, number)
-            by_emitter[emitter] = self._of_emitter(emitter, number, alone)
-        shared = {}
-        convolves = any(
-            decisions[name].called_for
-            for decisions in by_emitter.values()
-            for name in (EffectName.EARLY_REFLECTIONS, EffectName.LATE_REVERBERATION)
-        )
-        for name, change_of in SHARED.items():
-            change = change_of(self._prediction)
-            means_nothing = name in OF_RESPONSES and not convolves
-            shared[name] = self._decide(
-                name, None, change, means_nothing="nothing is convolved" if means_nothing else ""
-            )
+            alone |= {effect.name: effect.change(prediction, number) for effect in MOTION_EFFECTS}
+            made: dict[EffectName, RenderingDecision] = {}
+            for effect in _BY_NEED:
+                made[effect.name] = self._decide(effect, emitter, alone.get(effect.name, UNCHANGED), beside=[made])
+            self._allow_for_sum(prediction, emitter, number, made)
+            by_emitter[emitter] = {effect.name: made[effect.name] for effect in _OF_EMITTERS}
+        of_all = by_emitter.values()
+        shared = {
+            effect.name: self._decide(effect, None, effect.change(prediction), beside=of_all)
+            for effect in SHARED_EFFECTS
+        }
         return Plan(shared, by_emitter)
 
-    def _may_change(self, name: EffectName) -> bool:
-        """Whether it can be asked at all; most situations have no corners and nobody who beams."""
-        place = self._situation.place
-        match name:
-            case EffectName.OCCLUSION | EffectName.DIFFRACTION:
-                return place.paths is not None
-            case EffectName.DIRECTIVITY:
-                return any(not emitter.is_omnidirectional for emitter in self._situation.emitters.values())
-            case EffectName.EARLY_REFLECTIONS:
-                return place.reflections is not None
-            case _:
-                return True
-
-    def _of_emitter(self, emitter: str, number: int, alone: Mapping[EffectName, Change]) -> dict[EffectName, Decision]:
-        direct = self._decide(EffectName.DIRECT_PATH, emitter, alone.get(EffectName.DIRECT_PATH, UNCHANGED))
-        decisions = {EffectName.DIRECT_PATH: direct}
-        for name in _OF_EACH:
-            if name != EffectName.DIRECT_PATH:
-                missing = "" if direct.called_for or name not in OF_DIRECT_SOUND else "there is no direct sound"
-                decisions[name] = self._decide(name, emitter, alone.get(name, UNCHANGED), means_nothing=missing)
-        self._allow_for_sum(emitter, number, decisions)
-        return decisions
-
-    def _allow_for_sum(self, emitter: str, number: int, decisions: dict[EffectName, Decision]) -> None:
+    def _allow_for_sum(
+        self, prediction: Prediction, emitter: str, number: int, decisions: dict[EffectName, RenderingDecision]
+    ) -> None:
         """Switch on what is inaudible alone while all that is off is audible together."""
-        assert self._prediction is not None
         while True:
-            off = [name for name in _OF_ENERGY if not decisions[name].called_for and decisions[name].change_jnd > 0]
-            candidates = [name for name in off if name not in self._overrides]
+            made = [(effect, decisions[effect.name]) for effect in ENERGY_EFFECTS]
+            off = [(effect, one) for effect, one in made if not one.called_for and one.change_jnd > 0]
+            candidates = [(effect, one) for effect, one in off if effect.name not in self._overrides]
             if len(off) < 2 or not candidates:
                 return
-            without = frozenset(off)
+            without = frozenset(effect.name for effect, _ in off)
             if without not in self._without:
-                (self._without[without],) = worst(self._prediction.changes([without]))
+                (self._without[without],) = worst(prediction.changes([without]))
             together = self._without[without][number]
-            if together.jnd < ENTER_JND:
+            if together.jnd < THRESHOLD.enter_jnd:
                 return
-            largest = max(candidates, key=lambda name: decisions[name].change_jnd)
-            others = [name for name in off if name != largest]
-            decisions[largest] = self._decide(largest, emitter, together, together_with=others)
+            largest, _ = max(candidates, key=lambda each: each[1].change_jnd)
+            others = [effect for effect, _ in off if effect is not largest]
+            decisions[largest.name] = self._decide(largest, emitter, together, together_with=others)
 
     def _decide(
         self,
-        name: EffectName,
+        effect: Effect,
         emitter: str | None,
         change: Change,
         *,
-        means_nothing: str = "",
-        together_with: list[EffectName] | None = None,
-    ) -> Decision:
-        wanted = self._overrides.get(name)
+        beside: Collection[Mapping[EffectName, RenderingDecision]] = (),
+        together_with: Sequence[EnergyEffect] = (),
+    ) -> RenderingDecision:
+        """`beside` are the decisions that there may be something to act on by, of one emitter or of all."""
+        wanted = self._overrides.get(effect.name)
+        means_nothing = self._lacks(effect, beside)
         if means_nothing:
             change = UNCHANGED
-        is_predicted = change.jnd >= (LEAVE_JND if self._was_on(name, emitter) else ENTER_JND)
-        called_for = is_predicted if wanted is None else wanted and not means_nothing
-        cost = self._costs.get(name)
+        was_on = self._was_on(effect.name, emitter)
+        cost = self._costs.get(effect.name)
         concerned = self._situation.emitters if emitter is None else {emitter: self._situation.emitters[emitter]}
-        return Decision(
-            name=name,
-            emitter=emitter,
-            called_for=called_for,
+        return RenderingDecision(
+            name=effect.name,
+            called_for=not means_nothing and THRESHOLD.decides(change.jnd, wanted, was_on=was_on),
             change_jnd=change.jnd,
             parameter=change.parameter,
+            reason=means_nothing
+            or reason(
+                change,
+                is_predicted=THRESHOLD.is_reached(change.jnd, was_on=was_on),
+                wanted=wanted,
+                absence=self._absence(effect, emitter),
+                together_with=[other.title for other in together_with],
+            ),
+            overridden=wanted is not None,
+            emitter=emitter,
             cost_us=None if cost is None else sum(self._cost_us(cost, each) for each in concerned.values()),
             memory_bytes=None if cost is None else cost.memory_bytes * len(concerned),
-            reason=means_nothing
-            or reason(self._situation, name, emitter, change, is_predicted, wanted, together_with or []),
-            overridden=wanted is not None,
         )
+
+    @staticmethod
+    def _lacks(effect: Effect, beside: Collection[Mapping[EffectName, RenderingDecision]]) -> str:
+        """What an effect means nothing without, where it is not there."""
+        need = effect.needs
+        if need is None or not beside or any(each[name].called_for for each in beside for name in need.any_of):
+            return ""
+        return need.absence
+
+    def _absence(self, effect: Effect, emitter: str | None) -> str:
+        if effect.needs is DIRECT_SOUND and self._situation.place.holds_direct_sound:
+            return HOLDS_DIRECT_SOUND
+        if effect.absence is None:
+            return ""
+        return effect.absence(self._situation, None if emitter is None else self._situation.emitters[emitter])
 
     def _cost_us(self, cost: Cost, emitter: Emitter) -> float:
         listener, share = self._situation.listener, 1 / len(self._situation.emitters)

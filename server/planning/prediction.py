@@ -1,15 +1,15 @@
 """What is heard of each emitter, in energies: of the direct sound along the paths within reach, of the first
 reflections, and of what a field holds; and so what changes where an effect is left out.
 
-Energies add up, except where first reflections meet the direct sound, whose interference is computed. A head is a
-sphere with outer ears. Axes as in `server.planning.reach`, and v variants, in each of which some effects are left out;
-energies are relative to the direct sound at one metre.
+Energies add up, except where first reflections meet the direct sound, whose interference is computed. What an effect
+does to them is its own matter (`Factors`). A head is a sphere with outer ears. Axes as in `server.planning.reach`, and
+v variants, in each of which some effects are left out; energies are relative to the direct sound at one metre.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,27 +18,16 @@ from server.acoustics.audibility import JND_THRESHOLDS, ratio_in_jnd
 from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import axes_of
+from server.acoustics.sound_path import SoundPaths
+from server.planning.change import MOST_JND, Change
 from server.planning.reach import Reach
-from server.planning.scene_acoustics import Emitter, Reverberation, Situation
+from server.planning.scene_acoustics import Emitter, Reverberation, SceneAcoustics, Situation
 from server.scene.effects import EffectName
 
 Floats = npt.NDArray[np.float64]
 Off = frozenset[EffectName]
 
 ALL_ON: Off = frozenset()
-MOST_JND = 100.0
-"""Where something is missing altogether; numbers stay finite."""
-
-_COHERENT = frozenset(
-    {
-        EffectName.DIRECT_PATH,
-        EffectName.DISTANCE_ATTENUATION,
-        EffectName.DIRECTIVITY,
-        EffectName.EARLY_REFLECTIONS,
-        EffectName.DIFFRACTION,
-    }
-)
-"""What changes how direct sound and first reflections add up."""
 
 _SILENCE = 1e-12
 _FACING_GAIN = 4.0
@@ -71,31 +60,87 @@ class Mirrored:
     departure_db: Floats
     arrival: Floats
 
-
-class _Way(NamedTuple):
-    """What paths do to energy: by their length, by the air (·, band), and by the direction they leave in (·, band)."""
-
-    spread: Floats
-    air: Floats
-    departure: Floats
+    @cached_property
+    def departure(self) -> Floats:
+        """(m, band) what the direction a path leaves in does to its energy."""
+        return db_to_power(self.departure_db)
 
 
 @dataclass(frozen=True)
-class Change:
-    """What leaving out an effect changes most, in JND."""
+class Way:
+    """The paths of the direct sound within reach, n of them, and what they do to energy. With `goes_through`, straight
+    through whatever stands in the way."""
 
-    jnd: float
-    parameter: str
+    place: SceneAcoustics
+    paths: SoundPaths
+    departure_db: Floats
+    goes_through: bool
+
+    @cached_property
+    def spread(self) -> Floats:
+        """(n, 1) by their length."""
+        return _spread(self.paths.length_m, self.place)
+
+    @cached_property
+    def air(self) -> Floats:
+        """(n, band)"""
+        return _air(self.paths.length_m, self.place)
+
+    @cached_property
+    def departure(self) -> Floats:
+        """(n, band) by the direction they leave in."""
+        return db_to_power(self.departure_db)
+
+    @cached_property
+    def screen(self) -> Floats:
+        """(n, band) by the edges that they pass."""
+        return db_to_power(self.paths.screen_db)
 
 
-UNCHANGED = Change(0.0, "level")
+_Of = TypeVar("_Of")
+
+
+@dataclass(frozen=True)
+class Factors(Generic[_Of]):
+    """What an effect multiplies energies by where it is on, and where it is off; without a factor they stay as they
+    are."""
+
+    on: Callable[[_Of], Floats | float] | None = None
+    off: Callable[[_Of], Floats | float] | None = None
+
+
+UNTOUCHED: Factors[Any] = Factors()
+
+
+class EffectOnEnergies(Protocol):
+    """An effect, as far as predictions are concerned (`server.planning.effect.EnergyEffect`)."""
+
+    @property
+    def name(self) -> EffectName: ...
+    @property
+    def is_coherent(self) -> bool: ...
+    @property
+    def leads_round(self) -> bool: ...
+    @property
+    def direct(self) -> Factors[Way]: ...
+    @property
+    def mirrored(self) -> Factors[Mirrored]: ...
+    @property
+    def held(self) -> Factors[Floats]: ...
+
+
+_Known = list[tuple[EffectName, Floats | float | None, Floats | float | None]]
+"""Factors of effects, on and off."""
 
 
 class Prediction:
-    """Of all emitters of a situation, one at least."""
+    """Of all emitters of a situation, one at least, and of these `effects` on energies."""
 
-    def __init__(self, situation: Situation) -> None:
+    def __init__(self, situation: Situation, effects: Sequence[EffectOnEnergies]) -> None:
         self.situation = situation
+        self._effects = effects
+        self._leading_round = frozenset(effect.name for effect in effects if effect.leads_round)
+        self._coherent = frozenset(effect.name for effect in effects if effect.is_coherent)
         self.place, self.listener = situation.place, situation.listener
         self.emitters: list[Emitter] = list(situation.emitters.values())
         self.reach = Reach.of(situation)
@@ -118,61 +163,51 @@ class Prediction:
 
     def energies(self, variants: Sequence[Off]) -> Energies:
         """What is heard without some effects, in each of v variants."""
-        reach, place = self.reach, self.place
         mirror = self.mirrored_energies(variants)
-        direct = np.zeros((len(variants), len(reach.owner), len(OCTAVE_BANDS_HZ)))
+        direct = np.zeros((len(variants), len(self.reach.owner), len(OCTAVE_BANDS_HZ)))
         mirrored = np.zeros((len(variants), *self._held.shape))
         held = np.zeros_like(mirrored)
         for variant, off in enumerate(variants):
-            straight = EffectName.OCCLUSION in off
-            way = self._straight if straight else self._bent
-            if EffectName.DIRECT_PATH not in off and not place.holds_direct_sound:
-                row = direct[variant]
-                row += 1
-                if EffectName.DISTANCE_ATTENUATION not in off:
-                    row *= way.spread
-                if EffectName.AIR_ABSORPTION not in off:
-                    row *= way.air
-                if EffectName.DIRECTIVITY not in off:
-                    row *= way.departure
-                if EffectName.DIFFRACTION in off and not straight:
-                    row *= reach.paths.in_sight[:, None]
-                elif not straight:
-                    row *= self._screen
-            if EffectName.EARLY_REFLECTIONS not in off:
-                np.add.at(mirrored[variant], self.mirrored.owner, mirror[variant])
-            if EffectName.LATE_REVERBERATION not in off:
-                held[variant] = self._held if EffectName.DIRECTIVITY in off else self._held * self._diffuse
+            if not self.place.holds_direct_sound:
+                direct[variant] = 1
+                _multiply(direct[variant], self._straight if off & self._leading_round else self._bent, off)
+            np.add.at(mirrored[variant], self.mirrored.owner, mirror[variant])
+            held[variant] = self._held
+            _multiply(held[variant], self._on_held, off)
         return Energies(direct, mirrored, held, held * self._early)
 
     def mirrored_energies(self, variants: Sequence[Off]) -> Floats:
         """(v, m, band) where there are any; air is in them whether or not the direct sound is without."""
-        everywhere, beamed = self._mirrored_energies
-        return np.array([everywhere if EffectName.DIRECTIVITY in off else beamed for off in variants])
+        energies = np.tile(self._mirrored_everywhere, (len(variants), 1, 1))
+        for energy, off in zip(energies, variants, strict=True):
+            _multiply(energy, self._on_mirrored, off)
+        return energies
 
     @cached_property
-    def _mirrored_energies(self) -> tuple[Floats, Floats]:
-        """(m, band) where all radiate alike everywhere, and as they do."""
-        paths = self.mirrored
-        way = self._way(paths.length_m, paths.departure_db)
-        everywhere = db_to_power(paths.surface_db) * way.spread * way.air
-        return everywhere, everywhere * way.departure
+    def _mirrored_everywhere(self) -> Floats:
+        """(m, band) where all radiate alike everywhere."""
+        paths, place = self.mirrored, self.place
+        return db_to_power(paths.surface_db) * _spread(paths.length_m, place) * _air(paths.length_m, place)
 
     @cached_property
-    def _bent(self) -> "_Way":
-        return self._way(self.reach.paths.length_m, self.reach.departure_db)
+    def _on_mirrored(self) -> _Known:
+        return [_known(effect.name, effect.mirrored, self.mirrored) for effect in self._effects]
 
     @cached_property
-    def _straight(self) -> "_Way":
-        return self._way(self.reach.straight_m, self.reach.straight_departure_db)
+    def _on_held(self) -> _Known:
+        return [_known(effect.name, effect.held, self._diffuse) for effect in self._effects]
 
     @cached_property
-    def _screen(self) -> Floats:
-        return db_to_power(self.reach.paths.screen_db)
+    def _bent(self) -> _Known:
+        """Of the direct sound that goes round what stands in the way."""
+        way = Way(self.place, self.reach.paths, self.reach.departure_db, goes_through=False)
+        return [_known(effect.name, effect.direct, way) for effect in self._effects]
 
-    def _way(self, length_m: Floats, departure_db: Floats) -> "_Way":
-        spread = np.maximum(length_m, self.place.nearest_m)[:, None] ** -2.0
-        return _Way(spread, db_to_power(-length_m[:, None] * self.place.air_db_per_m), db_to_power(departure_db))
+    @cached_property
+    def _straight(self) -> _Known:
+        """Of the direct sound that goes through it."""
+        way = Way(self.place, self.reach.straight, self.reach.straight_departure_db, goes_through=True)
+        return [_known(effect.name, effect.direct, way) for effect in self._effects]
 
     def changes(self, variants: Sequence[Off]) -> dict[str, Floats]:
         """(v, e) change of each parameter in each variant, in JND, the worst within reach."""
@@ -192,7 +227,7 @@ class Prediction:
                 changes[name] = self.reach.most(difference)
         for number, off in enumerate(variants):
             quiet = all(change[number].min() < 1 for change in changes.values())
-            if quiet and off & _COHERENT:
+            if quiet and off & self._coherent:
                 beats_db = np.max(np.abs(self._thirds_db(off) - self._heard_thirds_db), axis=-1)
                 changes["spectrum"][number] = np.maximum(
                     changes["spectrum"][number], beats_db / JND_THRESHOLDS["spectrum"].amount
@@ -270,9 +305,8 @@ class Prediction:
         energies, (bands, turns) = self.energies([off]), self._phases
         count = len(self.emitters)
         wave = np.sqrt(energies.direct[0, :count])[:, bands].astype(np.complex128)
-        if EffectName.EARLY_REFLECTIONS not in off:
-            amplitude = np.sqrt(self.mirrored_energies([off])[0])
-            wave += self._decays.whose @ (amplitude[:, bands] * turns)
+        amplitude = np.sqrt(self.mirrored_energies([off])[0])
+        wave += self._decays.whose @ (amplitude[:, bands] * turns)
         power = np.abs(wave) ** 2 + energies.held[0][:, bands] + _SILENCE
         return power_to_db(power.reshape(count, -1, len(_PER_THIRD)).mean(axis=-1))
 
@@ -291,6 +325,27 @@ class Prediction:
                     found.departure[mine] @ axes_of(emitter.pose.orientation).T
                 )
         return Mirrored(found.emitter, found.length_m, found.gain_db, departure_db, found.arrival)
+
+
+def _spread(length_m: Floats, place: SceneAcoustics) -> Floats:
+    return np.asarray(np.maximum(length_m, place.nearest_m)[:, None] ** -2.0)
+
+
+def _air(length_m: Floats, place: SceneAcoustics) -> Floats:
+    return db_to_power(-length_m[:, None] * place.air_db_per_m)
+
+
+def _known(
+    name: EffectName, factors: Factors[_Of], of: _Of
+) -> tuple[EffectName, Floats | float | None, Floats | float | None]:
+    return name, None if factors.on is None else factors.on(of), None if factors.off is None else factors.off(of)
+
+
+def _multiply(energy: Floats, factors: _Known, off: Off) -> None:
+    for name, on, without in factors:
+        factor = without if name in off else on
+        if factor is not None:
+            energy *= factor
 
 
 @dataclass(frozen=True)

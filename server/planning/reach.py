@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import COINCIDENT_M, axes_of
-from server.acoustics.sound_path import SoundPaths
+from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.planning.scene_acoustics import SceneAcoustics, Situation
 
 Floats = npt.NDArray[np.float64]
@@ -27,14 +27,15 @@ _TURNS = np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
 
 @dataclass(frozen=True)
 class Reach:
-    """`owner` (n,) is the index of a row's emitter. `departure_db` (n, band) is its gain where the path leaves it and
-    `straight_departure_db` where the straight line does."""
+    """`owner` (n,) is the index of a row's emitter. `paths` go round what stands in the way, `straight` ones through
+    it; `departure_db` (n, band) is the emitter's gain where the one leaves it, and `straight_departure_db` where the
+    other does."""
 
     owner: npt.NDArray[np.int64]
     listener: Floats
     emitter: Floats
-    straight_m: Floats
     paths: SoundPaths
+    straight: SoundPaths
     departure_db: Floats
     straight_departure_db: Floats
 
@@ -69,21 +70,20 @@ class Reach:
             at_emitter.append(here[turners])
         rows, listener, emitter = np.concatenate(owner), np.concatenate(at_listener), np.concatenate(at_emitter)
 
-        paths, offset = _paths(place, listener, emitter), listener - emitter
-        straight_m = np.linalg.norm(offset, axis=-1)
-        straight = offset / np.maximum(straight_m, COINCIDENT_M)[:, None]
+        straight = _straight(listener, emitter)
+        paths = straight if place.paths is None else _paths(place.paths, listener, emitter)
         departure_db, straight_departure_db = np.zeros((2, len(rows), len(OCTAVE_BANDS_HZ)))
         for number, each in enumerate(emitters):
             if not each.is_omnidirectional:
                 of_it = np.flatnonzero(rows == number)
                 axes = axes_of(each.pose.orientation)
                 departure_db[of_it] = each.directivity.gain_db(paths.departure[of_it] @ axes.T)
-                straight_departure_db[of_it] = each.directivity.gain_db(straight[of_it] @ axes.T)
+                straight_departure_db[of_it] = each.directivity.gain_db(straight.departure[of_it] @ axes.T)
                 if number in turners:
                     turned = each.directivity.gain_db(_TURNS)
                     departure_db[of_it[-len(_TURNS) :]] = turned
                     straight_departure_db[of_it[-len(_TURNS) :]] = turned
-        return cls(rows, listener, emitter, straight_m, paths, departure_db, straight_departure_db)
+        return cls(rows, listener, emitter, paths, straight, departure_db, straight_departure_db)
 
     def most(self, values: Floats) -> Floats:
         """(v, n) to (v, e): the greatest of each emitter's rows."""
@@ -109,20 +109,21 @@ def _within_reach(points: Floats, speeds_m_s: list[float], place: SceneAcoustics
     return np.concatenate([points[np.newaxis], ends])
 
 
-def _paths(place: SceneAcoustics, listener: Floats, emitter: Floats) -> SoundPaths:
-    if place.paths is None:
-        straight_m = np.linalg.norm(listener - emitter, axis=-1)
-        towards = (emitter - listener) / np.maximum(straight_m, COINCIDENT_M)[:, None]
-        silent = np.zeros((len(listener), len(OCTAVE_BANDS_HZ)))
-        return SoundPaths(
-            straight_m, towards, -towards, np.zeros(len(listener)), np.ones(len(listener), dtype=np.bool_), silent
-        )
+def _paths(finder: SoundPathFinder, listener: Floats, emitter: Floats) -> SoundPaths:
     found = SoundPaths.empty(len(listener))
     # Rows of one listener stand together.
     edges = np.flatnonzero(np.any(np.diff(listener, axis=0), axis=-1)) + 1
     for start, stop in zip([0, *edges], [*edges, len(listener)], strict=True):
         for whole, part in zip(
-            vars(found).values(), vars(place.paths.find(listener[start], emitter[start:stop])).values(), strict=True
+            vars(found).values(), vars(finder.find(listener[start], emitter[start:stop])).values(), strict=True
         ):
             whole[start:stop] = part
     return found
+
+
+def _straight(listener: Floats, emitter: Floats) -> SoundPaths:
+    """Whatever stands in the way."""
+    straight_m, count = np.linalg.norm(listener - emitter, axis=-1), len(listener)
+    towards = (emitter - listener) / np.maximum(straight_m, COINCIDENT_M)[:, None]
+    silent = np.zeros((count, len(OCTAVE_BANDS_HZ)))
+    return SoundPaths(straight_m, towards, -towards, np.zeros(count), np.ones(count, dtype=np.bool_), silent)

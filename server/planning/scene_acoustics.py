@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose, Vector3
 from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
 from server.acoustics.sound_path import SoundPathFinder
 from server.acoustics.transmission import PathFinder, TransmittedPaths, transmission_loss_db
+from server.responses.emitter_state import EmitterState
 from server.scene.geometry import Materials
 
 Output = Literal["headphones", "mono"]
@@ -44,18 +45,14 @@ class Reverberation:
 
 
 @dataclass(frozen=True)
-class Emitter:
-    """Radiates from `pose`; moves at `speed_m_s` at most, 0 at rest.
+class Emitter(EmitterState):
+    """As plans see it: with all effects on, and how it may move; at `speed_m_s` at most, 0 at rest.
 
-    `reverberation` is of this emitter where it is; None where nobody knows, and the place's own stands for it.
+    `reverberation` is of this emitter where it is; None where that is not known, and the place's own stands for it.
     """
 
-    pose: Pose
-    directivity: Directivity = OMNIDIRECTIONAL
-    gain_db: float = 0.0
     speed_m_s: float = 0.0
     turns: bool = False
-    is_live: bool = False
     reverberation: Reverberation | None = None
 
     @property

@@ -307,7 +307,7 @@ def _require_version(data: str) -> None:
         return
     version = hello.get("protocol")
     if isinstance(version, bool) or not isinstance(version, int | float) or version % 1 > 0:
-        problem = f"protocol: is to be the version, a whole number; this server speaks {PROTOCOL}"
+        problem = f"protocol: has to be the version, a whole number; this server speaks {PROTOCOL}"
         raise RequestError("malformed_message", problem, field="protocol")
     if version != PROTOCOL:
         problem = f"this server speaks protocol {PROTOCOL}, not {version:g}"

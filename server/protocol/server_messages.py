@@ -6,12 +6,12 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from server.core.durations import DurationHistogram
 from server.core.errors import RequestError
+from server.planning.plan import Plan
 from server.protocol.blocks import Encoding
 from server.protocol.client_messages import PROTOCOL
 from server.protocol.message import Message, Position
 from server.scene.geometry import Opening
 from server.scene.manifest import AcceptedLaw, Bounds, QualityLevel
-from server.scene.plan import Plan
 
 LevelReason = Literal["chosen", "load", "recovered"]
 """Why the quality level changed: the client chose it, the server's load rose, or the load fell again."""

@@ -19,7 +19,7 @@ IntArray = npt.NDArray[np.int64]
 _PER_STAGE = 3
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _SHIFT = np.uint64(32)
-_SPARES = ArrayPool(64 * 1024 * 1024)
+_POOL = ArrayPool(64 * 1024 * 1024)
 """A few dozen responses of a second: each that is exchanged leaves what the next one needs."""
 
 
@@ -67,7 +67,7 @@ def pack(
             digests.append(like.digests[number])
             continue
         count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
-        spectra.append(_SPARES.floats(2 * stage.size * count * channels))  # all of it is written below
+        spectra.append(_POOL.floats(2 * stage.size * count * channels))  # all of it is written below
         digests.append(all_digests[taken : taken + count])
         header[at : at + _PER_STAGE] = address(spectra[-1]), count, address(digests[-1])
         made, taken = number + 1, taken + count  # those that are taken over come last

@@ -7,13 +7,13 @@ Metres; positions and directions in the world's axes.
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.decibels import amplitude_to_db, db_to_amplitude
-from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
+from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.rendering.direct_path import NEAR_LIMIT_M
@@ -23,7 +23,7 @@ from server.rendering.renderer import Renderer
 from server.rendering.still_paths import StillPaths
 from server.responses.binaural import Binauralization
 from server.responses.early_reflections import EarlyReflections
-from server.responses.effect_flags import EmitterEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.radiation import departure_gain_db, reverberation_gain
 from server.scene.bundle import Bundle
 
@@ -33,19 +33,6 @@ Key = TypeVar("Key")
 _SILENT_DB = -100.0
 _IN_THE_OPEN = FloorPlan(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)), 1.0)
 """A plan without a corner to go round: every path is straight."""
-
-
-class Aimed(Protocol):
-    """An emitter, as far as its direct sound is concerned; `directivity` is the one that is heard."""
-
-    @property
-    def pose(self) -> Pose: ...
-
-    @property
-    def directivity(self) -> Directivity: ...
-
-    @property
-    def effects(self) -> EmitterEffects: ...
 
 
 class FoundPaths(NamedTuple):
@@ -59,7 +46,7 @@ class FoundPaths(NamedTuple):
 class PathBatch(Generic[Key]):
     """The ways from emitters whose paths are found alike, as long as those stay as and where they are."""
 
-    def __init__(self, finder: SoundPathFinder, emitters: Sequence[tuple[Key, Aimed]]) -> None:
+    def __init__(self, finder: SoundPathFinder, emitters: Sequence[tuple[Key, EmitterState]]) -> None:
         self.keys = [key for key, _ in emitters]
         self._finder = finder
         self._places = np.array([emitter.pose.position for _, emitter in emitters])
@@ -68,15 +55,23 @@ class PathBatch(Generic[Key]):
         self._beaming = [
             (row, emitter) for row, (_, emitter) in enumerate(emitters) if emitter.directivity is not OMNIDIRECTIONAL
         ]
+        gains = dict.fromkeys(gain for _, emitter in emitters for gain in emitter.effects.path_gains)
+        self._gains = [
+            (gain, [row for row, (_, emitter) in enumerate(emitters) if gain in emitter.effects.path_gains])
+            for gain in gains
+        ]
 
     def find(self, listener: Pose) -> FoundPaths:
         """The paths to a listener, in the order of `keys`; good until the next are found."""
         paths = self._finder.find(np.array(listener.position), self._places, self._paths)
+        more_db = [(rows, gain_of(paths)[rows]) for gain_of, rows in self._gains]
         gain_db = paths.screen_db
         for row in self._unbent:
             gain_db[row] = 0.0 if paths.in_sight[row] else _SILENT_DB
         for row, emitter in self._beaming:
             gain_db[row] += departure_gain_db(emitter, paths.departure[row])
+        for rows, row_db in more_db:
+            gain_db[rows] += row_db
         return FoundPaths(paths.length_m, paths.arrival, gain_db)
 
 
@@ -157,7 +152,7 @@ class DirectSound:
         """Those that two ears hear, or one without a head."""
         return self.early_reflections if channels == 2 else self.early_without_head
 
-    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Aimed]) -> None:
+    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
         """Add the direct sound that `listener` hears of each emitter to its response (B, ear, sample), for emitters
         whose direct sound stands still; sample 0 is emission.
 
@@ -182,11 +177,11 @@ class DirectSound:
         """Whether there is a direct sound beside what the scene's fields hold."""
         return self._filters is not None
 
-    def ways_from(self, emitters: Iterable[tuple[Key, Aimed]]) -> list["PathBatch[Key]"]:
+    def ways_from(self, emitters: Iterable[tuple[Key, EmitterState]]) -> list["PathBatch[Key]"]:
         """From emitters, each with what tells it from others. Those that walls may hide are looked for round corners;
         for others nothing is looked for."""
-        hidden: list[tuple[Key, Aimed]] = []
-        open_: list[tuple[Key, Aimed]] = []
+        hidden: list[tuple[Key, EmitterState]] = []
+        open_: list[tuple[Key, EmitterState]] = []
         for each in emitters:
             (hidden if each[1].effects.occlusion else open_).append(each)
         return [PathBatch(finder, some) for finder, some in ((self._finder, hidden), (self._straight, open_)) if some]

@@ -25,7 +25,8 @@ from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.fractional_delay import TAPS
 from server.rendering.hrtf import HeadFilters, NoHead
 from server.rendering.still_paths import StillPaths
-from server.responses.radiation import Placed, departure_gain_db, reverberation_gain
+from server.responses.emitter_state import EmitterState
+from server.responses.radiation import departure_gain_db, reverberation_gain
 from server.scene.bundle import Bundle
 from server.scene.geometry import Materials
 
@@ -77,7 +78,7 @@ class EarlyReflections:
             transmission=manifest.transmission,
         )
 
-    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[Placed]) -> None:
+    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
         """Add what `listener` hears of each emitter to its response (B, ear, sample); sample 0 is emission.
 
         A renderer plays these responses at the emitter's `reverberation_gain`, as is right for sound from all sides;

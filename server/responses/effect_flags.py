@@ -1,28 +1,22 @@
-"""What a plan of effects means to whoever renders: which parts of a listener's sound there are."""
+"""Which parts of a listener's sound are made: what a plan of effects switches."""
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
-from server.scene.effects import EffectName
-from server.scene.plan import Plan
+import numpy as np
+import numpy.typing as npt
 
-PARTS: Mapping[EffectName, str] = {
-    EffectName.DIRECT_PATH: "direct_path",
-    EffectName.DISTANCE_ATTENUATION: "distance_attenuation",
-    EffectName.AIR_ABSORPTION: "air_absorption",
-    EffectName.OCCLUSION: "occlusion",
-    EffectName.DIFFRACTION: "diffraction",
-    EffectName.DIRECTIVITY: "directivity",
-    EffectName.EARLY_REFLECTIONS: "early",
-    EffectName.LATE_REVERBERATION: "late",
-}
-"""Which part of `EmitterEffects` an effect is, of those that a single moment tells."""
+from server.acoustics.sound_path import SoundPaths
+
+PathGain = Callable[[SoundPaths], npt.NDArray[np.float64]]
+"""How much louder the direct sound of n paths is in each octave band, (n, band) in decibels: beside what distance, air,
+edges and directivity do; 0 where it stays as it is."""
 
 
 @dataclass(frozen=True)
 class EmitterEffects:
-    """Of one emitter. `early` are the first reflections from geometry, `late` is what the field holds."""
+    """Of one emitter. `early` are the first reflections from geometry, `late` is what the field holds; `path_gains`
+    change the direct sound besides."""
 
     direct_path: bool = True
     propagation_delay: bool = True
@@ -35,25 +29,7 @@ class EmitterEffects:
     late: bool = True
     holds_still: bool = False
     """Whether the delay is to stand still even while something moves."""
-
-    @classmethod
-    def of(cls, plan: Plan, emitter: str, *, has_early: bool, has_late: bool) -> Self:
-        """`has_early` and `has_late` say what there is in the scene."""
-
-        def is_on(name: EffectName) -> bool:
-            return plan.is_on(name, emitter)
-
-        return cls(
-            direct_path=is_on(EffectName.DIRECT_PATH),
-            propagation_delay=is_on(EffectName.PROPAGATION_DELAY),
-            distance_attenuation=is_on(EffectName.DISTANCE_ATTENUATION),
-            air_absorption=is_on(EffectName.AIR_ABSORPTION),
-            occlusion=is_on(EffectName.OCCLUSION),
-            diffraction=is_on(EffectName.DIFFRACTION),
-            directivity=is_on(EffectName.DIRECTIVITY),
-            early=has_early and is_on(EffectName.EARLY_REFLECTIONS),
-            late=has_late and is_on(EffectName.LATE_REVERBERATION),
-        )
+    path_gains: tuple[PathGain, ...] = ()
 
     @property
     def has_response(self) -> bool:
@@ -64,8 +40,14 @@ class EmitterEffects:
         """Whether the direct sound stands still and is part of the impulse response."""
         return self.direct_path and not self.propagation_delay and self.has_response
 
+    @property
+    def path(self) -> tuple[object, ...]:
+        """What the path of the direct sound, and its gains, depend on."""
+        return self.occlusion, self.diffraction, self.directivity, self.path_gains
+
 
 ALL_ON = EmitterEffects()
+"""All that the renderer does of its own, without path gains."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +58,6 @@ class SharedEffects:
     head: bool = True
     own_tails: bool = True
     head_rotation: bool = True
-
-    @classmethod
-    def of(cls, plan: Plan) -> Self:
-        return cls(
-            head=plan.is_on(EffectName.HRTF),
-            own_tails=plan.is_on(EffectName.PER_SOURCE_TAIL),
-            head_rotation=plan.is_on(EffectName.HEAD_ROTATION),
-        )
 
     @property
     def channels(self) -> int:

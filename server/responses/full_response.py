@@ -5,14 +5,12 @@ Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metre
 """
 
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_power
-from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
 from server.acoustics.geometry import Pose
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
@@ -21,17 +19,11 @@ from server.rendering.hrtf import HeadFilters, kemar
 from server.rendering.sphere import solid_angles
 from server.rendering.still_paths import StillPaths
 from server.responses.early_reflections import EarlyReflections
+from server.responses.emitter_state import EmitterState
 from server.responses.node_reflections import add_first_reflections
 from server.scene.bundle import Bundle
 
 _N_FFT = 512
-
-
-class _AllRound(NamedTuple):
-    """An emitter that radiates alike in all directions."""
-
-    pose: Pose
-    directivity: Directivity = OMNIDIRECTIONAL
 
 
 class FullResponse:
@@ -73,7 +65,9 @@ class FullResponse:
             paths = self._paths.find(listener, emitter[None])
             self._direct.add(paths.length_m, paths.arrival, paths.screen_db, head.orientation, response)
             if self._early is not None:
-                add_first_reflections(self.field, self._early, response[None], head, [_AllRound(Pose(tuple(emitter)))])
+                add_first_reflections(
+                    self.field, self._early, response[None], head, [EmitterState(Pose(tuple(emitter)))]
+                )
         return responses
 
     def path_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:

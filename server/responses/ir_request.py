@@ -2,74 +2,30 @@
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose
+from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.rendering.convolver import PartitionedIr
+from server.rendering.renderer import Renderer
 from server.responses.direct_sound import DirectSound
 from server.responses.downmix import binaural_to_mono
-from server.responses.effect_flags import ALL_ON, EmitterEffects
-from server.responses.ir_cache import Preparer, prepared_irs
-from server.responses.node_reflections import Snapping, add_first_reflections
-
-
-class Asked(Protocol):
-    """An emitter, as far as its response is concerned; `directivity` is the one that is heard."""
-
-    @property
-    def pose(self) -> Pose: ...
-
-    @property
-    def directivity(self) -> Directivity: ...
-
-    @property
-    def effects(self) -> EmitterEffects: ...
-
-
-class Ask(Protocol):
-    """Impulse responses (batch, channel, sample), in an array of their own, for poses in metres and radians."""
-
-    def __call__(
-        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
-    ) -> npt.NDArray[np.float32]: ...
-
-
-class Field(Snapping, Protocol):
-    """What an acoustic field gives."""
-
-    @property
-    def ir_samples(self) -> int: ...
-
-    @property
-    def sample_rate(self) -> int: ...
-
-    def impulse_responses(
-        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
-    ) -> npt.NDArray[np.float32]: ...
-
-
-class Hearing(Preparer, Protocol):
-    """A renderer, as far as it makes anything ready on any thread."""
-
-    def prepare_hearing(self, channels: int) -> None: ...
+from server.responses.emitter_state import EmitterState
+from server.responses.ir_cache import prepared_irs
+from server.responses.node_reflections import add_first_reflections
 
 
 @dataclass(frozen=True)
-class EmitterSnapshot:
-    """An emitter as it was when its IR was asked for; `serial` tells it from others of the same id."""
+class AskedIr:
+    """The response of one emitter as it was; `serial` tells it from others of the same id, and `identity` its response
+    from others where poses share responses."""
 
     serial: int
-    pose: Pose
-    directivity: Directivity
+    state: EmitterState
     identity: Hashable | None = None
-    """Of the response asked for, where poses share responses."""
-    effects: EmitterEffects = ALL_ON
 
 
 @dataclass(frozen=True)
@@ -80,8 +36,8 @@ class IrRequest:
     pose_id: int
     level: str
     listener: Pose
-    emitters: tuple[EmitterSnapshot, ...]
-    """Those whose IR is out of date."""
+    asked: tuple[AskedIr, ...]
+    """Of those emitters whose IR is out of date."""
     direct_sound: DirectSound
     """What the field's IRs leave out, as this session's head hears it."""
     channels: int = 2
@@ -93,37 +49,37 @@ class IrRequest:
 class IrResponse:
     request: IrRequest
     irs: tuple[PartitionedIr, ...]
-    """One per emitter of the request."""
+    """One for each that was asked for."""
 
 
-def compute_irs(levels: FieldsByLevel, request: IrRequest, hearing: Hearing) -> IrResponse:
+def compute_irs(levels: FieldsByLevel, request: IrRequest, renderer: Renderer) -> IrResponse:
     """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
     field, direct = levels[request.level], request.direct_sound
-    hearing.prepare_hearing(request.channels)
-    is_whole = all(emitter.effects.late and emitter.effects.early for emitter in request.emitters)
-    bakes_direct = any(emitter.effects.bakes_direct for emitter in request.emitters)
-    if field.level.reuse is not None and is_whole and not bakes_direct and request.channels == 2:
+    renderer.prepare_hearing(request.channels)
+    emitters = [asked.state for asked in request.asked]
+    is_whole = all(emitter.effects.late and emitter.effects.early for emitter in emitters)
+    bakes_direct = any(emitter.effects.bakes_direct for emitter in emitters)
+    if field.kind.reuses_responses and is_whole and not bakes_direct and request.channels == 2:
         early = direct.early_reflections
-        kept = prepared_irs(field, levels.kept, early, hearing, request.listener, request.emitters)
+        kept = prepared_irs(field, levels.node_cache, early, renderer, request.listener, emitters)
         return IrResponse(request, kept)
-    ask = partial(field.impulse_responses, remember=True)
-    irs = composed_irs(field, direct, request.listener, request.emitters, request.channels, ask=ask)
-    return IrResponse(request, tuple(hearing.prepare(ir if is_whole else _without_end(ir)) for ir in irs))
+    irs = composed_irs(field, direct, request.listener, emitters, request.channels, remember=True)
+    return IrResponse(request, tuple(renderer.prepare(ir if is_whole else _without_end(ir)) for ir in irs))
 
 
 def composed_irs(
-    field: Field,
+    field: AcousticField,
     direct: DirectSound,
     listener: Pose,
-    emitters: Sequence[Asked],
+    emitters: Sequence[EmitterState],
     channels: int = 2,
     *,
-    ask: Ask | None = None,
+    remember: bool = False,
 ) -> npt.NDArray[np.float32]:
     """(B, channel, sample) the responses of emitters, of the parts that their effects call for: the field is asked for
-    none but those whose late part is, or somebody else in its place is if there is one to `ask`."""
+    none but those whose late part is. `remember` is as in `AcousticField.impulse_responses`."""
     count = len(emitters)
-    held = _held(field, direct, listener, emitters, ask or field.impulse_responses)
+    held = _held(field, direct, listener, emitters, remember=remember)
     if direct.binauralization is not None:
         places = [emitter.pose.position for emitter in emitters]
         return direct.binauralization.binauralize(held, listener, places) if channels == 2 else held
@@ -145,7 +101,7 @@ def composed_irs(
 
 
 def _held(
-    field: Field, direct: DirectSound, listener: Pose, emitters: Sequence[Asked], ask: Ask
+    field: AcousticField, direct: DirectSound, listener: Pose, emitters: Sequence[EmitterState], *, remember: bool
 ) -> npt.NDArray[np.float32]:
     """(B, channel, sample) of the field, an array of its own; zeros for those whose late part is off."""
     late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
@@ -153,7 +109,8 @@ def _held(
     if not late:
         return np.zeros((len(emitters), channels, field.ir_samples), np.float32)
     heads = np.tile(np.asarray(listener.position), (len(late), 1))
-    answer = ask(heads, np.array([emitters[row].pose.position for row in late]), np.full(len(late), listener.yaw))
+    places = np.array([emitters[row].pose.position for row in late])
+    answer = field.impulse_responses(heads, places, np.full(len(late), listener.yaw), remember=remember)
     if direct.field_gain != 1.0:
         answer *= np.float32(direct.field_gain)
     if len(late) == len(emitters):

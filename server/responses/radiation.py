@@ -2,27 +2,17 @@
 room gets."""
 
 import math
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.decibels import db_to_power
 from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
-from server.acoustics.geometry import Pose, Quaternion, Vector3
+from server.acoustics.geometry import Quaternion, Vector3
+from server.responses.emitter_state import EmitterState
 
 
-class Placed(Protocol):
-    """An emitter, as far as the paths from it are concerned."""
-
-    @property
-    def pose(self) -> Pose: ...
-
-    @property
-    def directivity(self) -> Directivity: ...
-
-
-def departure_gain_db(emitter: Placed, departure: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:
+def departure_gain_db(emitter: EmitterState, departure: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:
     """(band,) gain of what leaves an emitter in a direction (3,) of the world; 0 for one that radiates all round."""
     if emitter.directivity == OMNIDIRECTIONAL:
         return 0.0

@@ -340,7 +340,9 @@ class Manifest(Strict):
         if self.direct_sound == "field" and any(level.reuse is not None for level in self.levels):
             raise ValueError("levels: responses that hold the direct sound cannot be those of another place (reuse)")
         if len(self.channels) == 1 and self.direct_sound == "geometry":
-            raise ValueError("direct_sound: what one microphone heard holds it; it is computed for two ears only")
+            raise ValueError(
+                "direct_sound: responses of one microphone have to hold it; it is computed for two ears only"
+            )
         return self
 
     @property

@@ -277,8 +277,8 @@ class _Life:
     def too_loud(self) -> list[str | bytes]:
         return ['{"type": "set_gain", "id": "e1", "gain_db": 1e30}']
 
-    def nobody(self) -> list[str | bytes]:
-        return [RemoveEmitter(id="nobody").serialize()]
+    def unknown_emitter(self) -> list[str | bytes]:
+        return [RemoveEmitter(id="unheard").serialize()]
 
     def unknown_level(self) -> list[str | bytes]:
         return [SetLevel(level="perfect").serialize()]
@@ -353,7 +353,7 @@ _FAULTS: Mapping[str, _Trick] = {
         _Life.misspelt_field,
         _Life.random_bytes,
         _Life.too_loud,
-        _Life.nobody,
+        _Life.unknown_emitter,
         _Life.unknown_level,
         _Life.unknown_effect,
         _Life.unknown_clip,

@@ -14,8 +14,9 @@ from server.rendering.hrtf import kemar
 from server.rendering.ingest import DryAudio
 from server.rendering.sources import ClipPlayer
 from server.responses.direct_sound import DirectSound
+from server.responses.emitter_state import EmitterState
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import StreamedEmitter
 
 _BLOCK_SIZE = 256
 _SOUND_S = 2.0
@@ -30,7 +31,7 @@ def silence_to_sound(field: AcousticField) -> float:
     direct = DirectSound.of(field.bundle, kemar(rate))
     start = manifest.start
     listener = Pose(start.listener)
-    emitter = Emitter(serial=0, pose=Pose(start.emitter))
+    emitter = StreamedEmitter(0, EmitterState(Pose(start.emitter)))
     ir = field.impulse_responses([start.listener], [start.emitter], [0.0])[0]
     loud = np.random.default_rng(0).uniform(-1, 1, round(_SOUND_S * rate)).astype(np.float32)
     ratios = []

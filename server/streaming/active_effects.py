@@ -1,20 +1,22 @@
 """Has a renderer make what a session's effects call for, and nothing else.
 
-Direct sound that stands still is *folded*: it is part of the impulse response (IR), and the renderer does no more for
-it than keep the delay line. The IR without it is kept, so that it follows with the next block when something moves.
+Direct sound that stands still is *baked*: it is part of the impulse response (IR), and the renderer does no more for it
+than keep the delay line. The IR without it is kept, so that it follows with the next block when something moves.
 """
 
 import dataclasses
 from collections.abc import Mapping
 
 from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.planning.catalogue import ENERGY_EFFECTS, emitter_effects
 from server.planning.planned_effects import PlannedEffects
 from server.rendering.convolver import PartitionedIr
 from server.rendering.renderer import Renderer
-from server.responses.effect_flags import PARTS, EmitterEffects, SharedEffects
+from server.responses.effect_flags import EmitterEffects, SharedEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.radiation import reverberation_gain
 from server.scene.effects import EffectName
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import StreamedEmitter
 
 
 class ActiveEffects:
@@ -28,7 +30,8 @@ class ActiveEffects:
         self.shared = SharedEffects() if planned is None else planned.shared
         self._renderer = renderer
         self._sample_rate = sample_rate
-        self._has_early, self._has_late = has_early, has_late
+        has = {EffectName.EARLY_REFLECTIONS: has_early, EffectName.LATE_REVERBERATION: has_late}
+        self._lacking = frozenset(name for name, is_there in has.items() if not is_there)
 
     @property
     def clock_s(self) -> float:
@@ -50,7 +53,7 @@ class ActiveEffects:
         """Of the IRs to ask for."""
         return self.shared.channels if self.awaits_ears else self._renderer.channels
 
-    def enforce(self, emitters: Mapping[str, Emitter]) -> list[str]:
+    def enforce(self, emitters: Mapping[str, StreamedEmitter]) -> list[str]:
         """Put the plan into effect. Emitters that are decided about by it for the first time and have no IR to wait
         for."""
         assert self.planned is not None
@@ -58,32 +61,33 @@ class ActiveEffects:
         self.shared = self.planned.shared
         begin = []
         for name, emitter in emitters.items():
-            effects = self.planned.of_emitter(name, self.clock_s, has_early=self._has_early, has_late=self._has_late)
+            effects = self.planned.of_emitter(name, self.clock_s, lacking=self._lacking)
             if effects is None:
                 continue
             if not emitter.is_decided and not effects.has_response:
                 begin.append(name)
             self._switch(name, emitter, effects)
-            emitter.is_decided = True
+            emitter.decide()
             if ears != self.shared.channels:
-                self._outdate(emitter)
+                emitter.discard_response()
         return begin
 
     def whole(self) -> tuple[EmitterEffects, bool]:
         """What would be on if all were but what was switched off by hand, and whether that has a head."""
         assert self.planned is not None
         off = {name for name, is_on in self.planned.overrides.items() if not is_on}
-        parts = {part: name not in off for name, part in PARTS.items()}
-        parts["early"] &= self._has_early
-        parts["late"] &= self._has_late
-        return EmitterEffects(**parts), self.planned.output == "headphones" and EffectName.HRTF not in off
+        told = {effect.name for effect in ENERGY_EFFECTS} - off - self._lacking
+        whole = emitter_effects(told | {EffectName.PROPAGATION_DELAY})
+        return whole, self.planned.output == "headphones" and EffectName.HRTF not in off
 
-    def share_tail(self, is_shared: bool, emitters: Mapping[str, Emitter]) -> None:
+    def share_tail(self, is_shared: bool, emitters: Mapping[str, StreamedEmitter]) -> None:
         """Have emitters share a late tail where a quality level does, or none would be told from its own."""
         several = sum(emitter.effects.late for emitter in emitters.values()) > 1
         self._renderer.share_tail(is_shared or (several and not self.shared.own_tails))
 
-    def accept_ir(self, name: str, emitter: Emitter, ir: PartitionedIr, asked: EmitterEffects, token: int) -> bool:
+    def accept_ir(
+        self, name: str, emitter: StreamedEmitter, ir: PartitionedIr, asked: EmitterEffects, token: int
+    ) -> bool:
         """Hand the renderer an IR that was asked for with some effects. False where others are in force by now."""
         if not emitter.effects.has_response or (asked.early, asked.late) != (
             emitter.effects.early,
@@ -97,64 +101,58 @@ class ActiveEffects:
             if emitter.is_outdated and not emitter.effects.holds_still:
                 return False
             self._renderer.set_ir(name, ir, token=token)
-            self._renderer_hears(name, emitter, is_folded=True)
+            self._set_direct(name, emitter, bakes_direct=True)
         else:
             self._renderer.set_ir(name, ir, token=token)
-            self._renderer_hears(name, emitter, is_folded=False)
-            emitter.unfolded = ir
-        emitter.token = token
+            self._set_direct(name, emitter, bakes_direct=False)
+            emitter.heard.without_direct = ir
+        emitter.heard.token = token
         return True
 
-    def unbake(self, name: str, emitter: Emitter) -> None:
+    def unbake(self, name: str, emitter: StreamedEmitter) -> None:
         """Have the direct sound follow poses again, with the next block."""
-        if not emitter.is_folded or emitter.effects.holds_still:
+        heard = emitter.heard
+        if not heard.bakes_direct or emitter.effects.holds_still:
             return
-        if emitter.unfolded is not None and emitter.unfolded.channels == self._renderer.channels:
-            self._renderer.set_ir(name, emitter.unfolded, token=emitter.token)
-            self._renderer_hears(name, emitter, is_folded=False)
+        if heard.without_direct is not None and heard.without_direct.channels == self._renderer.channels:
+            self._renderer.set_ir(name, heard.without_direct, token=heard.token)
+            self._set_direct(name, emitter, bakes_direct=False)
 
-    def _switch(self, name: str, emitter: Emitter, effects: EmitterEffects) -> None:
-        before, emitter.effects = emitter.effects, effects
+    def _switch(self, name: str, emitter: StreamedEmitter, effects: EmitterEffects) -> None:
+        before = emitter.effects
+        emitter.set_effects(effects)
         if before == effects and emitter.is_decided:
             return
-        if _aim(before) != _aim(effects):
+        if before.path != effects.path:
             emitter.is_displaced = True
-        if before.directivity != effects.directivity and emitter.pattern != OMNIDIRECTIONAL:
-            self._renderer.set_reverberation_gain(name, reverberation_gain(emitter.directivity))
-            self._outdate(emitter)
+        if before.directivity != effects.directivity and emitter.state.pattern != OMNIDIRECTIONAL:
+            self._renderer.set_reverberation_gain(name, reverberation_gain(emitter.state.directivity))
+            emitter.discard_response()
         if (before.early, before.late) != (effects.early, effects.late):
-            self._outdate(emitter)
+            emitter.discard_response()
         if not effects.has_response:
             self._renderer.drop_ir(name)
-            emitter.is_folded, emitter.unfolded = False, None
-        elif emitter.is_folded and (not effects.bakes_direct or before != effects):
+            emitter.heard.bakes_direct, emitter.heard.without_direct = False, None
+        elif emitter.heard.bakes_direct and (not effects.bakes_direct or before != effects):
             self.unbake(name, emitter)
-            if emitter.is_folded:  # in a response that nothing stands for
-                self._outdate(emitter)
-        self._renderer_hears(name, emitter, is_folded=emitter.is_folded)
+            if emitter.heard.bakes_direct:  # in a response that nothing stands for
+                emitter.discard_response()
+        self._set_direct(name, emitter, bakes_direct=emitter.heard.bakes_direct)
 
-    def _outdate(self, emitter: Emitter) -> None:
-        emitter.is_outdated, emitter.identity = True, None
-
-    def _renderer_hears(self, name: str, emitter: Emitter, *, is_folded: bool) -> None:
-        emitter.is_folded = is_folded
+    def _set_direct(self, name: str, emitter: StreamedEmitter, *, bakes_direct: bool) -> None:
+        emitter.heard.bakes_direct = bakes_direct
         effects = emitter.effects
         self._renderer.enable_direct(
             name,
-            is_heard=effects.direct_path and not is_folded,
+            is_heard=effects.direct_path and not bakes_direct,
             distance=effects.distance_attenuation,
             air=effects.air_absorption,
         )
 
 
-def _aim(effects: EmitterEffects) -> tuple[bool, ...]:
-    """What the path of the direct sound depends on."""
-    return effects.occlusion, effects.diffraction, effects.directivity
-
-
-def as_asked(emitter: Emitter) -> EmitterEffects:
-    """The effects to ask for an IR with: of one that is to be folded, but has no IR of its pose, that first."""
+def as_asked(emitter: StreamedEmitter) -> EmitterState:
+    """The state to ask for an IR of. Before the direct sound is baked, there has to be an IR of the pose without it."""
     effects = emitter.effects
-    if not effects.bakes_direct or emitter.wants_folding or effects.holds_still:
-        return effects
-    return dataclasses.replace(effects, propagation_delay=True)
+    if not effects.bakes_direct or emitter.wants_baking or effects.holds_still:
+        return emitter.state
+    return dataclasses.replace(emitter.state, effects=dataclasses.replace(effects, propagation_delay=True))

@@ -11,13 +11,13 @@ stream rendered would wait for the last. So a thread offers `PHASES` instants pe
 new stream the one with the fewest others, and renders what is due at an instant in one call without the lock, or, where
 it fell behind, as much of it as a tick has time for.
 
-**Under load**, two blocks of a stream are rendered at once, or four, or eight (`server.streaming.render_ahead`): those
-after the first cost less rendering, for much of what they read is in the caches, and hardly any of what waking,
-messages and the way to the event loop cost. They are ready before they are due, so poses are heard up to so many blocks
-later. The streams of an instant take turns with it, so that every instant has as much to do.
+**Under load**, two blocks of a stream are rendered at once, or four, or eight: those after the first cost less
+rendering, for much of what they read is in the caches, and hardly any of what waking, messages and the way to the event
+loop cost. They are ready before they are due, so poses are heard up to so many blocks later. The streams of an instant
+take turns with it, so that every instant has as much to do.
 
-**What a stream gets.** Four times a second a thread looks at what its streams went through, and moves them to cheaper
-or better quality (`server.streaming.load`).
+**What a stream gets.** Four times a second a thread measures what it and its streams went through, and does what the
+load policy decides (`server.streaming.load_policy`): how many blocks at once, which quality, how often responses.
 
 Messages that may call for an IR wake the thread at once, which asks for the IR and renders nothing early. Streams take
 turns with that (`server.streaming.request_queue`).
@@ -32,6 +32,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from operator import attrgetter
 from typing import NamedTuple, get_args
@@ -41,9 +42,8 @@ from server.rendering.renderer import render_all
 from server.runtime.priority import become_real_time
 from server.runtime.thread_watch import Watched
 from server.runtime.workers import Workers
-from server.streaming.load import PERIOD_S, LoadControl, ir_share
-from server.streaming.render_ahead import NUMBERS as NUMBERS_AT_ONCE
-from server.streaming.render_ahead import RenderAhead
+from server.streaming.load_policy import LoadState, Measurement, RenderAhead, ThreadState, decide, requests_at_once
+from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.request_queue import RequestQueue
 from server.streaming.stream import Outgoing, Stream, StreamFailed
 
@@ -59,10 +59,6 @@ _GIVE_WAY_S = 0.001
 """How long an audio thread that would sleep less waits for the event loop at the most, about twice as long as the loop
 takes. Where both have but one core, and the thread hardly sleeps, the loop got nothing of it for up to 0.1 s: blocks
 were ready in time and sent too late."""
-_AHEAD = 1
-"""Requests for IRs beside those being computed, so that no worker waits for the next."""
-_PRESUMED_LOAD = 0.02
-"""Share of a core that a stream is taken to need at least, as long as it has shown no more."""
 _SWITCH_S = 0.0005
 """How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, one that is busy
 half of the time holds audio up for longer than blocks last."""
@@ -77,9 +73,9 @@ Post = Callable[[Callable[[], None]], object]
 class AudioEngine:
     """Renders streams until stopped.
 
-    `workers` computes IRs; each stream has at most one request with it. Under load, those of one audio thread's streams
-    take `ir_share` of a core, or less where rendering leaves less. `is_real_time` asks the system to schedule audio
-    threads before all others. Its threads are watched (`server.runtime.thread_watch`).
+    `workers` computes IRs; each stream has at most one request with it. `thresholds` are those of the load policy.
+    `is_real_time` asks the system to schedule audio threads before all others. Its threads are watched
+    (`server.runtime.thread_watch`).
     """
 
     patience_s = 1.0
@@ -92,12 +88,13 @@ class AudioEngine:
         *,
         threads: int = 1,
         is_real_time: bool = False,
-        ir_share: float = 0.25,
+        thresholds: Thresholds = THRESHOLDS,
         time_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._workers = workers
+        self._thresholds = thresholds
         self.threads = [
-            AudioThread(post, workers, number=number, is_real_time=is_real_time, ir_share=ir_share, time_s=time_s)
+            AudioThread(post, workers, number=number, is_real_time=is_real_time, thresholds=thresholds, time_s=time_s)
             for number in range(threads)
         ]
         self._thread_of: dict[Stream, AudioThread] = {}
@@ -131,7 +128,7 @@ class AudioEngine:
         """Start a stream now, on the thread that is least busy."""
         loads = dict.fromkeys(self.threads, 0.0)
         for other, thread in self._thread_of.items():
-            loads[thread] += max(_PRESUMED_LOAD, other.load)
+            loads[thread] += max(self._thresholds.presumed_load, other.load)
         thread = min(self.threads, key=loads.__getitem__)
         self._thread_of[stream] = thread
         self._share_workers()
@@ -170,7 +167,9 @@ class AudioEngine:
         """Have threads with streams keep as many of them busy as each other."""
         sharing = set(self._thread_of.values())
         for thread in sharing:
-            thread.turns.requests = _AHEAD + math.ceil(self._workers.threads / len(sharing))
+            thread.turns.requests = requests_at_once(
+                self._thresholds, workers=self._workers.threads, threads=len(sharing)
+            )
 
 
 class AudioThread:
@@ -183,7 +182,7 @@ class AudioThread:
         *,
         number: int,
         is_real_time: bool,
-        ir_share: float,
+        thresholds: Thresholds,
         time_s: Callable[[], float],
     ) -> None:
         self._post = post
@@ -192,17 +191,16 @@ class AudioThread:
         """Of its streams, to ask for IRs."""
         self._number = number
         self._is_real_time = is_real_time
-        self._ir_share = ir_share
+        self._thresholds = thresholds
         self._time_s = time_s
-        # All reasons from the start: whoever reads it on another thread must not find it growing.
+        # All reasons from the start: a reader on another thread must not find it growing.
         self.steps: Counter[LevelReason] = Counter(dict.fromkeys(get_args(LevelReason), 0))
         """Times that streams were moved to other quality."""
-        self._load = LoadControl()
+        self._load = ThreadState()
         self._busy_s = 0.0
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
         """With the place of each: its phase, and with which block it begins to be rendered several at once."""
-        self._at_once = RenderAhead()
         self._arrivals: deque[tuple[Stream, bool]] = deque()
         self._origin_s: float | None = None
         self._wake = threading.Event()
@@ -217,7 +215,7 @@ class AudioThread:
     @property
     def blocks_at_once(self) -> int:
         """How many blocks of a stream it renders together."""
-        return self._at_once.count
+        return self._load.ahead.blocks
 
     @property
     def name(self) -> str:
@@ -243,7 +241,7 @@ class AudioThread:
             self._workers,
             number=self._number,
             is_real_time=self._is_real_time,
-            ir_share=self._ir_share,
+            thresholds=self._thresholds,
             time_s=self._time_s,
         )
         thread.steps = self.steps
@@ -295,7 +293,7 @@ class AudioThread:
         if due:
             self._render(due, made)
             self._busy_s += self._time_s() - now_s
-        if now_s - self._looked_s >= PERIOD_S:
+        if now_s - self._looked_s >= self._thresholds.period_s:
             self._look(now_s, made)
         if any(made.values()):
             self._has_arrived.clear()
@@ -308,7 +306,7 @@ class AudioThread:
         has time for. A thread that fell behind has the first of them sent before it goes on."""
         soon_s = now_s + _EARLY_S
         due = sorted((stream for stream in self._streams if stream.due_s <= soon_s), key=attrgetter("deadline_s"))
-        if due and self.blocks_at_once == NUMBERS_AT_ONCE[-1]:
+        if due and self.blocks_at_once == self._thresholds.blocks_at_once[-1]:
             due += [stream for stream in self._streams if stream.due_s > soon_s and self._may_come_along(stream, now_s)]
         blocks_of: dict[Stream, int] = {}
         left_s = _MOST_AT_A_TICK * min((stream.block_s for stream in due), default=0.0)
@@ -360,20 +358,21 @@ class AudioThread:
                 self._fail(stream, made)
 
     def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
-        """Have streams step down or up, and IRs and checks take no more than their share."""
+        """Measure what the thread and its streams went through, and do what the load policy decides."""
         busy, self._busy_s = self._busy_s / (now_s - self._looked_s), 0.0
         self._looked_s = now_s
-        by_ladder = {stream.ladder: stream for stream in self._streams}
-        strains = {ladder: stream.strain(now_s) for ladder, stream in by_ladder.items()}
-        can_make_time = self._at_once.can_be_more
-        self._at_once.look(busy, max((strain.lateness for strain in strains.values()), default=0.0))
-        for ladder, reason in self._load.decide(now_s, busy, strains, can_make_time=can_make_time).items():
-            stream = by_ladder[ladder]
-            made.setdefault(stream, []).extend(stream.step(reason, now_s))
+        state = LoadState(self._load, {stream: stream.ladder for stream in self._streams})
+        measurement = Measurement(now_s, busy, {stream: stream.sample_load(now_s) for stream in self._streams})
+        state, decision = decide(self._thresholds, state, measurement)
+        self._load = state.thread
+        for stream, ladder in state.ladders.items():
+            stream.ladder = ladder
+        for stream, reason in decision.moved.items():
+            made.setdefault(stream, []).extend(stream.follow_ladder(reason, now_s))
             self.steps[reason] += 1
-        share = ir_share(self._ir_share, busy=busy)
         for stream in self._streams:
-            stream.set_cpu_budget(streams=len(self._streams), share=share)
+            stream.set_intervals(decision.ir_intervals_s[stream], decision.plan_intervals_s[stream])
+            stream.company = len(self._streams)
 
     def _fail(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> None:
         """The boundary between streams: one that breaks leaves the others sounding."""
@@ -385,7 +384,7 @@ class AudioThread:
             stream, is_opening = self._arrivals.popleft()
             if is_opening:
                 if not self._streams:
-                    self._at_once = RenderAhead()
+                    self._load = replace(self._load, ahead=RenderAhead())
                 place = self._freest_place(stream.block_s)
                 stream.start(self._origin_of(place % PHASES, stream.block_s, now_s))
                 self._streams[stream] = place
@@ -398,7 +397,7 @@ class AudioThread:
         with it, two at once or more. Of equal ones, one that lies apart from those taken before: where one instant has
         more to do, the next is to have less, or neither the event loop nor IRs get anything for long."""
         taken = [place for stream, place in self._streams.items() if stream.block_s == block_s]
-        *periods, cycle = [PHASES * count for count in NUMBERS_AT_ONCE]
+        *periods, cycle = [PHASES * count for count in self._thresholds.blocks_at_once]
 
         def company(place: int) -> list[int]:
             alike = [sum((other - place) % period == 0 for other in taken) for period in periods]

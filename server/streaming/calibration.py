@@ -6,16 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES, Kept
+from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.rendering.hrtf import HeadFilters
 from server.responses.direct_sound import DirectSound
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_cache import Shared, shared_response
-from server.responses.ir_request import EmitterSnapshot, IrRequest, compute_irs
+from server.responses.ir_request import AskedIr, IrRequest, compute_irs
 
 POSES = 5
 _BLOCK_SIZE = 256
@@ -26,7 +26,7 @@ _MOST_MS = 50.0
 class Listener:
     """Somebody who hears one emitter, all of its sound, at the level of `field`, as a stream serves them.
 
-    `kept` is what was kept from before; `time_s` is the clock.
+    `node_cache` holds what was kept from before; `time_s` is the clock.
     """
 
     def __init__(
@@ -34,23 +34,23 @@ class Listener:
         field: AcousticField,
         filters: HeadFilters,
         *,
-        kept: Kept | None = None,
+        node_cache: NodeCache | None = None,
         time_s: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._field = field
-        self._kept: Kept = BoundedCache(KEPT_BYTES) if kept is None else kept
-        self._levels = FieldsByLevel([field], self._kept)
+        self._node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
+        self._levels = FieldsByLevel([field], self._node_cache)
         self._time_s = time_s
         self._direct_sound = DirectSound.of(field.bundle, filters)
         self._renderer = self._direct_sound.renderer(
             block_size=_BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
         )
-        self._emitter = EmitterSnapshot(0, Pose(field.bundle.manifest.start.emitter), OMNIDIRECTIONAL)
+        self._emitter = EmitterState(Pose(field.bundle.manifest.start.emitter))
         self._heard: Shared | None = None
 
     @property
     def kept_bytes(self) -> int:
-        return self._kept.bytes
+        return self._node_cache.bytes
 
     def time_ms(self, listener: Pose) -> float:
         """Milliseconds that a pose takes: next to nothing where its response is heard already."""
@@ -58,14 +58,16 @@ class Listener:
         if self._heard is None or not self._heard.around.holds(listener):
             shared = shared_response(self._field, self._direct_sound.early_reflections, listener, self._emitter)
             if shared is None or self._heard is None or shared.identity != self._heard.identity:
-                request = IrRequest(0, self._field.level.name, listener, (self._emitter,), self._direct_sound)
+                request = IrRequest(
+                    0, self._field.level.name, listener, (AskedIr(0, self._emitter),), self._direct_sound
+                )
                 compute_irs(self._levels, request, self._renderer)
             self._heard = shared
         return 1000 * (self._time_s() - started_s)
 
     def forget(self) -> None:
         """Have nothing kept, and hear nothing."""
-        self._kept.clear()
+        self._node_cache.clear()
         self._heard = None
 
 
@@ -79,7 +81,8 @@ def calibrate(levels: FieldsByLevel, filters: HeadFilters, poses: int = POSES) -
     start = levels.bundle.manifest.start
     places = [(float(x), float(y), float(z)) for x, y, z in np.linspace(start.listener, start.emitter, poses)]
     listeners = {
-        name: Listener(field, filters, kept=levels.kept, time_s=time.thread_time) for name, field in levels.items()
+        name: Listener(field, filters, node_cache=levels.node_cache, time_s=time.thread_time)
+        for name, field in levels.items()
     }
     times_ms: dict[str, list[float]] = {name: [] for name in levels}
     for number in range(-1, poses):

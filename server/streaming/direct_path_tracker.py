@@ -4,19 +4,19 @@ A listener who moves has every path found anew, many times a second, while what 
 the same: it is kept from one time to the next.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from server.acoustics.geometry import Pose, Vector3
 from server.rendering.renderer import Renderer
 from server.responses.direct_sound import DirectSound, PathBatch
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import StreamedEmitter
 
 
 class DirectPathTracker:
     """That of `renderer`, at `emitters` by id, all of which it has. Whoever moves one of them, or changes how its path
     is heard, says so by its `is_displaced`."""
 
-    def __init__(self, direct_sound: DirectSound, renderer: Renderer, emitters: Mapping[str, Emitter]) -> None:
+    def __init__(self, direct_sound: DirectSound, renderer: Renderer, emitters: Mapping[str, StreamedEmitter]) -> None:
         self._direct_sound = direct_sound
         self._renderer = renderer
         self._emitters = emitters
@@ -37,13 +37,16 @@ class DirectPathTracker:
             self._ways, self._known = [], 0
         if moves and emitters:
             if not self._known:
-                self._ways, self._known = self._direct_sound.ways_from(emitters.items()), len(emitters)
+                self._ways, self._known = self._ways_from(emitters), len(emitters)
             self._aim(self._ways, listener)
         elif displaced:
-            self._aim(self._direct_sound.ways_from((name, emitters[name]) for name in displaced), listener)
+            self._aim(self._ways_from(displaced), listener)
         self._place = listener.position
         for name in displaced:
             emitters[name].is_displaced = False
+
+    def _ways_from(self, names: Iterable[str]) -> list[PathBatch[str]]:
+        return self._direct_sound.ways_from((name, self._emitters[name].state) for name in names)
 
     def _aim(self, ways: list[PathBatch[str]], listener: Pose) -> None:
         for some in ways:

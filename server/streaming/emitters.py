@@ -1,83 +1,125 @@
-"""What a session knows of one emitter: where it is, how it radiates, what it plays, and what is out of date."""
+"""What a session knows of one emitter: its state, what it plays, what is heard of it, and what is out of date."""
 
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from enum import Enum, auto
 
-from server.acoustics.directivity import OMNIDIRECTIONAL, Directivity
-from server.acoustics.geometry import Pose, Vector3
+from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.acoustics.geometry import Pose
 from server.core.errors import RequestError
 from server.field.lattice import Neighbourhood
+from server.planning.catalogue import EVERYTHING
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import AddEmitter, MoveEmitter
 from server.protocol.server_messages import LiveStatus
 from server.rendering.convolver import PartitionedIr
 from server.rendering.sources import LiveSource
-from server.responses.effect_flags import ALL_ON, EmitterEffects
+from server.responses.effect_flags import EmitterEffects
+from server.responses.emitter_state import EmitterState
 
 _LIVE_LEAD_BLOCKS = 2
 _LIVE_QUEUE_S = 0.5
 
 
+class Stage(Enum):
+    """How far an emitter has come since it was added. Every one goes through all stages, in this order."""
+
+    UNDECIDED = auto()
+    """No plan has said yet which of its effects are heard."""
+    DECIDED = auto()
+    """It waits for its first impulse response, if its effects call for one."""
+    ANNOUNCED = auto()
+    """The client was told that it sounds."""
+
+
 @dataclass
-class Emitter:
-    """Sounds from `pose`; `serial` tells it from others that had the same id before."""
+class HeardResponse:
+    """The newest impulse response (IR) of an emitter that the renderer has."""
+
+    token: int | None = None
+    """Pose id; None before the first."""
+    identity: Hashable | None = None
+    """Which one it is, where poses share responses; None where it is not known to be that of a pose."""
+    without_direct: PartitionedIr | None = None
+    """The newest that leaves the direct sound to the renderer."""
+    bakes_direct: bool = False
+    """Whether the direct sound is part of it."""
+    validity: "Validity | None" = None
+
+
+@dataclass(frozen=True)
+class Validity:
+    """An IR is sure to be that of a listener too who is in `around`, as long as the `circumstances` are the same."""
+
+    circumstances: Hashable
+    around: Neighbourhood
+
+    def holds(self, circumstances: Hashable, listener: Pose) -> bool:
+        return self.circumstances == circumstances and self.around.holds(listener)
+
+
+@dataclass
+class StreamedEmitter:
+    """`state` is what the client and the plan say; `heard` is what the renderer was given last. Code that changes the
+    state notes here what of that is out of date. `serial` tells it from others that had the same id before."""
 
     serial: int
-    pose: Pose
-    pattern: Directivity = OMNIDIRECTIONAL
-    """How it radiates, whether or not that is heard."""
+    state: EmitterState
     live: "LiveInput | None" = None
-    gain_db: float = 0.0
-    effects: EmitterEffects = ALL_ON
-    is_decided: bool = True
-    """Whether `effects` are those called for, or nobody has told yet."""
-    is_announced: bool = False
-    """Whether the client was told that it sounds."""
+    stage: Stage = Stage.DECIDED
+    heard: HeardResponse = field(default_factory=HeardResponse)
     is_outdated: bool = True
-    """Whether its impulse response is of another pose."""
+    """Whether the IR may be of another state: one is to be asked for, unless the one that is heard is that one."""
     is_displaced: bool = True
-    """Whether its direct path is of another pose of its own, or of other effects."""
-    identity: Hashable | None = None
-    """Of its impulse response, where poses share responses."""
-    found_for: Hashable | None = None
-    around: Neighbourhood | None = None
-    """Listeners who hear that response for certain, as long as everything else is as it was `found_for`."""
-    unfolded: PartitionedIr | None = None
-    """The newest impulse response in effect that leaves the direct sound to the renderer."""
-    is_folded: bool = False
-    """Whether the response in effect holds the direct sound."""
-    token: int | None = None
-    """Pose id of the newest impulse response handed to the renderer; None before the first."""
+    """Whether the renderer has the direct path of another state."""
 
     @classmethod
-    def added_by(cls, message: AddEmitter, serial: int, live: "LiveInput | None") -> "Emitter":
-        pattern = message.directivity
-        radiates = OMNIDIRECTIONAL if pattern is None else pattern.directivity
-        return cls(serial, message.pose, radiates, live, message.gain_db)
+    def added_by(
+        cls, message: AddEmitter, serial: int, live: "LiveInput | None", stage: Stage = Stage.DECIDED
+    ) -> "StreamedEmitter":
+        pattern = OMNIDIRECTIONAL if message.directivity is None else message.directivity.directivity
+        return cls(serial, EmitterState(message.pose, pattern, EVERYTHING, message.gain_db), live, stage)
 
     @property
-    def directivity(self) -> Directivity:
-        """The one that is heard."""
-        return self.pattern if self.effects.directivity else OMNIDIRECTIONAL
+    def effects(self) -> EmitterEffects:
+        return self.state.effects
 
     @property
-    def is_live(self) -> bool:
-        return self.live is not None
+    def is_decided(self) -> bool:
+        """Whether a plan has said which effects are heard, or there is none."""
+        return self.stage is not Stage.UNDECIDED
 
     @property
-    def wants_folding(self) -> bool:
-        """Whether the direct sound is to become part of a response that is otherwise up to date."""
-        return self.effects.bakes_direct and self.unfolded is not None and not (self.is_folded or self.is_outdated)
+    def wants_baking(self) -> bool:
+        """Whether the direct sound is to become part of an IR that is otherwise up to date."""
+        has_other = self.heard.without_direct is not None and not self.heard.bakes_direct
+        return self.effects.bakes_direct and has_other and not self.is_outdated
 
-    @property
-    def position(self) -> Vector3:
-        return self.pose.position
+    def decide(self) -> None:
+        if self.stage is Stage.UNDECIDED:
+            self.stage = Stage.DECIDED
+
+    def announce(self) -> bool:
+        """Whether the client is still to be told that it sounds."""
+        is_news, self.stage = self.stage is not Stage.ANNOUNCED, Stage.ANNOUNCED
+        return is_news
 
     def move(self, message: MoveEmitter) -> None:
         # Turning on the spot leaves what a field says as it is.
-        self.is_outdated |= message.position != self.position
+        self.is_outdated |= message.position != self.state.position
         self.is_displaced = True
-        self.pose = message.pose if message.has_front else Pose(message.position, self.pose.orientation)
+        pose = message.pose if message.has_front else Pose(message.position, self.state.pose.orientation)
+        self.state = replace(self.state, pose=pose)
+
+    def set_gain(self, gain_db: float) -> None:
+        self.state = replace(self.state, gain_db=gain_db)
+
+    def set_effects(self, effects: EmitterEffects) -> None:
+        self.state = replace(self.state, effects=effects)
+
+    def discard_response(self) -> None:
+        """The IR is no longer right, wherever the emitter is."""
+        self.is_outdated, self.heard.identity = True, None
 
 
 @dataclass

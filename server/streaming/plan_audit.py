@@ -17,11 +17,12 @@ import numpy.typing as npt
 from server.acoustics.difference import audible_difference
 from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
+from server.planning.catalogue import emitter_effects, names_on
 from server.responses.direct_sound import DirectSound
-from server.responses.effect_flags import PARTS, EmitterEffects
+from server.responses.effect_flags import EmitterEffects
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs
 from server.scene.effects import EffectName
-from server.streaming.emitters import Emitter
 
 FIRST_S = 2.0
 PERIOD_S = 10.0
@@ -58,7 +59,7 @@ class PlanAudit:
 
     level: str
     listener: Pose
-    emitter: Emitter
+    emitter: EmitterState
     whole: EmitterEffects
     channels: int
     whole_channels: int
@@ -84,12 +85,11 @@ class PlanAudit:
         self, field: AcousticField, reference: npt.NDArray[np.float32], planned: Mapping[str, float]
     ) -> dict[EffectName, str]:
         parameter = max(planned, key=planned.__getitem__)
-        effects = self.emitter.effects
-        left = {}
-        for name, part in PARTS.items():
-            if getattr(self.whole, part) and not getattr(effects, part):
-                with_it = dataclasses.replace(effects, **{part: True})
-                left[name] = max(self._compare(field, reference, with_it, self.channels).values())
+        effects, left = self.emitter.effects, {}
+        on = names_on(effects) | {EffectName.PROPAGATION_DELAY}
+        for name in [name for name in EffectName if name in names_on(self.whole) - on]:
+            with_it = emitter_effects(on | {name})
+            left[name] = max(self._compare(field, reference, with_it, self.channels).values())
         if self.channels != self.whole_channels:
             left[EffectName.HRTF] = max(self._compare(field, reference, effects, self.whole_channels).values())
         if not left:
@@ -101,7 +101,7 @@ class PlanAudit:
         self, field: AcousticField, reference: npt.NDArray[np.float32], effects: EmitterEffects, channels: int
     ) -> dict[str, float]:
         heard = self._heard(field, effects, channels)
-        onset_s = float(field.onset_s([self.listener.position], [self.emitter.pose.position])[0])
+        onset_s = float(field.onset_s([self.listener.position], [self.emitter.position])[0])
         return audible_difference(reference, heard, field.sample_rate, onset_s=onset_s)
 
     def _heard(self, field: AcousticField, effects: EmitterEffects, channels: int) -> npt.NDArray[np.float32]:

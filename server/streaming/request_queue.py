@@ -1,8 +1,8 @@
-"""Who of an audio thread's streams asks for impulse responses next.
+"""Which of an audio thread's streams asks for impulse responses next.
 
 A request that waits in a long queue is of poses long gone when it is answered. So only as many are made as keep the
-workers busy, each of the newest poses, and whoever has not asked for longest is next. Threads share workers and know
-nothing of each other's turns: each counts on its part of them.
+workers busy, each of the newest poses, and the stream that has not asked for longest is next. Threads share workers and
+know nothing of each other's turns: each counts on its part of them (`server.streaming.load_policy.requests_at_once`).
 """
 
 from collections.abc import Iterable
@@ -34,11 +34,11 @@ class RequestQueue:
 
     @property
     def are_left(self) -> bool:
-        """Whether somebody who comes now may ask at once."""
+        """Whether a stream that comes now may ask at once."""
         return self._left > 0
 
     def deal(self, askers: Iterable[Asker]) -> None:
-        """Give this tick's turns to those who wait, longest first; what is left is for who comes."""
+        """Give this tick's turns to the streams that wait, longest first; what is left is for those that come."""
         askers = tuple(askers)
         left = self.requests - sum(asker.is_unanswered for asker in askers)
         waiting = [asker for asker in askers if asker.wants_turn] if left > 0 else []

@@ -1,8 +1,8 @@
 """One listener's stream as a state machine without input, output or waiting.
 
 Messages go in, messages and audio blocks come out. The direct paths of each block follow the newest poses. What follows
-the direct sound comes later: `take_request` hands out what impulse responses (IRs) to compute, and whoever computes
-them brings the answer back through `accept` between two blocks. Sound never waits for it.
+the direct sound comes later: `take_request` hands out what impulse responses (IRs) to compute, and the answer comes
+back through `accept` between two blocks. Sound never waits for it.
 
 Blocks are rendered in three steps, so that many sessions' can be rendered in one call: `begin_block`, rendering
 `renderer`, `finish_blocks`.
@@ -10,7 +10,6 @@ Blocks are rendered in three steps, so that many sessions' can be rendered in on
 A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -19,8 +18,9 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.cost import Costs
+from server.planning.plan import Plan
 from server.planning.planned_effects import PlannedEffects, PlanRequest
-from server.planning.planner import Costs
 from server.planning.scene_acoustics import SceneAcoustics
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import (
@@ -46,14 +46,13 @@ from server.responses.ir_request import IrRequest, IrResponse
 from server.responses.radiation import reverberation_gain
 from server.scene.bundle import Bundle
 from server.scene.effects import read_overrides, require_effect
-from server.scene.plan import Plan
 from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter, LiveInput
-from server.streaming.load import QualityStep
+from server.streaming.emitters import LiveInput, Stage, StreamedEmitter
 from server.streaming.pacing import SendWindow
 from server.streaming.plan_audit import PlanAudit, Regret
-from server.streaming.response_scheduler import ResponseScheduler
+from server.streaming.quality_steps import QualityStep
+from server.streaming.response_scheduler import ResponseScheduler, Scope
 
 
 def _start_pose(bundle: Bundle) -> Pose:
@@ -61,10 +60,20 @@ def _start_pose(bundle: Bundle) -> Pose:
     return Pose.from_yaw(start.listener, math.radians(start.listener_yaw_deg))
 
 
+def _require_served(hello: Hello, sample_rate: int) -> None:
+    """Raises RequestError for another protocol or sample rate than a session has."""
+    if hello.protocol != PROTOCOL:
+        problem = f"this server speaks protocol {PROTOCOL}, not {hello.protocol}"
+        raise RequestError("unsupported_protocol", problem, field="protocol")
+    if hello.sample_rate not in {None, sample_rate}:
+        problem = f"scene {hello.scene!r} is rendered at {sample_rate} Hz: ask for that, or leave sample_rate out"
+        raise RequestError("unsupported_sample_rate", problem, field="sample_rate")
+
+
 class Session:
     """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
 
-    `levels` are the scene's, and `rung` is what to hear of them first.
+    `levels` are the scene's, and `quality` is what to hear of them first.
     `filters` are the head it hears through. `load_clip` gives audio at the scene's rate, and is quick: it is
     called on the rendering thread.
     Raises RequestError for a hello that cannot be served.
@@ -77,7 +86,7 @@ class Session:
         filters: HeadFilters,
         load_clip: Callable[[str], DryAudio],
         *,
-        rung: QualityStep,
+        quality: QualityStep,
         max_emitters: int = 16,
         shared_tail: bool = False,
         window: int = 40,
@@ -85,18 +94,7 @@ class Session:
         costs: Callable[[], Costs] = dict,
     ) -> None:
         field = levels.default
-        if hello.protocol != PROTOCOL:
-            raise RequestError(
-                "unsupported_protocol",
-                f"this server speaks protocol {PROTOCOL}, not {hello.protocol}",
-                field="protocol",
-            )
-        if hello.sample_rate not in {None, field.sample_rate}:
-            raise RequestError(
-                "unsupported_sample_rate",
-                f"scene {hello.scene!r} is rendered at {field.sample_rate} Hz: ask for that, or leave sample_rate out",
-                field="sample_rate",
-            )
+        _require_served(hello, field.sample_rate)
         self.window = SendWindow(window)
         self.ir_exchanges = 0
         self.blocks_dropped = 0
@@ -117,7 +115,7 @@ class Session:
             sample_rate=field.sample_rate,
             max_emitters=max_emitters,
             shared_tail=shared_tail,
-            switches_tail=planned is not None or any(level.level.shared_tail for level in levels.values()),
+            switches_tail=planned is not None or any(field.kind.shares_tail for field in levels.values()),
             outputs=1 if hello.output == "mono" else 2,
             has_head=planned is None or planned.shared.head,
         )
@@ -128,10 +126,15 @@ class Session:
             has_early=self._direct_sound.early_reflections is not None,
             has_late=bool(self._bundle.manifest.fields),
         )
-        self._emitters: dict[str, Emitter] = {}
+        self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(self._direct_sound, self.renderer, self._emitters)
         self._responses = ResponseScheduler(
-            self.renderer, self._effects, self._emitters, levels=levels, direct_sound=self._direct_sound, rung=rung
+            self.renderer,
+            self._effects,
+            self._emitters,
+            levels=levels,
+            direct_sound=self._direct_sound,
+            quality=quality,
         )
         self._next_serial = 0
         self._followed_pose_id = 0  # by the direct paths
@@ -143,7 +146,7 @@ class Session:
         return self.renderer.sample_clock
 
     @property
-    def rung(self) -> QualityStep:
+    def quality(self) -> QualityStep:
         """The quality that is heard."""
         return self._responses.heard
 
@@ -152,10 +155,10 @@ class Session:
         """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
         return self._responses.are_awaited
 
-    def set_quality(self, rung: QualityStep, reason: LevelReason) -> list[ServerMessage]:
-        """Have what follows the direct sound come from another rung: from now on, or, where it takes another level's
+    def set_quality(self, quality: QualityStep, reason: LevelReason) -> list[ServerMessage]:
+        """Have what follows the direct sound come from another step: from now on, or, where it takes another level's
         IRs, from when they are there."""
-        return self._responses.set_quality(rung, reason)
+        return self._responses.set_quality(quality, reason)
 
     def set_ir_interval(self, interval_s: float) -> None:
         """Have so much time pass from one request for IRs to the next, unless an emitter waits for its first."""
@@ -177,7 +180,7 @@ class Session:
                 case AddEmitter():
                     self._add_emitter(message)
                 case SetGain():
-                    self._require_emitter(message.id).gain_db = message.gain_db
+                    self._require_emitter(message.id).set_gain(message.gain_db)
                     self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)))
                 case DryBlock():
                     self._push(message)
@@ -198,10 +201,10 @@ class Session:
         """Whether there was something to ask for when `take_request` looked last, and it is time to."""
         return self._responses.are_wanted
 
-    def take_request(self, *, only_first: bool = False) -> IrRequest | None:
+    def take_request(self, scope: Scope = Scope.ALL) -> IrRequest | None:
         """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
-        `only_first` ones may be asked for and none is the first of an emitter."""
-        return self._responses.take_request(self._listener, only_first=only_first)
+        none is in `scope`."""
+        return self._responses.take_request(self._listener, scope)
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer of the last request into effect, with the block that follows."""
@@ -216,7 +219,8 @@ class Session:
         planned = self._effects.planned
         if planned is None:
             return None
-        return planned.take_request(self._listener, self._emitters, self._effects.clock_s)
+        states = {name: emitter.state for name, emitter in self._emitters.items()}
+        return planned.take_request(self._listener, states, self._effects.clock_s)
 
     def adopt(self, plan: Plan) -> list[ServerMessage]:
         """Put the plan asked for last into effect, with the block that follows."""
@@ -238,9 +242,9 @@ class Session:
         emitter = self._emitters[named[self._checked % len(named)]]
         whole, head = self._effects.whole()
         check = PlanAudit(
-            self.rung.level,
+            self.quality.level,
             self._listener,
-            dataclasses.replace(emitter),
+            emitter.state,
             whole,
             self.renderer.channels,
             2 if head else self.renderer.channels,
@@ -259,7 +263,7 @@ class Session:
         assert planned is not None
         planned.give_up()
         for emitter in self._emitters.values():
-            emitter.is_decided = True
+            emitter.decide()
         self._responses.retry()
         return [Error(code="plan_failure", message="no plan of effects could be made")]
 
@@ -305,9 +309,9 @@ class Session:
         refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
 
-    def _follow(self, identifier: str, emitter: Emitter) -> None:
+    def _follow(self, identifier: str, emitter: StreamedEmitter) -> None:
         if self._effects.planned is not None:
-            self._effects.planned.follow_emitter(identifier, emitter.pose, self._effects.clock_s)
+            self._effects.planned.follow_emitter(identifier, emitter.state.pose, self._effects.clock_s)
 
     def _wish(self, message: SetEffects) -> None:
         if self._effects.planned is not None:
@@ -333,11 +337,11 @@ class Session:
         emitter = self._require_emitter(message.id)
         self._bundle.require_inside(message.position, "position")
         self._responses.advance(message.pose_id)
-        before = emitter.pose.orientation
+        before = emitter.state.pose.orientation
         emitter.move(message)
         # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
-        is_mirrored = self._direct_sound.early_reflections is not None and emitter.directivity != OMNIDIRECTIONAL
-        emitter.is_outdated |= is_mirrored and emitter.pose.orientation != before
+        is_mirrored = self._direct_sound.early_reflections is not None and emitter.state.directivity != OMNIDIRECTIONAL
+        emitter.is_outdated |= is_mirrored and emitter.state.pose.orientation != before
         self._effects.unbake(message.id, emitter)
         self._follow(message.id, emitter)
 
@@ -353,10 +357,10 @@ class Session:
             raise RequestError("duplicate_emitter", f"emitter {message.id!r} is already there", field="id") from exc
         except RendererFullError as exc:
             raise RequestError("too_many_emitters", str(exc)) from exc
-        emitter = Emitter.added_by(message, self._next_serial, live)
-        emitter.is_decided = self._effects.planned is None
-        if emitter.directivity != OMNIDIRECTIONAL:
-            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.directivity))
+        stage = Stage.DECIDED if self._effects.planned is None else Stage.UNDECIDED
+        emitter = StreamedEmitter.added_by(message, self._next_serial, live, stage)
+        if emitter.state.directivity != OMNIDIRECTIONAL:
+            self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.state.directivity))
         self._emitters[message.id] = emitter
         self._follow(message.id, emitter)
         self._next_serial += 1
@@ -381,9 +385,9 @@ class Session:
             self._effects.planned.forget_emitter(message.id)
         self.renderer.remove_emitter(message.id)
         self._responses.retry()
-        return [EmitterRemoved(id=message.id), *self._responses.change_rung_unheard()]
+        return [EmitterRemoved(id=message.id), *self._responses.change_quality_unheard()]
 
-    def _require_emitter(self, identifier: str) -> Emitter:
+    def _require_emitter(self, identifier: str) -> StreamedEmitter:
         if identifier not in self._emitters:
             raise RequestError("unknown_emitter", f"there is no emitter {identifier!r}", field="id", status=404)
         return self._emitters[identifier]

@@ -9,32 +9,30 @@ A `Stream` and its session belong to the audio thread that renders them; only `o
 import logging
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
 
-from server.core.durations import DurationHistogram
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
-from server.planning.planned_effects import SHARE_OF_ALL as PLAN_SHARE
+from server.planning.plan import Plan
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
 from server.protocol.server_messages import Durations, Error, LevelReason, ServerMessage, Status
 from server.rendering.output import Rendered
-from server.responses.ir_request import IrRequest, IrResponse, compute_irs
+from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
-from server.scene.plan import Plan
-from server.streaming.load import Ladder, LoadSample, Offer, ir_interval_s
+from server.streaming.inbox import ComputedResponse, Inbox, PendingWork
+from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
+from server.streaming.quality_steps import Offer
 from server.streaming.request_queue import RequestQueue
+from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
+from server.streaming.stream_times import ResponseWait, StreamTimes
 
-MAX_WAITING_MESSAGES = 256
 PAUSE_AFTER_S = 1.0
 """How long a window may be full before nothing is rendered for it: a network that falters for less costs no sound but
 that which there was no room for."""
@@ -42,7 +40,6 @@ _MAX_BEHIND_S = 0.5
 _LOAD_SMOOTHING = 0.02
 _COST_SMOOTHING = 0.2
 _logger = logging.getLogger(__name__)
-T = TypeVar("T")
 
 
 @dataclass(slots=True)
@@ -61,20 +58,22 @@ class StreamFailed:
 Outgoing = ServerMessage | TimedBlock | StreamFailed
 
 
-class PoseTimes:
-    """How long poses take from their arrival to the first block that has them, or a newer one."""
+@dataclass
+class CpuCosts:
+    """Seconds of CPU time that work for a stream has taken of late."""
 
-    def __init__(self) -> None:
-        self.durations = DurationHistogram()
-        # Where a field fails, poses wait in vain; the oldest are forgotten.
-        self._waiting: deque[tuple[int, float]] = deque(maxlen=1024)
+    request_s: float = 0.0
+    """A request for impulse responses."""
+    plan_s: float = 0.0
+    """A plan of effects."""
 
-    def arrive(self, pose_id: int, now_s: float) -> None:
-        self._waiting.append((pose_id, now_s))
 
-    def take_effect(self, pose_id: int, now_s: float) -> None:
-        while self._waiting and self._waiting[0][0] <= pose_id:
-            self.durations.add(now_s - self._waiting.popleft()[1])
+@dataclass
+class Pause:
+    """A stream is paused from when its window has been full for a while until there is room in it."""
+
+    full_since_s: float | None = None
+    is_paused: bool = False
 
 
 class Stream:
@@ -97,51 +96,33 @@ class Stream:
         self.block_s = block_s
         self.deliver = deliver
         self.blocks_late = 0
-        """Counted by whoever sends the blocks, since only it knows when they left."""
-        self.render_times = DurationHistogram()
-        self.latenesses = DurationHistogram()
-        self.ir_times = DurationHistogram()
-        self.pose_times = PoseTimes()
-        self.reverberation_times = PoseTimes()
+        """Counted by the sender of the blocks, since only it knows when they left."""
+        self.times = StreamTimes()
+        self.regrets = RegretRecord()
+        self.load = 0.0
+        """Share of a core that its blocks have taken of late."""
         self.next_block = 0
         self.due_s = math.inf
         """When that should be rendered; never before the stream has started."""
-        self.load = 0.0
-        """Share of a core that its blocks have taken of late."""
-        self._levels = levels
-        self._offer = offer
-        self._request_s = 0.0
-        """CPU time that a request for impulse responses has taken of late."""
-        self._plan_s = 0.0
-        """And a plan of effects."""
         self.wants_turn = False
         """Whether impulse responses are to be asked for as soon as it is its turn."""
         self.asked_last_s = -math.inf
-        self._brings_emitter = False
-        """Whether one waits among the messages."""
         self._has_asked = False
-        self._asked_s: float | None = None
-        """Since when it waits for them: for its turn, or for an answer."""
-        self._longest_wait_s: float | None = None
-        self._worst_lateness_s = 0.0
+        self._wait = ResponseWait()
+        self._costs = CpuCosts()
+        self._inbox = Inbox()
+        self._pending = PendingWork()
+        self._pause = Pause()
+        self._levels = levels
+        self._offer = offer
         self._lead = lead
         self._clock: StreamClock | None = None
         self._wake: Callable[[], None] = lambda: None
         self._time_s: Callable[[], float] = time.monotonic
         self._turns = RequestQueue(1)
-        self._messages: deque[tuple[float, ClientMessage]] = deque()
-        # Outcomes and not the futures, which hold whom they call back: this stream.
-        self._answers: deque[tuple[IrRequest, _Computed | BaseException]] = deque()
-        self._plans: deque[tuple[Plan, float] | BaseException] = deque()
-        self._under_way: set[Future[Any]] = set()
-        """What workers were given and have not answered. Whatever is answered is taken out, as it holds this stream."""
-        self.regrets = RegretRecord()
-        self._checks: deque[Regret | BaseException] = deque()
-        self._full_since_s: float | None = None
-        """Since when there has been no room in the window for a block."""
-        self._is_paused = False
-        self._streams = 1
-        """Of the audio thread."""
+        self.company = 1
+        """Streams of the audio thread, with this one."""
+        self._worst_lateness_s = 0.0
         self._next_check_s: float | None = FIRST_S
         """None while one is under way."""
         self._next_status_s = 1.0
@@ -153,12 +134,12 @@ class Stream:
     @property
     def awaits_irs_since_s(self) -> float | None:
         """When impulse responses were called for that have not come."""
-        return self._asked_s
+        return self._wait.since_s
 
     @property
     def stalled_s(self) -> float:
         """For how long no block could be sent, since too many are unacknowledged; may be asked from any thread."""
-        since_s = self._full_since_s
+        since_s = self._pause.full_since_s
         return 0.0 if since_s is None else self._time_s() - since_s
 
     @property
@@ -175,29 +156,12 @@ class Stream:
 
         What may call for an impulse response that can be asked for is looked at now, anything else with the next block.
         """
-        if not self._replace_pose(message):
-            if len(self._messages) >= MAX_WAITING_MESSAGES:
-                return False
-            self._messages.append((self._time_s(), message))
-        self._brings_emitter |= isinstance(message, AddEmitter)
+        if not self._inbox.put_message(message, self._time_s()):
+            return False
         # While one is computed, no other is asked for until its answer comes, and that wakes too.
         asks = isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once
-        if asks or self._is_paused:  # which no block would wake
+        if asks or self._pause.is_paused:  # which no block would wake
             self._wake()
-        return True
-
-    def _replace_pose(self, message: ClientMessage) -> bool:
-        """Have a listener's pose take the place of an older one that came directly before it and still waits."""
-        if not (isinstance(message, ListenerPose) and self._messages):
-            return False
-        try:
-            _, last = self._messages[-1]
-            if not (isinstance(last, ListenerPose) and last.pose_id < message.pose_id):
-                return False
-            # Only here anything is appended: if the audio thread has taken it meanwhile, nothing is left at all.
-            self._messages[-1] = self._time_s(), message
-        except IndexError:
-            return False
         return True
 
     def start(self, origin_s: float) -> None:
@@ -214,39 +178,38 @@ class Stream:
     @property
     def has_news(self) -> bool:
         """Whether something waits that cannot wait for the next block: for an IR to be asked for, or for an answer."""
-        is_urgent = self._is_paused or self._asks_at_once
-        return bool(self._answers or self._plans or (self._messages and is_urgent))
+        is_urgent = self._pause.is_paused or self._asks_at_once
+        return self._inbox.has_answers or (self._inbox.has_messages and is_urgent)
 
     @property
     def _asks_at_once(self) -> bool:
         """Whether it need not wait for its turn, be it since an emitter comes that is not heard yet."""
-        return not self.session.awaits_irs and (self._brings_emitter or self._turns.are_left)
+        return not self.session.awaits_irs and (self._inbox.brings_emitter or self._turns.are_left)
 
     @property
     def is_unanswered(self) -> bool:
         """Whether impulse responses have been asked for, and no answer has come."""
-        return self._has_asked and not self._answers
+        return self._has_asked and not self._inbox.responses
 
     def drain_inbox(self, workers: Workers) -> list[Outgoing]:
         """Heed what waits and ask for impulse responses, or, where it is not its turn, `wants_turn` from then on."""
         outgoing: list[Outgoing] = []
-        self._brings_emitter = False
-        while self._answers:
-            outgoing += self._take_answer(*self._answers.popleft())
-        while self._plans:
-            outgoing += self._take_plan(self._plans.popleft())
-        for _ in range(len(self._messages)):
-            arrived_s, message = self._messages.popleft()
+        inbox = self._inbox
+        inbox.brings_emitter = False
+        while inbox.responses:
+            outgoing += self._take_answer(*inbox.responses.popleft())
+        while inbox.plans:
+            outgoing += self._take_plan(inbox.plans.popleft())
+        for arrived_s, message in inbox.take_messages():
             refused = self._choose(message) if isinstance(message, SetLevel) else self.session.receive(message)
             if isinstance(message, ListenerPose | MoveEmitter) and not refused:
-                self.pose_times.arrive(message.pose_id, arrived_s)
-                self.reverberation_times.arrive(message.pose_id, arrived_s)
+                self.times.arrive(message.pose_id, arrived_s)
             outgoing += refused
-        while self._checks:
-            self._take_regret(self._checks.popleft())
-        if self._full_since_s is not None and not self.session.window.is_full:
+        while inbox.regrets:
+            self._take_regret(inbox.regrets.popleft())
+        if self._pause.full_since_s is not None and not self.session.window.is_full:
             self._resume()
-        if not self._is_paused:
+        if not self._pause.is_paused:
             self._call_for_work(workers)
         return outgoing
 
@@ -255,12 +218,12 @@ class Stream:
         # Who has not been heard yet waits for it; all others only for something better.
         if (wanted := self.session.take_plan_request()) is not None:
             plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
-            self._await(plan, self._keep_plan)
+            self._pending.keep_outcome(plan, self._keep_plan)
         self._ask(workers)
 
     def _ask(self, workers: Workers) -> None:
         """For the impulse responses of the newest poses, if it is its turn, or for the first of an emitter."""
-        request = self.session.take_request(only_first=not self._turns.may_ask(self))
+        request = self.session.take_request(Scope.ALL if self._turns.may_ask(self) else Scope.FIRST)
         self.wants_turn = self.session.wants_irs
         if request is not None:
             self._has_asked, self.asked_last_s = True, self._time_s()
@@ -268,51 +231,27 @@ class Stream:
             answer = workers.submit(
                 _compute_timed, self._levels, request, self.session, kind="response", is_urgent=request.is_first
             )
-            self._await(answer, partial(self._keep_answer, request))
-        if not (self._has_asked or self.wants_turn):
-            self._asked_s = None
-        elif self._asked_s is None:
-            self._asked_s = self._time_s()
-
-    def _await(self, future: "Future[T]", keep: "Callable[[T | BaseException], None]") -> None:
-        """Have what comes of it kept: on the worker's thread, or at once where it is done."""
-        self._under_way.add(future)
-        future.add_done_callback(partial(self._settle, keep))
-
-    def _settle(self, keep: "Callable[[T | BaseException], None]", future: "Future[T]") -> None:
-        self._under_way.discard(future)
-        if not future.cancelled():
-            outcome: T | BaseException = _outcome(future)
-            keep(outcome)
+            self._pending.keep_outcome(answer, partial(self._keep_answer, request))
+        self._wait.note(self._has_asked or self.wants_turn, self._time_s())
 
     def leave(self) -> None:
         """Have nothing computed any more that this stream has asked for."""
-        for future in tuple(self._under_way):
-            future.cancel()
+        self._pending.cancel()
 
-    def strain(self, now_s: float) -> LoadSample:
+    def sample_load(self, now_s: float) -> LoadSample:
         """What it went through since this was asked last."""
-        waiting_s = () if self._asked_s is None else (now_s - self._asked_s,)
-        answered_s = () if self._longest_wait_s is None else (self._longest_wait_s,)
-        strain = LoadSample(
-            self._worst_lateness_s / (self._lead * self.block_s), max((*waiting_s, *answered_s), default=None)
-        )
-        self._worst_lateness_s, self._longest_wait_s = 0.0, None
-        return strain
+        lateness, self._worst_lateness_s = self._worst_lateness_s / (self._lead * self.block_s), 0.0
+        return LoadSample(lateness, self._wait.take_longest_s(now_s), self._costs.request_s, self._costs.plan_s)
 
-    def step(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
-        """Hear what the ladder, which has been moved, now stands on."""
-        self._forget_waits(now_s)
-        return [*self.session.set_quality(self.ladder.rung, reason)]
+    def follow_ladder(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
+        """Have the session hear the step on which the ladder, which has been moved, now stands."""
+        self._wait.restart(now_s)  # what was asked for before does not tell how a new step does
+        return [*self.session.set_quality(self.ladder.step, reason)]
 
-    def set_cpu_budget(self, *, streams: int, share: float) -> None:
-        """Take one of `streams` equal parts of what IRs may take of a core, `share`, and of what plans of effects and
-        checks of them may."""
-        self._streams = streams
-        self.session.space_plans(self._plan_s * streams / PLAN_SHARE)
-        self.session.set_ir_interval(
-            ir_interval_s(self.ladder, request_s=self._request_s, streams=streams, share=share)
-        )
+    def set_intervals(self, ir_s: float, plan_s: float) -> None:
+        """Have so much time pass from one request for IRs to the next, and from one plan of effects to the next."""
+        self.session.space_plans(plan_s)
+        self.session.set_ir_interval(ir_s)
 
     def finish_blocks(
         self, sample_clock: int, rendered: Sequence[Rendered], *, cost_s: float, now_s: float
@@ -324,18 +263,18 @@ class Stream:
             TimedBlock(block, clock.deadline_s(number)) for number, block in enumerate(blocks, self.next_block)
         ]
         if blocks:
-            self.pose_times.take_effect(blocks[0].pose_id, now_s)
-            self.reverberation_times.take_effect(blocks[0].reverberation_pose_id, now_s)
+            self.times.pose.take_effect(blocks[0].pose_id, now_s)
+            self.times.reverberation.take_effect(blocks[0].reverberation_pose_id, now_s)
         each_s = cost_s / count
         self.load += (1 - (1 - _LOAD_SMOOTHING) ** count) * (each_s / self.block_s - self.load)
-        self.render_times.add(each_s, count)
+        self.times.render.add(each_s, count)
         if self.next_block >= self._lead:  # the first were due before the stream was
             lateness_s = max(0.0, now_s - self.due_s)  # what is early is not late
             self._worst_lateness_s = max(self._worst_lateness_s, lateness_s)
             after_due = min(count, 1 + int(lateness_s / self.block_s))
             for ahead in range(after_due):
-                self.latenesses.add(lateness_s - ahead * self.block_s)
-            self.latenesses.add(0.0, count - after_due)
+                self.times.lateness.add(lateness_s - ahead * self.block_s)
+            self.times.lateness.add(0.0, count - after_due)
         if clock.ahead_s(self.next_block, now_s) < -_MAX_BEHIND_S:
             clock.slip(self.next_block, now_s)
         self.next_block += count
@@ -349,36 +288,30 @@ class Stream:
         return outgoing
 
     def _note_full(self, now_s: float) -> None:
-        if self._full_since_s is None:
-            self._full_since_s = now_s
-        elif now_s - self._full_since_s >= PAUSE_AFTER_S:
-            self._is_paused, self.due_s = True, math.inf
-            self.wants_turn, self._asked_s = False, None
+        if self._pause.full_since_s is None:
+            self._pause.full_since_s = now_s
+        elif now_s - self._pause.full_since_s >= PAUSE_AFTER_S:
+            self._pause.is_paused, self.due_s = True, math.inf
+            self.wants_turn = False
+            self._wait.note(False, now_s)
 
     def _resume(self) -> None:
         """There is room again: the block that is next is due now, and not when it would have been."""
-        self._full_since_s = None
-        if self._is_paused:
-            self._is_paused = False
+        was_paused, self._pause = self._pause.is_paused, Pause()
+        if was_paused:
             self.clock.slip(self.next_block, self._time_s())
             self.due_s = self.clock.due_s(self.next_block)
 
     def _choose(self, message: SetLevel) -> list[ServerMessage]:
         try:
-            self.ladder = self._offer.ladder(message.level, block_s=self.block_s)
+            self.ladder = Ladder(self._offer.steps(message.level, block_s=self.block_s))
         except RequestError as refusal:
             return [Error.from_refusal(refusal)]
-        self._forget_waits(self._time_s())
-        return self.session.set_quality(self.ladder.rung, "chosen")
+        self._wait.restart(self._time_s())
+        return self.session.set_quality(self.ladder.step, "chosen")
 
-    def _forget_waits(self, now_s: float) -> None:
-        """What was asked for before does not tell how a new rung does."""
-        self._longest_wait_s = None
-        if self._asked_s is not None:
-            self._asked_s = now_s
-
-    def _keep_answer(self, request: IrRequest, computed: "_Computed | BaseException") -> None:
-        self._answers.append((request, computed))
+    def _keep_answer(self, request: IrRequest, computed: ComputedResponse | BaseException) -> None:
+        self._inbox.responses.append((request, computed))
         self._wake()
 
     def _check_plan(self, workers: Workers) -> None:
@@ -389,10 +322,10 @@ class Stream:
         if (check := self.session.take_check()) is not None:
             self._next_check_s = None
             regret = workers.submit(check.run, self._levels[check.level], kind="plan")
-            self._await(regret, self._keep_regret)
+            self._pending.keep_outcome(regret, self._keep_regret)
 
     def _keep_regret(self, regret: Regret | BaseException) -> None:
-        self._checks.append(regret)  # looked at with the next block
+        self._inbox.regrets.append(regret)  # looked at with the next block
 
     def _take_regret(self, regret: Regret | BaseException) -> None:
         clock_s = self.next_block * self.block_s
@@ -400,12 +333,12 @@ class Stream:
         if isinstance(regret, BaseException):
             _logger.error("a plan of effects could not be checked", exc_info=regret)
             return
-        self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self._streams)
+        self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self.company)
         self.regrets.add(regret)
         self.session.learn(regret)
 
     def _keep_plan(self, planned: tuple[Plan, float] | BaseException) -> None:
-        self._plans.append(planned)
+        self._inbox.plans.append(planned)
         self._wake()
 
     def _take_plan(self, planned: tuple[Plan, float] | BaseException) -> list[ServerMessage]:
@@ -413,19 +346,17 @@ class Stream:
             _logger.error("no plan of effects", exc_info=planned)
             return self.session.keep_effects()
         plan, cpu_s = planned
-        self._plan_s = _smoothed(self._plan_s, cpu_s)
+        self._costs.plan_s = _smoothed(self._costs.plan_s, cpu_s)
         return self.session.adopt(plan)
 
-    def _take_answer(self, request: IrRequest, computed: "_Computed | BaseException") -> list[ServerMessage]:
+    def _take_answer(self, request: IrRequest, computed: ComputedResponse | BaseException) -> list[ServerMessage]:
         self._has_asked = False
-        if self._asked_s is not None:
-            self._longest_wait_s = max(self._longest_wait_s or 0.0, self._time_s() - self._asked_s)
-            self._asked_s = None
+        self._wait.end(self._time_s())
         if isinstance(computed, BaseException):
             _logger.error("no impulse response for pose %d", request.pose_id, exc_info=computed)
             return self.session.give_up(request)
-        self.ir_times.add(computed.duration_s)
-        self._request_s = _smoothed(self._request_s, computed.cpu_s)
+        self.times.response.add(computed.duration_s)
+        self._costs.request_s = _smoothed(self._costs.request_s, computed.cpu_s)
         return self.session.accept(computed.response)
 
     def _status(self, now_s: float) -> Status:
@@ -437,31 +368,17 @@ class Stream:
             blocks_dropped=session.blocks_dropped,
             unacknowledged=session.window.unacknowledged,
             buffer_ms=round(self.clock.ahead_s(self.next_block, now_s) * 1000, 3),
-            render_ms=Durations.of(self.render_times),
-            lateness_ms=Durations.of(self.latenesses),
-            ir_ms=Durations.of(self.ir_times),
-            pose_ms=Durations.of(self.pose_times.durations),
-            reverberation_ms=Durations.of(self.reverberation_times.durations),
+            render_ms=Durations.of(self.times.render),
+            lateness_ms=Durations.of(self.times.lateness),
+            ir_ms=Durations.of(self.times.response),
+            pose_ms=Durations.of(self.times.pose.durations),
+            reverberation_ms=Durations.of(self.times.reverberation.durations),
             ir_exchanges=session.ir_exchanges,
             blocks_limited=session.blocks_limited,
-            level=session.rung.level,
-            ir_rate_hz=session.rung.ir_rate_hz,
+            level=session.quality.level,
+            ir_rate_hz=session.quality.ir_rate_hz,
             live=session.live_statuses(),
         )
-
-
-@dataclass(frozen=True)
-class _Computed:
-    response: IrResponse
-    duration_s: float
-    cpu_s: float
-    """What the thread that computed it spent."""
-
-
-def _outcome(future: Future[T]) -> T | BaseException:
-    """What a future that is done has come to."""
-    failure = future.exception()
-    return future.result() if failure is None else failure
 
 
 def _smoothed(cost_s: float, newest_s: float) -> float:
@@ -474,7 +391,7 @@ def _plan_timed(request: PlanRequest) -> tuple[Plan, float]:
     return request.plan(), time.thread_time() - started_s
 
 
-def _compute_timed(levels: FieldsByLevel, request: IrRequest, session: Session) -> _Computed:
+def _compute_timed(levels: FieldsByLevel, request: IrRequest, session: Session) -> ComputedResponse:
     started_s, started_cpu_s = time.perf_counter(), time.thread_time()
     response = compute_irs(levels, request, session.renderer)
-    return _Computed(response, time.perf_counter() - started_s, time.thread_time() - started_cpu_s)
+    return ComputedResponse(response, time.perf_counter() - started_s, time.thread_time() - started_cpu_s)

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from scipy.special import fresnel
 
+from server.acoustics import diffraction
 from server.acoustics.decibels import amplitude_to_db
-from server.acoustics.diffraction import CLEAR_FRESNEL_NUMBER, diffraction_gain_db
+from server.acoustics.diffraction import CLEAR_FRESNEL_NUMBER
+from tests.oracles.sound_path import diffraction_gain_db as gain_db_by_numpy
+
+diffraction_gain_db = np.vectorize(diffraction.diffraction_gain_db, otypes=[float])
 
 
 # Read off the measured curve of Maekawa, "Noise reduction by screens", Applied Acoustics 1 (1968), figure 3.
@@ -68,3 +72,8 @@ def test_is_exactly_nothing_in_the_clear() -> None:
     assert abs(diffraction_gain_db(CLEAR_FRESNEL_NUMBER + 1e-9)) < 1e-6
     assert diffraction_gain_db(0.0) == -5.0
     assert np.isfinite(diffraction_gain_db(1e12))
+
+
+def test_compiled_and_numpy_agree() -> None:
+    numbers = np.concatenate([np.linspace(-1, 4, 5_001), [0.0, -0.0, 5e-324, -5e-324, 1e-9, -1e-9, 1e300, -1e300]])
+    np.testing.assert_allclose(diffraction_gain_db(numbers), gain_db_by_numpy(numbers), atol=1e-12)

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from scipy.special import fresnel
 
+from server.acoustics import diffraction
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db
-from server.acoustics.diffraction import diffraction_gain_db
 
+diffraction_gain_db = np.vectorize(diffraction.diffraction_gain_db, otypes=[float])
 SPEED_OF_SOUND = 343.0
 WALL_END, RIGHT_ANGLE = 2.0, 1.5
 

@@ -14,10 +14,9 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse.csgraph import dijkstra
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
-from tests.oracles.sound_path import NumpySoundPathFinder
+from tests.oracles.sound_path import NumpySoundPathFinder, diffraction_gain_db
 
 Floats = npt.NDArray[np.float64]
 

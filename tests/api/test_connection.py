@@ -22,7 +22,7 @@ from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
 from server.runtime.workers import Workers
 from server.streaming.audio_engine import AudioEngine
-from server.streaming.load import Offer
+from server.streaming.quality_steps import Offer
 from server.streaming.session import Session
 
 HELLO = Hello(protocol=PROTOCOL, scene="flat")

@@ -5,9 +5,8 @@ import threading
 import pytest
 
 from server.api.stream_counts import StreamLedger
-from server.core.durations import DurationHistogram
 from server.streaming.plan_audit import Regret, RegretRecord
-from server.streaming.stream import PoseTimes
+from server.streaming.stream_times import StreamTimes
 
 
 class Counting:
@@ -17,13 +16,12 @@ class Counting:
         self.session = self.window = self.renderer = self
         self.sent = self.blocks_late = self.blocks_dropped = self.blocks_limited = self.ir_exchanges = blocks
         self.samples_silenced = 0
-        self.render_times, self.latenesses, self.ir_times = (DurationHistogram() for _ in range(3))
-        self.pose_times = PoseTimes()
+        self.times = StreamTimes()
         self._regrets, self._when_read = RegretRecord(), when_read
         self.count(blocks)
 
     def count(self, blocks):
-        self.render_times.add(0.0001, blocks)
+        self.times.render.add(0.0001, blocks)
 
     @property
     def regrets(self):
@@ -104,7 +102,7 @@ def test_sums_of_durations_are_the_same_whoever_has_ended():
     times_s = [0.1 / 3, 0.7 / 3, 1e-5 / 3, 0.9 / 7]
     ledger, streams = StreamLedger(), [Counting(0) for _ in times_s]
     for stream, time_s in zip(streams, times_s, strict=True):
-        stream.render_times.add(time_s, 3)
+        stream.times.render.add(time_s, 3)
         ledger.open(stream)
     sums = {ledger.totals().durations["render"].total_s}
     for stream in reversed(streams):

@@ -6,7 +6,7 @@ from starlette.testclient import TestClient
 from server.api.app import create_app
 from server.api.settings import Settings
 from server.field.fields_by_level import FieldsByLevel
-from server.planning.planner import Cost
+from server.planning.cost import Cost
 from server.scene.effects import EffectName
 from tests.api.test_routes import wait_until_ready
 

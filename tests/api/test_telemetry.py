@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -11,7 +13,8 @@ from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
 from server.streaming.audio_engine import AudioEngine
-from server.streaming.load import Offer
+from server.streaming.load_policy import Ladder, RenderAhead, ThreadState
+from server.streaming.quality_steps import Offer
 from server.streaming.session import Session
 from server.streaming.stream import Stream
 from tests.engine_stage import Patient
@@ -37,9 +40,9 @@ def host(field):
 
 
 def open_stream(host, field, filters):
-    ladder = host.offers["flat"].ladder("auto", block_s=BLOCK_S)
+    ladder = Ladder(host.offers["flat"].steps("auto", block_s=BLOCK_S))
     hello = Hello(protocol=PROTOCOL, scene="flat")
-    session = Session(hello, FieldsByLevel([field]), filters, lambda _: np.ones(9, np.float32), rung=ladder.rung)
+    session = Session(hello, FieldsByLevel([field]), filters, lambda _: np.ones(9, np.float32), quality=ladder.step)
     stream = Stream(
         session,
         FieldsByLevel([field]),
@@ -78,9 +81,9 @@ def test_streams_are_counted_together_and_stay_counted_when_they_end(host, field
         stream.session.receive(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
         for _ in range(5):
             stream.session.render_block()
-        stream.render_times.add(0.001)
+        stream.times.render.add(0.001)
         stream.blocks_late += 1
-    streams[0].ladder.at = 1
+    streams[0].ladder = replace(streams[0].ladder, at=1)
     told = samples(host)
     assert told["nafir_streams", ("level", "standard"), ("scene", "flat")] == 2
     assert told["nafir_streams_eased", ("scene", "flat")] == 1
@@ -98,7 +101,7 @@ def test_durations_are_buckets_that_contain_each_other(host, field, filters):
     times_s = [1e-4, 2e-4, 2e-4, 0.03, 100.0]
     stream = open_stream(host, field, filters)
     for time_s in times_s:
-        stream.render_times.add(time_s)
+        stream.times.render.add(time_s)
     told = samples(host)
     counts = sorted(
         (float(dict(labels)["le"]), value)
@@ -121,7 +124,7 @@ def test_steps_are_counted_by_reason(host):
 
 def test_how_many_blocks_are_rendered_at_once_is_told(host):
     assert samples(host)["nafir_blocks_at_once",] == 1
-    host.audio.threads[0]._at_once.count = 4
+    host.audio.threads[0]._load = ThreadState(RenderAhead(4))
     assert samples(host)["nafir_blocks_at_once",] == 4
 
 

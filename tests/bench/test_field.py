@@ -4,7 +4,7 @@ import pytest
 
 from server.bench.field import measure_levels
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES
+from server.field.node_responses import NODE_CACHE_BYTES
 from server.scene.bundle import write_bundle
 from server.scene.manifest import Phase, QualityLevel, Reuse
 from server.streaming.calibration import calibrate
@@ -40,4 +40,4 @@ def test_where_responses_are_kept_the_room_for_them_is_full(bundle, tmp_path):
     manifest = bundle.manifest.model_copy(update={"levels": (reusing,)})
     levels = FieldsByLevel.load(write_bundle(tmp_path / "scene", manifest, files))
     measure_levels(levels, rounds=1, poses=2)
-    assert levels.kept.bytes > 0.9 * KEPT_BYTES
+    assert levels.node_cache.bytes > 0.9 * NODE_CACHE_BYTES

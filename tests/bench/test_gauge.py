@@ -10,6 +10,7 @@ import pytest
 from server.bench.gauge import Gauge, Waiting
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
+from server.streaming.stream_times import StreamTimes
 
 
 def pose(pose_id):
@@ -135,7 +136,7 @@ class Stream:
     def __init__(self):
         self.session = Session()
         self.blocks_late = 7
-        self.render_times = self.latenesses = self.ir_times = None
+        self.times = StreamTimes()
 
 
 def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_ones_found(monkeypatch):
@@ -145,7 +146,7 @@ def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_on
 
     async def scenario():
         await ask(gauge, "/bench/begin")
-        stream.render_times.add(0.002)
+        stream.times.render.add(0.002)
         stream.session.window.sent += 90
         stream.session.blocks_dropped += 3
         stream.blocks_late += 2

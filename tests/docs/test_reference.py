@@ -1,6 +1,7 @@
 """The reference says all that the code has: settings, commands, routes, messages, codes, fields of bundles, metrics."""
 
 import ast
+import dataclasses
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
 from server.scene.manifest import Manifest
 from server.streaming.audio_engine import AudioEngine
+from server.streaming.load_thresholds import Thresholds
 from tests.engine_stage import Patient
 from training.cli.main import app as nafir_train
 
@@ -65,6 +67,17 @@ def test_every_route_is_listed_with_its_parameters(page: Page) -> None:
             assert f"{method.upper()} {path}" in text
             assert {each["name"] for each in operation.get("parameters", ())} <= words(text)
     assert {"/metrics", "/v1/stream", "/asyncapi.json"} <= set(re.findall(r"/[a-z0-9./]+", text))
+
+
+def test_every_threshold_of_the_load_policy_is_listed_with_a_reason(site: Path) -> None:
+    html = (site / "explanation/load-policy/index.html").read_text()
+    cells = [re.findall(r"<td>(.*?)</td>", row, re.DOTALL) for row in re.findall(r"<tr>.*?</tr>", html, re.DOTALL)]
+    listed = {re.sub(r"<.*?>", "", row[0]): row[1:] for row in cells if len(row) == 3}
+    for each in dataclasses.fields(Thresholds):
+        value, reason = listed[each.name]
+        first, *_ = each.default if isinstance(each.default, tuple) else (each.default,)
+        assert float(value.split(",")[0]) == pytest.approx(first, abs=0.001)
+        assert len(reason.split()) > 5, each.name
 
 
 def test_every_message_of_the_stream_is_described(page: Page) -> None:

@@ -16,7 +16,7 @@ from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
 from server.responses.ir_request import compute_irs
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from tests.signals import decaying_noise, noise
 
@@ -115,7 +115,7 @@ class Listening:
             self.levels,
             filters,
             lambda _name: audio,
-            rung=FULL,
+            quality=FULL,
             window=100_000,
             **options,
         )

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from server.acoustics import diffraction
 from server.acoustics.air import absorption_db_per_m
-from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, HYPERCARDIOID, OMNIDIRECTIONAL, Cardioid
 from server.acoustics.geometry import FARTHEST_M, FloorPlan, Pose
 from server.acoustics.reflections import ReflectionFinder
@@ -42,6 +42,7 @@ SPECIAL = {
     "outside": (20.0, 1.0, 1.0),
     "a million metres away": (1e6, -1e6, 1e6),
 }
+diffraction_gain_db = np.vectorize(diffraction.diffraction_gain_db, otypes=[float])
 LISTENER = (1.0, 5.0, 1.5)
 
 
@@ -243,6 +244,16 @@ def test_a_screen_never_amplifies_and_is_always_finite(measured, number):
     gain = float(diffraction_gain_db(number))
     assert math.isfinite(gain)
     measured("gain", gain, 0.0, "dB")
+
+
+@pytest.mark.parametrize("number", [0.0, -0.0, 5e-324, -5e-324, 1e-300, -1e-300, 1e-9, -1e-9])
+def test_a_screen_that_the_line_grazes_takes_five_decibels(measured, number):
+    measured("difference", abs(float(diffraction_gain_db(number)) + 5), 1e-6, "dB")
+
+
+@pytest.mark.parametrize("number", [-0.1915871349, -0.25, -1.0, -2.0, -7.3, -1e6, -1e300])
+def test_a_screen_far_from_the_line_takes_nothing(measured, number):
+    measured("taken", abs(float(diffraction_gain_db(number))), 0.0, "dB")
 
 
 def test_a_screen_grows_without_steps_as_one_walks_behind_it(measured):

@@ -12,6 +12,7 @@ import pytest
 from websockets.sync.client import connect
 
 from server.field.fields_by_level import FieldsByLevel
+from server.field.kinds.catalogue import kind_of
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, SetLevel
 from server.protocol.server_messages import LevelChanged, Status, parse_server_message
@@ -31,6 +32,7 @@ class Laborious:
 
     def __init__(self, field, name, cost_s):
         self.bundle, self.level, self._cost_s = field.bundle, QualityLevel(name=name, field="arithmetic"), cost_s
+        self.kind = kind_of(self.level)
         self.onset_s = field.onset_s
         self._ir = (0.01 * np.random.default_rng(1).standard_normal((2, self.ir_samples))).astype(np.float32)
 

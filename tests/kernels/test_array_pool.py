@@ -14,60 +14,60 @@ def place(array):
 
 
 def test_what_was_let_go_of_is_given_to_the_next_of_its_size():
-    spares = ArrayPool(4 * MIB)
-    array = spares.take(MIB)
+    pool = ArrayPool(4 * MIB)
+    array = pool.take(MIB)
     where = place(array)
     assert where % 64 == 0
     del array
-    assert spares.nbytes == MIB
-    smaller, again = spares.take(MIB - 64), spares.take(MIB)
-    assert (place(again), spares.nbytes) == (where, 0)
+    assert pool.nbytes == MIB
+    smaller, again = pool.take(MIB - 64), pool.take(MIB)
+    assert (place(again), pool.nbytes) == (where, 0)
     assert place(smaller) != where
 
 
 def test_an_array_is_not_let_go_of_while_a_view_is_left():
-    spares = ArrayPool(4 * MIB)
-    view = spares.take(MIB).view(np.float32).reshape(2, -1)[1, ::2]
-    assert spares.nbytes == 0
+    pool = ArrayPool(4 * MIB)
+    view = pool.take(MIB).view(np.float32).reshape(2, -1)[1, ::2]
+    assert pool.nbytes == 0
     view.fill(1)
-    other = spares.take(MIB)
+    other = pool.take(MIB)
     other.fill(255)
     assert (view == 1).all()
     del view
-    assert spares.nbytes == MIB
+    assert pool.nbytes == MIB
 
 
 def test_no_more_wait_than_may_and_the_oldest_go_first():
-    spares = ArrayPool(4 * MIB)
-    held = [spares.take(size) for size in (2 * MIB, MIB, MIB, MIB)]
+    pool = ArrayPool(4 * MIB)
+    held = [pool.take(size) for size in (2 * MIB, MIB, MIB, MIB)]
     wanted = place(held[-1])
     while held:
         del held[0]
-    assert spares.nbytes == 3 * MIB
-    assert place(spares.take(MIB)) == wanted
+    assert pool.nbytes == 3 * MIB
+    assert place(pool.take(MIB)) == wanted
 
 
 def test_an_array_that_would_drive_out_the_others_does_not_wait():
-    spares = ArrayPool(3 * MIB)
-    useful, large = spares.take(MIB), spares.take(2 * MIB)
+    pool = ArrayPool(3 * MIB)
+    useful, large = pool.take(MIB), pool.take(2 * MIB)
     del useful, large
-    assert spares.nbytes == MIB
+    assert pool.nbytes == MIB
 
 
 def test_small_arrays_do_not_wait():
-    spares = ArrayPool(MIB)
-    array = spares.take(1000)
+    pool = ArrayPool(MIB)
+    array = pool.take(1000)
     del array
-    assert spares.nbytes == 0
+    assert pool.nbytes == 0
 
 
 def test_threads_never_hold_one_array_at_once():
     """Each writes its own number all over what it took, and looks again."""
-    spares, faults = ArrayPool(8 * MIB), []
+    pool, faults = ArrayPool(8 * MIB), []
 
     def work(number):
         for turn in range(200):
-            array = spares.take(MIB // 8 * (1 + turn % 2))
+            array = pool.take(MIB // 8 * (1 + turn % 2))
             array[::4096] = number
             if (array[::4096] != number).any():
                 faults.append(number)
@@ -78,4 +78,4 @@ def test_threads_never_hold_one_array_at_once():
     for thread in threads:
         thread.join()
     assert not faults
-    assert spares.nbytes <= 8 * MIB
+    assert pool.nbytes <= 8 * MIB

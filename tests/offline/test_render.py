@@ -9,13 +9,14 @@ from scipy.signal import fftconvolve
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
 from server.field.fields_by_level import FieldsByLevel
+from server.field.kinds.catalogue import kind_of
 from server.offline.render import PathError, PathPoint, RenderedEmitter, read_path, render
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose
 from server.rendering.fade import raised_cosine
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import compute_irs
 from server.scene.manifest import QualityLevel
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from tests.signals import error_db
 
@@ -31,6 +32,7 @@ class NoiseField:
     ir_samples = 1_500
     sample_rate = SAMPLE_RATE
     level = QualityLevel(name="noise", field="noise")
+    kind = kind_of(level)
 
     def impulse_responses(self, listeners, emitters, yaws):
         return np.stack([self.one(*poses) for poses in zip(listeners, emitters, yaws, strict=True)])
@@ -179,6 +181,7 @@ class OtherField(NoiseField):
 
     ir_samples = 1_100
     level = QualityLevel(name="other", field="noise", shared_tail=True)
+    kind = kind_of(level)
 
     def one(self, listener, emitter, yaw):
         return super().one(listener, emitter, yaw + 10)
@@ -221,7 +224,7 @@ def test_a_live_session_replayed_is_equal_to_the_bit(name, filters, request):
         FieldsByLevel([field]),
         filters,
         clips.get,
-        rung=QualityStep.full(field.level, 1.0),
+        quality=QualityStep.full(field.level, 1.0),
         window=1_000,
     )
     places = {"a": Pose.from_yaw((1.0, 2.0, 1.5), 1.0), "b": THERE}

@@ -6,11 +6,21 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.diffraction import diffraction_gain_db
+from server.acoustics.decibels import amplitude_to_db
+from server.acoustics.diffraction import CLEAR_FRESNEL_NUMBER, GRAZING_LOSS_DB, SMALL_ARGUMENT
 from server.acoustics.geometry import COINCIDENT_M, FloorPlan
 from server.acoustics.sound_path import SoundPaths
 
 Floats = npt.NDArray[np.float64]
+
+
+def diffraction_gain_db(fresnel_number: npt.ArrayLike) -> Floats:
+    """(...) gain in dB, 0 or less, for Fresnel numbers (...)."""
+    number = np.asarray(fresnel_number, dtype=np.float64)
+    x = np.sqrt(2 * np.pi * np.abs(np.maximum(number, CLEAR_FRESNEL_NUMBER)))
+    safe = np.maximum(x, SMALL_ARGUMENT)
+    bent = np.where(x < SMALL_ARGUMENT, 1.0, np.where(number > 0, safe / np.tanh(safe), safe / np.tan(safe)))
+    return np.where(number > CLEAR_FRESNEL_NUMBER, np.minimum(0.0, -(GRAZING_LOSS_DB + amplitude_to_db(bent))), 0.0)
 
 
 class NumpySoundPathFinder:
@@ -73,13 +83,7 @@ class NumpySoundPathFinder:
         return np.where(reached, distance, np.inf)
 
     def _clearance_m(self, listener: Floats, emitters: Floats, from_listener: Floats) -> Floats:
-        """(n,) how much farther than the straight line it is over the nearest corner, for emitters in sight.
-
-        Divided by the cosine of the turn at the corner: next to 1 where the line grazes it, and without end where one
-        would turn by a right angle or more, since such a corner is beside the line and screens nothing. The nearest
-        corner changes without a jump, and it is enough to ask which corners the listener sees: whatever hides one from
-        the emitter stands in the triangle of the three, so it has a corner that is nearer and that both see.
-        """
+        """(n,) how much farther than the straight line it is over the nearest corner, for emitters in sight."""
         from_emitters = np.linalg.norm(emitters[:, None, :2] - self._bends, axis=-1)
         seen = np.isfinite(from_listener) & (from_emitters >= COINCIDENT_M)
         from_listener = np.where(seen, from_listener, 1.0)

@@ -17,13 +17,14 @@ from server.cli.main import main
 from server.core.errors import RequestError
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.catalogue import CATALOGUE
 from server.planning.effect_costs import measured_costs
 from server.planning.places import reverberation_of
 from server.planning.plan_query import PlanDocument, PlanQuery, parse_effects
 from server.planning.plan_table import print_plan
 from server.rendering.still_paths import StillPaths
 from server.scene.bundle import Bundle, find_bundle
-from server.scene.effects import CATALOGUE, EffectName
+from server.scene.effects import EffectName
 
 PLAN = "/v1/scenes/flat/plan"
 

@@ -7,8 +7,8 @@ from server.acoustics.geometry import Pose
 from server.planning.places import place_of_field
 from server.planning.planned_effects import PlannedEffects
 from server.planning.reach import HORIZON_S
+from server.responses.emitter_state import EmitterState
 from server.scene.effects import EffectName
-from server.streaming.emitters import Emitter
 
 HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 
@@ -16,7 +16,7 @@ HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 @pytest.mark.parametrize("who", ["listener", "emitter"])
 def test_what_moves_faster_than_it_did_is_planned_for_at_once(mirrored_field, who):
     planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE))
-    emitters = {str(number): Emitter(number, Pose(THERE)) for number in range(16)}
+    emitters = {str(number): EmitterState(Pose(THERE)) for number in range(16)}
     for name, emitter in emitters.items():
         planned.follow_emitter(name, emitter.pose, 0.0)
 
@@ -26,7 +26,7 @@ def test_what_moves_faster_than_it_did_is_planned_for_at_once(mirrored_field, wh
             planned.follow_listener(pose, clock_s)
         else:
             pose = Pose(HERE)
-            emitters["0"].pose = Pose((THERE[0] - way_m, *THERE[1:]))
+            emitters["0"] = EmitterState(Pose((THERE[0] - way_m, *THERE[1:])))
             planned.follow_emitter("0", emitters["0"].pose, clock_s)
         request = planned.take_request(pose, emitters, clock_s)
         if request is not None:
@@ -46,7 +46,7 @@ def test_a_plan_is_a_first_one_where_an_emitter_is_in_none_yet(mirrored_field):
     emitters = {}
     for number, (clock_s, is_first) in enumerate([(0.0, True), (10.0, False), (20.0, True)]):
         if is_first:
-            emitters[str(number)] = Emitter(number, Pose(THERE))
+            emitters[str(number)] = EmitterState(Pose(THERE))
         pose = Pose((HERE[0] + 0.5 * number, *HERE[1:]))
         for name, emitter in emitters.items():
             planned.follow_emitter(name, emitter.pose, clock_s)
@@ -58,7 +58,7 @@ def test_a_plan_is_a_first_one_where_an_emitter_is_in_none_yet(mirrored_field):
 
 def test_plans_are_made_less_often_under_load_but_before_they_are_outdated(mirrored_field):
     planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE))
-    emitters = {"one": Emitter(1, Pose(THERE))}
+    emitters = {"one": EmitterState(Pose(THERE))}
     planned.follow_emitter("one", emitters["one"].pose, 0.0)
 
     def plans_of_a_walk(began_s):

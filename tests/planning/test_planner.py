@@ -10,9 +10,11 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.directivity import CARDIOID
 from server.acoustics.geometry import FloorPlan, Pose
 from server.core.errors import RequestError
-from server.planning.planner import ENTER_JND, Cost, make_plan
+from server.planning.catalogue import CATALOGUE
+from server.planning.cost import Cost
+from server.planning.planner import THRESHOLD, make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Reverberation, SceneAcoustics, Situation
-from server.scene.effects import CATALOGUE, EffectName, read_overrides
+from server.scene.effects import EffectName, read_overrides
 from server.scene.geometry import Material, Materials
 
 BANDS = len(OCTAVE_BANDS_HZ)
@@ -151,7 +153,7 @@ def test_deep_in_the_shadow_there_is_no_direct_sound_to_compute():
 
 
 def test_what_beams_is_called_for_where_it_is_not_heard_from_ahead():
-    aside = at(4, directivity=CARDIOID)
+    aside = at(4, pattern=CARDIOID)
     assert not make_plan(situation(OPEN, at(4))).is_on(EffectName.DIRECTIVITY)
     assert make_plan(situation(OPEN, aside)).is_on(EffectName.DIRECTIVITY)
     towards = replace(aside, pose=Pose.from_yaw((4.0, 1.0, 1.5), np.pi))
@@ -201,15 +203,15 @@ def test_where_the_field_holds_the_direct_sound_nothing_is_computed_of_it():
 
 def test_inaudible_alone_but_audible_together_is_on():
     """Air and a pattern that each take 0.8 dB at 8 kHz take 1.6 dB together."""
-    narrow = at(1 + 0.8 / AIR[-1], directivity=replace(CARDIOID, omni_share=1 - (1 - 10 ** (-0.8 / 20)) / 2))
+    narrow = at(1 + 0.8 / AIR[-1], pattern=replace(CARDIOID, omni_share=1 - (1 - 10 ** (-0.8 / 20)) / 2))
     plan = make_plan(situation(OPEN, replace(narrow, pose=Pose(narrow.pose.position))))
     effects = {EffectName.AIR_ABSORPTION, EffectName.DIRECTIVITY}
-    alone = [make_plan(situation(OPEN, replace(narrow, directivity=at(0).directivity)))]
+    alone = [make_plan(situation(OPEN, replace(narrow, pattern=at(0).pattern)))]
     assert not alone[0].is_on(EffectName.AIR_ABSORPTION)
     assert len(on(plan) & effects) == 1
     (decision,) = [each for each in plan.decisions if each.name in effects and each.called_for]
     assert "air absorption" in decision.reason
-    assert decision.change_jnd > ENTER_JND
+    assert decision.change_jnd > THRESHOLD.enter_jnd
 
 
 def test_decisions_do_not_flutter_about_a_threshold():
@@ -264,7 +266,7 @@ def test_what_it_costs_that_there_is_any_is_shared_by_all():
 
 
 def test_the_same_situation_has_the_same_plan_and_json_holds_it():
-    asked = situation(CORNER, at(1.5, 7, directivity=CARDIOID), stands=(7, 1.5, 1.5), speed_m_s=1.4, turns=True)
+    asked = situation(CORNER, at(1.5, 7, pattern=CARDIOID), stands=(7, 1.5, 1.5), speed_m_s=1.4, turns=True)
     assert make_plan(asked) == make_plan(asked)
     document = json.loads(json.dumps(make_plan(asked).to_json(), allow_nan=False))
     assert len(document["decisions"]) == len(CATALOGUE)
@@ -276,7 +278,7 @@ def test_without_emitters_there_is_nothing_to_plan():
 
 
 def test_a_listener_inside_an_emitter_is_planned_for():
-    plan = make_plan(situation(CORNER, at(1.0, 1.0, directivity=CARDIOID), turns=True, speed_m_s=1.4))
+    plan = make_plan(situation(CORNER, at(1.0, 1.0, pattern=CARDIOID), turns=True, speed_m_s=1.4))
     assert all(np.isfinite(decision.change_jnd) for decision in plan.decisions)
 
 

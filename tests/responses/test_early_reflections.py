@@ -1,6 +1,5 @@
 """First reflections in whole responses, against mirrored emitters in the free field."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -8,29 +7,24 @@ import pytest
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
-from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL, Directivity
+from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT
 from server.acoustics.geometry import Pose
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, MoveEmitter
 from server.rendering.still_paths import StillPaths
 from server.responses.early_reflections import EarlyReflections
+from server.responses.emitter_state import EmitterState
 from server.responses.full_response import FullResponse
 from server.responses.ir_request import compute_irs
 from server.responses.radiation import reverberation_gain
 from server.scene.manifest import Manifest
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 SIZE = np.array((8.0, 5.0, 2.8))
 SURFACE_DB = 10 * math.log10(0.8 * 0.9)  # a fifth is absorbed, a tenth scattered
 LISTENER, EMITTER = np.array((2.0, 2.5, 1.5)), np.array((5.0, 3.2, 1.2))
 SAMPLES = 4_000
-
-
-@dataclasses.dataclass
-class Emitter:
-    pose: Pose
-    directivity: Directivity = OMNIDIRECTIONAL
 
 
 @pytest.fixture
@@ -80,7 +74,7 @@ def test_heads_may_nod_and_each_emitter_has_its_own(early, mirrored_bundle, filt
     listener = Pose(tuple(LISTENER), (0.2, 0.3, 0.1, 0.9))
     places = [EMITTER, np.array((1.0, 1.0, 1.9))]
     responses = np.zeros((2, 2, SAMPLES), np.float32)
-    early.add(responses, listener, [Emitter(Pose(tuple(place))) for place in places])
+    early.add(responses, listener, [EmitterState(Pose(tuple(place))) for place in places])
     for response, place in zip(responses, places, strict=True):
         assert_allclose(response, free_field(mirrored_bundle, filters, images(place), listener, SURFACE_DB), atol=1e-5)
 
@@ -88,7 +82,7 @@ def test_heads_may_nod_and_each_emitter_has_its_own(early, mirrored_bundle, filt
 @pytest.mark.parametrize("directivity", [CARDIOID, FIGURE_OF_EIGHT])
 def test_a_reflection_has_the_gain_of_the_direction_it_leaves_in(early, mirrored_bundle, filters, directivity):
     """As it is heard: played at the gain by which the emitter fills the room."""
-    listener, emitter = Pose(tuple(LISTENER)), Emitter(Pose.from_yaw(tuple(EMITTER), 2.0), directivity)
+    listener, emitter = Pose(tuple(LISTENER)), EmitterState(Pose.from_yaw(tuple(EMITTER), 2.0), directivity)
     ahead = np.array((math.cos(2.0), math.sin(2.0), 0.0))
     # To the listener's image: the same mirror seen from the other side.
     leaves = images(LISTENER) - EMITTER
@@ -125,8 +119,8 @@ def test_a_directive_emitter_that_turns_is_mirrored_anew(name, turned, filters, 
     field = request.getfixturevalue(name)
     levels = FieldsByLevel([field])
     hello = Hello(protocol=PROTOCOL, scene="flat")
-    rung = QualityStep.full(field.level, 1.0)
-    session = Session(hello, levels, filters, lambda _: np.ones(9, np.float32), rung=rung)
+    quality = QualityStep.full(field.level, 1.0)
+    session = Session(hello, levels, filters, lambda _: np.ones(9, np.float32), quality=quality)
     place = tuple(EMITTER)
     for identifier, pattern in (("all-round", None), ("ahead", {"pattern": "cardioid"})):
         session.receive(AddEmitter(id=identifier, clip="click", position=place, directivity=pattern))
@@ -134,7 +128,7 @@ def test_a_directive_emitter_that_turns_is_mirrored_anew(name, turned, filters, 
     for pose_id, identifier in enumerate(("all-round", "ahead"), 1):
         session.receive(MoveEmitter(pose_id=pose_id, id=identifier, position=place, yaw=1.0))
     wanted = session.take_request()
-    assert ([] if wanted is None else [emitter.directivity for emitter in wanted.emitters]) == turned
+    assert ([] if wanted is None else [each.state.directivity for each in wanted.asked]) == turned
 
 
 def test_order_is_none_or_one_and_none_by_default(bundle):

@@ -12,10 +12,11 @@ from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, MoveEmitter, RemoveEmitter
 from server.rendering.renderer import Renderer
 from server.responses.early_reflections import EarlyReflections
-from server.responses.full_response import FullResponse, _AllRound
+from server.responses.emitter_state import EmitterState
+from server.responses.full_response import FullResponse
 from server.responses.ir_request import compute_irs
 from server.scene.manifest import Reuse
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 RATE = 24_000
@@ -25,7 +26,7 @@ CLIP = np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
 
 def open_session(field, filters, clip=CLIP, levels=None):
     hello, levels = Hello(protocol=PROTOCOL, scene="flat"), levels or FieldsByLevel([field])
-    session = Session(hello, levels, filters, lambda _: clip, rung=QualityStep.full(field.level, 1.0), window=10_000)
+    session = Session(hello, levels, filters, lambda _: clip, quality=QualityStep.full(field.level, 1.0), window=10_000)
     session.receive(ListenerPose(pose_id=1, position=START))
     session.receive(AddEmitter(id="talker", clip="noise", position=EMITTER))
     return session
@@ -148,7 +149,7 @@ def test_an_emitter_that_beams_elsewhere_has_another_response(whole_at_nodes, fi
     answer(session, levels)
     session.receive(MoveEmitter(pose_id=2, id="horn", position=EMITTER, yaw=1.0))
     asked = answer(session, levels)
-    assert [each.serial for each in asked.emitters] == [1]
+    assert [each.serial for each in asked.asked] == [1]
     session.receive(MoveEmitter(pose_id=3, id="talker", position=EMITTER, yaw=1.0))
     assert answer(session, levels) is None
 
@@ -178,7 +179,7 @@ def test_first_reflections_end_before_the_sample_from_which_the_rest_is_used_aga
     corners = np.array([(x, y, z) for x in (0.01, 7.99) for y in (0.01, 4.99) for z in (0.01, 2.79)])
     places = np.concatenate([corners, rng.uniform((0.3, 0.3, 0.5), (7.7, 4.7, 2.3), (20, 3))])
     for listener in places:
-        heads = [_AllRound(Pose(tuple(emitter))) for emitter in places]
+        heads = [EmitterState(Pose(tuple(emitter))) for emitter in places]
         responses = np.zeros((len(places), 2, early.end_samples + 2_000), np.float32)
         early.add(responses, Pose.from_yaw(tuple(listener), rng.uniform(-3, 3)), heads)
         latest = max(latest, int(np.flatnonzero(np.abs(responses).max(axis=(0, 1)))[-1]))

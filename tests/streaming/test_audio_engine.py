@@ -15,7 +15,8 @@ from server.runtime.thread_watch import ThreadWatch
 from server.runtime.workers import Workers
 from server.streaming import audio_engine
 from server.streaming.audio_engine import PHASES, AudioEngine
-from server.streaming.stream import MAX_WAITING_MESSAGES, PAUSE_AFTER_S, StreamFailed
+from server.streaming.inbox import MAX_WAITING_MESSAGES
+from server.streaming.stream import PAUSE_AFTER_S, StreamFailed
 from tests.engine_stage import BLOCK_S, Clock, Patient, Stage, blocks, open_stream, spy_on_batches
 from tests.killing import kill, threads_may_die
 
@@ -326,7 +327,7 @@ def test_a_pose_takes_the_place_of_an_older_one_that_nobody_has_heard(stage):
 
     poses = [ListenerPose(pose_id=number, position=(2.0, 2.0, 1.5)) for number in range(1, 1_001)]
     assert say(*poses) == ([], 1_000)
-    assert stream.pose_times.durations.count == 1
+    assert stream.times.pose.durations.count == 1
     later = [ListenerPose(pose_id=number, position=(2.0, 2.0, 1.5)) for number in (1_002, 1_001)]
     assert say(*later) == (["stale_pose"], 1_002)
     between = MoveEmitter(id="ghost", position=(2.0, 2.0, 1.5), pose_id=2_000)

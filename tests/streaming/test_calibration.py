@@ -8,7 +8,7 @@ from server.acoustics.geometry import Pose
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES
+from server.field.node_responses import NODE_CACHE_BYTES
 from server.scene.bundle import write_bundle
 from server.scene.manifest import QualityLevel, Reuse
 from server.streaming.calibration import Listener, calibrate
@@ -62,10 +62,10 @@ def test_what_is_compiled_the_first_time_is_no_cost_of_the_level(bundle, tmp_pat
 def test_a_response_that_is_kept_is_no_measure_of_one_that_is_not(mirrored_bundle, field, filters):
     """All poses asked for here have one node: kept, the response would cost a hundredth."""
     reuse = Reuse(spacing_m=20, turn_deg=360, first_reflections="node")
-    kept = BoundedCache(KEPT_BYTES)
+    kept = BoundedCache(NODE_CACHE_BYTES)
     level = QualityLevel(name="one", field="arithmetic", reuse=reuse)
-    one = AcousticField(mirrored_bundle, level, field.graph, kept=kept)
+    one = AcousticField(mirrored_bundle, level, field.graph, node_cache=kept)
     found_ms = calibrate(FieldsByLevel([one], kept), filters)["one"]
-    listener, pose = Listener(one, filters, kept=kept, time_s=time.thread_time), Pose((2.0, 2.0, 1.5))
+    listener, pose = Listener(one, filters, node_cache=kept, time_s=time.thread_time), Pose((2.0, 2.0, 1.5))
     listener.time_ms(pose)
     assert min(listener.time_ms(pose) for _ in range(20)) < 0.1 * found_ms

@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 
 from server.acoustics.directivity import CARDIOID
 from server.acoustics.geometry import FloorPlan, Pose
+from server.acoustics.sound_path import SoundPathFinder
 from server.rendering.hrtf import NoHead
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import ALL_ON
+from server.responses.emitter_state import EmitterState
 from server.streaming.direct_path_tracker import DirectPathTracker
-from server.streaming.emitters import Emitter
+from server.streaming.emitters import StreamedEmitter
 
 CORNER = FloorPlan(((0.0, 0.0), (8.0, 0.0), (8.0, 4.0), (4.0, 4.0), (4.0, 8.0), (0.0, 8.0)), 3.0)
 PLACES = [(1.0, 1.0, 1.5), (7.0, 3.0, 1.2), (2.0, 7.5, 1.0), (3.5, 3.5, 2.0), (1.0, 1.0, 2.5)]
@@ -38,7 +40,7 @@ def sound():
 
 
 def emitters_at(*places):
-    return {str(number): Emitter(number, Pose(place)) for number, place in enumerate(places)}
+    return {str(number): StreamedEmitter(number, EmitterState(Pose(place))) for number, place in enumerate(places)}
 
 
 ACTIONS = st.sampled_from(["listener", "emitter", "turn", "effects", "remove", "add", "nothing"])
@@ -47,7 +49,7 @@ ACTIONS = st.sampled_from(["listener", "emitter", "turn", "effects", "remove", "
 @given(st.lists(st.tuples(ACTIONS, st.integers(0, 4), st.booleans()), max_size=20))
 def test_paths_are_those_found_anew(sound, actions):
     emitters, paths = emitters_at(*PLACES[:3]), Paths()
-    emitters["0"].pattern = CARDIOID
+    emitters["0"].state = replace(emitters["0"].state, pattern=CARDIOID)
     aim, listener, serial = DirectPathTracker(sound, paths, emitters), Pose(PLACES[0]), 3
     for action, number, is_block in [("nothing", 0, True), *actions, ("nothing", 0, True)]:
         place, chosen = PLACES[number], list(emitters.values())[number % max(1, len(emitters)) :][:1]
@@ -59,23 +61,28 @@ def test_paths_are_those_found_anew(sound, actions):
                 paths.newest.pop(name, None)
             case "add":
                 # Ids are free again once who had them is gone.
-                emitters[str(number if str(number) not in emitters else serial)] = Emitter(serial, Pose(place))
+                emitters[str(number if str(number) not in emitters else serial)] = StreamedEmitter(
+                    serial, EmitterState(Pose(place))
+                )
                 serial += 1
         for emitter in chosen:
             match action:
                 case "emitter":
-                    emitter.pose = Pose(place)
+                    emitter.state = replace(emitter.state, pose=Pose(place))
                 case "turn":
-                    emitter.pose = Pose.from_yaw(emitter.position, float(number))
+                    turned = Pose.from_yaw(emitter.state.position, float(number))
+                    emitter.state = replace(emitter.state, pose=turned)
                 case "effects":
                     bent = number % 3 > 0
-                    emitter.effects = replace(ALL_ON, occlusion=number % 2 > 0, diffraction=bent, directivity=not bent)
+                    emitter.set_effects(
+                        replace(ALL_ON, occlusion=number % 2 > 0, diffraction=bent, directivity=not bent)
+                    )
             emitter.is_displaced |= action in {"emitter", "turn", "effects"}
         if not is_block:
             continue
         aim.follow(listener)
         anew = Paths()
-        for ways in sound.ways_from(emitters.items()):
+        for ways in sound.ways_from((name, emitter.state) for name, emitter in emitters.items()):
             anew.set_paths(ways.keys, *ways.find(listener))
         assert paths.newest == anew.newest
 
@@ -98,3 +105,25 @@ def test_nothing_is_aimed_where_fields_hold_the_direct_sound():
     paths = Paths()
     DirectPathTracker(whole, paths, emitters_at(*PLACES)).follow(Pose(PLACES[0]))
     assert paths.asked == 0
+
+
+def test_a_gain_that_is_handed_over_is_of_those_alone_whose_effects_have_it(sound):
+    """Told from the path as it was found, whatever else is on the way."""
+
+    def gain_db(paths):
+        return paths.length_m[:, None] * np.arange(7.0) - paths.screen_db / 2
+
+    def found_db(*with_gain):
+        emitters = emitters_at(*PLACES)
+        emitters["3"].pattern = CARDIOID
+        for name in with_gain:
+            emitters[name].effects = replace(ALL_ON, path_gains=(gain_db,))
+        (ways,) = sound.ways_from(emitters.items())
+        return ways.find(Pose((7.5, 0.5, 1.5))).gain_db.copy()
+
+    plain, changed = found_db(), found_db("2", "3")
+    paths = SoundPathFinder(CORNER, 343.0).find(np.array((7.5, 0.5, 1.5)), np.array(PLACES))
+    assert paths.screen_db[2].min() < -10
+    expected = gain_db(paths)
+    np.testing.assert_array_equal(changed[[0, 1, 4]], plain[[0, 1, 4]])
+    np.testing.assert_allclose(changed[[2, 3]] - plain[[2, 3]], expected[[2, 3]], atol=1e-12)

@@ -28,7 +28,7 @@ from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.effects import EffectName
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 SIZE = 256
@@ -61,7 +61,7 @@ class Stage:
             self.levels,
             filters,
             lambda _: self.clip,
-            rung=QualityStep(field.level.name, None, False, 1.0),
+            quality=QualityStep(field.level.name, None, False, 1.0),
             window=1_000_000,
             place=place,
         )
@@ -99,8 +99,8 @@ class Stage:
         )
 
     @property
-    def is_folded(self):
-        return [emitter.is_folded for emitter in self.session._emitters.values()]
+    def is_baked(self):
+        return [emitter.heard.bakes_direct for emitter in self.session._emitters.values()]
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ def test_what_stands_still_is_part_of_the_response_and_follows_at_once_when_it_m
         stage.add()
         parts = [stage.hear(1.0)]
         if plans:
-            assert stage.is_folded == [True]
+            assert stage.is_baked == [True]
             state = next(iter(stage.session.renderer._mixers)).direct.state
             windows = state.heard.copy()
             parts.append(stage.hear(0.2))
@@ -170,13 +170,13 @@ def test_what_stands_still_is_part_of_the_response_and_follows_at_once_when_it_m
             stage.step_to((2.0 + 0.01 * step, 2.0, 1.5))
             parts.append(stage.block())
         if plans:
-            assert stage.is_folded == [False]
+            assert stage.is_baked == [False]
             assert stage.is_on(EffectName.PROPAGATION_DELAY)
         parts.append(stage.hear(0.5))
         heard[plans] = np.concatenate(parts, axis=1)
         if plans:
             stage.hear(REST_S + 2 * PERIOD_S)
-            assert stage.is_folded == [True]
+            assert stage.is_baked == [True]
     error = heard[True] - heard[False]
     # In the block in which it starts to move, the response that stood still fades out.
     assert level_db(error) - level_db(heard[False]) < -55
@@ -189,7 +189,7 @@ def test_a_switch_is_heard_of_direct_sound_that_is_held_in_a_response(open_stage
     stage = open_stage(effects={"propagation_delay": False})
     stage.add()
     stage.hear(1.0)
-    assert stage.is_folded == [True]
+    assert stage.is_baked == [True]
     before_db = level_db(stage.hear(0.5))
     stage.tell(SetEffects(effects={"distance_attenuation": False, "propagation_delay": False}))
     stage.hear(1.5)
@@ -205,7 +205,7 @@ def test_a_pose_that_is_sent_again_moves_nothing(open_stage):
         stage.step_to(HERE)
         stage.hear(0.2)
     assert len(stage.asked) == asked
-    assert stage.is_folded == [True]
+    assert stage.is_baked == [True]
 
 
 def test_a_mono_loudspeaker_has_one_channel_and_no_head(open_stage):
@@ -317,7 +317,7 @@ def test_nobody_has_no_response(mirrored_field, filters, channels):
 
 
 def test_somebody_who_shifts_about_does_not_make_it_flutter(open_stage):
-    """A step every second: the direct sound follows all the while, and is not folded and unfolded in turn."""
+    """A step every second: the direct sound follows all the while, and is not baked and unbaked in turn."""
     stage = open_stage()
     stage.add()
     stage.hear(1.0)
@@ -327,7 +327,7 @@ def test_somebody_who_shifts_about_does_not_make_it_flutter(open_stage):
     for step in range(6):
         stage.step_to((2.0 + 0.01 * (step % 2), 2.0, 1.5))
         stage.hear(1.0)
-        assert stage.is_folded == [False]
+        assert stage.is_baked == [False]
     assert len([event for event in stage.events if isinstance(event, PlanChanged)]) <= changes + 1
 
 

@@ -5,12 +5,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from server.field.fields_by_level import FieldsByLevel
+from server.field.kinds.catalogue import kind_of
 from server.planning.places import place_of_field
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, RemoveEmitter, SetEffects
 from server.protocol.server_messages import EmitterAdded, LevelChanged
 from server.responses.ir_request import compute_irs
 from server.scene.manifest import QualityLevel
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 RATE, BLOCK = 24_000, 256
@@ -27,6 +28,7 @@ class Room:
 
     def __init__(self, field, name, ir, **level):
         self.bundle, self.level, self._ir = field.bundle, QualityLevel(name=name, field="arithmetic", **level), ir
+        self.kind = kind_of(self.level)
 
     @property
     def ir_samples(self):
@@ -50,8 +52,8 @@ def levels(field):
 
 @pytest.fixture
 def open_session(levels, filters):
-    def start(clip=CLIP, rung=GOOD):
-        return Session(HELLO, levels, filters, lambda _: clip, rung=rung, window=10_000)
+    def start(clip=CLIP, quality=GOOD):
+        return Session(HELLO, levels, filters, lambda _: clip, quality=quality, window=10_000)
 
     return start
 
@@ -84,10 +86,10 @@ def test_a_level_is_heard_from_when_it_says_so(open_session, levels):
         if number == 1:  # the direct sound alone
             each.renderer.set_reverberation_gain("talker", 0.0)
     assert session.set_quality(FAST, "load") == []
-    assert session.rung == GOOD
+    assert session.quality == GOOD
     (event,) = answer(session, levels)
     assert event == LevelChanged(level="fast", reason="load", ir_rate_hz=None, shared_tail=False, sample_clock=0)
-    assert session.rung == FAST
+    assert session.quality == FAST
     heard = hear(session, 40) - hear(silent, 40)
     expected = [np.convolve(CLIP, ear.astype(float)) for ear in levels["fast"]._ir]
     assert_allclose(heard[:, : len(expected[0])], expected, atol=1e-7)
@@ -136,7 +138,7 @@ def test_without_emitters_there_is_nothing_to_wait_for(open_session):
 def test_where_nothing_has_a_response_there_is_nothing_to_wait_for(levels, filters, field):
     off = {"early_reflections": False, "late_reverberation": False}
     hello = Hello(protocol=PROTOCOL, scene="flat", effects=off)
-    session = Session(hello, levels, filters, lambda _: CLIP, rung=GOOD, window=10_000, place=place_of_field(field))
+    session = Session(hello, levels, filters, lambda _: CLIP, quality=GOOD, window=10_000, place=place_of_field(field))
     add(session)
     assert changes(session.set_quality(FAST, "chosen")) == []  # nobody knows yet whether it will have one
     assert changes(session.adopt(session.take_plan_request().plan())) == [("fast", "chosen")]
@@ -157,7 +159,7 @@ def test_an_answer_of_a_level_nobody_wants_any_more_is_not_heard(open_session, l
     assert request.level == "fast"
     assert session.set_quality(GOOD, "recovered") == []  # it never was anything else
     assert session.accept(compute_irs(levels, request, session.renderer)) == []
-    assert session.rung == GOOD
+    assert session.quality == GOOD
     assert session.take_request().level == "good"
 
 

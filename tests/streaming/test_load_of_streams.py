@@ -1,16 +1,19 @@
-"""The audio engine and the load control together, with a clock that only a test moves."""
+"""The audio engine and the load policy together, with a clock that only a test moves."""
 
 from concurrent.futures import Future
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from server.field.fields_by_level import FieldsByLevel
+from server.field.kinds.catalogue import kind_of
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, SetLevel
 from server.protocol.server_messages import Error, LevelChanged, Status
 from server.scene.manifest import QualityLevel
 from server.streaming.audio_engine import AudioEngine
-from server.streaming.load import Offer
+from server.streaming.load_policy import Ladder
+from server.streaming.quality_steps import Offer
 from server.streaming.session import Session
 from server.streaming.stream import Stream
 
@@ -23,6 +26,7 @@ class Room:
 
     def __init__(self, field, name):
         self.bundle, self.level = field.bundle, QualityLevel(name=name, field="arithmetic")
+        self.kind = kind_of(self.level)
 
     def impulse_responses(self, listeners, *_, **__):
         return np.zeros((len(listeners), 2, self.ir_samples), np.float32)
@@ -66,10 +70,10 @@ class Stage:
         (self.thread,) = self.engine.threads
         levels = FieldsByLevel([Room(field, "fine"), Room(field, "quick")])
         offer = Offer((levels["quick"].level, levels["fine"].level), {"quick": 0.5, "fine": 1.0})
-        ladder = offer.ladder(level, block_s=BLOCK_S)
+        ladder = Ladder(offer.steps(level, block_s=BLOCK_S))
         hello = Hello(protocol=PROTOCOL, scene="flat", block_size=BLOCK)
         clip = np.ones(64, np.float32)
-        session = Session(hello, levels, filters, lambda _: clip, rung=ladder.rung, window=100_000)
+        session = Session(hello, levels, filters, lambda _: clip, quality=ladder.step, window=100_000)
         self.delivered = []
         self.stream = Stream(
             session, levels, offer=offer, ladder=ladder, block_s=BLOCK_S, lead=8, deliver=self.delivered.extend
@@ -115,23 +119,23 @@ def test_slow_responses_lower_the_rate_then_the_level_and_quick_ones_raise_them_
     assert stage.changes[0] == ("fine", "load")
     assert stage.changes[-1] == ("quick", "load")
     # Some steps follow before the one before is heard, and are told as one.
-    assert stage.engine.steps["load"] == len(stage.stream.ladder.rungs) - 1 >= len(stage.changes)
+    assert stage.engine.steps["load"] == len(stage.stream.ladder.steps) - 1 >= len(stage.changes)
     stage.workers.delay_s = 0.001
     stage.run(30.0)
     assert stage.changes[-1] == ("fine", "recovered")
-    assert stage.stream.session.rung.ir_rate_hz is None
+    assert stage.stream.session.quality.ir_rate_hz is None
     assert stage.engine.steps["recovered"] == stage.engine.steps["load"]
 
 
-def test_requests_come_at_the_rate_of_the_rung(stage):
+def test_requests_come_at_the_rate_of_the_step(stage):
     stage.run(1.0)
-    stage.stream.ladder.at = 2
-    stage.stream.step("load", stage.clock.now_s)
+    stage.stream.ladder = replace(stage.stream.ladder, at=2)
+    stage.stream.follow_ladder("load", stage.clock.now_s)
     stage.run(0.5)
     stage.workers.asked_at_s.clear()
     stage.run(3.0)
     gaps = np.diff(stage.workers.asked_at_s)
-    assert gaps.min() >= 1 / stage.stream.ladder.rung.ir_rate_hz - 2 * BLOCK_S
+    assert gaps.min() >= 1 / stage.stream.ladder.step.ir_rate_hz - 2 * BLOCK_S
 
 
 def test_a_level_is_chosen_kept_and_given_back_to_the_server(stage):

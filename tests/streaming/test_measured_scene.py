@@ -27,7 +27,7 @@ from server.responses.ir_request import compute_irs
 from server.responses.loudness import loudness_map
 from server.scene.effects import EffectName
 from server.scene.manifest import Manifest
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from tests.conftest import CODEC, MANIFEST, MEASURED, measured_response
 
@@ -137,8 +137,8 @@ def test_sound_from_everywhere_keeps_its_energy(filters):
 @pytest.fixture
 def session(field, filters):
     hello = Hello(protocol=PROTOCOL, scene="measured")
-    rung = QualityStep("standard", None, False, 1.0)
-    return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, rung=rung, window=1_000)
+    quality = QualityStep("standard", None, False, 1.0)
+    return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, quality=quality, window=1_000)
 
 
 def test_a_stream_plays_the_clip_through_what_the_ears_hear(session, field, filters):

@@ -7,8 +7,8 @@ import pytest
 from server.acoustics.geometry import Pose
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import ALL_ON, EmitterEffects
+from server.responses.emitter_state import EmitterState
 from server.scene.effects import EffectName
-from server.streaming.emitters import Emitter
 from server.streaming.plan_audit import LIMIT_JND, PERIOD_S, SHARE_OF_ALL, PlanAudit, RegretRecord, interval_s
 
 HERE, THERE = Pose((2.0, 2.0, 1.5)), Pose((3.0, 2.5, 1.5))
@@ -19,7 +19,7 @@ def check(mirrored_field, filters):
     direct = DirectSound.of(mirrored_field.bundle, filters)
 
     def run(effects, *, whole=ALL_ON, channels=2, whole_channels=2):
-        emitter = Emitter(0, THERE, effects=effects)
+        emitter = EmitterState(THERE, effects=effects)
         asked = PlanAudit("standard", HERE, emitter, whole, channels, whole_channels, direct)
         return asked, asked.run(mirrored_field)
 

@@ -126,7 +126,7 @@ def test_a_stream_waits_from_when_it_wants_responses_whether_or_not_it_could_ask
     """Its ladder has to know."""
     now_s = crowd.stage.clock.now_s
     crowd.run(20)
-    assert all(stream.strain(now_s + 20 * BLOCK_S).ir_wait_s > 19 * BLOCK_S for stream in crowd.streams)
+    assert all(stream.sample_load(now_s + 20 * BLOCK_S).ir_wait_s > 19 * BLOCK_S for stream in crowd.streams)
 
 
 def test_who_has_come_to_rest_and_is_up_to_date_waits_for_nothing(crowd):

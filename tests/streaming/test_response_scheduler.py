@@ -7,7 +7,8 @@ from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, MoveEmitter, RemoveEmitter
 from server.protocol.server_messages import EmitterAdded, EmitterRemoved, Error
 from server.responses.ir_request import compute_irs
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
+from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
 
 CLIP = 0.005 * np.random.default_rng(3).standard_normal(3_000).astype(np.float32)  # no limiter acts
@@ -16,8 +17,8 @@ HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 
 @pytest.fixture
 def session(field, filters):
-    hello, rung = Hello(protocol=PROTOCOL, scene="flat"), QualityStep("standard", None, False, 1.0)
-    return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, rung=rung, window=1_000)
+    hello, quality = Hello(protocol=PROTOCOL, scene="flat"), QualityStep("standard", None, False, 1.0)
+    return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, quality=quality, window=1_000)
 
 
 def add(session, identifier="talker", position=THERE):
@@ -74,7 +75,7 @@ def test_only_what_moved_is_computed_again(session, field):
     add(session, "b")
     answer(session, field)
     session.receive(MoveEmitter(id="b", position=HERE, pose_id=1))
-    assert [emitter.pose.position for emitter in session.take_request().emitters] == [HERE]
+    assert [each.state.position for each in session.take_request().asked] == [HERE]
 
 
 def test_a_pose_of_one_emitter_counts_for_the_whole(session, field):
@@ -124,7 +125,7 @@ def test_after_a_failure_sound_goes_on_and_the_next_pose_asks_for_everything_out
     assert poses(block) == (1, 0)
     assert np.any(block.samples)
     session.receive(MoveEmitter(id="a", position=HERE, pose_id=2))
-    assert len(session.take_request().emitters) == 2
+    assert len(session.take_request().asked) == 2
 
 
 def test_after_a_failure_whoever_comes_is_asked_for_with_everything_outstanding(session):
@@ -132,7 +133,7 @@ def test_after_a_failure_whoever_comes_is_asked_for_with_everything_outstanding(
     session.give_up(session.take_request())
     assert session.take_request() is None
     add(session, "b")
-    assert len(session.take_request().emitters) == 2
+    assert len(session.take_request().asked) == 2
 
 
 def test_what_changes_while_a_request_fails_is_asked_for_at_once(session):
@@ -142,7 +143,7 @@ def test_what_changes_while_a_request_fails_is_asked_for_at_once(session):
     session.receive(ListenerPose(pose_id=1, position=HERE))
     session.give_up(failing)
     again = session.take_request()
-    assert (again.pose_id, len(again.emitters)) == (1, 2)
+    assert (again.pose_id, len(again.asked)) == (1, 2)
     session.give_up(again)
     assert session.take_request() is None, "nothing has changed since: no failure after the other"
 
@@ -154,14 +155,14 @@ def test_a_newcomer_is_asked_for_alone_where_it_is_not_time_for_others(session, 
     session.render_block()
     session.receive(ListenerPose(pose_id=1, position=HERE))
     add(session, "b")
-    request = session.take_request(only_first=True)
-    assert [emitter.serial for emitter in request.emitters] == [1]
+    request = session.take_request(Scope.FIRST)
+    assert [each.serial for each in request.asked] == [1]
     assert request.is_first
     session.accept(compute_irs(FieldsByLevel([field]), request, session.renderer))
     assert poses(session.render_block()) == (1, 0)
-    assert session.take_request(only_first=True) is None
+    assert session.take_request(Scope.FIRST) is None
     assert session.wants_irs
-    assert [emitter.serial for emitter in session.take_request().emitters] == [0]
+    assert [each.serial for each in session.take_request().asked] == [0]
     assert not session.wants_irs
 
 
@@ -171,10 +172,10 @@ def test_where_a_newcomers_request_fails_others_still_get_theirs(session, field)
     session.render_block()
     session.receive(ListenerPose(pose_id=1, position=HERE))
     add(session, "b")
-    session.give_up(session.take_request(only_first=True))
-    assert session.take_request(only_first=True) is None, "no failure after the other"
+    session.give_up(session.take_request(Scope.FIRST))
+    assert session.take_request(Scope.FIRST) is None, "no failure after the other"
     assert session.wants_irs
-    assert len(session.take_request().emitters) == 2
+    assert len(session.take_request().asked) == 2
 
 
 def test_a_field_that_is_not_finite_is_not_an_answer(session, field):

@@ -27,7 +27,7 @@ from server.protocol.client_messages import (
 from server.protocol.server_messages import EmitterAdded, Error
 from server.responses.full_response import FullResponse
 from server.responses.ir_request import compute_irs
-from server.streaming.load import QualityStep
+from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
 # Quiet enough that no limiter acts.
@@ -45,7 +45,7 @@ def load_clip(name):
 
 @pytest.fixture
 def session(field, filters):
-    return Session(HELLO, FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000)
+    return Session(HELLO, FieldsByLevel([field]), filters, load_clip, quality=FULL, window=1_000)
 
 
 def add(session, identifier="talker", **changes):
@@ -80,7 +80,12 @@ def level_db(samples):
 def test_sound_is_the_clip_along_the_direct_path_and_convolved_with_the_fields_ir(field, filters):
     def heard(field):
         session = Session(
-            Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000
+            Hello(protocol=PROTOCOL, scene="flat"),
+            FieldsByLevel([field]),
+            filters,
+            load_clip,
+            quality=FULL,
+            window=1_000,
         )
         session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
         add(session, loop=False, gain_db=-6.0)
@@ -145,7 +150,12 @@ def test_a_gain_scales_direct_sound_and_reverberation_alike(session, field):
 def test_what_is_sent_live_sounds_as_the_same_clip_does(field, filters):
     def heard(message, blocks):
         session = Session(
-            Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000
+            Hello(protocol=PROTOCOL, scene="flat"),
+            FieldsByLevel([field]),
+            filters,
+            load_clip,
+            quality=FULL,
+            window=1_000,
         )
         session.receive(message)
         answer(session, field)
@@ -173,7 +183,7 @@ def test_live_blocks_have_to_come_in_order(session, field):
 @pytest.mark.parametrize("name", ["field", "mirrored_field"])
 def test_who_stands_still_hears_the_scenes_whole_response(name, filters, request):
     field = request.getfixturevalue(name)
-    session = Session(HELLO, FieldsByLevel([field]), filters, load_clip, rung=FULL, window=1_000)
+    session = Session(HELLO, FieldsByLevel([field]), filters, load_clip, quality=FULL, window=1_000)
     session.receive(ListenerPose(pose_id=1, position=HERE, yaw=0.5))
     add(session, loop=False)
     answer(session, field)
@@ -186,7 +196,7 @@ def test_who_stands_still_hears_the_scenes_whole_response(name, filters, request
 def test_a_full_window_drops_blocks_but_not_time(field, filters):
     def run(acknowledged):
         session = Session(
-            Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, window=4
+            Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, quality=FULL, window=4
         )
         add(session)
         answer(session, field)
@@ -243,7 +253,7 @@ def test_a_bad_message_changes_nothing_and_the_stream_goes_on(session, field, me
 
 def test_emitters_are_limited(field, filters):
     session = Session(
-        Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, rung=FULL, max_emitters=2
+        Hello(protocol=PROTOCOL, scene="flat"), FieldsByLevel([field]), filters, load_clip, quality=FULL, max_emitters=2
     )
     assert codes(add(session, "a") + add(session, "b") + add(session, "c")) == ["too_many_emitters"]
 
@@ -264,7 +274,7 @@ def test_a_hello_that_cannot_be_served_is_refused(field, filters, changes, code)
             FieldsByLevel([field]),
             filters,
             load_clip,
-            rung=FULL,
+            quality=FULL,
         )
     assert refusal.value.code == code
 
@@ -277,7 +287,7 @@ def test_a_listener_starts_where_the_scene_says_unless_hello_says_otherwise(fiel
             Pose.from_yaw(HERE, 1.0),
         ),
     ]:
-        session = Session(hello, FieldsByLevel([field]), filters, load_clip, rung=FULL)
+        session = Session(hello, FieldsByLevel([field]), filters, load_clip, quality=FULL)
         add(session)
         assert session.take_request().listener == expected
 
@@ -291,7 +301,7 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
                 FieldsByLevel([field]),
                 filters,
                 load_clip,
-                rung=FULL,
+                quality=FULL,
                 window=6,
             )
             self.pose_id = self.sequence = 0
@@ -370,5 +380,5 @@ def test_laws_hold_whatever_a_client_says_in_whatever_order(field, filters):
 def test_a_shared_tail_is_the_operators_choice(field, filters):
     hello = Hello(protocol=PROTOCOL, scene="flat")
     for wanted in (False, True):
-        session = Session(hello, FieldsByLevel([field]), filters, load_clip, rung=FULL, shared_tail=wanted)
+        session = Session(hello, FieldsByLevel([field]), filters, load_clip, quality=FULL, shared_tail=wanted)
         assert session.renderer._mixers.preparer(2)._has_shared_tail is wanted

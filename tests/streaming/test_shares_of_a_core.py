@@ -4,9 +4,11 @@ import time
 
 import pytest
 
-from server.planning.planned_effects import SHARE_OF_ALL
+from server.planning.plan import Plan
 from server.protocol.client_messages import AddEmitter, ListenerPose
-from server.scene.plan import Plan
+from server.streaming import audio_engine
+from server.streaming.load_policy import decide
+from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.plan_audit import Regret
 from tests.engine_stage import BLOCK_S, Stage
 
@@ -17,7 +19,7 @@ def stage(field, filters):
 
 
 @pytest.mark.parametrize(("busy", "share"), [(0.0, 0.25), (0.6, 0.15), (0.95, 0.25 / 3)])
-def test_the_busier_a_thread_the_less_its_responses_may_take(stage, busy, share):
+def test_the_busier_a_thread_the_less_its_responses_may_take(stage, busy, share, monkeypatch):
     """Rendering takes `busy` of the time of a clock that stands still otherwise."""
     (stream, _), shares = stage.open(window=10_000), []
     follow_poses = stream.session.begin_block
@@ -26,8 +28,12 @@ def test_the_busier_a_thread_the_less_its_responses_may_take(stage, busy, share)
         follow_poses()
         stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
 
+    def note(decided):
+        shares.append(decided[1].ir_share)
+        return decided
+
     stream.session.begin_block = take_time
-    stream.set_cpu_budget = lambda **budget: shares.append(budget["share"])
+    monkeypatch.setattr(audio_engine, "decide", lambda *given: note(decide(*given)))
     while len(shares) < 8:
         stage.thread.tick()
         stage.clock.now_s = max(stage.clock.now_s, stream.due_s)
@@ -79,7 +85,7 @@ def test_the_more_streams_share_a_thread_the_less_often_plans_are_made(stage):
     stage.workers.run()
     stage.run(1.0)
     assert intervals_s[0] == 0.0  # nobody knows yet what they take
-    assert 0.004 * 5 / SHARE_OF_ALL <= intervals_s[-1] < 0.02 * 5 / SHARE_OF_ALL
+    assert 0.004 * 5 / THRESHOLDS.plan_share <= intervals_s[-1] < 0.02 * 5 / THRESHOLDS.plan_share
 
 
 def test_who_is_not_heard_yet_goes_before_who_is_to_be_heard_better(stage):

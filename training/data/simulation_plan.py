@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
+from server.planning.decision import Decision
+
 
 class SimulatedEffect(StrEnum):
     EARLY_REFLECTIONS = "early_reflections"
@@ -31,17 +33,10 @@ def overrides_among(effects: Mapping[str, bool]) -> dict[SimulatedEffect, bool]:
 
 
 @dataclass(frozen=True)
-class SimulationDecision:
-    """`change_jnd` is what leaving the effect out changes, in just-noticeable differences of `parameter`. `cost_s` are
-    seconds of one core for the whole scene that the effect takes, or saves where it is off; None where it costs next to
-    nothing or nobody measured."""
+class SimulationDecision(Decision[SimulatedEffect]):
+    """`cost_s` are seconds of one core for the whole scene that the effect takes, or saves where it is off; None where
+    it costs next to nothing or nobody measured."""
 
-    name: SimulatedEffect
-    called_for: bool
-    change_jnd: float
-    parameter: str
-    reason: str
-    overridden: bool = False
     cost_s: float | None = None
 
 

@@ -12,7 +12,7 @@ from server.responses.full_response import FullResponse
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy, QualityLevel
 from training.baselines.held_out import EvaluationError, HeldOut, Responses, require_same_scene
-from training.baselines.moved_lattice import with_moved_lattice
+from training.baselines.moved_nodes import with_moved_nodes
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
 
 _LATTICE_POSITIONS = 8
@@ -52,7 +52,7 @@ def _method(architecture: str) -> str:
 
 def field_source(field: AcousticField, held_out: HeldOut) -> Source:
     """Whole responses as the server gives them: direct sound and first reflections are added, unless the field includes
-    them. A lattice on which responses are reused is moved between pairs."""
+    them. Nodes whose responses are reused are moved between pairs."""
     codec = field.bundle.manifest.codec.codec
     if codec.sample_rate != held_out.sample_rate:
         raise EvaluationError(
@@ -63,7 +63,8 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
             f"{field.bundle.folder}: has {field.channels} channels, {held_out.name} has {held_out.channels}"
         )
     rng = np.random.default_rng(_LATTICE_POSITIONS)
-    fields = [field] if field.nodes is None else [with_moved_lattice(field, rng) for _ in range(_LATTICE_POSITIONS)]
+    is_moved = field.kind.reuses_responses
+    fields = [with_moved_nodes(field, rng) for _ in range(_LATTICE_POSITIONS)] if is_moved else [field]
     wholes = [FullResponse.through_kemar(moved) for moved in fields]
     listeners, emitters = held_out.listeners, held_out.emitters
 

@@ -8,36 +8,13 @@ that the rest was cut off.
 from collections.abc import Iterable, Iterator
 
 from server.core.errors import BundleError
+from server.field.kinds.catalogue import KINDS
 from server.scene.bundle import Bundle
-from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel, Reuse
+from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel
 
 NONE = "none"
 """Stands for no field, in place of a field's name."""
 GRIFFIN_LIM_ITERATIONS = (1, 4, 16, 64)
-_LATTICES = (
-    (0.1, 15),
-    (0.25, 15),
-    (0.25, 30),
-    (0.5, 30),
-    (0.5, 60),
-    (1.0, 30),
-    (1.0, 60),
-    (1.0, 120),
-    (2.0, 60),
-    (2.0, 120),
-    (2.0, 360),
-    (5.0, 120),
-    (5.0, 360),
-)
-"""Spacing in metres, step of the heading in degrees."""
-
-
-REUSES = (
-    *(Reuse(spacing_m=spacing_m, turn_deg=turn_deg) for spacing_m, turn_deg in _LATTICES),
-    *(Reuse(spacing_m=spacing_m, turn_deg=turn_deg, first_reflections="node") for spacing_m, turn_deg in _LATTICES),
-)
-"""Lattices from a spacing of centimetres to one node per room, each with first reflections for every pose, and with
-first reflections stored at nodes."""
 
 
 def candidates(
@@ -46,8 +23,8 @@ def candidates(
     """One level per combination, named after what distinguishes it.
 
     `phases_of` names the fields for which all methods of finding the phase are measured, by default all fields; the
-    time of Griffin and Lim's iteration does not depend on the field. `reuse_of` names the fields for which lattices are
-    measured. Either may be `NONE`. Raises BundleError for a name that is not a field.
+    time of Griffin and Lim's iteration does not depend on the field. `reuse_of` names the fields for which all kinds
+    of reuse are measured. Either may be `NONE`. Raises BundleError for a name that is not a field.
     """
     fields = bundle.manifest.fields
     reused = set(reuse_of)
@@ -59,13 +36,7 @@ def candidates(
             other = min(named - {NONE})
             raise BundleError(bundle.folder, "fields", f"{NONE!r} and {other!r} contradict each other: leave one out")
     levels = [level for name, file in fields.items() for level in _levels(bundle.manifest, name, file, name in swept)]
-    return [*levels, *(_reusing(name, reuse) for name in fields if name in reused for reuse in REUSES)]
-
-
-def _reusing(name: str, reuse: Reuse) -> QualityLevel:
-    whole = "" if reuse.first_reflections == "pose" else "-whole"
-    title = f"{name}-{100 * reuse.spacing_m:.0f}cm-{reuse.turn_deg:.0f}deg{whole}"
-    return QualityLevel(name=title, field=name, reuse=reuse)
+    return [*levels, *(level for name in fields if name in reused for kind in KINDS for level in kind.candidates(name))]
 
 
 def _levels(manifest: Manifest, name: str, file: FieldFile, with_phases: bool) -> Iterator[QualityLevel]:

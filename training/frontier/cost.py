@@ -17,7 +17,7 @@ from server.bench.machine import processor
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES, Kept
+from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.rendering.hrtf import HeadFilters, kemar
 from server.scene.bundle import Bundle
 from server.scene.manifest import Cost, QualityLevel
@@ -85,7 +85,7 @@ def measure(
     for start in starts:
         for name in rng.permutation(list(levels)):
             listener = listeners[name]
-            if levels[name].level.reuse is not None:
+            if levels[name].kind.reuses_responses:
                 times[name] += [listener.time_ms(pose) for pose in poses[start : start + segment]]
             elif math.fsum(times[name]) <= 1000 * budget_s or start < 3 * segment:
                 times[name] += [listener.time_ms(pose) for pose in poses[start : start + _FEW_POSES]]
@@ -93,7 +93,7 @@ def measure(
     kept_mb = {name: listener.kept_bytes / 1e6 for name, listener in listeners.items()}
     for start in starts[:: len(starts) // _SEGMENTS_OF_MISSES or 1]:
         for name, level in levels.items():
-            if level.level.reuse is not None:
+            if level.kind.reuses_responses:
                 for pose in poses[start : start + _FEW_POSES]:
                     listeners[name].forget()
                     misses[name].append(listeners[name].time_ms(pose))
@@ -102,9 +102,9 @@ def measure(
 
 def _alone(field: AcousticField, filters: HeadFilters) -> Listener:
     """A listener with its own cache of responses."""
-    kept: Kept = BoundedCache(KEPT_BYTES)
-    alone = AcousticField(field.bundle, field.level, field.graph, kept=kept)
-    return Listener(alone, filters, kept=kept, time_s=time.thread_time)
+    cache: NodeCache = BoundedCache(NODE_CACHE_BYTES)
+    alone = AcousticField(field.bundle, field.level, field.graph, node_cache=cache)
+    return Listener(alone, filters, node_cache=cache, time_s=time.thread_time)
 
 
 def cost_of(bundle: Bundle, level: QualityLevel, times: Times, memory_mb: float) -> Cost:

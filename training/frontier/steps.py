@@ -29,7 +29,7 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
     emitter = field.bundle.manifest.start.emitter
     poses = walk(field.bundle, duration_s=_WALK_S, poses_per_s=SPEED_M_PER_S / STEP_M, seed=seed)
     steps = list(itertools.pairwise(poses))
-    if field.nodes is not None:
+    if field.kind.reuses_responses:
         nodes = [field.snap(pose.position, emitter, pose.yaw) for pose in poses]
         steps = [step for step, (one, other) in zip(steps, itertools.pairwise(nodes), strict=True) if one != other]
     spread = np.linspace(0, len(steps) - 1, min(count, len(steps))).astype(int) if steps else np.array([], int)

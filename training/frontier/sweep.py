@@ -20,7 +20,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, QualityLevel
 from training.baselines.held_out import require_same_scene
-from training.baselines.moved_lattice import with_moved_lattice
+from training.baselines.moved_nodes import with_moved_nodes
 from training.data.dataset import Dataset
 from training.frontier.accuracy import Errors, Estimate, SampledPairs
 from training.frontier.bound import TruePhase
@@ -201,12 +201,12 @@ def _accuracies(
 
 
 def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:
-    """The errors of a level. For a lattice, they are the mean over several positions and headings of it."""
+    """The errors of a level. Where it reuses responses, they are the mean over several positions of its nodes."""
     steps = largest_steps(field, count=_STEPS, seed=seed)
-    if field.nodes is None:
+    if not field.kind.reuses_responses:
         return dataclasses.replace(sample.errors_of(Estimate(field)), steps=steps)
     rng = np.random.default_rng([seed, 12])
-    measured = [sample.errors_of(Estimate(with_moved_lattice(field, rng))) for _ in range(_OFFSETS)]
+    measured = [sample.errors_of(Estimate(with_moved_nodes(field, rng))) for _ in range(_OFFSETS)]
     return dataclasses.replace(Errors.mean(measured), steps=steps)
 
 

@@ -4,13 +4,14 @@ An effect is called for where leaving it out would change some parameter by a qu
 errors of the data add to those of the fields trained on them, which are two to three times as large.
 """
 
+from server.planning.decision import Threshold
 from training.data.dataset import GEOMETRIC_ORDER
 from training.data.scene_file import SceneFile, SceneFileError
 from training.data.simulation_plan import Overrides, SimulatedEffect, SimulationDecision, SimulationPlan
 from training.simulation.predictions import Prediction, Predictions
 from training.simulation.size import SimulationSize
 
-THRESHOLD_JND = 0.25
+THRESHOLD = Threshold(enter_jnd=0.25, leave_jnd=0.25)
 
 
 def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
@@ -45,9 +46,9 @@ class SimulationPlanner:
         self._refuse_what_cannot_be(overrides)
         order, images = self._images(overrides)
         late = predicted.late_reverberation()
-        has_rays = overrides.get(SimulatedEffect.LATE_REVERBERATION, late.change_jnd >= THRESHOLD_JND)
+        has_rays = THRESHOLD.decides(late.change_jnd, overrides.get(SimulatedEffect.LATE_REVERBERATION))
         scattering = predicted.scattering(has_rays=has_rays)
-        scatters = overrides.get(SimulatedEffect.SCATTERING, scattering.change_jnd >= THRESHOLD_JND)
+        scatters = THRESHOLD.decides(scattering.change_jnd, overrides.get(SimulatedEffect.SCATTERING))
         decided = {
             SimulatedEffect.EARLY_REFLECTIONS: images,
             SimulatedEffect.LATE_REVERBERATION: late,
@@ -60,9 +61,7 @@ class SimulationPlanner:
                 0.0, "level", "fields are of emitters that radiate all round; rendering gives each its directivity"
             ),
         }
-        is_on = {
-            name: overrides.get(name, prediction.change_jnd >= THRESHOLD_JND) for name, prediction in decided.items()
-        }
+        is_on = {name: THRESHOLD.decides(each.change_jnd, overrides.get(name)) for name, each in decided.items()}
         has_own_tails = is_on[SimulatedEffect.PER_SOURCE_TAIL]
         shares_tail = has_rays and not has_own_tails and not predicted.ends_before_tail
         rays = predicted.rays() if shares_tail else self._settings.rays
@@ -84,7 +83,7 @@ class SimulationPlanner:
 
     def _images(self, overrides: Overrides) -> tuple[int, Prediction]:
         """The highest order that is called for, and what leaving out all beyond those left to geometry would change."""
-        called_for = [order for order, each in self._by_order.items() if each.change_jnd >= THRESHOLD_JND]
+        called_for = [order for order, each in self._by_order.items() if THRESHOLD.is_reached(each.change_jnd)]
         order = max(called_for, default=GEOMETRIC_ORDER)
         if SimulatedEffect.EARLY_REFLECTIONS in overrides:
             order = self._settings.image_order if overrides[SimulatedEffect.EARLY_REFLECTIONS] else GEOMETRIC_ORDER

@@ -17,6 +17,7 @@ from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.acoustics.transmission import transmission_loss_db, walls_between
+from server.planning.change import Change
 from server.scene.limits import MOST_SAMPLES
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import SceneFile
@@ -26,7 +27,7 @@ from training.simulation.diffuse_room import DiffuseRoom
 from training.simulation.rays import receiver_radii, surface_shares
 from training.simulation.size import SimulationSize
 from training.simulation.tracing import RoomTracer
-from training.simulation.trial import Change, Trial
+from training.simulation.trial import Trial
 
 _Floats = npt.NDArray[np.float64]
 

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from server.acoustics.audibility import JND_THRESHOLDS, ratio_in_jnd
 from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
+from server.planning.change import MOST_JND, Change
 from server.scene.geometry import Geometry
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
@@ -53,17 +54,6 @@ _LASTING, _LONGER, _LONGEST_S = 1.2, 2.5, 30.0
 _SHORTEST_S = 0.2
 _DECAY_DB = (-5.0, -35.0)
 _SILENCE = 1e-14
-MOST_JND = 100.0
-"""The change where a parameter exists only with the effect or only without it."""
-
-
-@dataclass(frozen=True)
-class Change:
-    """The change of the parameter that changes most, in JND: root mean square over pairs, in the band in which it is
-    greatest."""
-
-    jnd: float
-    parameter: str
 
 
 @dataclass(frozen=True)
@@ -219,8 +209,8 @@ class Trial:
         return min(math.ceil(start_s / HISTOGRAM_BIN_S), round(self.duration_s / HISTOGRAM_BIN_S))
 
     def change(self, reference: Energies, other: Energies) -> Change:
-        """The greatest change of level, clarity, early and late decay. A parameter that neither of the two has does not
-        change."""
+        """The greatest change of level, clarity, early and late decay: root mean square over pairs, in the band in
+        which it is greatest. A parameter that neither of the two has does not change."""
         audible = bands_within(self.scene.simulation.sample_rate)
         before, after = (parameters(each) for each in (reference, other))
         found = Change(0.0, "level")

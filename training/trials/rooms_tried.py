@@ -29,7 +29,7 @@ from training.data.scene_file import Probes, SceneFile, Simulation
 from training.data.simulation_plan import SimulatedEffect, SimulationPlan
 from training.simulation.check import GeometricResponses
 from training.simulation.pairs import PairSimulation
-from training.simulation.planner import THRESHOLD_JND, planner_of
+from training.simulation.planner import THRESHOLD, planner_of
 
 _Floats = npt.NDArray[np.float64]
 
@@ -250,11 +250,15 @@ def _in_jnd(measured: RoomParameters) -> dict[str, _Floats]:
 
 
 def table(rows: list[Compared]) -> Table:
-    shown = Table(title=f"an effect is on from {THRESHOLD_JND:g} JND; heard from {AUDIBLE_JND:g}", title_justify="left")
+    shown = Table(
+        title=f"an effect is on from {THRESHOLD.enter_jnd:g} JND; heard from {AUDIBLE_JND:g}", title_justify="left"
+    )
     for column in ("room", "effect", "plan", "predicted", "simulated", "of", ""):
         shown.add_column(column, justify="right" if column in {"predicted", "simulated"} else "left", no_wrap=True)
     for row in rows:
-        verdict = "WRONG" if row.is_wrong else "on, not heard" if row.is_on and row.simulated < THRESHOLD_JND else ""
+        verdict = (
+            "WRONG" if row.is_wrong else "on, not heard" if row.is_on and row.simulated < THRESHOLD.enter_jnd else ""
+        )
         state = "on" if row.is_on else "off"
         numbers = f"{row.predicted:.2f}", f"{row.simulated:.2f}"
         shown.add_row(row.room, row.effect.replace("_", " "), state, *numbers, row.parameter, verdict)

@@ -11,7 +11,7 @@ from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.field.reuse import KEPT_BYTES
+from server.field.node_responses import NODE_CACHE_BYTES
 from server.rendering.hrtf import kemar
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Phase, QualityLevel, Reuse
@@ -152,9 +152,9 @@ def test_a_listener_that_forgot_pays_again_and_one_that_stands_still_pays_once(t
     (field,) = tiny_bundle.manifest.fields
     level = QualityLevel(name="kept", field=field, reuse=Reuse(spacing_m=2, turn_deg=90, first_reflections="node"))
     graph = AcousticField.load(tiny_bundle).graph
-    kept = BoundedCache(KEPT_BYTES)
-    field_at_nodes = AcousticField(tiny_bundle, level, graph, kept=kept)
-    listener = Listener(field_at_nodes, kemar(field_at_nodes.sample_rate), kept=kept)
+    kept = BoundedCache(NODE_CACHE_BYTES)
+    field_at_nodes = AcousticField(tiny_bundle, level, graph, node_cache=kept)
+    listener = Listener(field_at_nodes, kemar(field_at_nodes.sample_rate), node_cache=kept)
     pose = walk(tiny_bundle, duration_s=1, seed=0)[0]
     first = listener.time_ms(pose)
     again = min(listener.time_ms(pose) for _ in range(20))

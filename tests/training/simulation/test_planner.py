@@ -9,7 +9,7 @@ import pytest
 from server.scene.geometry import Opening
 from training.data.scene_file import SceneFile, SceneFileError
 from training.data.simulation_plan import SimulatedEffect, SimulationPlan, overrides_among
-from training.simulation.planner import THRESHOLD_JND, planner_of
+from training.simulation.planner import THRESHOLD, planner_of
 from training.simulation.predictions import Predictions
 
 TWO_ROOMS = ((0, 0), (3, 0), (3, 4), (3.2, 4), (3.2, 0), (7, 0), (7, 5), (0, 5))
@@ -52,7 +52,7 @@ def test_an_effect_is_on_where_its_change_reaches_the_threshold(apartment, box):
     for scene in (apartment, box):
         for each in planner_of(scene, 0).plan({}).decisions:
             assert np.isfinite(each.change_jnd)
-            assert each.called_for == (each.change_jnd >= THRESHOLD_JND)
+            assert each.called_for == (each.change_jnd >= THRESHOLD.enter_jnd)
             assert each.reason
 
 
@@ -185,9 +185,9 @@ def test_air_matters_less_where_walls_take_most(box):
         )
         for share, has_rays in ((0.05, True), (0.99, False))
     )
-    assert live.change_jnd > THRESHOLD_JND
+    assert live.change_jnd > THRESHOLD.enter_jnd
     assert live.change_jnd > 10 * dead.change_jnd
-    assert THRESHOLD_JND < dead.change_jnd < 1
+    assert THRESHOLD.enter_jnd < dead.change_jnd < 1
 
 
 def test_sound_bends_where_there_are_corners(box):
@@ -195,7 +195,7 @@ def test_sound_bends_where_there_are_corners(box):
     parted, round_corners = decided(two_rooms(box), SimulatedEffect.DIFFRACTION)
     assert (alone.diffraction, none.change_jnd) == (False, 0.0)
     assert parted.diffraction
-    assert round_corners.change_jnd > THRESHOLD_JND
+    assert round_corners.change_jnd > THRESHOLD.enter_jnd
 
 
 def test_only_thin_walls_let_anything_heard_through(box):
@@ -204,7 +204,7 @@ def test_only_thin_walls_let_anything_heard_through(box):
         for mass in (0.5, 5.0, 50.0, 500.0)
     ]
     assert changes == sorted(changes, reverse=True)
-    assert changes[0] > THRESHOLD_JND > changes[-1]
+    assert changes[0] > THRESHOLD.enter_jnd > changes[-1]
     assert decided(two_rooms(box), SimulatedEffect.TRANSMISSION)[1].change_jnd == 0.0
     assert (
         decided(with_materials(box, walls={"surface_mass_kg_m2": 0.5}), SimulatedEffect.TRANSMISSION)[1].change_jnd == 0

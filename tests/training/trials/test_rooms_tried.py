@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from training.data.simulation_plan import SimulatedEffect
-from training.simulation.planner import THRESHOLD_JND
+from training.simulation.planner import THRESHOLD
 from training.trials.rooms_tried import AUDIBLE_JND, _difference, compare, rooms
 
 RATE = 24_000
@@ -29,7 +29,7 @@ def test_what_is_off_is_not_heard(name):
     rows = list(compare(room(name), emitters=2, rays=3_000))
     assert {row.effect for row in rows} >= {SimulatedEffect.SCATTERING, SimulatedEffect.LATE_REVERBERATION}
     for row in rows:
-        assert row.is_on == (row.predicted >= THRESHOLD_JND)
+        assert row.is_on == (row.predicted >= THRESHOLD.enter_jnd)
         assert row.is_on or row.simulated < AUDIBLE_JND
 
 

@@ -2,8 +2,8 @@
 
 from server.api.frontier import Frontier
 from server.field.fields_by_level import FieldsByLevel
+from server.field.level_titles import LevelOfField, level_titles
 from server.scene.bundle import Bundle, bundled_scenes
-from server.scene.level_titles import LevelOfField, level_titles
 from server.scene.manifest import Phase, QualityLevel, Reuse
 
 

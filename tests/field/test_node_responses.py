@@ -5,7 +5,7 @@ from numpy.testing import assert_array_equal
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
 from server.field.lattice import delay_response
-from server.field.reuse import KEPT_BYTES
+from server.field.node_responses import NODE_CACHE_BYTES
 from server.scene.manifest import QualityLevel, Reuse
 
 RNG = np.random.default_rng(3)
@@ -23,7 +23,7 @@ def reusing(bundle, graph, kept=None, **reuse):
     level = QualityLevel(
         name="at-nodes", field="arithmetic", reuse=Reuse(**{"spacing_m": 0.5, "turn_deg": 30, **reuse})
     )
-    return AcousticField(bundle, level, graph, kept=kept)
+    return AcousticField(bundle, level, graph, node_cache=kept)
 
 
 def counted(field, monkeypatch):
@@ -52,7 +52,7 @@ def test_what_was_asked_before_or_with_it_makes_no_difference_to_a_bit(bundle, g
 
 
 def test_a_node_is_computed_once_for_all_poses_around_it_and_all_levels(bundle, graph, monkeypatch):
-    kept = BoundedCache(KEPT_BYTES)
+    kept = BoundedCache(NODE_CACHE_BYTES)
     levels = [reusing(bundle, graph, kept, first_reflections=kind) for kind in ("pose", "node")]
     asked = counted(levels[0], monkeypatch)
     node, _ = levels[0].snap((2.0, 2.0, 1.5), (4.0, 3.0, 1.5), 0.1)

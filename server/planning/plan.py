@@ -4,49 +4,44 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from server.planning.decision import Decision
 from server.scene.effects import EffectName
 
 
 @dataclass(frozen=True)
-class Decision:
-    """On or off of one effect, of `emitter` or, with None, of all that the listener hears.
+class RenderingDecision(Decision[EffectName]):
+    """About `emitter` or, with None, about all that the listener hears. `cost_us` per block and `memory_bytes` are what
+    the effect costs where it is on, and saves where it is off; None where nothing was measured."""
 
-    `change_jnd` is what leaving it out changes, in just-noticeable differences of the `parameter` that changes most.
-    `cost_us` per block and `memory_bytes` are what it costs where it is on, and saves where it is off; None where
-    nothing was measured.
-    """
-
-    name: EffectName
-    emitter: str | None
-    called_for: bool
-    change_jnd: float
-    parameter: str
-    cost_us: float | None
-    memory_bytes: int | None
-    reason: str
-    overridden: bool = False
+    emitter: str | None = None
+    cost_us: float | None = None
+    memory_bytes: int | None = None
 
 
 @dataclass(frozen=True)
 class Plan:
     """`shared` are decisions about all that a listener hears, `by_emitter` those about one emitter."""
 
-    shared: Mapping[EffectName, Decision]
-    by_emitter: Mapping[str, Mapping[EffectName, Decision]]
+    shared: Mapping[EffectName, RenderingDecision]
+    by_emitter: Mapping[str, Mapping[EffectName, RenderingDecision]]
 
     def is_on(self, name: EffectName, emitter: str | None = None) -> bool:
         """Of an effect decided for each emitter, without one of them: whether it is on for any."""
         return any(each.called_for for each in self.about(name, emitter))
 
-    def about(self, name: EffectName, emitter: str | None = None) -> tuple[Decision, ...]:
+    def about(self, name: EffectName, emitter: str | None = None) -> tuple[RenderingDecision, ...]:
         """The decisions about one effect; those of one emitter, or of all."""
         if name in self.shared:
             return (self.shared[name],)
         chosen = self.by_emitter.values() if emitter is None else (self.by_emitter[emitter],)
         return tuple(decisions[name] for decisions in chosen)
 
+    def on(self, emitter: str) -> set[EffectName]:
+        """The effects of one emitter that are on."""
+        return {name for name, decision in self.by_emitter[emitter].items() if decision.called_for}
+
     @property
-    def decisions(self) -> Iterator[Decision]:
+    def decisions(self) -> Iterator[RenderingDecision]:
         yield from self.shared.values()
         for of_one in self.by_emitter.values():
             yield from of_one.values()

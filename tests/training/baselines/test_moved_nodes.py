@@ -6,7 +6,7 @@ import pytest
 
 from server.field.field import AcousticField
 from server.scene.manifest import QualityLevel, Reuse
-from training.baselines.moved_lattice import with_moved_lattice
+from training.baselines.moved_nodes import with_moved_nodes
 from training.evaluation.fields import field_source
 
 
@@ -27,11 +27,11 @@ def nodes_of(field, count=40):
     low, high = (np.array(end) for end in (field.bundle.manifest.bounds.minimum, field.bundle.manifest.bounds.maximum))
     listeners, emitters = random.uniform(low, high, (2, count, 3)).tolist()
     yaws = random.uniform(-math.pi, math.pi, count).tolist()
-    return [field.nodes.lattice.snap(*pose) for pose in zip(listeners, emitters, yaws, strict=True)]
+    return [field.snap(*pose) for pose in zip(listeners, emitters, yaws, strict=True)]
 
 
 def test_nodes_are_elsewhere_by_less_than_half_a_cell_and_look_elsewhere(reusing) -> None:
-    moved = with_moved_lattice(reusing, np.random.default_rng(0))
+    moved = with_moved_nodes(reusing, np.random.default_rng(0))
     before, after = nodes_of(reusing), nodes_of(moved)
     assert nodes_of(reusing) == before
     apart_m = [np.abs(np.subtract(a.node.emitter, b.node.emitter)) for a, b in zip(before, after, strict=True)]
@@ -46,7 +46,7 @@ def test_nodes_are_elsewhere_by_less_than_half_a_cell_and_look_elsewhere(reusing
 
 
 def test_a_field_without_a_lattice_is_itself(exact) -> None:
-    assert with_moved_lattice(exact, np.random.default_rng(0)) is exact
+    assert with_moved_nodes(exact, np.random.default_rng(0)) is exact
 
 
 def test_pairs_at_nodes_do_not_make_a_lattice_seem_exact(exact, reusing) -> None:

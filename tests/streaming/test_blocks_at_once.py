@@ -9,11 +9,12 @@ import pytest
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, RemoveEmitter
 from server.streaming import audio_engine
-from server.streaming.audio_engine import PHASES, AudioEngine
-from server.streaming.render_ahead import NUMBERS, RenderAhead
+from server.streaming.audio_engine import PHASES, AudioEngine, AudioThread
+from server.streaming.load_policy import RenderAhead, ThreadState
+from server.streaming.load_thresholds import THRESHOLDS
 from tests.engine_stage import BLOCK_S, Patient, Stage, blocks, open_stream, spy_on_batches
 
-MOST = max(NUMBERS)
+MOST = THRESHOLDS.blocks_at_once[-1]
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def open_sounding(stage, **emitter):
 
 
 def render_at_once(monkeypatch, count):
-    monkeypatch.setattr(RenderAhead, "look", lambda self, *_: setattr(self, "count", count))
+    monkeypatch.setattr(AudioThread, "blocks_at_once", count)
 
 
 @pytest.fixture(params=[2, 4, 8])
@@ -42,79 +43,15 @@ def count(request, monkeypatch):
     return request.param
 
 
-class Core:
-    """Which a thread takes `demand` of, block by block, and an eighth less each time that it renders twice as many at
-    once, or whatever else `saves`."""
-
-    def __init__(self, saves=1 / 8):
-        self.at_once, self.saves = RenderAhead(), saves
-
-    def run(self, demand, periods=40):
-        """How many blocks were rendered at once in each."""
-        counts = []
-        for _ in range(periods):
-            counts.append(self.at_once.count)
-            busy = demand * (1 - self.saves) ** NUMBERS.index(self.at_once.count)
-            self.at_once.look(min(1.0, busy), lateness=busy - 0.7)
-        return counts
-
-
-@pytest.mark.parametrize(("demand", "count"), [(0.4, 1), (0.69, 1), (0.75, 2), (0.94, 2), (1.0, 4), (1.2, 8)])
-def test_as_many_blocks_are_rendered_at_once_as_the_load_calls_for(demand, count):
-    core = Core()
-    core.run(demand)
-    assert set(core.run(demand)) == {count}
-
-
-@pytest.mark.parametrize("demand", [0.4, 0.75, 0.85])
-def test_what_fills_a_core_for_a_moment_changes_nothing(demand):
-    core = Core()
-    before = core.run(demand)[-1]
-    core.at_once.look(1.0, lateness=0.2)
-    assert set(core.run(demand)) == {before}
-
-
-def test_a_full_period_among_others_does_not_keep_a_thread_at_the_most():
-    core = Core()
-    core.run(1.5)
-    assert core.at_once.count == MOST
-    for number in range(12):
-        core.at_once.look(0.97 if number % 3 == 0 else 0.5, lateness=0.3)
-    assert core.at_once.count < MOST
-
-
 def test_a_thread_that_had_no_streams_begins_with_one(stage):
     stream, _ = stage.open()
     stage.run(BLOCK_S)
-    stage.thread._at_once.count = MOST
+    stage.thread._load = ThreadState(RenderAhead(MOST))
     stage.engine.close(stream)
     stage.run(BLOCK_S)
     stage.open()
     stage.run(BLOCK_S)
     assert stage.thread.blocks_at_once == 1
-
-
-def test_a_thread_that_falls_behind_renders_more_at_once_without_waiting_for_a_mean():
-    core = Core()
-    assert core.run(1.3, periods=5) == [1, 2, 4, 8, 8]
-
-
-@pytest.mark.parametrize("demand", np.arange(0.5, 1.2, 0.05))
-def test_who_renders_more_at_once_than_is_needed_soon_does_not(demand):
-    """A server opens with more to do than it has later."""
-    core, calm = Core(), Core()
-    core.run(1.5)
-    needed = calm.run(demand)[-1]
-    assert core.run(demand)[12] <= 2 * needed
-
-
-@pytest.mark.parametrize("saves", [0.0, 0.04, 1 / 8])
-def test_a_steady_load_keeps_its_number(saves):
-    """Whatever rendering more at once saves on a host, up to an eighth: no to and fro."""
-    for demand in np.arange(0.3, 1.1, 0.01):
-        core = Core(saves)
-        core.run(demand)
-        assert len(set(core.run(demand))) == 1, demand
 
 
 def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(stage, monkeypatch):
@@ -278,4 +215,4 @@ def test_no_block_is_later_than_alone(stage):
     assert len(ready_s) > 40
     assert all(now_s <= deadline_s - lead_s + BLOCK_S / 2 for now_s, deadline_s in ready_s.values())
     assert stream.session.blocks_dropped == 0
-    assert stream.latenesses.total_s >= 0  # what is early makes up for nothing
+    assert stream.times.lateness.total_s >= 0  # what is early makes up for nothing

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from server.field.kinds.catalogue import kind_of
 from server.scene.manifest import QualityLevel
 
 _PHASES: Final = {"frozen": "", "integrated": "integrated phase", "griffin_lim": "iterated phase"}
@@ -43,25 +44,7 @@ def _groups(levels: Sequence[LevelOfField], titles: dict[str, str]) -> list[list
 
 
 def _kind(entry: LevelOfField) -> str:
-    level = entry.level
-    if entry.architecture is None:
-        return "Geometry only"
-    limits = []
-    if level.reuse is not None:
-        renewed = "reverberation" if level.reuse.first_reflections == "pose" else "all reflections"
-        limits.append(f"{renewed} renewed every {level.reuse.spacing_m:g} m")
-    if level.shared_tail:
-        limits.append("shared late reverberation")
-    if level.frames is not None:
-        limits.append("shortened reverberation")
-    if level.ir_rate_hz is not None:
-        limits.append(f"at most {level.ir_rate_hz:g} responses a second")
-    kind = ", ".join(limits) or "full"
-    return kind[0].upper() + kind[1:]
-
-
-def _turn(entry: LevelOfField) -> str:
-    return "" if entry.level.reuse is None else f"{entry.level.reuse.turn_deg:g}°"
+    return "Geometry only" if entry.architecture is None else kind_of(entry.level).title
 
 
 def _network(entry: LevelOfField) -> str:
@@ -69,7 +52,7 @@ def _network(entry: LevelOfField) -> str:
 
 
 _DETAILS: Final[tuple[Callable[[LevelOfField], str], ...]] = (
-    _turn,
+    lambda entry: kind_of(entry.level).detail,
     lambda entry: _PHASES[entry.level.phase.kind],
     _network,
     lambda entry: entry.name,

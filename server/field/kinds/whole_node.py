@@ -1,0 +1,10 @@
+"""Levels whose responses, first reflections and all, are those of the nearest node of a lattice."""
+
+from server.field.kinds.lattice_reverberation import LatticeReverberation
+
+
+class WholeNode(LatticeReverberation):
+    shares_reflections = True
+    _first_reflections = "node"
+    _suffix = "-whole"
+    _renewed = "all reflections"

@@ -1,0 +1,63 @@
+"""Head rotation: responses are of the way the head is turned."""
+
+import numpy as np
+
+from server.planning.between_ears import LATERAL_ILD_DB, delay_s
+from server.planning.change import UNCHANGED, Change, in_jnd, most
+from server.planning.cost import Cost, Measured
+from server.planning.effect import RESPONSES, SharedEffect
+from server.planning.prediction import ALL_ON, Prediction
+from server.planning.reasons import one_loudspeaker
+from server.planning.scene_acoustics import Emitter, Situation
+from server.scene.effects import EffectName
+
+_EAR_GAIN = 3.0
+"""Of the energy from one side, by how much that of some third of an octave changes at an ear that turns to it: 6 dB."""
+
+
+def _change(prediction: Prediction) -> Change:
+    """Responses of one orientation while the head turns."""
+    listener = prediction.listener
+    if not listener.turns or listener.output == "mono":
+        return UNCHANGED
+    if prediction.place.holds_direct_sound:
+        between_s = delay_s(1.0, prediction.place.speed_of_sound)
+        return most(in_jnd("itd", 1e6 * between_s), in_jnd("ild", LATERAL_ILD_DB))
+    energies, shares = prediction.whole, prediction.shares
+    mirrored = prediction.mirrored_energies([ALL_ON])[0] @ shares
+    change_db = 0.0
+    for number, rest in enumerate(prediction.reverberation):
+        mine = prediction.mirrored.owner == number
+        # What comes from one side more than from the other, of which a head takes or adds some bands when it turns.
+        sided = _EAR_GAIN * np.linalg.norm(mirrored[mine] @ prediction.mirrored.arrival[mine, :2])
+        held = float(energies.held[0, number] @ shares)
+        turned = sided + (0.0 if rest is None else held * (10 ** (rest.turn_db / 10) - 1))
+        whole = float(energies.direct[0, number] @ shares) + float(mirrored[mine].sum()) + held
+        if whole > 0:
+            change_db = max(change_db, 10 * np.log10(1 + turned / whole))
+    return in_jnd("ild", change_db)
+
+
+def _absence(situation: Situation, _: Emitter | None) -> str:
+    return one_loudspeaker(situation.listener) or ("" if situation.listener.turns else "the head keeps still")
+
+
+def _responses(measured: Measured) -> Cost:
+    """Responses of where one walks are of where one looks: it costs where the head turns alone."""
+    each_us, first_us = measured.response_us
+    return Cost(turning_us=each_us, turning_first_us=first_us)
+
+
+EFFECT = SharedEffect(
+    name=EffectName.HEAD_ROTATION,
+    title="head rotation",
+    what="impulse responses are those of the way the head is turned",
+    without="they are those of one orientation; only the direct sound turns",
+    parameters=("ild",),
+    prediction="how the field's responses differ between orientations, and from which side first reflections come",
+    flag="head_rotation",
+    needs=RESPONSES,
+    change=_change,
+    absence=_absence,
+    costs_more=_responses,
+)

@@ -1,0 +1,94 @@
+"""The numbers of the load policy (`server.streaming.load_policy`), all in one place, each with its unit and its reason.
+
+*Busy* is the share of a period in which an audio thread rendered. *Lateness* is how long after it was due a block was
+ready, as a share of what its client has in hand: at 1 the client runs out.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """What the load policy compares its measurements with."""
+
+    period_s: float = 0.25
+    """Seconds from one decision to the next: some two dozen blocks, enough to tell a load from a hiccup, and so soon
+    that few blocks are late before something is done."""
+
+    ir_rates_hz: tuple[float, ...] = (12.0, 5.0)
+    """Responses per second and emitter on the steps below the top: reverberation that follows a walk 12 times a second
+    is hardly told from one that follows every pose, 5 times is heard as a lag."""
+    least_ir_rate_hz: float = 2.0
+    """Responses per second and emitter on the lowest step: a walk is still followed."""
+
+    full_busy: float = 0.85
+    """Busy share from which on a thread has no time to spare, unless it can make some by rendering more blocks at once.
+    The rest is what the event loop and the system take."""
+    free_busy: float = 0.6
+    """Busy share up to which streams may step up. It lies so far below `full_busy` that one step up does not fill the
+    thread."""
+    late: float = 1.0
+    """Lateness beyond which a block is late: streams step down in the same period."""
+    tight: float = 0.5
+    """Lateness beyond which what clients have in hand runs out: streams step down if that lasts."""
+    easy: float = 0.25
+    """Lateness up to which what clients have in hand is hardly touched: streams may step up."""
+    overloaded_periods: int = 2
+    """Periods in a row that show too much load before a stream steps down: one alone is a hiccup."""
+    settle_s: float = 0.75
+    """Seconds between two steps down: the first has to show in what is measured."""
+    clear_s: float = 4.0
+    """Seconds in which all has to be well before a stream steps up: a change of quality every few seconds would be
+    heard."""
+    relapse_s: float = 10.0
+    """Seconds after a step up in which a step down means that it was too early."""
+    most_caution: int = 16
+    """Times `clear_s` that a stream waits at the most. Each relapse doubles the wait, each step up that lasts halves
+    it: at a limit a stream tries again about once a minute."""
+
+    patience_s: float = 0.15
+    """Seconds that responses may take from being asked for: a reverberation that follows later is heard to lag."""
+    patience_intervals: float = 1.5
+    """Intervals between requests that responses may take, on a step that asks less often."""
+    patience_above: float = 0.5
+    """Share of the patience of the step above within which responses are expected there, before a stream steps up."""
+
+    blocks_at_once: tuple[int, ...] = (1, 2, 4, 8)
+    """Blocks of a stream that are rendered at once. Up to two, most poses are heard within 15 ms; four or eight are for
+    a thread that has no time otherwise."""
+    more_blocks_above: tuple[float, ...] = (0.7, 0.84, 0.84)
+    """Mean busy share above which a thread renders twice as many blocks at once, for each number but the last. The last
+    lies below `full_busy`: poses are heard later before quality falls."""
+    behind_busy: float = 0.95
+    """Busy share of one period that is no time for a mean, where `behind_lateness` is passed as well."""
+    behind_lateness: float = 0.25
+    """Lateness that goes with it: the thread falls behind."""
+    saved_by_doubling: float = 1 / 7
+    """Share of a thread's time that twice as many blocks at once save, at the most. A thread that would do with half as
+    many if it were so renders half as many."""
+    mean_periods: int = 3
+    """Periods after a change until a mean of busy shares says something."""
+    newest_weight: float = 0.25
+    """Weight of a period in that mean, which so reaches back about a second: a moment in which something else has the
+    core is what clients have blocks in hand for."""
+
+    ir_share: float = 0.25
+    """Share of a core that responses of a thread's streams may take below the top of their ladders; `NAFIR_IR_SHARE`
+    sets it."""
+    shared_core: float = 0.75
+    """Share of a core that rendering and responses may take together: the event loop, plans and checks need the
+    rest."""
+    least_ir_share: float = 1 / 3
+    """Share of `ir_share` that responses get however busy a thread is: reverberation keeps following."""
+    requests_ahead: int = 1
+    """Requests for responses beside those being computed, so that no worker waits for the next. More would be of poses
+    long gone when their turn comes."""
+    plan_share: float = 0.03
+    """Share of a core that plans of effects may take for all streams of a thread, as far as plans last."""
+    presumed_load: float = 0.02
+    """Share of a core that a new stream is taken to need at least, until it has shown more: streams that come together
+    are spread over the threads."""
+
+
+THRESHOLDS: Final = Thresholds()

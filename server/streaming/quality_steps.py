@@ -1,0 +1,67 @@
+"""The qualities that a stream can be given under load: its steps, best first.
+
+A step is a quality level and how many impulse responses (IRs) per second it gets. From the top there are first fewer
+IRs, then cheaper levels, then levels whose emitters share a tail. Costs are milliseconds per IR.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+from server.core.errors import RequestError
+from server.field.kinds.catalogue import kind_of
+from server.protocol.client_messages import AUTO
+from server.scene.manifest import QualityLevel
+from server.streaming.load_thresholds import THRESHOLDS, Thresholds
+
+
+@dataclass(frozen=True)
+class QualityStep:
+    """IRs of `level`, `cost_ms` each: at most `ir_rate_hz` a second for each emitter, or one with every pose."""
+
+    level: str
+    ir_rate_hz: float | None
+    shared_tail: bool
+    cost_ms: float
+
+    @classmethod
+    def full(cls, level: QualityLevel, cost_ms: float) -> Self:
+        """All that a level has."""
+        return cls(level.name, level.ir_rate_hz, level.shared_tail, cost_ms)
+
+
+@dataclass(frozen=True)
+class Offer:
+    """The levels of a scene, cheapest first, and what an IR of each costs on this host."""
+
+    levels: tuple[QualityLevel, ...]
+    ms_here: Mapping[str, float]
+    thresholds: Thresholds = THRESHOLDS
+
+    def steps(self, choice: str, *, block_s: float) -> tuple[QualityStep, ...]:
+        """Best first, for a client that chose a level, or `AUTO`: then all levels whose IR takes no longer than a block
+        lasts, or, where none is so cheap, the cheapest. Raises RequestError unknown_level."""
+        least_hz = self.thresholds.least_ir_rate_hz
+        if choice != AUTO:
+            level = next((level for level in self.levels if level.name == choice), None)
+            if level is None:
+                known = ", ".join(sorted(level.name for level in self.levels))
+                raise RequestError("unknown_level", f"{choice!r} is none of {AUTO}, {known}", field="level")
+            return (*self._slower(level), self._step(level, least_hz))
+        fitting = [level for level in self.levels if self.ms_here[level.name] <= 1000 * block_s] or self.levels[:1]
+        # The most expensive is the best, but what shares a tail comes last.
+        best_first = reversed(fitting)
+        best, *cheaper = sorted(best_first, key=lambda level: kind_of(level).shares_tail)
+        # What reuses responses has fewer to compute, however often it is asked.
+        often_hz, *_, seldom_hz = self.thresholds.ir_rates_hz
+        down = [self._step(level, often_hz if kind_of(level).reuses_responses else seldom_hz) for level in cheaper]
+        return (*self._slower(best), *down, self._step((best, *cheaper)[-1], least_hz))
+
+    def _slower(self, level: QualityLevel) -> tuple[QualityStep, ...]:
+        own = level.ir_rate_hz
+        rates = [rate for rate in self.thresholds.ir_rates_hz if own is None or rate < own]
+        return (QualityStep.full(level, self.ms_here[level.name]), *(self._step(level, rate) for rate in rates))
+
+    def _step(self, level: QualityLevel, most_hz: float) -> QualityStep:
+        rate_hz = most_hz if level.ir_rate_hz is None else min(most_hz, level.ir_rate_hz)
+        return QualityStep(level.name, rate_hz, level.shared_tail, self.ms_here[level.name])

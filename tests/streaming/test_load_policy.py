@@ -1,0 +1,314 @@
+"""Laws of the load policy, one measurement after the other, with a clock that only the tests move and a host that is
+arithmetic."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from server.protocol.client_messages import AUTO
+from server.scene.manifest import QualityLevel
+from server.streaming.load_policy import (
+    Ladder,
+    LoadSample,
+    LoadState,
+    Measurement,
+    RenderAhead,
+    ThreadState,
+    decide,
+    ir_interval_s,
+    ir_share,
+    patience_s,
+    render_ahead,
+    requests_at_once,
+)
+from server.streaming.load_thresholds import THRESHOLDS
+from server.streaming.quality_steps import Offer
+
+BLOCK_S = 256 / 24_000
+NUMBERS = THRESHOLDS.blocks_at_once
+PERIOD_S = THRESHOLDS.period_s
+FULL_AHEAD = RenderAhead(NUMBERS[-1])
+"""Of a thread that can make no more time by rendering more blocks at once."""
+
+
+def ladder(*ms_here, at=0):
+    names = {f"level{number}": ms for number, ms in enumerate(sorted(ms_here))}
+    levels = tuple(QualityLevel(name=name, field="any") for name in names)
+    return Ladder(Offer(levels, names).steps(AUTO, block_s=BLOCK_S), at)
+
+
+class Host:
+    """A thread that renders as many blocks at once as it can, measured every period. `sample` says what a stream goes
+    through, by its number, and `busy` how much of the time all take, by their ladders."""
+
+    def __init__(self, ladders, sample=lambda _: LoadSample(), busy=lambda _: 0.0, ahead=FULL_AHEAD):
+        self.state, self.now_s, self.steps = LoadState(ThreadState(ahead), dict(enumerate(ladders))), 100.0, []
+        self.sample, self.busy = sample, busy
+
+    @property
+    def ladders(self):
+        return [*self.state.ladders.values()]
+
+    def measure(self):
+        self.now_s += PERIOD_S
+        samples = {number: self.sample(number) for number in self.state.ladders}
+        measurement = Measurement(self.now_s, self.busy(self.ladders), samples)
+        self.state, decision = decide(THRESHOLDS, self.state, measurement)
+        self.steps += [(self.now_s, number, reason) for number, reason in decision.moved.items()]
+        return decision
+
+    def run(self, duration_s):
+        for _ in range(round(duration_s / PERIOD_S)):
+            self.state = dataclasses.replace(
+                self.state, thread=dataclasses.replace(self.state.thread, ahead=FULL_AHEAD)
+            )
+            self.measure()
+        return self
+
+
+def test_a_stream_that_is_at_ease_stays_at_its_top():
+    host = Host([ladder(1, 2)], lambda _: LoadSample(lateness=0.2, ir_wait_s=0.01), lambda _: 0.5).run(600)
+    assert host.steps == []
+
+
+def test_one_hiccup_that_makes_nothing_late_changes_nothing():
+    samples = iter([LoadSample(lateness=0.9, ir_wait_s=1.0)])
+    assert Host([ladder(1, 2)], lambda _: next(samples, LoadSample())).run(60).steps == []
+
+
+@pytest.mark.parametrize(("lateness", "steps"), [(0.0, set()), (0.6, {"load"})])
+def test_a_full_thread_that_can_make_time_lowers_nobody_until_blocks_are_nearly_late(lateness, steps):
+    host = Host([ladder(1, 2)], lambda _: LoadSample(lateness), lambda _: 0.99, ahead=RenderAhead())
+    for _ in range(3):
+        host.measure()
+    assert {reason for _, _, reason in host.steps} == steps
+
+
+def test_late_blocks_are_answered_in_the_same_period():
+    host = Host([ladder(1, 2)], lambda _: LoadSample(lateness=1.5)).run(PERIOD_S)
+    assert [reason for _, _, reason in host.steps] == ["load"]
+
+
+def test_a_stream_settles_between_two_steps_down_and_stops_at_the_bottom():
+    host = Host([ladder(1, 2, 3)], busy=lambda _: 1.0).run(60)
+    times = [now_s for now_s, _, _ in host.steps]
+    (eased,) = host.ladders
+    assert len(times) == len(eased.steps) - 1
+    assert min(after - before for before, after in itertools.pairwise(times)) >= 0.75
+    assert eased.is_lowest
+    assert eased.step is eased.steps[-1]
+
+
+def test_a_load_that_ends_is_recovered_from_step_by_step():
+    host = Host([ladder(1, 2, 3)], busy=lambda _: 1.0).run(20)
+    host.busy = lambda _: 0.1
+    host.steps.clear()
+    host.run(3.5)
+    assert host.steps == []  # not before it has been well for a while
+    host.run(60)
+    assert host.ladders[0].at == 0
+    assert {reason for _, _, reason in host.steps} == {"recovered"}
+    times = [now_s for now_s, _, _ in host.steps]
+    assert min(after - before for before, after in itertools.pairwise(times)) >= 4.0
+
+
+def test_between_overloaded_and_well_nothing_moves():
+    host = Host([ladder(1, 2, 3)], busy=lambda _: 1.0).run(2)
+    at, host.busy = host.ladders[0].at, lambda _: 0.7
+    assert at > 0
+    host.run(300)
+    assert host.ladders[0].at == at
+
+
+def test_near_a_limit_steps_become_rare():
+    """The host can bear the second step and not the first: forever trying would be heard as flutter."""
+    host = Host([ladder(1, 2)], busy=lambda ladders: 0.9 if ladders[0].at == 0 else 0.5).run(1_200)
+    early = sum(now_s < 200 for now_s, _, _ in host.steps)
+    late = sum(now_s > 1_200 for now_s, _, _ in host.steps)
+    assert early > 0
+    assert late <= 4  # up and down again about once a minute
+
+
+def test_a_stream_whose_responses_are_slow_steps_down_alone():
+    host = Host([ladder(1, 2), ladder(1, 2)], lambda number: LoadSample(ir_wait_s=[0.4, 0.01][number])).run(10)
+    assert {number for _, number, _ in host.steps} == {0}
+
+
+def test_a_stream_does_not_rise_to_a_level_whose_responses_would_be_slow():
+    eased = ladder(0.5, 10, at=3)
+    assert (eased.steps[2].level, eased.step.level) == ("level1", "level0")
+    waits_s = 0.02  # of the cheap level; twenty times that of the other
+    host = Host([eased], lambda _: LoadSample(ir_wait_s=waits_s)).run(120)
+    assert host.ladders[0].at == 3
+    host.sample = lambda _: LoadSample(ir_wait_s=waits_s / 10)
+    assert host.run(120).ladders[0].at == 0
+
+
+@settings(max_examples=20)
+@given(st.lists(st.integers(0, 4), min_size=2, max_size=6), st.integers(1, 12))
+def test_streams_of_an_overloaded_thread_become_equal_and_stay_so(starts, capacity):
+    """What a thread can bear is shared: its streams end within a step of each other, wherever they began."""
+    costs = [1.0, 0.6, 0.4, 0.3, 0.2, 0.1]
+
+    def busy(ladders):
+        return 2 * sum(costs[ladder.at] for ladder in ladders) / capacity
+
+    host = Host([ladder(1, 2, 3, at=at) for at in starts], busy=busy).run(200)
+    heights = [ladder.at for ladder in host.ladders]
+    assert busy(host.ladders) <= 0.85 or min(heights) == len(host.ladders[0].steps) - 1
+    if host.steps:
+        assert max(heights) - min(heights) <= max(1, max(starts) - min(starts))
+    host.busy = lambda _: 0.0
+    host.run(600)
+    assert {ladder.at for ladder in host.ladders} == {0}
+
+
+courses = st.lists(st.tuples(st.floats(0, 3), st.floats(0, 2), st.floats(0, 1.5)), min_size=1, max_size=300)
+
+
+@given(courses)
+def test_whatever_happens_a_ladder_moves_by_one_step_at_a_time_and_never_up_and_down_within_a_second(course):
+    host, at, moved_s = Host([ladder(1, 2, 3)]), 0, -10.0
+    for lateness, wait_s, busy in course:
+        host.sample, host.busy = lambda _, it=(lateness, wait_s): LoadSample(*it), lambda _, busy=busy: busy
+        moved = host.measure().moved
+        (climber,) = host.ladders
+        assert abs(climber.at - at) == len(moved)
+        if moved and climber.at < at:
+            assert busy <= 0.6
+            assert lateness <= 0.25
+            assert host.now_s - moved_s >= 4
+        moved_s = host.now_s if moved else moved_s
+        at = climber.at
+
+
+@given(courses)
+def test_a_decision_is_of_its_state_and_its_measurement_alone(course):
+    """The same again for the same, and nothing that was given has changed."""
+    state = LoadState(ThreadState(), {"one": ladder(1, 2, 3), "other": ladder(1, 2, at=2)})
+    for number, (lateness, wait_s, busy) in enumerate(course):
+        samples = {"one": LoadSample(lateness, wait_s, 0.01), "other": LoadSample(lateness / 2, None, 0.01)}
+        measurement = Measurement(number * PERIOD_S, busy, samples)
+        ladders = dict(state.ladders)
+        after = decide(THRESHOLDS, state, measurement)
+        assert state.ladders == ladders
+        assert after == decide(THRESHOLDS, state, measurement)
+        state = after[0]
+
+
+def test_responses_are_unbounded_at_the_top_and_take_an_equal_part_of_a_share_of_a_core_below_it():
+    top, eased = ladder(1, 2), ladder(1, 2, at=1)
+    budget = {"request_s": 0.016, "share": 0.25}
+    assert ir_interval_s(top, streams=10, **budget) == 0
+    interval_s = ir_interval_s(eased, streams=10, **budget)
+    assert 10 * budget["request_s"] / interval_s == pytest.approx(budget["share"])
+    assert ir_interval_s(eased, streams=1, **budget) == pytest.approx(1 / 12)  # the step's own rate bounds it sooner
+
+
+def test_a_decision_divides_the_shares_of_a_core_among_all_streams():
+    host = Host([ladder(1, 2, at=at) for at in (0, 1, 1, 1)], lambda _: LoadSample(request_s=0.04, plan_s=0.003))
+    decision = host.measure()
+    assert [*decision.ir_intervals_s.values()] == pytest.approx([0.0, *[0.04 * 4 / 0.25] * 3])
+    assert [*decision.plan_intervals_s.values()] == pytest.approx([0.003 * 4 / 0.03] * 4)
+
+
+def test_responses_leave_to_rendering_and_the_event_loop_what_these_need():
+    assert ir_share(THRESHOLDS, busy=0.3) == 0.25
+    shares = [ir_share(THRESHOLDS, busy=busy) for busy in np.linspace(0.4, 1.0, 13)]
+    assert shares == sorted(shares, reverse=True)
+    assert ir_share(THRESHOLDS, busy=0.6) == pytest.approx(0.15)
+    assert shares[-1] == pytest.approx(0.25 / 3)  # where nothing is left, reverberation still follows
+    # A host that allows more than a core gets a third of it at least.
+    assert ir_share(dataclasses.replace(THRESHOLDS, ir_share=2.0), busy=0.2) == pytest.approx(2.0 / 3)
+
+
+@pytest.mark.parametrize(("workers", "threads", "requests"), [(1, 1, 2), (5, 1, 6), (5, 2, 4), (5, 3, 3), (1, 4, 2)])
+def test_threads_keep_all_workers_busy_with_one_request_to_spare_each(workers, threads, requests):
+    assert requests_at_once(THRESHOLDS, workers=workers, threads=threads) == requests
+
+
+def test_a_step_that_asks_less_often_bears_longer_waits():
+    top, often, seldom, _ = ladder(1).steps
+    assert patience_s(THRESHOLDS, top) == patience_s(THRESHOLDS, often) == 0.15
+    assert patience_s(THRESHOLDS, seldom) == pytest.approx(0.3)
+
+
+class Core:
+    """Which a thread takes `demand` of, block by block, and an eighth less each time that it renders twice as many at
+    once, or whatever else `saves`."""
+
+    def __init__(self, saves=1 / 8):
+        self.ahead, self.saves = RenderAhead(), saves
+
+    def look(self, busy, lateness):
+        self.ahead = render_ahead(THRESHOLDS, self.ahead, busy=busy, lateness=lateness)
+
+    def run(self, demand, periods=40):
+        """How many blocks were rendered at once in each."""
+        counts = []
+        for _ in range(periods):
+            counts.append(self.ahead.blocks)
+            busy = demand * (1 - self.saves) ** NUMBERS.index(self.ahead.blocks)
+            self.look(min(1.0, busy), lateness=busy - 0.7)
+        return counts
+
+
+@pytest.mark.parametrize(("demand", "count"), [(0.4, 1), (0.69, 1), (0.75, 2), (0.94, 2), (1.0, 4), (1.2, 8)])
+def test_as_many_blocks_are_rendered_at_once_as_the_load_calls_for(demand, count):
+    core = Core()
+    core.run(demand)
+    assert set(core.run(demand)) == {count}
+
+
+@pytest.mark.parametrize("demand", [0.4, 0.75, 0.85])
+def test_what_fills_a_core_for_a_moment_changes_nothing(demand):
+    core = Core()
+    before = core.run(demand)[-1]
+    core.look(1.0, lateness=0.2)
+    assert set(core.run(demand)) == {before}
+
+
+def test_a_full_period_among_others_does_not_keep_a_thread_at_the_most():
+    core = Core()
+    core.run(1.5)
+    assert core.ahead.blocks == NUMBERS[-1]
+    for number in range(12):
+        core.look(0.97 if number % 3 == 0 else 0.5, lateness=0.3)
+    assert core.ahead.blocks < NUMBERS[-1]
+
+
+def test_a_thread_that_falls_behind_renders_more_at_once_without_waiting_for_a_mean():
+    core = Core()
+    assert core.run(1.3, periods=5) == [1, 2, 4, 8, 8]
+
+
+@pytest.mark.parametrize("demand", np.arange(0.5, 1.2, 0.05))
+def test_a_thread_that_renders_more_at_once_than_is_needed_soon_does_not(demand):
+    """A server opens with more to do than it has later."""
+    core, calm = Core(), Core()
+    core.run(1.5)
+    needed = calm.run(demand)[-1]
+    assert core.run(demand)[12] <= 2 * needed
+
+
+@pytest.mark.parametrize("saves", [0.0, 0.04, 1 / 8])
+def test_a_steady_load_keeps_its_number(saves):
+    """Whatever rendering more at once saves on a host, up to an eighth: no to and fro."""
+    for demand in np.arange(0.3, 1.1, 0.01):
+        core = Core(saves)
+        core.run(demand)
+        assert len(set(core.run(demand))) == 1, demand
+
+
+def test_the_thresholds_stand_in_an_order_that_leaves_room_between_up_and_down():
+    one = THRESHOLDS
+    assert one.easy < one.tight < one.late
+    assert one.free_busy < one.more_blocks_above[0] < one.more_blocks_above[-1] < one.full_busy < one.behind_busy
+    assert len(one.more_blocks_above) == len(one.blocks_at_once) - 1
+    assert [2 * number for number in one.blocks_at_once[:-1]] == [*one.blocks_at_once[1:]]
+    assert one.settle_s < one.clear_s < one.relapse_s
+    assert [*one.ir_rates_hz, one.least_ir_rate_hz] == sorted({*one.ir_rates_hz, one.least_ir_rate_hz}, reverse=True)
