@@ -17,12 +17,13 @@ from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_c
 from server.api.connection import StreamHost
 from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
+from server.api.first_start import ResponseCompiler, tell_while_compiling
 from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
 from server.api.problems import install_problems
 from server.api.response_cache import ResponseCache
 from server.api.routes import api, documents, health
-from server.api.settings import Settings
+from server.api.settings import Settings, usable_cores
 from server.api.strict_requests import StrictRequests
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.core.entity_tags import fingerprint
@@ -81,6 +82,7 @@ def create_app(
                 waiting=settings.max_waiting_requests,
                 is_urgent=lambda: workers.are_busy,
             ) as responses,
+            ResponseCompiler() as compiler,
         ):
             audio = AudioEngine(
                 asyncio.get_running_loop().call_soon_threadsafe,
@@ -101,7 +103,10 @@ def create_app(
             if settings.realtime:
                 become_prompt()
             audio.start()
-            tasks = [asyncio.create_task(_become_ready(host)), asyncio.create_task(host.readiness.watch.run())]
+            tasks = [
+                asyncio.create_task(_become_ready(host, compiler)),
+                asyncio.create_task(host.readiness.watch.run()),
+            ]
             try:
                 yield {"host": host}
             finally:
@@ -131,13 +136,16 @@ def create_app(
     return app
 
 
-async def _become_ready(host: StreamHost) -> None:
+async def _become_ready(host: StreamHost, compiler: ResponseCompiler) -> None:
+    progress = asyncio.create_task(tell_while_compiling())
     try:
-        await run_in_own_thread(partial(_warm_up, host), "nafir-warm-up")
+        await run_in_own_thread(partial(_warm_up, host, compiler), "nafir-warm-up")
     except Exception:  # the server stays up but not ready, so that an operator can look at it
         _logger.exception("warm-up failed")
         host.readiness.warm_up = "failed"
         return
+    finally:
+        progress.cancel()
     collect_rarely()
     host.readiness.warm_up = "done"
     _logger.info("ready: %s", ", ".join(host.scenes))
@@ -162,10 +170,12 @@ def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:
             return
 
 
-def _warm_up(host: StreamHost) -> None:
+def _warm_up(host: StreamHost, compiler: ResponseCompiler) -> None:
     """Decode clips, compute responses and render once, so that the first stream does not have to wait for it. Also
     measure how long this host takes for a response of each level."""
+    compiler.begin(next(iter(host.scenes.values())).bundle, cores=usable_cores())
     warm_up(get_args(BlockSize))
+    compiler.wait()
     for scene, levels in host.scenes.items():
         host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)

@@ -18,7 +18,7 @@ _SERVICE_LINK = re.compile(r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)|(\w+_)?PORT_\d+_(
 """Names after the prefix that Kubernetes sets in every container for a service called nafir."""
 
 
-def _usable_cores() -> int:
+def usable_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -76,11 +76,11 @@ class Settings(BaseSettings):
     hrtfs: NamedFiles = ()
     """SOFA files (SimpleFreeFieldHRIR) to offer as heads, named by their stem, besides KEMAR."""
 
-    audio_threads: Annotated[int, Field(ge=1)] = _usable_cores()
+    audio_threads: Annotated[int, Field(ge=1)] = usable_cores()
     """Threads that render streams."""
     realtime: bool = True
     """Whether to ask for real-time priority for the audio threads. If the system refuses, they run without."""
-    ir_workers: Annotated[int, Field(ge=1)] = max(1, _usable_cores() - 1)
+    ir_workers: Annotated[int, Field(ge=1)] = max(1, usable_cores() - 1)
     """Threads that compute impulse responses, at low priority. The default leaves one core to the audio threads."""
     ir_share: Annotated[float, Field(gt=0)] = 0.25
     """CPU time, in cores, that impulse responses for the streams of one audio thread may take under load. They get less

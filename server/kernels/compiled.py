@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
+from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -39,6 +40,17 @@ def _compile(function: Function, **options: bool) -> Function:
     dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
     dispatcher._cache = _Cache(function)
     return dispatcher  # type: ignore[no-any-return]
+
+
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Whether code of a compiled function for this processor is on disk already."""
+    processor = cpu_target.target_context.codegen().magic_tuple()
+    return any(key[1] == processor for key in function._cache._cache_file._load_index())  # type: ignore[attr-defined]
+
+
+def functions_compiled() -> int:
+    """How many functions this process has compiled so far, and not loaded from disk."""
+    return _Cache.compiled
 
 
 def _look_for_no_blas() -> None:
@@ -114,6 +126,7 @@ class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
 
 class _Cache(FunctionCache):  # type: ignore[misc]
     _impl_class = _CacheFiles
+    compiled = 0
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -131,5 +144,6 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return loaded
 
     def save_overload(self, signature: Any, result: Any) -> None:
+        _Cache.compiled += 1
         if _is_writable(Path(self.cache_path)):
             super().save_overload(signature, result)

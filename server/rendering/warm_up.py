@@ -19,8 +19,6 @@ def warm_up(block_sizes: Iterable[int]) -> None:
     sample_rate = 24_000
     filters = kemar(sample_rate)
     flat, ahead = np.zeros(len(OCTAVE_BANDS_HZ)), np.array([(1.0, 0.0, 0.0)])
-    still = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=flat)
-    still.add(np.ones(1), ahead, flat[None], (0.0, 0.0, 0.0, 1.0), np.zeros((2, 1), np.float32))
     for block_size in block_sizes:
         longest = 64 * block_size  # every stage
         renderer = Renderer(
@@ -37,3 +35,6 @@ def warm_up(block_sizes: Iterable[int]) -> None:
         renderer.set_ir("", np.ones((2, longest), np.float32))
         renderer.set_path("", PathTarget(1.0, (1.0, 0.0, 0.0), flat))
         renderer.process()
+    # Last: at a first start another process compiles responses meanwhile.
+    still = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=flat)
+    still.add(np.ones(1), ahead, flat[None], (0.0, 0.0, 0.0, 1.0), np.zeros((2, 1), np.float32))

@@ -69,6 +69,19 @@ def test_what_is_kept_runs_without_what_only_compiling_needs(package):
     assert output.stdout.split() == ["20", "1", "False"]
 
 
+def test_what_is_on_disk_for_this_processor_is_known(package):
+    check = (
+        "import server.kernels.compiled as c, server.outer as o; before = c.is_kept(o.outer); o.outer(1); "
+        "print(before, c.is_kept(o.outer), c.functions_compiled())"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(package)
+    command = [sys.executable, "-c", check]
+    for told in ("False True 2", "True True 0"):
+        output = subprocess.run(command, cwd=package, env=environment, check=True, capture_output=True, text=True)
+        assert output.stdout.strip() == told
+
+
 def test_a_change_in_a_function_called_is_heeded(package):
     assert run(package) == (20, 0)
     inner = package / "server" / "inner.py"

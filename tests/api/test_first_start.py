@@ -1,0 +1,65 @@
+"""A first start compiles in two processes, of which none is left behind, and tells how far it is."""
+
+import asyncio
+import subprocess
+import sys
+
+import pytest
+
+from server.api import first_start
+from server.api.first_start import ResponseCompiler, tell_while_compiling
+
+
+@pytest.fixture
+def begun(monkeypatch):
+    """The processes that were begun, each of which sleeps in place of what it was to do; nothing is on disk."""
+    processes, begin = [], subprocess.Popen
+
+    def sleep(arguments, **options):
+        processes.append((arguments, begin([sys.executable, "-c", "import time; time.sleep(60)"], **options)))
+        return processes[-1][1]
+
+    monkeypatch.setattr(first_start.subprocess, "Popen", sleep)
+    monkeypatch.setattr(first_start, "is_kept", lambda _: False)
+    return processes
+
+
+def test_another_process_computes_a_response_and_ends_with_the_context(field, begun):
+    with ResponseCompiler() as compiler:
+        compiler.begin(field.bundle, cores=2)
+        ((arguments, process),) = begun
+        assert process.poll() is None
+    assert arguments[1:5] == ["-m", "server", "ir", str(field.bundle.folder)]
+    assert process.returncode != 0
+    compiler.wait()
+
+
+@pytest.mark.parametrize(("cores", "is_kept"), [(1, False), (2, True)])
+def test_on_one_core_or_with_all_compiled_none_is_begun(field, begun, monkeypatch, cores, is_kept):
+    monkeypatch.setattr(first_start, "is_kept", lambda _: is_kept)
+    with ResponseCompiler() as compiler:
+        compiler.begin(field.bundle, cores=cores)
+        compiler.wait()
+    assert not begun
+
+
+def test_after_the_end_none_is_begun(field, begun):
+    with ResponseCompiler() as compiler:
+        pass
+    compiler.begin(field.bundle, cores=2)
+    assert not begun
+
+
+def test_progress_is_told_while_functions_are_compiled(monkeypatch, capsys):
+    counts = iter([3, 3, 7])
+    monkeypatch.setattr(first_start, "functions_compiled", lambda: next(counts, 7))
+    monkeypatch.setattr(first_start, "_TOLD_EVERY_S", 0.01)
+
+    async def scenario():
+        telling = asyncio.create_task(tell_while_compiling())
+        await asyncio.sleep(0.2)
+        telling.cancel()
+
+    asyncio.run(scenario())
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "7 functions" in line
