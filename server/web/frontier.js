@@ -35,7 +35,7 @@ export class Frontier extends EventTarget {
   #changes;
   #levels = [];
   #heard = null;
-  #changes = []; // {at, level, text}, newest first
+  #history = []; // {at, level, text}, newest first
 
   /** `root` is the section. Emits "chosen" with a level's name or "auto". */
   constructor(root) {
@@ -84,10 +84,10 @@ export class Frontier extends EventTarget {
   changed({ level, reason, ir_rate_hz: rateHz }) {
     const pace = rateHz === null ? "" : `, at most ${+rateHz.toFixed(1)} responses a second`;
     const title = this.#levels.find(({ name }) => name === level)?.title ?? level;
-    this.#changes.unshift({ at: new Date(), level, text: `${title}${pace}: ${REASONS[reason] ?? reason}` });
-    this.#changes.length = Math.min(this.#changes.length, KEPT);
+    this.#history.unshift({ at: new Date(), level, text: `${title}${pace}: ${REASONS[reason] ?? reason}` });
+    this.#history.length = Math.min(this.#history.length, KEPT);
     this.#changes.replaceChildren(
-      ...this.#changes.map(({ at, level: name, text }) => {
+      ...this.#history.map(({ at, level: name, text }) => {
         const item = document.createElement("li");
         item.title = name;
         const time = document.createElement("time");
