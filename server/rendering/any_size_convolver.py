@@ -1,6 +1,7 @@
-"""The convolver for blocks that are no power of two, such as the 480 samples of an offline render, in NumPy.
+"""A convolver in NumPy for block sizes that are no power of two, such as the 480 samples of an offline render.
 
-The same stages, windows and exchanges; a stage does the work of a window all at once when it is full.
+It uses the same stages, windows and IR exchanges as the compiled one, but a stage does all the work of a window at
+once, when the window is full.
 """
 
 from dataclasses import dataclass
@@ -18,13 +19,14 @@ Spectra = npt.NDArray[np.complex64]
 
 @dataclass(frozen=True)
 class SpectralFilter:
-    """An IR transformed for every stage: spectra (channel, partition, bin) each; immutable."""
+    """An impulse response (IR) transformed for every stage: one array (channel, partition, bin) per stage.
+    Immutable."""
 
     spectra: tuple[Spectra, ...]
 
 
 class AnySizeConvolver:
-    """See `server.rendering.convolver.Convolver`."""
+    """The NumPy engine of `server.rendering.convolver.Convolver`, which documents the methods."""
 
     def __init__(
         self,
@@ -71,7 +73,7 @@ class AnySizeConvolver:
         self._wanted[source] = self._own_tails_wanted[source] = filters
 
     def want_own_tail(self, source: int, filters: SpectralFilter) -> None:
-        """After `want`, another filter for a source's last stage."""
+        """Set a different filter for a source's last stage; call it after `want`, which sets all stages."""
         self._own_tails_wanted[source] = filters
 
     def want_tail(self, filters: SpectralFilter | None) -> None:
@@ -152,7 +154,7 @@ class _StageState:
             self._window[:, : self._stage.size] = self._window[:, self._stage.size :]
 
     def _filter(self, sounds: npt.NDArray[np.bool], wanted: list[SpectralFilter | None], window: int) -> FloatArray:
-        """The output (channel, size) that the window now full makes."""
+        """Filter the window that is now full and return its output (channel, size)."""
         self._spectra = np.roll(self._spectra, 1, axis=1)
         self._spectra[:, 0] = scipy.fft.rfft(self._window)
         shape = len(self._made), self._stage.size + 1
@@ -160,7 +162,7 @@ class _StageState:
         for source, new in enumerate(wanted):
             old = self._current[source]
             if old is not None and new is not None and self._number > 0 and (window + source) % TURNS:
-                new = old  # not its turn
+                new = old  # it is not this source's turn
             self._current[source] = new
             self.exchanged[source] = sounds[source] and old is not None and old is not new
             if new is None or not sounds[source]:

@@ -1,4 +1,4 @@
-"""The arrays behind the compiled convolver."""
+"""The arrays that the compiled convolver works on."""
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +20,12 @@ _PER_SOURCE = ("current", "job_source", "job_old", "job_new")
 
 
 class CompiledConvolver:
-    """Owns the arrays; see `server.rendering.convolver.Convolver` for what they mean to a user.
+    """Allocates and keeps the arrays of the compiled convolver; see `server.rendering.convolver.Convolver` for the
+    methods.
 
-    `wanted` (source,) holds the address of each source's filter, 0 for none; `silent` (source,) its blocks of silence.
-    The last stage is there once per source, once for the tail they share, or both.
+    `_wanted` (source,) holds the address of each source's filter, 0 for none; `silent` (source,): how many blocks in a
+    row each source has been silent. The last stage, which holds the tail, exists for each source, once for the shared
+    tail, or both.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class CompiledConvolver:
         self.tail_gain = zeros_on_lines(2, sources)
         self._history = zeros_on_lines(sources, history * block_size)
         self._wanted: IntArray = np.zeros(sources, np.int64)
-        # Apart from the other stages' only where both kinds of tail exist.
+        # The last stage reads these instead of `_wanted` only where both kinds of tail exist.
         self._own_tails_wanted: IntArray = np.zeros(sources, np.int64)
         self._tail_history = zeros_on_lines(1, history * block_size)
         self._tail_wanted: IntArray = np.zeros(1, np.int64)
@@ -106,7 +108,7 @@ class CompiledConvolver:
         self._wanted[source] = self._own_tails_wanted[source] = filters.address
 
     def want_own_tail(self, source: int, filters: PackedFilter) -> None:
-        """After `want`, another filter for a source's last stage."""
+        """Set a different filter for a source's last stage; call it after `want`, which sets all stages."""
         self._own_tails_wanted[source] = filters.address
 
     def want_tail(self, filters: PackedFilter | None) -> None:
@@ -140,7 +142,7 @@ class CompiledConvolver:
 
 
 class _StageArrays:
-    """What one stage needs."""
+    """The arrays of one stage."""
 
     def __init__(self, stage: Stage, sources: int, channels: int) -> None:
         self.stage = stage
@@ -155,7 +157,7 @@ class _StageArrays:
         self.group = np.zeros((GROUP, 3), np.int64)
 
     def enter(self, record: npt.NDArray[np.void]) -> None:
-        """Write sizes and addresses into a STAGE record (1,)."""
+        """Write the sizes and addresses of these arrays into a STAGE record (1,)."""
         record["size"], record["ticks"] = self.stage.size, self.stage.ticks
         record["partitions"], record["slots"], record["sources"] = self.stage.partitions, self.slots, self.sources
         for name in ("twist", "passes", "lanes"):

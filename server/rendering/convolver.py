@@ -1,16 +1,18 @@
-"""Convolution of several sources with impulse responses (IRs) that may change while they sound.
+"""Convolution of several sources with impulse responses (IRs) that may change while the sources sound.
 
-Non-uniformly partitioned overlap-save, nothing delayed (`server.rendering.partitions`). Sources are summed in the
-frequency domain, in an order that their numbers alone decide; one that is silent costs nothing and adds nothing at all.
+The method is non-uniformly partitioned overlap-save, which adds no delay (`server.rendering.partitions`). Sources are
+summed in the frequency domain, in an order that depends only on their numbers. A silent source costs nothing and adds
+exactly nothing.
 
-A new IR is exchanged stage by stage: at the stage's next window both IRs run over the same input spectra, and their
-outputs are crossfaded in the time domain over one partition, a raised cosine. Interpolating the spectra instead would
-wrap around in time (a click) and comb. Only partitions that differ are computed twice. The head, the first stage,
-begins with the next block; later stages exchange one source in TURNS per window, so later parts of the IR follow within
-TURNS + 1 partitions of their stage, and of several IRs that arrive meanwhile only the newest is heard there.
+A new IR is exchanged stage by stage: in the stage's next window both IRs are applied to the same input spectra, and
+their outputs are crossfaded in the time domain over one partition, along a raised cosine. Interpolating the spectra
+instead would wrap around in time (a click) and cause comb filtering. Only partitions that differ are computed twice.
+The first stage, called the head, exchanges in the next block. Each later stage exchanges one source in TURNS per
+window, so the later parts of the IR follow within TURNS + 1 partitions of their stage; if several IRs arrive meanwhile,
+these stages use only the newest.
 
-Blocks of a power of two are convolved by compiled code (`server.rendering.convolver_kernel`), others by NumPy
-(`server.rendering.any_size_convolver`): the same to -120 dB.
+Compiled code (`server.rendering.convolver_kernel`) convolves blocks of a power of two, and NumPy
+(`server.rendering.any_size_convolver`) all others; their results agree to -120 dB.
 """
 
 from collections import deque
@@ -32,13 +34,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PartitionedIr:
-    """An impulse response made ready for convolvers of one layout; immutable, so threads may share it."""
+    """An impulse response transformed for convolvers of one layout. Immutable, so threads may share it."""
 
     layout: tuple[Partitioning, int]
-    """Partitioning, channels."""
+    """The partitioning, and the number of channels."""
     filters: Any
     tail_energy: float
-    """Sum of squares of the samples that a shared tail stands for, over both channels."""
+    """The sum of squares, over both channels, of the samples that a shared tail can replace."""
 
     @property
     def channels(self) -> int:
@@ -46,13 +48,13 @@ class PartitionedIr:
 
     @property
     def nbytes(self) -> int:
-        """What its spectra take, including any that it shares with another."""
+        """The size of its spectra in bytes, including spectra that it shares with another IR."""
         return sum(int(part.nbytes) for part in self.filters.spectra)
 
 
 @dataclass(frozen=True)
 class _Tail:
-    """What the stage of the shared tail convolves with: `filters` of `ir`, or silence."""
+    """The filter of the shared tail's stage: `filters`, made from `ir`, or silence."""
 
     ir: PartitionedIr | None
     filters: Any
@@ -62,16 +64,18 @@ _NO_TAIL = _Tail(None, None)
 
 
 class Convolver:
-    """`sources` mono inputs, each with its own IR of `channels` channels (1 or 2), mixed into one output.
+    """Convolves `sources` mono inputs, each with its own IR of `channels` channels (1 or 2), and mixes them into one
+    output.
 
-    `block_size` is a power of two from 64 on or, with `any_size` and in NumPy alone, any that a renderer takes. With
-    `shared_tail` the last stage convolves one mix of all sources with one tail, that of the first source that has any,
-    each source at the level of its own: later than twice the longest partition, tails differ little but in level. It
-    makes many sources cheaper. With `switches_tail` it begins without, and `share_tail` has it share its tail or not:
-    fades like those of an exchange lead from one to the other.
+    `block_size` is a power of two from 64 up. With `any_size` it may be any size that a renderer accepts, and NumPy
+    does the work. With `shared_tail` the last stage convolves one mix of all sources with one tail. This tail comes
+    from the first source that has one, and each source is scaled to the level of its own tail: later than twice the
+    longest partition, tails differ in little but level. A shared tail makes many sources cheaper. With `switches_tail`
+    the convolver begins with separate tails, and `share_tail` switches between shared and separate ones with the same
+    crossfades as an IR exchange.
 
-    One thread at a time may use it, except `prepare`, which any thread may call. Raises ValueError for sizes it cannot
-    have.
+    Only one thread at a time may use it, except `prepare`, which any thread may call. Raises ValueError for sizes that
+    are not supported.
     """
 
     def __init__(
@@ -89,7 +93,7 @@ class Convolver:
             raise ValueError("a convolver has at least 1 source, and 1 or 2 channels")
         self._partitioning = Partitioning(block_size, ir_samples, any_size)
         stages = self._partitioning.stages
-        # A tail that starts with the IR is no tail.
+        # With one stage the tail would be the whole IR, which cannot be shared.
         self._has_shared_tail = (shared_tail or switches_tail) and len(stages) > 1
         self._switches_tail = self._has_shared_tail and not shared_tail
         self._shares_tail = self._has_shared_tail and shared_tail
@@ -106,35 +110,36 @@ class Convolver:
             has_shared_tail=self._has_shared_tail,
             has_own_tails=self._switches_tail or not self._has_shared_tail,
         )
-        # What a stage that is not to be heard convolves with: no partition of it but in the head.
+        # The filter of a stage that must stay inaudible: it has no partitions except in the head.
         self._silence = self._engine.prepare(np.zeros((channels, 1), np.float32)) if self._switches_tail else None
         self._layout = self._partitioning, channels
         self._irs: list[PartitionedIr | None] = [None] * sources
         self._tail_energy = np.zeros(sources)
         self._retired: deque[tuple[int, PartitionedIr]] = deque()
-        # Compiled code holds addresses: an IR that was replaced is in use until its source's turn, and in the
-        # window that is made of it then.
+        # Compiled code uses addresses, so a replaced IR must stay in memory until its source's turn, and during the
+        # window that is computed from it then.
         self._retires_after = (TURNS + 2) * stages[-1].ticks
         self._tail = self._tail_before = _NO_TAIL
         self._tail_chosen_at = -1
         self._came_at = np.full(sources, -1)
-        """In which block each source got its first IR."""
+        """The number of the block in which each source got its first IR; -1 before."""
 
     def prepare(
         self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None = None, same_from: int = 0
     ) -> PartitionedIr:
-        """Cut and transform an IR (channels, 1..ir_samples) for `set_ir`: most of its cost, on any thread.
+        """Cut an IR (channels, 1..ir_samples) into partitions and transform them for `set_ir`. This is most of the cost
+        of an exchange, and any thread may do it.
 
-        Where the IR is known to be, from sample `same_from` on, the one of the same length that `like` was made of, the
-        stages that begin there or later are taken from it, and an exchange of the two leaves them alone.
+        If the IR equals another one of the same length from sample `same_from` on, pass the other one as `like`: stages
+        that begin there or later are reused, and exchanging the two IRs does not touch these stages.
 
-        Raises ValueError for another shape, and for a sample that is not finite, or so large that a product might not
-        be: either would spoil every output to come.
+        Raises ValueError for another shape, and for samples that are not finite or so large that a product could
+        overflow: either would corrupt all later output.
         """
         # guard: a response has samples
         if ir.ndim != 2 or ir.shape[0] != self.channels or not 1 <= ir.shape[1] <= self.ir_samples:
             raise ValueError(f"expected an IR ({self.channels}, 1..{self.ir_samples}), got shape {ir.shape}")
-        with np.errstate(over="ignore"):  # seen below
+        with np.errstate(over="ignore"):  # an overflow is found below
             samples = ir.astype(np.float32, copy=False)
         head_energy, tail_energy = _energy(samples[:, : self._tail_start]), _energy(samples[:, self._tail_start :])
         # Energy says it at once of nearly all; neither is true of what is no number.
@@ -148,14 +153,16 @@ class Convolver:
 
     @property
     def preparation(self) -> Hashable:
-        """Convolvers of which this is equal prepare IRs alike, and may share them."""
+        """A key that is equal for convolvers which prepare IRs in the same way and may share them."""
         return self._layout, self._tail_start
 
     def set_ir(self, source: int, ir: npt.NDArray[np.floating] | PartitionedIr) -> None:
-        """Give a source its IR: at once before its first block, and by a crossfade from the next block on after it.
+        """Set the IR of a source: at once before the source's first block, by a crossfade from the next block on after
+        it.
 
-        Fades complete within their partition, so none is ever restarted; of several IRs that arrive before one, only
-        the newest is heard: what comes out is the same as if no other had arrived. Raises ValueError as `prepare`.
+        Crossfades complete within their partition, so none is ever restarted. If several IRs arrive before a crossfade,
+        only the newest is used, and the output is the same as if the others had never arrived. Raises ValueError as
+        `prepare` does.
         """
         prepared = ir if isinstance(ir, PartitionedIr) else self.prepare(ir)
         if prepared.layout != self._layout:
@@ -174,8 +181,8 @@ class Convolver:
             self._choose_tail()
 
     def share_tail(self, is_shared: bool) -> None:
-        """Have all sources share a tail, or none; only of a convolver that switches tails. Nothing happens where its
-        IRs are too short to have any."""
+        """Make all sources share one tail, or give each its own. Only for a convolver made with `switches_tail`;
+        without effect if its IRs are too short for a tail."""
         if not self._switches_tail or is_shared == self._shares_tail:
             return
         self._shares_tail = is_shared
@@ -188,10 +195,11 @@ class Convolver:
         self._retired.append((self._engine.blocks + self._retires_after, ir))
 
     def _choose_tail(self) -> None:
-        """Choose the shared tail, and the level at which each source feeds it; a newcomer's is in effect at once.
+        """Choose the shared tail and the level at which each source feeds it; the level of a new source applies at
+        once.
 
-        The choice depends on the IRs of the next block and on what the last block was made with, and on nothing that
-        was handed in and replaced between the two: an offline render knows nothing of that.
+        The choice depends on the IRs of the next block and on the tail of the last block, but not on IRs that were set
+        and replaced in between, because an offline render never sees those.
         """
         if self._tail_chosen_at != self._engine.blocks:
             self._tail_chosen_at, self._tail_before = self._engine.blocks, self._tail
@@ -199,7 +207,7 @@ class Convolver:
         if ir is not None:
             tail = _Tail(ir, ir.filters if self._shares_tail else self._silence)
         elif self._shares_tail or self._tail_before is _NO_TAIL:
-            tail = self._tail_before  # which nothing feeds any more: it rings out
+            tail = self._tail_before  # no source feeds this tail any more: it rings out
         else:
             tail = _Tail(self._tail_before.ir, self._silence)
         if self._tail.ir is not None and self._tail.ir is not tail.ir:
@@ -211,9 +219,10 @@ class Convolver:
         self._engine.tail_gain[0, newcomers] = self._engine.tail_gain[1, newcomers]
 
     def process(self, blocks: FloatArray, out: FloatArray | None = None) -> FloatArray:
-        """One block (sources, b) in, the mix (channels, b) of the same instant out: in `out`, or an array of its own.
+        """Convolve one block (sources, b) and return the mix (channels, b) of the same time span, in `out` or a new
+        array.
 
-        Rows of sources without an IR are ignored. Input must be finite: gate live audio where it enters.
+        Rows of sources without an IR are ignored. The input must be finite: check live audio where it enters.
         """
         if out is None:
             out = np.empty((self.channels, self.block_size), np.float32)
@@ -224,25 +233,25 @@ class Convolver:
 
     @property
     def compiled(self) -> "CompiledConvolver":
-        """What the compiled renderer runs in its own call; it has to `release` after each block."""
+        """The engine that the compiled renderer calls directly; the renderer has to call `release` after each block."""
         return self._engine  # type: ignore[no-any-return]
 
     def release(self) -> None:
-        """Let go of IRs that no stage can be using any more."""
+        """Drop references to IRs that no stage can be using any more."""
         while self._retired and self._retired[0][0] <= self._engine.blocks:
             self._retired.popleft()
 
     @property
     def exchanged(self) -> tuple[int, ...]:
-        """Sources whose IR was exchanged in the head, in the block last processed."""
+        """The sources whose IR was exchanged in the head during the last block."""
         return tuple(int(source) for source in np.flatnonzero(self._engine.exchanged))
 
     def is_quiet(self, source: int) -> bool:
-        """Whether this source has rung out: it adds exactly nothing until it is fed a sample that is not zero."""
+        """Whether this source has rung out: it adds exactly nothing until its input has a nonzero sample."""
         return self._irs[source] is None or bool(self._engine.silent[source] >= self._partitioning.quiet_blocks)
 
     def clear(self, source: int) -> None:
-        """Forget a source, IR and signal. Silence it first (`is_quiet`) unless a click is welcome."""
+        """Forget the IR and the signal of a source. Wait until it is silent (`is_quiet`), or this may click."""
         ir = self._irs[source]
         if ir is None:
             return
@@ -254,7 +263,7 @@ class Convolver:
             self._choose_tail()
 
     def reset(self) -> None:
-        """Forget everything, as if just constructed."""
+        """Forget everything, as if newly constructed."""
         self._engine.reset()
         self._irs = [None] * self.sources
         self._tail_energy.fill(0)
@@ -265,11 +274,11 @@ class Convolver:
 
 
 def _energy(samples: FloatArray) -> float:
-    """Of (channel, n), without a copy of it."""
+    """The energy of samples (channel, n): their sum of squares, computed without a copy."""
     return float(np.einsum("cn,cn->", samples, samples))
 
 
-# Either takes a third of a second to import, and is wanted without the other.
+# Importing either engine takes a third of a second, and most processes need only one of them.
 def _compiled_convolver() -> Any:
     from server.rendering.compiled_convolver import CompiledConvolver
 

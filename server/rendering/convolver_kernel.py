@@ -1,25 +1,26 @@
-"""The compiled convolver: everything that happens in a block, without allocation, locks or Python objects.
+"""The compiled convolver: all the work of a block, without allocation, locks or Python objects.
 
-A convolver is a record of numbers and addresses (`CONVOLVER`), with one record per stage (`STAGE`). Every array it
-needs is sized once, in `server.rendering.compiled_convolver`, which owns them. Bins are laid out in tiles of eight,
-complex numbers as eight real parts then eight imaginary ones, and what is read together lies together:
+A convolver is a record of numbers and addresses (`CONVOLVER`), with one record per stage (`STAGE`).
+`server.rendering.compiled_convolver` allocates every array once and keeps it. Bins are laid out in tiles of eight,
+complex numbers as eight real parts followed by eight imaginary parts. Data that is read together is stored together:
 
     filter of a stage   near: (partition, tile, channel, part, 8), the first NEAR partitions;
-                        far: (tile, partition, channel, part, 8), the others behind them
+                        far: (tile, partition, channel, part, 8), the other partitions
     ring of a stage     (source, slot, tile, part, 8)          spectra of windows, the newest first,
                                                                `multiply_accumulate.spectrum_stride` apart
     mix of a stage      (tile, channel, column, part, 8)       columns as in `server.rendering.multiply_accumulate`
 
-Memory is what limits it. So sources take turns, one in TURNS windows, and on its turn a source is multiplied for all
-of them, its filter read once: the window at work gets all partitions, the next one all but the first, whose input is
-not there yet, and so on. In the windows between, what is newest is all that is left to multiply: by the first
-partition for the window at work, and by the next ones for those up to the source's next turn.
+Memory bandwidth limits the speed. Therefore each source has its turn in one window out of TURNS, and is then multiplied
+for TURNS windows at once, so that its filter is read only once. The current window gets all partitions; the next window
+gets all but the first, whose input is not known yet; and so on. In the windows between two turns only the newest
+spectrum is left to multiply: by the first partition for the current window, and by the following partitions for the
+windows up to the source's next turn.
 
-An IR is exchanged in the first stage at once, and what the one before was multiplied for in advance is taken back;
-in later stages on the source's turn, when there is nothing to take back.
+The first stage exchanges an IR at once, and subtracts the products that were computed in advance with the old IR. Later
+stages exchange it on the source's turn, when there are no such products.
 
-A stage other than the first works on a window while the next one fills: its sources' transforms, their products, and
-the inverse transforms are a list of jobs with estimated costs, of which every block does its share.
+A stage other than the first works on one window while the next one fills. The transforms of its sources, their products
+and the inverse transforms form a list of jobs with estimated costs; every block does its share of them.
 """
 
 import numpy as np
@@ -43,7 +44,8 @@ from server.rendering.multiply_accumulate import (
 from server.rendering.partitions import TURNS
 
 _CHUNK_NS = 2500
-"""A list of products is cut into jobs of about this length."""
+"""About how long one job of products takes, in ns of estimated cost; a longer list of products is cut into several
+jobs."""
 
 
 @compiled
@@ -58,7 +60,7 @@ def _floats(address: int, count: int):
 
 @compiled
 def process_convolver(address: int) -> None:
-    """Take in the block at `input` and leave the mix at `output`; `address` is that of a CONVOLVER record."""
+    """Convolve the block at `input` and write the mix to `output`; `address` is the address of a CONVOLVER record."""
     convolver = carray(pointer(address), (1,), CONVOLVER)[0]
     stages = carray(pointer(convolver.stage), (convolver.stages,), STAGE)
     _take_in(convolver)
@@ -70,7 +72,7 @@ def process_convolver(address: int) -> None:
 
 @compiled
 def has_exchanged(address: int) -> bool:
-    """Whether an IR was exchanged in the head, in the block last processed."""
+    """Whether the head exchanged an IR in the last block."""
     convolver = carray(pointer(address), (1,), CONVOLVER)[0]
     exchanged = _ints(convolver.exchanged, convolver.sources)
     some = np.int64(0)
@@ -81,8 +83,8 @@ def has_exchanged(address: int) -> bool:
 
 @compiled
 def process_block(address: int, blocks: npt.NDArray[np.float32], output: npt.NDArray[np.float32]) -> bool:
-    """`process_convolver` of one block (source, block_size), its mix left in `output` (channel, block_size). False, and
-    nothing done, for other shapes."""
+    """Call `process_convolver` for one block (source, block_size) and write its mix to `output` (channel, block_size).
+    Returns False, and does nothing, for other shapes."""
     convolver = carray(pointer(address), (1,), CONVOLVER)[0]
     taken = (convolver.sources, convolver.block_size)
     made = (convolver.channels, convolver.block_size)
@@ -97,7 +99,7 @@ def process_block(address: int, blocks: npt.NDArray[np.float32], output: npt.NDA
 
 @compiled
 def _take_in(convolver) -> None:
-    """Write what sounds into the histories."""
+    """Write the block of every source that is not silent into its history."""
     size = convolver.block_size
     place = (convolver.blocks % convolver.history_blocks) * size
     silent = _ints(convolver.silent, convolver.sources)
@@ -145,7 +147,7 @@ def _take_in_tail(convolver, place, any_sounds) -> None:
 
 @compiled
 def _head(convolver, stage) -> None:
-    """The first stage: all at once, for the newest block."""
+    """Do all the work of the first stage for the newest block."""
     size, channels = stage.size, convolver.channels
     _begin(convolver, stage, convolver.blocks)
     exchanged = _ints(convolver.exchanged, convolver.sources)
@@ -169,7 +171,8 @@ def _head(convolver, stage) -> None:
 
 @compiled
 def _tick(convolver, stage) -> None:
-    """A later stage: hear the window made before, do a share of the work, and begin anew where a window is full."""
+    """Run a later stage for one block: output a part of the previous window's result, do a share of the work on the
+    current window, and start the next window when it is full."""
     tick = convolver.blocks % stage.ticks
     size = convolver.block_size
     if stage.is_heard:
@@ -188,7 +191,7 @@ def _tick(convolver, stage) -> None:
 
 @compiled
 def _begin(convolver, stage, window) -> None:
-    """List the jobs of a window that is full, and put into effect the filters wanted by now."""
+    """List the jobs of a full window, and switch to the filters that are wanted by now."""
     stage.window = window
     wanted, silent = _ints(stage.wanted, stage.sources), _ints(stage.silent, stage.sources)
     current = _ints(stage.current, stage.sources)
@@ -221,19 +224,20 @@ def _begin(convolver, stage, window) -> None:
 
 @compiled
 def _since_turn(stage, source) -> int:
-    """Windows since the one in which a source was multiplied for this one, too; 0 in that."""
+    """How many windows ago the source had its turn, when it was multiplied for this window too; 0 if its turn is
+    now."""
     return (stage.window + source) % TURNS
 
 
 @compiled
 def _transform_ns(size) -> int:
-    """About what a transform takes; only proportions matter."""
+    """Estimated cost of one transform; only the proportions between costs matter."""
     return 2 * size
 
 
 @compiled
 def _product_ns(stage, source, is_fading) -> int:
-    """About what the products of one tile take."""
+    """Estimated cost of the products of one tile."""
     since = _since_turn(stage, source)
     ns = 10 * (stage.partitions if since == 0 else TURNS - since)
     return ns + 20 * stage.partitions if is_fading else ns
@@ -241,8 +245,8 @@ def _product_ns(stage, source, is_fading) -> int:
 
 @compiled
 def _work(convolver, stage, until) -> None:
-    """Do jobs in order until the cost of those done reaches `until`, or all are: a source cleared meanwhile costs less
-    than was counted on."""
+    """Do jobs in order until their total cost reaches `until`, or until no job is left: a source that was cleared
+    meanwhile costs less than estimated."""
     jobs_and_inverses = stage.jobs + convolver.channels
     tiles = stage.size // 8
     job_source, job_old = _ints(stage.job_source, stage.sources), _ints(stage.job_old, stage.sources)
@@ -277,7 +281,7 @@ def _work(convolver, stage, until) -> None:
 
 @compiled
 def _transform(convolver, stage, job) -> None:
-    """The spectrum of a source's window, the newest in its ring."""
+    """Compute the spectrum of a source's window and store it as the newest in the source's ring."""
     source = _ints(stage.job_source, stage.sources)[job]
     size, span = stage.size, convolver.history_blocks * convolver.block_size
     history = stage.history + 4 * source * span
@@ -299,7 +303,8 @@ def _transform(convolver, stage, job) -> None:
 
 @compiled
 def _group_end(stage, job) -> int:
-    """The job after those that are multiplied together with this one: sources whose turn is in the same window."""
+    """Index after the last job of the group that begins at `job`. A group is at most GROUP jobs in a row whose sources
+    have their turn in the same window; they are multiplied together."""
     job_source = _ints(stage.job_source, stage.sources)
     end = job + 1
     while end < min(stage.jobs, job + GROUP) and (job_source[end] - job_source[job]) % TURNS == 0:
@@ -309,7 +314,7 @@ def _group_end(stage, job) -> int:
 
 @compiled
 def _multiply(convolver, stage, job, end, first, last) -> None:
-    """Add the products of the spectra and filters of a group, tiles `first` to `last`, to the mix."""
+    """Multiply the spectra of a group by its filters, tiles `first` to `last`, and add the products to the mix."""
     channels = convolver.channels
     job_source = _ints(stage.job_source, stage.sources)
     job_old, job_new = _ints(stage.job_old, stage.sources), _ints(stage.job_new, stage.sources)
@@ -328,8 +333,8 @@ def _multiply(convolver, stage, job, end, first, last) -> None:
 
 @compiled
 def _exchange(stage, channels, source, old, new, first, last) -> None:
-    """Add what the filter before differs by to the surplus, and have the new one stand for it where it was multiplied
-    in advance."""
+    """Add the difference between the old and the new filter's output to the SURPLUS column, and replace the old
+    filter's products by the new one's in windows that were multiplied in advance."""
     since, ring, newest = _since_turn(stage, source), _ring(stage, source), _newest(stage)
     begin, end = _changed(old, new, 3 * stage.number)
     for sign, header in ((np.float32(1), old), (np.float32(-1), new)):
@@ -349,13 +354,13 @@ def _ring(stage, source) -> int:
 
 @compiled
 def _newest(stage) -> int:
-    """The slot of the window at work in every ring."""
+    """The slot, the same in every ring, that holds the spectrum of the current window."""
     return -stage.window % stage.slots
 
 
 @compiled
 def _partitions(stage, header):
-    """The address of a filter's spectra for a stage, and how many partitions they are of; of none at 0."""
+    """The address of a filter's spectra for a stage, and the number of its partitions; (0, 0) if `header` is 0."""
     if header == 0:
         return 0, 0
     return load_int(header, 3 * stage.number), load_int(header, 3 * stage.number + 1)
@@ -363,7 +368,7 @@ def _partitions(stage, header):
 
 @compiled
 def _changed(old: int, new: int, header: int):
-    """The first partition in which two filters differ, and the one after the last."""
+    """The range of partitions in which two filters differ: its first index, and the index after its last."""
     old_count, new_count = load_int(old, header + 1), load_int(new, header + 1)
     old_digests, new_digests = load_int(old, header + 2), load_int(new, header + 2)
     both, most = min(old_count, new_count), max(old_count, new_count)
@@ -377,7 +382,7 @@ def _changed(old: int, new: int, header: int):
 
 @compiled
 def _synthesise(convolver, stage, channel, out) -> None:
-    """The samples of a channel at `out` (size,), faded from the filters before where any were exchanged."""
+    """Write the samples of a channel to `out` (size,), crossfaded from the old filters if any were exchanged."""
     _invert_column(convolver, stage, channel, stage.window % TURNS, out)
     if stage.fades > 0:
         faded_from = convolver.scratch + 8 * stage.size
@@ -388,7 +393,8 @@ def _synthesise(convolver, stage, channel, out) -> None:
 
 @compiled
 def _invert_column(convolver, stage, channel, column, out) -> None:
-    """The samples (size,) of what is in a column of a channel's mix; zeros are left there, for a window to come."""
+    """Transform one column of a channel's mix back into samples at `out` (size,), then zero the column for a later
+    window."""
     mix = stage.mix + 4 * mix_offset(convolver.channels, 0, channel, column)
     step = mix_offset(convolver.channels, 1, 0, 0)
     odd_fft.inverse(mix, step, 8, convolver.scratch, out, stage.size, stage.twist, stage.passes, stage.lanes)

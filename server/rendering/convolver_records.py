@@ -1,4 +1,5 @@
-"""What the compiled convolver knows of itself: numbers, and addresses of arrays that others own. All are int64."""
+"""The records of the compiled convolver. All fields are int64: numbers, and addresses of arrays that are kept
+elsewhere."""
 
 import numpy as np
 
@@ -18,22 +19,23 @@ STAGE = np.dtype(
             "fade_out",  # (size,) float32
             "slots",
             "ring",
-            "wanted",  # (source,) int64: filter a source should have
-            "silent",  # (source,) int64: blocks of silence it has had
+            "wanted",  # (source,) int64: filter that each source should get
+            "silent",  # (source,) int64: blocks in a row that were silent
             "current",  # (source,) int64: filter in effect, 0 for none
-            "job_source",  # (source,) int64: those that sound in the window at work
+            "job_source",  # (source,) int64: the source of each job of the current window
             "job_old",  # (source,) int64: filter to fade from, 0 for none
-            "job_new",  # (source,) int64
-            "group",  # (multiply_accumulate.GROUP, 3) int64: filter, partitions and ring of those multiplied together
+            "job_new",  # (source,) int64: filter of each job
+            "group",  # (multiply_accumulate.GROUP, 3) int64: filter, partitions and ring of each source of a group
             "jobs",
-            "window",  # number of the window at work
+            "window",  # number of the current window
             "cursor",
             "step",
             "cost",
             "cost_done",
             "fades",
             "mix",
-            "output",  # (2, channel, size) float32, heard and being made
+            # (2, channel, size) float32: one half is played while the other is computed; `heard` says which is played
+            "output",
             "heard",
             "is_heard",
             "is_made",
@@ -52,7 +54,7 @@ PROGRESS = (
     "is_heard",
     "is_made",
 )
-"""What of a STAGE changes while it runs; all zero at first."""
+"""The fields of a STAGE that change while it runs; all start at zero."""
 CONVOLVER = np.dtype(
     [
         (name, np.int64)
@@ -64,18 +66,18 @@ CONVOLVER = np.dtype(
             "history_blocks",
             "quiet_blocks",
             "stages",
-            "stage",  # STAGE records
+            "stage",  # address of the STAGE records
             "input",  # (source, block_size) float32
             "output",  # (channel, block_size) float32
             "history",
             "wanted",
             "silent",
-            "exchanged",  # (source,) int64: whether its IR was exchanged in this block
+            "exchanged",  # (source,) int64: whether the head exchanged the source's IR in this block
             "scratch",  # (3, size of the largest stage) float32
             "has_shared_tail",
             "tail_history",
             "tail_silent",
-            "tail_gain",  # (2, source) float32: in effect, and wanted
+            "tail_gain",  # (2, source) float32: gains in effect, and wanted gains
             "fade_in",  # (block_size,) float32
         )
     ]

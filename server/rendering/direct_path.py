@@ -1,9 +1,9 @@
-"""The direct sound of many emitters at one listener's ears, following poses every block.
+"""The direct sound of many emitters at one listener's ears; it follows the poses in every block.
 
-Free-field pressure is 1 / r at r metres, nearer than the near limit that of the near limit, through the air and the
-listener's head. What lies on the way besides (screens, directivity) comes as a gain per octave band.
+Pressure falls as 1 / r with distance r in metres; nearer than the near limit it no longer rises. The air and the
+listener's head filter it. Everything else on the path (screens, directivity) is given as one gain per octave band.
 
-World axes are those of the scene; the head's are x ahead, y left, z up.
+World axes are those of the scene; the axes of the head are x ahead, y left, z up.
 """
 
 from collections.abc import Sequence
@@ -30,19 +30,20 @@ _LEVEL: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
 class PathTarget(NamedTuple):
-    """The way that an emitter's first sound takes to the listener's head."""
+    """The path by which the first sound of an emitter reaches the listener's head."""
 
     length_m: float
     arrival: Sequence[float] | npt.NDArray[np.floating]
-    """(3,) unit vector in the world, from the listener towards where the sound comes from."""
+    """(3,) unit vector in world axes, from the listener towards the direction from which the sound comes."""
     band_gain_db: npt.NDArray[np.floating]
-    """(band,) beside distance and air."""
+    """(band,) gains of everything on the path except distance and air."""
 
 
 class DirectPath:
-    """Sizes everything here and allocates nothing afterwards. One thread at a time may use it.
+    """Renders the direct sound of `slots` emitters. The constructor allocates all arrays; nothing is allocated
+    afterwards. Only one thread at a time may use it.
 
-    Ways beyond `max_distance_m` are as late as if they were that long.
+    Paths longer than `max_distance_m` are delayed as if they had this length.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class DirectPath:
         air_db_per_m: npt.NDArray[np.floating],
         max_distance_m: float = 200.0,
     ) -> None:
-        """`filters` are those of a head, None for one ear without one."""
+        """`filters` describe a head; None means one ear without a head."""
         if min(slots, block_size) < 1 or (filters is not None and filters.sample_rate != sample_rate):
             raise ValueError("slots and block_size are at least 1, and filters are of the same sample rate")
         self.slots = slots
@@ -67,13 +68,13 @@ class DirectPath:
         self.state = _state(slots, block_size, ears, speed_of_sound, air_db_per_m, max_distance_m)
         self._blocks = np.zeros((slots, block_size), np.float32)
         self._heard = np.zeros((self.channels, block_size), np.float32)
-        # Compiled here, where it may take its time, and not on the audio thread at the first pose.
+        # Compile here, where it may take long, and not on the audio thread at the first pose.
         self.set_targets([], np.zeros(0), np.zeros((0, 3)), np.zeros((0, len(OCTAVE_BANDS_HZ))))
         self.reset()
 
     def set_target(self, slot: int, target: PathTarget, *, jump: bool = False) -> None:
-        """From the next block on. The first of a slot is reached at once, later ones as fast as things move, unless
-        they `jump`. Values are finite, `arrival` a unit vector."""
+        """Set the path of a slot from the next block on. The slot's first path applies at once; later ones are reached
+        by a smooth motion, or at once with `jump`. All values must be finite and `arrival` a unit vector."""
         record = self.state.slots[slot]
         record["present"] = True
         record["asked"] = True
@@ -89,33 +90,34 @@ class DirectPath:
         arrivals: npt.NDArray[np.floating],
         band_gains_db: npt.NDArray[np.floating],
     ) -> None:
-        """`set_target` of several slots (n,) at once: lengths (n,), arrivals (n, 3), gains (n, band)."""
+        """Call `set_target` for several slots (n,) at once: lengths (n,), arrivals (n, 3), gains (n, band)."""
         asked = (np.ascontiguousarray(values, np.float64) for values in (lengths_m, arrivals, band_gains_db))
         ask(self.state.slots, np.asarray(slots, np.int64), *asked)
 
     def set_muted(self, slot: int, is_muted: bool) -> None:
-        """Have a slot fade out, and do nothing more for it than keep what it plays; or fade in, where it is by then."""
+        """Fade a slot out and then only keep its delay line up to date, or fade it in again at its current position."""
         self.state.slots[slot]["muted"] = is_muted
 
     def set_losses(self, slot: int, *, distance: bool, air: bool) -> None:
-        """Whether the length of the way attenuates the sound, and the air on it."""
+        """Set whether the length of the path attenuates the sound, and whether the air absorbs some of it."""
         record = self.state.slots[slot]
         record["unattenuated"], record["airless"] = not distance, not air
 
     def copy_slot(self, slot: int, other: "DirectPath", from_slot: int) -> None:
-        """Ask for the same as another path was asked for."""
+        """Copy the settings of slot `from_slot` of another `DirectPath`."""
         for name in _ASKED:
             self.state.slots[slot][name] = other.state.slots[from_slot][name]
 
     def set_orientation(self, quaternion: Sequence[float] | npt.NDArray[np.floating]) -> None:
-        """(x, y, z, w), unit: turns the head's axes to where they are in the world. From the next block on."""
+        """Set the unit quaternion (x, y, z, w) that rotates head axes to world axes, from the next block on."""
         if self.channels == 2:
             self.state.to_head[:] = axes_of(quaternion)
 
     def process(self, blocks: FloatArray, out: FloatArray) -> None:
-        """Add to `out` (channel, b) what is heard of `blocks` (slots, b), finite. Slots without a target are ignored.
+        """Render `blocks` (slots, b), which must be finite, and add the result to `out` (channel, b). Slots without a
+        target are ignored.
 
-        Fastest where both are contiguous; other layouts are copied rather than compiled for.
+        This is fastest if both arrays are contiguous; other layouts are copied first.
         """
         if not (blocks.flags.c_contiguous and blocks.flags.writeable):
             np.copyto(self._blocks, blocks)
@@ -128,7 +130,7 @@ class DirectPath:
             out += self._heard
 
     def clear(self, slot: int) -> None:
-        """Forget a slot, target and signal."""
+        """Forget the target and the signal of a slot."""
         if not self.is_quiet(slot):
             self.state.line[slot] = 0
             self.state.heard[slot] = 0
@@ -136,14 +138,14 @@ class DirectPath:
         self.state.slots[slot]["silent"] = self.state.quiet
 
     def reset(self) -> None:
-        """Forget everything, as if just constructed."""
+        """Forget everything, as if newly constructed."""
         for slot in range(self.slots):
             self.clear(slot)
         self.state.position[0] = 0
         self.set_orientation(_LEVEL)
 
     def is_quiet(self, slot: int) -> bool:
-        """Whether this slot has rung out: it adds exactly nothing until it is fed a sample that is not zero."""
+        """Whether this slot has rung out: it adds exactly nothing until its input has a nonzero sample."""
         record = self.state.slots[slot]
         return not record["present"] or bool(record["silent"] == self.state.quiet)
 
@@ -161,9 +163,9 @@ def _state(
     shortest_m = speed_of_sound * ((AFTER + 1) / sample_rate + filters.longest_advance_s)
     longest_m = max(max_distance_m, shortest_m)
     orders = np.maximum(np.arange(taps), 1)
-    # Half a window of the transform: what is new, and no fewer than the filter has taps.
+    # Half a window of the transform: enough for a new block, and no fewer samples than the filter has taps.
     bins = max(_FEWEST_BINS, 2 ** (max(taps, wide) - 1).bit_length())
-    # A window is read back from the line where a filter begins.
+    # When a filter starts, a whole window before the block is read back from the delay line.
     longest = (longest_m / speed_of_sound + filters.longest_delay_s) * sample_rate + TAPS + 2 * (bins + block_size)
     ring = -(-int(longest) // block_size) * block_size
     again = -(-(2 * bins + TAPS) // block_size) * block_size

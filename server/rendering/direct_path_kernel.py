@@ -1,24 +1,24 @@
 """One block of the direct path of many emitters, in compiled code.
 
-An emitter's block goes into its delay line. Each ear reads the line at a delay of its own, the way's plus the head's,
-and hears it through one minimum-phase filter: what the head, the air and the way do to magnitude, summed as cepstra.
-Without a head there is one ear, which has no delay, and no filter either where nothing on the way calls for one.
+An emitter's block is written to its delay line. Each ear reads the line with its own delay, the path's plus the head's,
+and applies one minimum-phase filter that combines the magnitudes of head, air and path as a sum of cepstra. Without a
+head there is one ear, which has no delay of its own, and needs a filter only if something on the path has a gain.
 
-An emitter may be muted: its line goes on, nothing else is done for it, and it is there at once when it is heard again.
+A muted emitter still writes its delay line but costs nothing else, so it can be heard again at once.
 
-What is asked for jumps from block to block; what is heard follows. Lengths and the head's delays go to where they are
-asked to be like critically damped springs whose anchor moves steadily through a block, and within the block the delay
-is the cubic that meets position and speed at both of its ends. A filter is computed anew where direction or bands have
-moved, long before it could be heard, and crossfaded over the block: along a straight line in steady motion, whose
-blocks then join without a ripple at their rate, and along a raised cosine where they leap. A length that jumps further
-than anything moves is crossfaded too, from the old delay to the new.
+Requested values jump from block to block; the rendered values follow smoothly. Path lengths and the head's delays
+follow like critically damped springs whose anchor moves steadily through a block. Within the block the delay is the
+cubic that meets position and speed at both ends. A filter is computed anew when direction or bands have changed, long
+before the change is audible, and crossfaded over the block. In steady motion the crossfade is a straight line, so that
+blocks join without a ripple at the block rate; for a leap it is a raised cosine. A length that jumps further than any
+motion could is crossfaded too, from the old delay to the new.
 
-Filters work on the spectra of `server.kernels.odd_fft`, all slots summed before the one way back: a
-spectrum per ear of what it hears, one per filter whenever that changes.
+Filters work on the spectra of `server.kernels.odd_fft`, and all slots are summed before the single inverse transform:
+there is one spectrum of the delayed input per ear, and one per filter whenever the filter changes.
 
-Letters: s slots, e ears (2, or 1 without a head), n taps, f bins, b block size, w the same in whole tiles of the loops
-(what is beyond b means nothing), r ring of the delay line. Lengths in metres, delays in samples unless their name says
-seconds.
+Letters: s slots, e ears (2, or 1 without a head), n taps, f bins, b block size, w block size rounded up to whole tiles
+of the loops (values beyond b mean nothing), r length of the delay line's ring. Lengths are in metres, delays in samples
+unless their name says seconds.
 """
 
 from typing import Any
@@ -44,9 +44,9 @@ from server.rendering.sphere import find_triangle
 _LENGTH_TIME_S = 0.015
 _HEAD_TIME_S = 0.008
 _GREATEST_SPEED_RATIO = 0.5
-"""Of the speed of sound; what implies more is a jump, not a motion."""
+"""Fraction of the speed of sound; a change that implies a higher speed is a jump, not a motion."""
 _POSE_INTERVAL_S = 0.020
-"""A length asked for longer ago than this says nothing about speed."""
+"""Seconds; a length that was requested longer ago than this says nothing about speed."""
 _ANGLE_STEP = np.radians(0.3)
 _BAND_STEP_DB = 0.02
 _ANGLE_LEAP = np.radians(10.0)
@@ -67,7 +67,7 @@ def ask(
     arrivals: DoubleArray,
     band_gains_db: DoubleArray,
 ) -> None:
-    """Enter what is asked for of the slots in `rows` (n,): lengths (n,), arrivals (n, 3), gains (n, band)."""
+    """Set the targets of the slots in `rows` (n,): lengths (n,), arrivals (n, 3), gains (n, band)."""
     for number in range(rows.size):
         slot = slots[rows[number]]
         slot.present = True
@@ -81,7 +81,7 @@ def ask(
 
 @compiled_in_place
 def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatArray) -> None:
-    """Add what all ears (e, b) hear of the blocks (s, b) of all slots."""
+    """Render the blocks (s, b) of all slots and add the result to the ears (e, b) in `out`."""
     position = state.position[0]
     size = out.shape[1]
     state.is_mixed[:] = 0
@@ -101,8 +101,8 @@ def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatAr
 
 @compiled_in_place
 def _fetch(state: DirectPathState, index: int, position: int, size: int) -> None:
-    """Have what a slot reads come near while the one before it is worked on. With many listeners on a core, all of it
-    lies in main memory."""
+    """Prefetch the data of a slot while the slot before it is processed. With many listeners on a core, all of it lies
+    in main memory."""
     slot = state.slots[index]
     if not slot.present:
         return
@@ -117,7 +117,7 @@ def _fetch(state: DirectPathState, index: int, position: int, size: int) -> None
 
 @compiled_in_place
 def _open(state: DirectPathState, kind: int) -> None:
-    """Have a mix be silent before its first use in a block."""
+    """Zero a mix before its first use in a block."""
     if state.is_mixed[kind] == 0:
         state.mix[kind] = 0
         state.is_mixed[kind] = 1
@@ -125,7 +125,8 @@ def _open(state: DirectPathState, kind: int) -> None:
 
 @compiled_in_place
 def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
-    """Add one of the mixes: what the filters in effect make, or what those before add to it while they fade out."""
+    """Transform one of the mixes back and add it to `out`: the mix of the filters in effect, or a mix that fades out
+    from the previous filters."""
     block = state.filtered
     for ear in range(out.shape[0]):
         loops.synthesise(state.mix[kind, ear], state.twist, state.passes, state.lanes, block)
@@ -140,7 +141,8 @@ def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
 
 @compiled_in_place
 def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, block: FloatArray) -> bool:
-    """Write a block to its line. False if the slot has rung out: its line is silent then, and need not be written."""
+    """Write a block to the slot's delay line. Returns False if the slot has rung out: the line is silent then and need
+    not be written."""
     size = block.size
     if not loops.is_silent(block):
         slot.silent = 0
@@ -158,16 +160,15 @@ def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, 
 
 @compiled_in_place
 def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> None:
-    """Add a slot to the mixes. How it was heard before and is heard now decides what is done: nothing while it is not
-    heard, and between any two of the other ways, beginning and end included, a block that leads from one to the
-    other."""
+    """Add a slot to the mixes. The last mode and the current mode (see NOT_STARTED) decide what is done: nothing if
+    both are inaudible, otherwise a block that fades from the one to the other, including the start and the end."""
     before, ears = slot.mode, state.cepstra.shape[1]
     if slot.muted and before <= MUTED:
         slot.mode = MUTED
         slot.is_elsewhere = before == NOT_STARTED or slot.is_elsewhere or slot.asked
         slot.jump = slot.asked = False
         return
-    # What has not moved while it was muted goes on from where it was.
+    # A slot that did not move while it was muted continues from its old position.
     at_once = before == NOT_STARTED or (before == MUTED and slot.is_elsewhere)
     slot.is_elsewhere = False
     jumps = not at_once and _jumps(slot, size, state.sample_rate, state.speed_of_sound)
@@ -203,13 +204,14 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
         if before == FILTERED or now == FILTERED:
             _add_filtered(state, index, ear, before, now, change)
         if before == UNFILTERED or now == UNFILTERED:
-            # What has just started has nothing to fade in from.
+            # A slot that has just started has nothing to fade in from.
             _add_plain(state, newest[:size], before in (UNFILTERED, NOT_STARTED), now == UNFILTERED)
 
 
 @compiled_in_place
 def _read_past(state: DirectPathState, slot: Any, index: int, ear: int, back: int, at_once: bool, gain: float) -> None:
-    """Find what an ear would have heard from `back` samples before this block on: a filter that begins has to know."""
+    """Compute what an ear would have received from `back` samples before this block on; a filter that starts needs
+    these samples."""
     past = _delay(state, slot, ear) if at_once else slot.delay[ear]
     samples = state.heard[index, ear, : 2 * state.bins.shape[1]]
     _read_still(state, state.line[index], past, back, samples)
@@ -218,7 +220,8 @@ def _read_past(state: DirectPathState, slot: Any, index: int, ear: int, back: in
 
 @compiled_in_place
 def _add_filtered(state: DirectPathState, index: int, ear: int, before: int, now: int, change: int) -> None:
-    """Add what an ear hears through its filter, fading from the one before where they are different."""
+    """Filter what an ear receives and add it to the mix, with a crossfade from the previous filter if the two
+    differ."""
     loops.transform(state.heard[index, ear], state.twist, state.passes, state.lanes, state.bins)
     in_effect, after = state.spectra[index, ear], state.next_spectra[ear]
     if before != FILTERED:
@@ -238,7 +241,7 @@ def _add_filtered(state: DirectPathState, index: int, ear: int, before: int, now
 
 @compiled_in_place
 def _add_plain(state: DirectPathState, block: FloatArray, before: bool, after: bool) -> None:
-    """Add what is heard without a filter, fading where it was not or is not to be."""
+    """Add what an ear receives without a filter, faded in or out if it was not heard before or is not heard after."""
     if state.is_mixed[_PLAIN] == 0:
         state.plain[:] = 0
         state.is_mixed[_PLAIN] = 1
@@ -255,7 +258,7 @@ def _add_plain(state: DirectPathState, block: FloatArray, before: bool, after: b
 
 @compiled_in_place
 def _colours(slot: Any) -> bool:
-    """Whether anything on the way has a gain in some band."""
+    """Whether anything on the path has a gain in some band."""
     most = 0.0
     for band in range(BANDS):
         most = max(most, abs(slot.bands_db[band]))
@@ -274,8 +277,8 @@ def _jumps(slot: Any, size: int, sample_rate: float, speed_of_sound: float) -> b
 
 @compiled_in_place
 def _follow(spring: DoubleArray, goal: float, period_s: float, time_s: float, rest: float, at_once: bool) -> None:
-    """Move by one block, exactly, a critically damped spring of time constant `time_s` whose anchor moves steadily to
-    `goal`; it trails its anchor by twice the time constant. Within `rest` it stops."""
+    """Move a critically damped spring of time constant `time_s` exactly by one block, while its anchor moves steadily
+    to `goal`. The spring trails its anchor by twice the time constant, and stops within `rest` of it."""
     anchor, at, speed = spring[_ANCHOR], spring[_AT], spring[_SPEED]
     if not at_once and (at != goal or speed != 0.0 or anchor != goal):
         drift = (goal - anchor) / period_s
@@ -296,8 +299,8 @@ def _follow(spring: DoubleArray, goal: float, period_s: float, time_s: float, re
 
 @compiled_in_place
 def _change(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> int:
-    """How far direction and bands are from what the filters were computed for: not worth new ones, a step of steady
-    motion, or a leap."""
+    """Classify how far direction and bands are from those for which the filters were computed: too little for new
+    filters, a step of steady motion, or a leap."""
     turned = 0.0
     for axis in range(3):
         along = 0.0
@@ -319,7 +322,7 @@ def _change(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> int:
 
 @compiled_in_place
 def _find_filters(state: DirectPathState, slot: Any) -> None:
-    """The filters and the head's delays for a slot's direction and bands."""
+    """Compute the filters and the head's delays for the direction and bands of a slot."""
     for axis in range(3):
         slot.filtered_direction[axis] = slot.direction[axis]
     for band in range(BANDS):
@@ -360,7 +363,8 @@ def _read(
     gain_before: float,
     heard: FloatArray,
 ) -> None:
-    """What one ear's delay makes of the line, at the gain of the distance."""
+    """Read the delay line for one ear with the ear's moving delay, apply the gain of the distance, and write the result
+    to `heard`."""
     end = _delay(state, slot, ear)
     is_within = state.shortest_m <= slot.length[_AT] <= state.longest_m
     speed = slot.length[_SPEED] if is_within else 0.0
@@ -391,14 +395,14 @@ def _read(
 
 @compiled_in_place
 def _delay(state: DirectPathState, slot: Any, ear: int) -> float:
-    """Where length and head are, as a delay."""
+    """The current delay of one ear in samples, from the path's length and the head's delay."""
     within = min(max(slot.length[_AT], state.shortest_m), state.longest_m)
     return float((within / state.speed_of_sound + slot.head[ear, _AT]) * state.sample_rate)
 
 
 @compiled_in_place
 def _read_still(state: DirectPathState, line: FloatArray, delay: float, back: int, out: FloatArray) -> None:
-    """What was heard from `back` samples before this block on, had the delay always been this."""
+    """Read the line from `back` samples before this block on, as if the delay had always been `delay`."""
     first, row, share = state.first[:1], state.row[:1], state.share[:1]
     loops.locate(float(state.position[0] - back), state.ring, delay, 0.0, 0.0, 0.0, first, row, share)
     loops.interpolate_reversed(state.sinc[row[0]], share[0], state.still_taps)

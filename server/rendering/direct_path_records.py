@@ -1,4 +1,4 @@
-"""What the compiled direct path knows of itself, in letters and units as in `server.rendering.direct_path_kernel`."""
+"""The records of the compiled direct path; letters and units as in `server.rendering.direct_path_kernel`."""
 
 from typing import NamedTuple
 
@@ -12,24 +12,25 @@ IntArray = npt.NDArray[np.int64]
 BANDS = 7
 
 NOT_STARTED, MUTED, UNFILTERED, FILTERED = 0, 1, 2, 3
-"""How a slot was heard in the last block: not, as nothing was left to be heard of it; not, while its line went on; by
-its delays alone; by its delays and filters."""
+"""The mode of a slot in the last block: inaudible with nothing left to play; inaudible but with its delay line kept up
+to date; delayed only; delayed and filtered."""
 
 SLOT = np.dtype(
     [
-        # What is asked for; written between blocks.
+        # Requested values, written between blocks.
         ("present", np.bool_),
-        ("asked", np.bool_),  # anew since the last block
+        ("asked", np.bool_),  # requested anew since the last block
         ("jump", np.bool_),
         ("muted", np.bool_),
         ("unattenuated", np.bool_),  # as loud as at one metre
         ("airless", np.bool_),
         ("goal_m", np.float64),
-        ("arrival", np.float64, 3),  # world
+        ("arrival", np.float64, 3),  # in world axes
         ("band_gain_db", np.float64, BANDS),
-        # Where things are, at the end of the last block. A spring is where its anchor is, where it is, and its speed.
+        # The state at the end of the last block. A spring is three numbers: the position of its anchor, its own
+        # position, and its speed.
         ("mode", np.int64),  # NOT_STARTED, MUTED, UNFILTERED or FILTERED
-        ("is_elsewhere", np.bool_),  # asked for since it was muted
+        ("is_elsewhere", np.bool_),  # a new target was set while it was muted
         ("was_unattenuated", np.bool_),
         ("silent", np.int64),  # samples
         ("since_asked", np.int64),  # samples
@@ -39,29 +40,30 @@ SLOT = np.dtype(
         ("delay", np.float64, 2),
         ("slope", np.float64, 2),  # samples per sample
         ("gain", np.float64),
-        ("direction", np.float64, 3),  # head
+        ("direction", np.float64, 3),  # in head axes
         ("bands_db", np.float64, BANDS),
-        # What the filters were computed for, and where that was found.
+        # The direction and bands for which the filters were computed, and the triangle in which the direction was
+        # found.
         ("filtered_direction", np.float64, 3),
         ("filtered_db", np.float64, BANDS),
         ("triangle", np.int64),
     ],
     align=True,
 )
-"""One emitter."""
+"""The record of one emitter."""
 
 
 class DirectPathState(NamedTuple):
-    """Everything that `render_direct_paths` reads and writes. Tables may be shared between states; the rest is of one
-    thread at a time."""
+    """Everything that `render_direct_paths` reads and writes. States may share the tables; only one thread at a time
+    may use the rest."""
 
     slots: npt.NDArray[np.void]  # (s,) of SLOT
     to_head: DoubleArray  # (3, 3) from world to head
-    position: IntArray  # (1,) in the line, of the next block
-    line: FloatArray  # (s, r and its beginning once more)
-    heard: FloatArray  # (s, e, 2 f and room for whole tiles) delayed, the newest 2 f samples
-    plain: FloatArray  # (w,) what is heard without a filter
-    spectra: FloatArray  # (s, e, part, f) of the filter in effect
+    position: IntArray  # (1,) where the next block begins in the line
+    line: FloatArray  # (s, r + a copy of its beginning)
+    heard: FloatArray  # (s, e, 2 f + padding to whole tiles) delayed input, the newest 2 f samples
+    plain: FloatArray  # (w,) sum of the sound that needs no filter
+    spectra: FloatArray  # (s, e, part, f) of the filters in effect
 
     # Tables.
     cepstra: FloatArray  # (direction, e, n)
@@ -69,7 +71,7 @@ class DirectPathState(NamedTuple):
     triangles: IntArray
     across: IntArray
     inverses: DoubleArray
-    band_cepstra: FloatArray  # (band, n) of one decibel
+    band_cepstra: FloatArray  # (band, n) for a gain of one decibel
     orders: FloatArray  # (n,) 1, 1, 2, 3 ...
     reciprocals: FloatArray  # (n,) of `orders`
     sinc: FloatArray
@@ -77,10 +79,10 @@ class DirectPathState(NamedTuple):
     passes: FloatArray
     lanes: FloatArray
     fade: FloatArray  # (b,) from 0 to 1
-    ramp: FloatArray  # (b,) likewise, straight, the end of each sample
+    ramp: FloatArray  # (b,) rises in a straight line, sampled at the end of each sample
     air_db_per_m: DoubleArray  # (band,) >= 0
 
-    # Room for intermediate results.
+    # Buffers for intermediate results.
     weights: DoubleArray  # (3,)
     cepstrum: FloatArray  # (e, n + 8)
     sums: FloatArray  # (e, n + 8)
@@ -88,8 +90,8 @@ class DirectPathState(NamedTuple):
     padded: FloatArray  # (2 f,)
     next_spectra: FloatArray  # (e, part, f)
     bins: FloatArray  # (part, f)
-    is_mixed: IntArray  # (4,) whether anything was, in this block: in each mix, and without a filter
-    mix: FloatArray  # (3, e, part, f) by the filters in effect; what those before add, in a step and in a leap
+    is_mixed: IntArray  # (4,) whether this block used each of the three mixes, and `plain`
+    mix: FloatArray  # (3, e, part, f) output of the filters in effect, and of the previous ones in a step and in a leap
     first: npt.NDArray[np.int32]  # (w,)
     row: npt.NDArray[np.int32]  # (w,)
     share: FloatArray  # (w,)
@@ -100,8 +102,8 @@ class DirectPathState(NamedTuple):
     # Constants.
     sample_rate: float
     speed_of_sound: float
-    nearest_m: float  # for gain
-    shortest_m: float  # for delay: the sinc reads ahead, and an ear may be nearer than the head's centre
-    longest_m: float  # for delay
+    nearest_m: float  # for the gain
+    shortest_m: float  # for the delay: the sinc reads ahead, and an ear may be nearer than the head's centre
+    longest_m: float  # for the delay
     ring: int
-    quiet: int  # samples of silence after which nothing is left to be heard
+    quiet: int  # samples of silence after which a slot has rung out

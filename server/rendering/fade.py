@@ -1,4 +1,5 @@
-"""The one fade of the renderer: a raised cosine over one block, for gains and for the exchange of impulse responses."""
+"""The only fade of the renderer: a raised cosine over one block, for gains and for the exchange of impulse
+responses."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,7 +1,7 @@
-"""Head-related transfer functions: as spectra ready to multiply, and as filters ready to interpolate.
+"""Head-related transfer functions (HRTFs): as spectra to multiply, and as filters to interpolate.
 
-Directions are unit vectors in the head's frame (x ahead, y left, z up). Ear 0 is the left one: checked by energy,
-because the receiver order written in public files is not reliable.
+Directions are unit vectors in the head's frame (x ahead, y left, z up). Ear 0 is the left one: its energy is checked,
+because the receiver order in public files is not reliable.
 """
 
 from dataclasses import dataclass
@@ -23,31 +23,32 @@ _Floats = npt.NDArray[np.float64]
 
 KEMAR = Path(__file__).parent / "hrtf_data" / "mit_kemar_normal_pinna.sofa"
 PREPARED_RATE = 24_000
-"""Of the bundled scenes."""
+"""The sample rate of the bundled scenes, in Hz."""
 PREPARED_KEMAR = KEMAR.with_name(f"mit_kemar_normal_pinna_{PREPARED_RATE}_hz.npz")
-"""KEMAR's filters as `HeadFilters.save` writes them: reading the measurements and making filters of them takes a second
-of every start."""
+"""KEMAR's filters as `HeadFilters.save` writes them. Reading the measurements and computing the filters would add a
+second to every start."""
 
 _ROWS_AT_ONCE = 32
-"""Resampled together. soxr takes 120 kB for each, and for more of them at once it takes longer, too."""
+"""How many responses are resampled together. soxr needs 120 kB for each, and is slower with more at once."""
 _TAPER_S = 0.0005
 _LEAD_S = 0.001
 _LENGTH_S = 0.0045
 
 _LEVEL_RATE = 24_000
-"""Level is measured in the band of this rate, so that it is the same at every rate."""
+"""The level is measured in the band of this sample rate (Hz), so that it is the same at every rate."""
 
 _FILTER_S = 0.004
-"""KEMAR's responses truncated here keep their magnitude to 0.01 dB; at 2.7 ms one percent of it is off by 1 dB."""
+"""Seconds. KEMAR's responses keep their magnitude to 0.01 dB when cut to this length; at 2.7 ms one percent of the
+magnitudes is off by 1 dB."""
 _TAPS_MULTIPLE = 8
 _RESTRAINT = 1e-3
-_FLOOR = 1e-5  # of the loudest frequency of a response: no file is accurate below -100 dB
+_FLOOR = 1e-5  # relative to the loudest frequency of a response: no file is accurate below -100 dB
 
 
 @dataclass(frozen=True)
 class Hrtf:
-    """`impulse_responses` is (direction, ear, sample); sample `lead_samples` is the moment the wave passes the
-    head's centre, which is when a source ahead begins to be heard."""
+    """A head's impulse responses (direction, ear, sample). Sample `lead_samples` is the moment when the wave passes the
+    head's centre, which is when a source straight ahead begins to be heard."""
 
     directions: _Floats
     impulse_responses: _Floats
@@ -56,10 +57,10 @@ class Hrtf:
 
     @classmethod
     def read(cls, path: Path, sample_rate: int) -> "Hrtf":
-        """Reads a SimpleFreeFieldHRIR file, resampled, levelled to unit diffuse-field energy and cut to the head's
+        """Read a SimpleFreeFieldHRIR file, resample it, scale it to unit diffuse-field energy, and cut it to the head's
         response.
 
-        Raises HrtfError if the file cannot be used, or its ears cannot be told apart at azimuth 90 degrees.
+        Raises HrtfError if the file cannot be used, or if its ears cannot be told apart at azimuth 90 degrees.
         """
         measured = read_sofa(path)
         try:
@@ -78,19 +79,19 @@ class Hrtf:
 
     @cached_property
     def _tree(self) -> "cKDTree":
-        from scipy.spatial import cKDTree  # a tenth of a second
+        from scipy.spatial import cKDTree  # takes a tenth of a second
 
         return cKDTree(self.directions)
 
     def spectra(self, directions: _Floats, n_fft: int) -> npt.NDArray[np.complex128]:
-        """(..., ear, bin) spectrum of the measured direction nearest to each; time zero is the head's centre."""
+        """(..., ear, bin) spectra of the measured directions that are nearest; time zero is the head's centre."""
         _, nearest = self._tree.query(directions)
         advance = np.exp(2j * np.pi * np.fft.rfftfreq(n_fft) * self.lead_samples)
         return np.asarray((np.fft.rfft(self.impulse_responses, n_fft) * advance)[nearest])
 
 
 def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats:
-    """(direction, ear, sample): the head's response alone, tapered at both ends."""
+    """The head's responses (direction, ear, sample), cut from the measurement and tapered at both ends."""
     lead, length, taper = (round(time_s * sample_rate) for time_s in (_LEAD_S, _LENGTH_S, _TAPER_S))
     first = int(np.argmax(measured.directions[:, 0]))
     ahead = _resampled(measured, sample_rate, slice(first, first + 1), swapped)[0]
@@ -108,7 +109,7 @@ def _cut(measured: HeadMeasurements, sample_rate: int, swapped: bool) -> _Floats
 
 
 def _resampled(measured: HeadMeasurements, sample_rate: int, part: slice, swapped: bool) -> _Floats:
-    """(direction, ear, sample) of some directions, the left ear first."""
+    """The resampled responses (direction, ear, sample) of some directions, the left ear first."""
     import soxr
 
     responses = measured.responses[part]
@@ -124,18 +125,18 @@ def _resampled(measured: HeadMeasurements, sample_rate: int, part: slice, swappe
 
 
 def filter_taps(sample_rate: int) -> int:
-    """How long the filters of a direct path are."""
+    """The length in taps of a direct path's filters."""
     return -(-round(_FILTER_S * sample_rate) // _TAPS_MULTIPLE) * _TAPS_MULTIPLE
 
 
 @dataclass(frozen=True, eq=False)
 class HeadFilters:
-    """What a head does to a sound in a form that can be interpolated: minimum phase and delay, per direction. Two are
-    the same only if they are one object.
+    """A head as filters that can be interpolated: minimum phase and delay per direction. Two are equal only if they are
+    the same object.
 
-    `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear) after the wave passes the head's centre,
-    which is when a source ahead begins to be heard. Between directions, logarithms of magnitude and delays are
-    interpolated over spherical triangles.
+    `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear), counted from the moment when the wave
+    passes the head's centre, which is when a source straight ahead begins to be heard. Between directions, log
+    magnitudes and delays are interpolated over spherical triangles.
     """
 
     sample_rate: int
@@ -146,7 +147,7 @@ class HeadFilters:
 
     @classmethod
     def from_hrtf(cls, hrtf: Hrtf, taps: int | None = None) -> "HeadFilters":
-        """`taps` are 4 ms unless given; a multiple of 8 is fastest."""
+        """Compute the filters of a head, 4 ms long unless `taps` is given; a multiple of 8 is fastest."""
         if taps is None:
             taps = filter_taps(hrtf.sample_rate)
         responses = hrtf.impulse_responses
@@ -178,7 +179,7 @@ class HeadFilters:
 
     @classmethod
     def load(cls, path: Path) -> "HeadFilters":
-        """What was saved, to the bit."""
+        """Load filters exactly as `save` wrote them."""
         with np.load(path, allow_pickle=False) as file:
             triangulation = Triangulation(*(file[name] for name in Triangulation._fields))
             return cls(int(file["sample_rate"]), file["directions"], file["cepstra"], file["delays_s"], triangulation)
@@ -189,7 +190,7 @@ class HeadFilters:
 
     @cached_property
     def longest_advance_s(self) -> float:
-        """How much before the head's centre an ear can hear."""
+        """The longest time by which an ear can receive sound before the head's centre, in seconds."""
         return float(max(0.0, -self.delays_s.min()))
 
     @cached_property
@@ -199,14 +200,14 @@ class HeadFilters:
 
 @cache
 def kemar(sample_rate: int) -> HeadFilters:
-    """The head of whoever asks for no other: of single responses, of maps, and of simulations."""
+    """The default head: for single responses, maps and simulations, and for clients that name no other."""
     if sample_rate == PREPARED_RATE:
         return HeadFilters.load(PREPARED_KEMAR)
     return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
 
 
 class NoHead:
-    """One ear in the open: what there is of `HeadFilters` without a head."""
+    """One ear in the open air, with the attributes of `HeadFilters` that also make sense without a head."""
 
     longest_advance_s = longest_delay_s = 0.0
 
@@ -219,11 +220,11 @@ class NoHead:
 
 
 def _smooth(directions: _Floats, common_s: _Floats) -> _Floats:
-    """(d,) the delay common to both ears without the errors of measuring it, counted from straight ahead.
+    """(d,) the delay common to both ears without its measuring errors, relative to straight ahead.
 
     A loudspeaker a few centimetres out of place shifts whole rings of a measured set by 0.1 ms (KEMAR at elevations of
-    30, 50 and 60 degrees), which in a moving source would sound like a jump. The smoothest function that is the same on
-    the left and on the right is kept; the delay between the ears is not touched.
+    30, 50 and 60 degrees), which would sound like a jump for a moving source. The result is the smoothest function that
+    is equal on the left and on the right; the delay between the ears is not changed.
     """
 
     def shapes(xyz: _Floats) -> _Floats:
@@ -233,7 +234,7 @@ def _smooth(directions: _Floats, common_s: _Floats) -> _Floats:
     shares = np.sqrt(solid_angles(directions))
     at_measured = shapes(directions) * shares[:, None]
     values = common_s * shares
-    # A little of each shape but the constant is given up where directions are too few to tell them apart.
+    # Damp every shape except the constant a little, in case there are too few directions to tell the shapes apart.
     restraint = _RESTRAINT * np.diag([0.0, 1, 1, 1, 1, 1])
     weights = np.linalg.solve(at_measured.T @ at_measured + restraint, at_measured.T @ values)
     return np.asarray((shapes(directions) - shapes(np.array([[1.0, 0.0, 0.0]]))) @ weights)

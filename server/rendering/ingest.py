@@ -1,7 +1,7 @@
-"""The one door by which sound enters, be it a file, an array of a caller's, or what a client sends as it goes.
+"""The entry check for all audio: files, arrays from callers, and live samples from clients.
 
-Behind it nothing is checked any more. One NaN would stay in every filter it met; a number that overflows later would
-end as one; a denormal number is inaudible and slow.
+Later code checks nothing any more. A NaN would stay in every filter it reaches; a number that overflows later would
+become one; a denormal number is inaudible and slow.
 """
 
 import numpy as np
@@ -10,23 +10,24 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float32]
 
 LOUDEST = 1e6
-"""Full scale is 1. Integers written as float reach 2^31, and nobody wants to hear them so."""
+"""The largest magnitude accepted, where full scale is 1. Integers written as float reach 2^31, which is certainly a
+mistake."""
 LOUDEST_GAIN = 1e3
-"""Linear: 60 dB."""
+"""The largest gain accepted, linear: 60 dB."""
 _TINY = np.finfo(np.float32).tiny
 
 
 class DryAudio:
-    """Mono `samples` (n,) float32, read-only: each finite, within `LOUDEST`, and zero or no denormal.
+    """Mono `samples` (n,) float32, read-only. Each is finite, within `LOUDEST`, and not denormal.
 
-    What is no audio (not finite, or beyond) became silence, counted in `silenced`; denormals too, uncounted. Raises
-    ValueError for another shape.
+    Samples that are not finite or exceed the limit were replaced by zero and counted in `silenced`; denormal samples
+    were replaced too, but not counted. Raises ValueError for another shape.
     """
 
     __slots__ = ("samples", "silenced")
 
     def __init__(self, samples: npt.ArrayLike) -> None:
-        with np.errstate(invalid="ignore", over="ignore"):  # signalling NaNs; doubles beyond the largest float
+        with np.errstate(invalid="ignore", over="ignore"):  # signalling NaNs, and doubles beyond the largest float
             # guard: samples come in as floats
             given = np.asarray(samples, np.float32)
             # guard: audio has one channel
@@ -47,7 +48,7 @@ class DryAudio:
 
 
 def require_gain(gain: float) -> float:
-    """Raises ValueError for a linear gain that is no number, or beyond `LOUDEST_GAIN` either way."""
+    """Raise ValueError if a linear gain is not a number, or if its magnitude exceeds `LOUDEST_GAIN`."""
     # guard: a gain does not overflow
     if not abs(gain) <= LOUDEST_GAIN:
         raise ValueError(f"a gain is finite and at most {LOUDEST_GAIN:g}, got {gain:g}")

@@ -1,17 +1,19 @@
-"""The last thing that happens to what a listener hears: nothing, unless it would be too loud for a converter.
+"""The peak limiter, the last step before output. It changes a block only if the block would be too loud for a
+converter.
 
-A peak limiter, both ears by the same gain so that nothing moves. Peaks are true peaks: of the signal between samples
-too, which a converter makes of them, estimated at four times the rate as in ITU-R BS.1770-4, Annex 2. A block below the
-ceiling passes to the last bit.
+Both ears get the same gain, so that nothing seems to move. Peaks are true peaks: they include the signal between
+samples, which a converter reconstructs, estimated at four times the sample rate as in ITU-R BS.1770-4, Annex 2. A block
+below the ceiling passes unchanged to the last bit.
 
-It adds no latency, so it looks ahead no further than the end of its block. The gain falls in time for a peak within
-the block, at most by 1 over `_ATTACK` samples; where a block begins with a peak it falls as fast as it must, and until
-it is low enough samples are held at the ceiling. What lies between the last samples of a block and the first of the
-next is known only with the latter; a gain that recovers slowly keeps that in check while sound goes on. It stays down
-for as long as a period of the lowest tones before it does, so that they are not bent.
+The limiter adds no latency, so it looks ahead only to the end of its block. The gain falls early enough for a peak
+within the block, by at most 1 over `_ATTACK` samples. If a block begins with a peak, the gain falls as fast as needed,
+and samples are clipped to the ceiling until it is low enough. The signal between the last sample of a block and the
+first of the next is known only with the next block; a slowly recovering gain keeps these peaks small while sound
+continues. The gain stays down for about a period of the lowest tones before it recovers, so that they are not
+distorted.
 
-A sample that is not finite becomes silence here. Nothing before lets one arise; were it otherwise, a loudspeaker would
-be the wrong place to find out.
+Samples that are not finite are replaced by silence. Earlier stages should never produce any; this protects loudspeakers
+if one does.
 """
 
 import math
@@ -28,24 +30,25 @@ DoubleArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 CEILING = 10 ** (-1 / 20)
-"""-1 dB of full scale, true peak: the maximum permitted by EBU R 128, with room for what codecs and resamplers add."""
+"""-1 dB of full scale, true peak: the maximum permitted by EBU R 128, with headroom for codecs and resamplers."""
 
 _TAPS = 16
 _KAISER_BETA = 6.0
 _PHASES = 3  # between two samples
 _STEP = 16
-"""Samples between the points that the gain is a straight line between."""
+"""Samples between two points of the gain curve, which is a straight line between them."""
 _ATTACK = 64
 _HOLD_S = 0.02
 _AGAIN = 1.01
-"""A peak that asks for so little more than the gain there is keeps it down."""
+"""A peak that allows less than this factor times the current gain restarts the hold time."""
 _RELEASE_S = 0.2
 _AT_REST = 1e-5
-"""Of a gain that is so near to 1, the rest is let go: a ten-thousandth of a decibel."""
+"""When the gain is this close to 1, it is set to 1: a difference of a ten-thousandth of a decibel."""
 
 
 def _interpolators() -> FloatArray:
-    """(phase, tap): the signal a quarter, a half and three quarters of a sample after tap `_TAPS` / 2 - 1."""
+    """(phase, tap) filters that interpolate a quarter, a half and three quarters of a sample after tap `_TAPS` / 2
+    - 1."""
     offset = np.arange(_TAPS) - (_TAPS // 2 - 1) - np.arange(1, _PHASES + 1)[:, None] / (_PHASES + 1)
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1 - (offset / (_TAPS / 2)) ** 2)))
     rows = np.sinc(offset) * window
@@ -55,12 +58,12 @@ def _interpolators() -> FloatArray:
 class LimiterState(NamedTuple):
     """Everything that `limit` reads and writes."""
 
-    signal: FloatArray  # (channel, the last of the block before, and room for a block)
+    signal: FloatArray  # (channel, sample) the end of the previous block, then the current block
     table: FloatArray  # (phase, tap)
     peak: FloatArray  # (sample,)
     gain: DoubleArray  # at the ends of steps
-    held: IntArray  # (1,) steps since a peak asked for a gain
-    counts: IntArray  # (2,) whether the block last processed was changed; samples silenced so far
+    held: IntArray  # (1,) steps since a peak last needed a lower gain
+    counts: IntArray  # (2,) whether the last block was changed; samples silenced so far
     ceiling: float
     safe: float
     keep: float
@@ -68,7 +71,8 @@ class LimiterState(NamedTuple):
 
 
 class Limiter:
-    """Of blocks (channels, block_size), whose size is a multiple of 16. `state` is for compiled code to hand on."""
+    """Limits blocks (channels, block_size), whose size must be a multiple of 16. `state` can be passed to compiled
+    code."""
 
     def __init__(self, *, channels: int, block_size: int, sample_rate: int, ceiling: float = CEILING) -> None:
         if block_size % _STEP or not 0 < ceiling < math.inf:
@@ -78,12 +82,13 @@ class Limiter:
             signal=np.zeros((channels, _TAPS - 1 + block_size), np.float32),
             table=table,
             peak=np.zeros(block_size, np.float32),
-            # In double precision: in single, the last of a slow release is lost to rounding, and it never ends.
+            # Double precision: in single precision, the end of a slow release is lost to rounding, and the release
+            # never ends.
             gain=np.ones(block_size // _STEP + 1),
             held=np.zeros(1, np.int64),
             counts=np.zeros(2, np.int64),
             ceiling=float(np.float32(ceiling)),
-            # Up to here no signal reaches the ceiling between samples, whatever its phases.
+            # A signal below this level cannot reach the ceiling between samples, whatever its phases.
             safe=float(np.float32(ceiling / np.abs(table).sum(axis=-1).max())),
             keep=math.exp(-_STEP / (_RELEASE_S * sample_rate)),
             hold=round(_HOLD_S * sample_rate / _STEP),
@@ -91,19 +96,19 @@ class Limiter:
         self.state: Any = Reference(state)
 
     def reset(self) -> None:
-        """Forget what was heard before."""
+        """Forget the gain and all earlier samples."""
         for array in (self.state.signal, self.state.held, self.state.counts):
             array.fill(0)
         self.state.gain.fill(1)
 
     @property
     def acted(self) -> bool:
-        """Whether the block last processed was changed."""
+        """Whether the last block was changed."""
         return bool(self.state.counts[0])
 
     @property
     def samples_silenced(self) -> int:
-        """Since the beginning, because they were not finite."""
+        """How many samples so far were replaced by silence because they were not finite."""
         return int(self.state.counts[1])
 
     def process(self, block: FloatArray) -> None:
@@ -121,7 +126,7 @@ def limit(state: LimiterState, block: FloatArray) -> None:
 
 @compiled
 def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np.float32) -> tuple[bool, int]:
-    """Whether it would have been too loud, and how many samples were silenced."""
+    """Limit a block in place. Returns whether it would have been too loud, and how many samples were silenced."""
     signal, peak, gain = state.signal, state.peak, state.gain
     channels, size = block.shape
     before = signal.shape[1] - size
@@ -157,7 +162,7 @@ def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np
 
 @compiled
 def _is_within(samples: FloatArray, limit: np.float32) -> bool:
-    """Whether none is beyond; what is no number is."""
+    """Whether the magnitudes of all samples are within the limit; a NaN is not."""
     beyond = 0
     for channel in range(samples.shape[0]):
         for value in samples[channel]:
@@ -177,7 +182,7 @@ def _interpolate(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None
 
 @compiled
 def _raise_to(samples: FloatArray, peak: FloatArray) -> None:
-    """Have `peak` be no less than the magnitude of any sample."""
+    """Raise each value of `peak` to at least the magnitude of the sample."""
     for i in range(peak.size):
         peak[i] = max(peak[i], abs(samples[i]))
 
@@ -194,11 +199,11 @@ def _silence_what_is_not_finite(block: FloatArray) -> int:
 
 @compiled
 def _find_peaks(signal: FloatArray, table: FloatArray, peak: FloatArray) -> None:
-    """(sample,) the loudest of both channels at a sample, and between it and its neighbours as far as those are
-    known."""
+    """Write to `peak` (sample,) the largest magnitude over both channels, at each sample and between it and its
+    neighbours, as far as these are known."""
     size = peak.size
     ahead = _TAPS // 2
-    between = np.zeros(size, np.float32)  # after the samples from `ahead` before the block on
+    between = np.zeros(size, np.float32)  # starts `ahead` samples before the block
     read = np.zeros(size, np.float32)
     peak[:] = 0
     for channel in range(signal.shape[0]):
@@ -213,7 +218,7 @@ def _find_peaks(signal: FloatArray, table: FloatArray, peak: FloatArray) -> None
 
 @compiled
 def _follow(peak: FloatArray, ceiling: np.float32, keep: float, hold: int, gain: DoubleArray, held: IntArray) -> None:
-    """The gain at the ends of steps, from what it is at the beginning."""
+    """Compute the gain at the ends of steps from the gain at the beginning of the block."""
     steps = gain.size - 1
     for step in range(steps):
         allowed = float(ceiling) / max(float(ceiling), float(np.max(peak[step * _STEP : (step + 1) * _STEP])))

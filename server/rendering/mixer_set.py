@@ -1,8 +1,8 @@
-"""The mixers of one renderer: one for two ears of a head, one for one ear without, each made when it is wanted and let
-go when what was in it has rung out. The same goes for their convolvers.
+"""The mixers of one renderer: one for a head with two ears, one for a single ear without a head. Each mixer is made
+when it is needed and dropped when all sound in it has rung out; the same goes for its convolver.
 
-Making one takes milliseconds: `prepare` and `prepare_hearing` do it on another thread than the one that renders, which
-finds it made. Everything else is for the thread that renders.
+Making one takes milliseconds, so `prepare` and `prepare_hearing` do it on another thread before the rendering thread
+needs it. All other methods are for the rendering thread.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,8 @@ Slot = tuple[Mixer, int]
 
 
 class MixerSet:
-    """`new_direct` and `new_convolver` make those of so many channels."""
+    """The mixers of a renderer; `new_direct` and `new_convolver` take a number of channels and make the parts of a
+    mixer."""
 
     def __init__(
         self,
@@ -38,19 +39,19 @@ class MixerSet:
         self.clear()
 
     def clear(self) -> None:
-        """Drop all that sounds, and all mixers with it."""
+        """Drop all mixers and all sound in them."""
         self._mixers: dict[int, Mixer] = {}
         self._shares_tail = False
         self._orientation: Quaternion | None = None
-        self._leaving: list[Slot] = []  # ramp down in the next block
-        self._ringing: list[Slot] = []  # those gone since
-        self._hushed: list[Slot] = []  # whose IRs ring out
+        self._leaving: list[Slot] = []  # they ramp down in the next block
+        self._ringing: list[Slot] = []  # they have ramped down and ring out
+        self._hushed: list[Slot] = []  # only their IRs ring out
 
     def __iter__(self) -> Iterator[Mixer]:
         return iter(self._mixers.values())
 
     def prepare(self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None, same_from: int) -> PartitionedIr:
-        """An IR (1 or 2, samples) for the mixer of as many channels, as `Convolver.prepare` does.
+        """Prepare an IR (1 or 2, samples) for the mixer with the same number of channels, as `Convolver.prepare` does.
 
         Raises ValueError for another shape or a sample that is not finite.
         """
@@ -59,7 +60,7 @@ class MixerSet:
         return self.preparer(channels).prepare(ir, like=like, same_from=same_from)
 
     def preparer(self, channels: int) -> Convolver:
-        """That of the mixer of so many channels, or the one that it is to have."""
+        """The convolver of the mixer with this number of channels; made now if there is none yet."""
         known = self._mixers.get(channels)
         convolver = None if known is None else known.convolver
         if convolver is None:
@@ -69,12 +70,12 @@ class MixerSet:
         return convolver
 
     def prepare_hearing(self, channels: int) -> None:
-        """A mixer of so many channels, where there is none."""
+        """Make the mixer with this number of channels, unless it exists."""
         if channels not in self._mixers and channels not in self._spare_mixers:
             self._spare_mixers[channels] = self._new_mixer(channels)
 
     def of(self, channels: int) -> Mixer:
-        """The mixer of so many channels."""
+        """The mixer with this number of channels; made now if there is none yet."""
         if channels not in self._mixers:
             mixer = self._spare_mixers.pop(channels, None) or self._new_mixer(channels)
             if mixer.direct is not None and self._orientation is not None:
@@ -83,12 +84,12 @@ class MixerSet:
         return self._mixers[channels]
 
     def is_free(self, channels: int) -> bool:
-        """Whether nothing sounds in the mixer of so many channels."""
+        """Whether the mixer with this number of channels is free of sound."""
         mixer = self._mixers.get(channels)
         return mixer is None or len(mixer.free_slots) == self._slots
 
     def convolver_of(self, mixer: Mixer) -> Convolver:
-        """That of one of the mixers, which has one from now on."""
+        """The convolver of a mixer; made and connected now if there is none yet."""
         if mixer.convolver is None:
             convolver = self._spare_convolvers.pop(mixer.channels, None) or self._new_convolver(mixer.channels)
             convolver.share_tail(self._shares_tail)
@@ -111,11 +112,11 @@ class MixerSet:
 
     @property
     def rests(self) -> bool:
-        """Whether there is nothing to let go of but what an emitter is removed or handed over for."""
+        """Whether nothing is pending: nothing to let go of until an emitter is removed or moves to another mixer."""
         return len(self._mixers) == 1 and not (self._leaving or self._ringing or self._hushed)
 
     def leave(self, mixer: Mixer, slot: int, *, has_played: bool) -> None:
-        """Ramp down what a slot plays over the next block, and let it ring out."""
+        """Ramp a slot down over the next block, and let it ring out."""
         self._unhush(mixer, slot)
         if has_played:
             mixer.gain[1, slot] = 0.0
@@ -124,12 +125,12 @@ class MixerSet:
             mixer.release(slot)
 
     def hush(self, mixer: Mixer, slot: int) -> None:
-        """Send a slot to its IR no more, and let that ring out."""
+        """Stop sending a slot to its IR, and let the IR ring out."""
         mixer.send[1, slot] = 0.0
         self._hushed.append((mixer, slot))
 
     def resume(self, mixer: Mixer, slot: int, send: float, *, has_played: bool) -> None:
-        """Send a slot to the IR it has from now on, over the next block from silence if it plays already."""
+        """Send a slot to its current IR again; if the slot is already playing, fade the send in over the next block."""
         mixer.send[1, slot] = send
         if not self._unhush(mixer, slot) and has_played:
             mixer.send[0, slot] = 0.0
@@ -140,8 +141,8 @@ class MixerSet:
         return is_hushed
 
     def let_go(self, heard: set[Mixer], sending: set[Mixer]) -> None:
-        """After a block, of slots and IRs that have rung out; of mixers but those `heard`, through which there are
-        emitters or are to be; and of convolvers but those of mixers that are `sending` to IRs or are about to."""
+        """Free, after a block, the slots and IRs that have rung out. Also drop the mixers that are not in `heard` (with
+        emitters, now or soon), and the convolvers whose mixers are not in `sending` (to IRs, now or soon)."""
         for mixer, slot in self._leaving:
             mixer.stop(slot)
             self._ringing.append((mixer, slot))

@@ -1,10 +1,10 @@
-"""One listener's sound in so many channels: gains, direct paths and convolution, mixed in compiled code
-(`server.rendering.mixing_kernel`) or, in blocks of a size that it does not take, here.
+"""One listener's sound with a given number of channels: gains, direct paths and convolution. Compiled code
+(`server.rendering.mixing_kernel`) mixes it, or this module for block sizes that compiled code does not support.
 
-Slots are rows: what an emitter plays lies in `dry` (slot, block), is scaled by its gain for the direct path, and by its
-send besides for the convolver. Both reach what is wanted by the end of a block, along a raised cosine.
+Each emitter has a slot, which is a row of `dry` (slot, block). Its samples are scaled by its gain for the direct path,
+and by gain and send for the convolver. Both reach their wanted values by the end of a block, along a raised cosine.
 
-What nothing is sent to is not there: a mixer without a convolver has none and pays for none.
+A mixer has a convolver only while something is sent to it, and otherwise costs nothing for it.
 """
 
 from typing import TypeGuard
@@ -21,13 +21,14 @@ from server.rendering.sources import ClipPlayer, Source
 
 
 def is_read_by_compiled_code(source: Source) -> TypeGuard[ClipPlayer]:
-    """Of others, Python has to ask for each block."""
+    """Whether compiled code can read the source; for others, Python must fetch each block."""
     return isinstance(source, ClipPlayer)
 
 
 class Mixer:
-    """`gain` and `send` are (2, slot): in effect, and wanted. A slot that does not play adds nothing new. `is_compiled`
-    says whether compiled code mixes it, which convolves blocks of a power of two alone."""
+    """Mixes the sound of its slots. `gain` and `send` (2, slot): the values in effect, and the wanted values. A slot
+    that does not play adds nothing new. `is_compiled` says whether compiled code does the mixing; it requires blocks of
+    a power of two."""
 
     def __init__(self, *, channels: int, slots: int, block_size: int, direct: DirectPath | None) -> None:
         self.is_compiled = is_power_of_two(block_size)
@@ -52,13 +53,13 @@ class Mixer:
             self.address = int(self.record.ctypes.data)
 
     def connect(self, convolver: Convolver | None) -> None:
-        """Send to a convolver of as many sources and channels from the next block on, or to none."""
+        """Send to a convolver with the same numbers of sources and channels from the next block on, or to none."""
         self.convolver = convolver
         if self.is_compiled:
             enter_convolver(self.record, None if convolver is None else convolver.compiled)
 
     def take_slot(self) -> int | None:
-        """A slot that nothing is left of; None where there is none."""
+        """Reserve a slot that has rung out; None if there is none."""
         if not self.free_slots:
             return None
         slot = min(self.free_slots)
@@ -66,7 +67,7 @@ class Mixer:
         return slot
 
     def release(self, slot: int) -> None:
-        """Forget what a slot played and all that was sent on from it."""
+        """Free a slot: forget what it played and everything that was sent from it."""
         self.stop(slot)
         if self.convolver is not None:
             self.convolver.clear(slot)
@@ -81,22 +82,22 @@ class Mixer:
         )
 
     def has_no_response(self, slot: int) -> bool:
-        """Whether nothing is sent on from a slot, and all that was has rung out."""
+        """Whether nothing is sent from a slot to the convolver, and everything sent earlier has rung out."""
         return self.convolver is None or (not self.send[:, slot].any() and self.convolver.is_quiet(slot))
 
     def play(self, slot: int, source: Source) -> None:
-        """Have a slot play what a source makes, from the next block on. Compiled code reads clips by itself."""
+        """Play a source in a slot from the next block on. Compiled code reads clips itself."""
         self.plays[slot] = 1
         if self.is_compiled and is_read_by_compiled_code(source):
             self.clip[slot] = source.clip.ctypes.data
             self.clip_samples[slot], self.clip_at[slot], self.clip_loops[slot] = source.clip.size, 0, source.loop
-            self._clips[slot] = source.clip  # alive as long as it is played
+            self._clips[slot] = source.clip  # kept alive as long as it is played
         else:
             self._sources[slot] = source
 
     def take_over(self, slot: int, other: "Mixer", from_slot: int) -> None:
-        """Play what another mixer's slot plays, from the same sample on. That slot has one more block to play of it,
-        to fade out with."""
+        """Play the source of another mixer's slot, from the same sample on. The other slot gets one more block of it,
+        to fade out."""
         self.plays[slot] = 1
         if from_slot in other._clips:
             for mine, theirs in zip(self._clip_fields, other._clip_fields, strict=True):
@@ -111,7 +112,7 @@ class Mixer:
         return self.clip, self.clip_samples, self.clip_at, self.clip_loops
 
     def stop(self, slot: int) -> None:
-        """Have a slot fall silent."""
+        """Silence a slot at once."""
         self.plays[slot] = 0
         self.dry[slot] = 0
         if self.is_compiled and self.convolver is not None:
@@ -123,24 +124,25 @@ class Mixer:
 
     @property
     def plays_by_itself(self) -> bool:
-        """Whether none of its sources is one that Python has to ask."""
+        """Whether compiled code reads all of its sources, so that Python fetches none."""
         return not self._sources
 
     def fill(self) -> None:
-        """Have those sources play that Python has to ask."""
+        """Fetch the next block from the sources that compiled code cannot read."""
         for slot, source in self._sources.items():
             if slot not in self._followed:
                 source.process(self.dry[slot])
 
     def follow(self) -> None:
-        """After all are filled: a source that another mixer asked for this block has played it already."""
+        """Copy the blocks that another mixer fetched from a source that both play; call it after `fill` of all
+        mixers."""
         for slot, played in self._followed.items():
             np.copyto(self.dry[slot], played)
         self._followed.clear()
 
 
 def mix(mixer: Mixer) -> None:
-    """The next block of any size, in its `output`."""
+    """Compute the next block, of any size, and write it to the mixer's `output`."""
     plays = mixer.plays.astype(bool)
     mixer.dry[~plays] = 0
     mixer.dry *= _ramp(mixer.gain, mixer.fade_in)

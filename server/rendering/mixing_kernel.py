@@ -1,4 +1,4 @@
-"""The compiled part of `server.rendering.mixing`."""
+"""The compiled code of `server.rendering.mixing`."""
 
 from typing import Any
 
@@ -20,13 +20,13 @@ MIXER = np.dtype(
             "channels",
             "block_size",
             "plays",  # (slot,) int64
-            "clip",  # (slot,) int64: address of float32 samples that a slot plays, 0 where its row is filled for it
+            "clip",  # (slot,) int64: address of the float32 samples that a slot plays; 0 if Python fills its row
             "clip_samples",  # (slot,) int64
             "clip_at",  # (slot,) int64: next sample
             "clip_loops",  # (slot,) int64
             "dry",  # (slot, block_size) float32
-            "gain",  # (2, slot) float32
-            "send",  # (2, slot) float32
+            "gain",  # (2, slot) float32: in effect, and wanted
+            "send",  # (2, slot) float32: in effect, and wanted
             "sent",  # (slot, block_size) float32, the convolver's input; 0 for none
             "fade_in",  # (block_size,) float32
             "output",  # (channel, block_size) float32
@@ -40,8 +40,8 @@ MIXER = np.dtype(
 
 @compiled
 def mix(mixer, like: Reference | None) -> None:
-    """One block of what a MIXER record describes. `like` refers to any direct path's state, or is None where none has
-    one."""
+    """Mix one block as a MIXER record describes. `like` refers to any direct path's state; it is None if no mixer has a
+    direct path."""
     _play(mixer)
     _scale(mixer)
     if mixer.convolver != 0:
@@ -73,7 +73,7 @@ def _play(mixer) -> None:
         written = 0
         while written < size:
             count = min(size - written, samples[slot] - at[slot])
-            if count == 0:  # only once, and over
+            if count == 0:  # a clip that does not loop is over
                 dry[slot, written:] = 0
                 break
             dry[slot, written : written + count] = values[at[slot] : at[slot] + count]
@@ -85,7 +85,8 @@ def _play(mixer) -> None:
 
 @compiled
 def _scale(mixer) -> None:
-    """Apply gains in place, and send what is left to the convolver. Rows that play nothing are silent already."""
+    """Scale the rows by gain and send: the send goes to the convolver's input, the gain is applied in place. Rows that
+    play nothing are silent already."""
     slots, size = mixer.slots, mixer.block_size
     plays = carray(pointer(mixer.plays), (slots,), np.int64)
     gain = carray(pointer(mixer.gain), (2, slots), np.float32)
@@ -109,7 +110,7 @@ def _scale(mixer) -> None:
 
 
 def record_of(mixer: Any) -> npt.NDArray[np.void]:
-    """The MIXER record (1,) of a `server.rendering.mixing.Mixer`, which has to outlive it."""
+    """The MIXER record (1,) of a `server.rendering.mixing.Mixer`, which must outlive the record."""
     record = np.zeros(1, MIXER)
     record["slots"], record["block_size"] = mixer.dry.shape
     record["channels"] = mixer.output.shape[0]
@@ -120,7 +121,7 @@ def record_of(mixer: Any) -> npt.NDArray[np.void]:
 
 
 def enter_convolver(record: npt.NDArray[np.void], engine: Any) -> None:
-    """Have a MIXER record send to a `server.rendering.compiled_convolver.CompiledConvolver`, or to none."""
+    """Enter the `server.rendering.compiled_convolver.CompiledConvolver` to which a MIXER record sends, or none."""
     record["convolver"] = 0 if engine is None else engine.address
     record["sent"] = 0 if engine is None else engine.input.ctypes.data
     record["convolver_output"] = 0 if engine is None else engine.output.ctypes.data

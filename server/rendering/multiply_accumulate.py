@@ -1,13 +1,13 @@
 """The innermost loops of the compiled convolver: products of spectra and filters, summed over partitions.
 
-`stage` is a STAGE record, and layouts are as in `server.rendering.convolver_kernel`. Memory is what limits them: it is
-read in order and asked for ahead, by few streams at a time; a mix is read once for a group of sources, and sums stay in
-registers.
+`stage` is a STAGE record; layouts are as in `server.rendering.convolver_kernel`. Memory bandwidth limits the speed.
+Therefore memory is read in order and prefetched, in few streams at a time; a mix is read once for a group of sources,
+and sums stay in registers.
 
-Eight complex numbers are one vector of sixteen lanes, real parts in its first half and imaginary ones in the second, so
-that a product takes two steps: by the real parts of one factor twice, and by its imaginary parts crosswise, with
-opposed signs. Such a vector is one register with AVX-512 and two elsewhere, which is for loops alone that load more
-than they keep: two of each would not fit into the registers.
+Eight complex numbers are one vector of sixteen lanes, the real parts in its first half and the imaginary parts in the
+second. A product then takes two steps: multiply by the real parts of one factor, repeated in both halves, and by its
+imaginary parts, crosswise and with opposed signs. Such a vector is one register with AVX-512 and two elsewhere.
+Therefore it is used only in loops that load more than they keep in registers.
 """
 
 import numpy as np
@@ -32,31 +32,32 @@ _wide = lanes(16)
 load, broadcast, load_twice, load_opposed = _wide.load, _wide.broadcast, _wide.load_twice, _wide.load_opposed
 
 COLUMNS = TURNS + 1
-"""Of a mix: windows, by their number modulo TURNS, and what the IRs that are faded from add to the one at work."""
+"""Columns of a mix: one for each window, by its number modulo TURNS, and one (SURPLUS) for what the old IRs of a
+crossfade add to the current window."""
 SURPLUS = TURNS
 GROUP = 2
-"""Sources that are multiplied together at the most: the mix is read once for all of them, while each of them reads a
-few streams of its own. Four at a time take longer: those are too many streams."""
+"""The most sources that are multiplied together. The mix is read once for all of them, while each reads a few streams
+of its own; with four at a time the streams become too many, and it takes longer."""
 _SPECTRUM_AHEAD, _FILTER_AHEAD = 6 * LINE_BYTES, 16 * LINE_BYTES
 
 
 @compiled
 def mix_offset(channels, tile, channel, column) -> int:
-    """Where the real parts of a tile are in a mix; the imaginary ones follow."""
+    """Index of the real parts of a tile in a mix; the imaginary parts follow."""
     return 16 * (COLUMNS * (channels * tile + channel) + column)
 
 
 @compiled
 def spectrum_stride(size) -> int:
-    """From a spectrum of a ring to the next: one line further than it is long, since lines a power of two apart would
-    drive each other out of a cache."""
+    """Distance from one spectrum of a ring to the next: its length plus one cache line, because spectra a power of two
+    apart would evict each other from a cache."""
     return 2 * size + 16
 
 
 @compiled
 def filter_offset(channels, tiles, count, tile, partition) -> int:
-    """Where a tile is in a filter of `count` partitions: real and imaginary parts of the first channel, then of the
-    second."""
+    """Index of a tile in a filter of `count` partitions: the real and imaginary parts of the first channel, followed by
+    those of the second."""
     near = min(NEAR, count)
     if partition < near:
         return 16 * channels * (tiles * partition + tile)
@@ -65,43 +66,43 @@ def filter_offset(channels, tiles, count, tile, partition) -> int:
 
 @compiled
 def enter_member(stage, member, filters, count, ring) -> None:
-    """Have a source be in the group that is multiplied next: the address of its filter, of how many partitions, and of
-    its ring."""
+    """Enter one source of the group that is multiplied next: the address of its filter, the number of the filter's
+    partitions, and the address of its ring."""
     group = carray(pointer(stage.group), (GROUP, 3), np.int64)
     group[member, 0], group[member, 1], group[member, 2] = filters, count, ring
 
 
 @compiled
 def member_of(stage, member):
-    """What was entered."""
+    """The values that `enter_member` stored: filter, number of partitions, ring."""
     at = 3 * member
     return load_int(stage.group, at), load_int(stage.group, at + 1), load_int(stage.group, at + 2)
 
 
 @compiled
 def _multiply_add(total, real, opposed, filters, h):
-    """The sum of eight complex numbers, and of the product of eight others and what is in a filter."""
+    """Return `total` plus the complex product of eight bins with the filter's values at index `h`."""
     taps = load(filters, h)
     return multiply_add(opposed, swap_halves(taps), multiply_add(real, taps, total))
 
 
 @compiled
 def _add_to(mix, at, sums) -> None:
-    """Only sums meet the mix: added one by one to what is large already, products of many sources would lose more."""
+    """Add a finished sum to the mix. Adding each product to a mix that is already large would lose more precision."""
     store(mix, at, add(load(mix, at), sums))
 
 
 @compiled
 def _fetch_filter(filters, h) -> None:
-    """Have what a few tiles on are multiplied by come near. There are more streams than a processor follows by
-    itself, and with many listeners all of it lies in main memory."""
+    """Prefetch the filter values for a few tiles ahead. A processor cannot follow this many streams by itself, and with
+    many listeners all filters lie in main memory."""
     prefetch(filters + 4 * h + _FILTER_AHEAD)
     prefetch(filters + 4 * h + _FILTER_AHEAD + LINE_BYTES)
 
 
 @compiled
 def _step(near, tiles, channels, count, tile, partition) -> int:
-    """From a tile of a partition to that of the next one."""
+    """Distance in a filter from a tile of a partition to the next tile of that partition."""
     if partition + 1 == near:
         return filter_offset(channels, tiles, count, tile, near) - filter_offset(channels, tiles, count, tile, near - 1)
     return 16 * channels * (tiles if partition + 1 < near else 1)
@@ -109,8 +110,8 @@ def _step(near, tiles, channels, count, tile, partition) -> int:
 
 @compiled
 def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
-    """Add the products of the newest spectra of a group, in slot `newest` of their rings, to the mix of the window at
-    work, and of the `ahead` - 1 that follow it: with the first partition of their filters, the second and so on."""
+    """Multiply the newest spectra of a group, in slot `newest` of their rings, by the first `ahead` partitions of their
+    filters. The product with partition p is added to the mix of the window p after the current one."""
     mix, tiles, start = stage.mix, stage.size // 8, spectrum_stride(stage.size) * newest
     zero = broadcast(np.float32(0))
     for tile in range(first, last):
@@ -134,8 +135,8 @@ def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
 
 @compiled
 def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, column, first, last, sign) -> None:
-    """Add partitions `begin` to `end` of a filter, times `sign` and the spectra in the ring, to a column of the mix,
-    which is that of a window `ahead` of the one whose spectrum is in slot `newest`."""
+    """Multiply partitions `begin` to `end` of a filter by the spectra of the ring, and add the products, times `sign`,
+    to a column of the mix. The column belongs to the window `ahead` of the one whose spectrum is in slot `newest`."""
     mix, tiles, slots, factor = stage.mix, stage.size // 8, stage.slots, broadcast(sign)
     spectrum = spectrum_stride(stage.size)
     zero = broadcast(np.float32(0))
@@ -160,12 +161,12 @@ def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, 
 
 @compiled
 def add_turn(stage, channels, members, newest, first, last) -> None:
-    """Add all partitions of a group's filters, times the spectra in their rings from slot `newest` on, to the mix of
-    the window at work, and to those of the three that follow it what is known of them by now: from the first, second
-    and third partition on."""
+    """Multiply all partitions of a group's filters by the spectra in their rings, from slot `newest` on, and add the
+    products to the mix of the current window. Also add the products that are known by now to the mixes of the next
+    three windows: from the first, second and third partition on."""
     mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
     spectrum = spectrum_stride(stage.size)
-    other = 16 * COLUMNS * (channels - 1)  # from one channel to the other, which is the same if there is only one
+    other = 16 * COLUMNS * (channels - 1)  # distance from one channel to the other; 0 if there is only one
     zero = broadcast(np.float32(0))
     for tile in range(first, last):
         a = mix_offset(channels, tile, 0, stage.window % TURNS)

@@ -1,7 +1,7 @@
-"""What reaches a listener: the sum of its mixers, limited, the frames interleaved as they go over a wire.
+"""The output for a listener: the sum of its mixers, limited, with interleaved frames as they are sent.
 
-`mix_all` renders many listeners in one call without the interpreter's lock. To let go of that lock and to get it back
-costs little by itself; but where others want it, each time may mean to wait for them.
+`mix_all` renders many listeners in one call without the interpreter's lock. Releasing and taking the lock again costs
+little by itself, but each time may mean waiting for other threads.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from server.rendering.output_kernel import mixing_with, record_of
 
 
 class Output:
-    """So many channels for one listener; with a `ceiling`, no sample is beyond it."""
+    """The output of one listener with `channels` channels; with a `ceiling`, no sample exceeds it."""
 
     def __init__(self, *, channels: int, block_size: int, sample_rate: int, ceiling: float | None) -> None:
         self.channels = channels
@@ -29,18 +29,18 @@ class Output:
 
 
 class Rendered(NamedTuple):
-    """A block (channel, block_size), in an array of its own."""
+    """A rendered block (channel, block_size), in a new array."""
 
     samples: FloatArray
     is_exchange: bool
-    """Whether an impulse response was exchanged in it."""
+    """Whether an impulse response was exchanged in this block."""
     is_limited: bool
-    """Whether it would have been too loud, and was turned down."""
+    """Whether the block would have been too loud and was turned down."""
 
 
 def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer], int]]) -> list[list[Rendered]]:
-    """The next blocks of each, of its one or two mixers, and how many they are: more than one only where all mixers
-    play by themselves."""
+    """Render the next blocks of each listener from its one or two mixers. The number is how many blocks to render: more
+    than one only if all of its mixers read their sources by themselves."""
     mixers = [mixer for _, mixed, _ in listeners for mixer in mixed]
     for mixer in mixers:
         mixer.fill()
@@ -77,7 +77,7 @@ def _mix(output: Output, mixers: Sequence[Mixer]) -> Rendered:
     output.sum.fill(0)
     for mixer in mixers:
         mix(mixer)
-        # One ear without a head is as good as either of two; a head's two make one by their mean.
+        # One channel without a head is copied to both outputs; the two ears of a head are averaged to one output.
         output.sum += mixer.output if mixer.channels <= output.channels else mixer.output.mean(axis=0)
     if output.limiter is not None:
         output.limiter.process(output.sum)

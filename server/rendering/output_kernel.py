@@ -1,4 +1,4 @@
-"""The compiled part of `server.rendering.output`."""
+"""The compiled code of `server.rendering.output`."""
 
 from collections.abc import Callable
 from functools import cache
@@ -37,11 +37,11 @@ def mix_listeners(
     like: Reference | None,
     like_limiter: Reference | None,
 ) -> None:
-    """The next blocks of every row, in order. A row (6,) has the addresses of an OUTPUT record and two MIXER records,
-    the second 0 for none, how many blocks it gets, and of the first its row of `flags` (block, 2) and where it begins
-    in `frames`.
-    Flags say of a block whether an IR was exchanged in it, and whether it would have been too loud. `like` and
-    `like_limiter` refer to any direct path's state and any limiter's, or are None where there is none."""
+    """Render the next blocks of every row, in order. A row (6,) holds: the address of an OUTPUT record, the addresses
+    of two MIXER records (the second 0 for none), the number of blocks, the row of `flags` (block, 2) for the first
+    block, and the index in `frames` at which it begins. The flags of a block say whether an IR was exchanged in it, and
+    whether it would have been too loud. `like` and `like_limiter` refer to any direct path's state and any limiter's
+    state, or are None if there is none."""
     mode = flush_to_zero()
     for number in range(rows.shape[0]):
         output = carray(pointer(rows[number, 0]), (1,), OUTPUT)[0]
@@ -69,7 +69,8 @@ def mix_listeners(
 
 @compiled
 def _add(mixer, total) -> None:
-    """One ear without a head is as good as either of two; a head's two make one by their mean."""
+    """Add a mixer's output to the total. One channel without a head is copied to both outputs; the two ears of a head
+    are averaged to one output."""
     channels, size = total.shape
     made = carray(pointer(mixer.output), (mixer.channels, size), np.float32)
     for channel in range(channels):
@@ -84,8 +85,8 @@ def _add(mixer, total) -> None:
 
 @cache
 def mixing_with(kind: ReferenceType | None, limiter: ReferenceType | None) -> Callable[..., None]:
-    """`mix_listeners` for references of these kinds, which numba, called without, finds out in Python with every
-    call."""
+    """`mix_listeners` compiled for these types of reference. Calling it directly would let numba look up the types in
+    Python at every call."""
     signature = (
         types.Array(types.int64, 2, "C"),
         types.Array(types.float32, 1, "C"),
@@ -98,7 +99,7 @@ def mixing_with(kind: ReferenceType | None, limiter: ReferenceType | None) -> Ca
 
 
 def record_of(output: Any) -> npt.NDArray[np.void]:
-    """The OUTPUT record (1,) of a `server.rendering.output.Output`, which has to outlive it."""
+    """The OUTPUT record (1,) of a `server.rendering.output.Output`, which must outlive the record."""
     record = np.zeros(1, OUTPUT)
     record["channels"], record["block_size"] = output.sum.shape
     record["sum"] = output.sum.ctypes.data

@@ -1,4 +1,4 @@
-"""Impulse responses (IRs) in the layout that the compiled convolver multiplies."""
+"""Impulse responses (IRs) in the memory layout of the compiled convolver."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +20,7 @@ _PER_STAGE = 3
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _SHIFT = np.uint64(32)
 _POOL = ArrayPool(64 * 1024 * 1024)
-"""A few dozen responses of a second: each that is exchanged leaves what the next one needs."""
+"""Enough for a few dozen responses of one second: an exchanged response frees the memory that the next one needs."""
 
 
 def address(array: npt.NDArray[np.generic]) -> int:
@@ -29,10 +29,10 @@ def address(array: npt.NDArray[np.generic]) -> int:
 
 @dataclass(frozen=True)
 class PackedFilter:
-    """An IR (channel, sample) transformed for every stage; immutable, so threads may share it.
+    """An IR (channel, sample) transformed for every stage. Immutable, so threads may share it.
 
-    `header` holds, per stage, the address of its spectra, how many partitions they have, and the address of a digest of
-    each partition's samples.
+    `header` holds, per stage, the address of its spectra, how many partitions they have, and the address of the digests
+    of the partitions' samples.
     """
 
     header: IntArray
@@ -47,12 +47,14 @@ class PackedFilter:
 def pack(
     ir: FloatArray, partitioning: Partitioning, like: PackedFilter | None = None, same_from: int = 0
 ) -> PackedFilter:
-    """Transform an IR (channels, n), n >= 1, n <= the partitioning's; on any thread, which leaves the interpreter to
-    others for nearly all of it.
+    """Transform an IR (channels, n), with n from 1 to the partitioning's `ir_samples`. Any thread may call it; it
+    releases the interpreter's lock for nearly all of the work.
 
-    From sample `same_from` on it is that of which `like` was made, and so are the stages that begin there or later.
+    From sample `same_from` on, the IR must equal the one from which `like` was made; stages that begin there or later
+    are reused.
     """
-    ir = np.require(ir, np.float32, ["C", "A", "W"])  # of one kind, since every kind is compiled for
+    # one memory layout, because numba compiles for each layout separately
+    ir = np.require(ir, np.float32, ["C", "A", "W"])
     channels, samples = ir.shape
     header = np.zeros(_PER_STAGE * len(partitioning.stages), np.int64)
     spectra: list[FloatArray] = []
@@ -67,10 +69,10 @@ def pack(
             digests.append(like.digests[number])
             continue
         count = max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size)))
-        spectra.append(_POOL.floats(2 * stage.size * count * channels))  # all of it is written below
+        spectra.append(_POOL.floats(2 * stage.size * count * channels))  # every value is written below
         digests.append(all_digests[taken : taken + count])
         header[at : at + _PER_STAGE] = address(spectra[-1]), count, address(digests[-1])
-        made, taken = number + 1, taken + count  # those that are taken over come last
+        made, taken = number + 1, taken + count  # reused stages come last
     stages, _ = _stage_tables(partitioning)
     _pack(ir, ir.view(np.uint32), stages[:made], header, all_digests)
     return PackedFilter(header, tuple(spectra), tuple(digests))
@@ -78,8 +80,8 @@ def pack(
 
 @cache
 def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[odd_fft.Tables, ...]]:
-    """(stage, 5) where each begins, the size of its partitions, and the addresses of its transform's tables; and those
-    tables, so that they last as long."""
+    """(stage, 5) the start of each stage, the size of its partitions, and the addresses of its transform's tables; also
+    these tables, to keep them alive."""
     all_tables = tuple(odd_fft.tables(stage.size) for stage in partitioning.stages)
     rows = [
         (stage.start, stage.size, address(tables.twist), address(tables.passes), address(tables.lanes))
@@ -90,7 +92,8 @@ def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[odd_fft.T
 
 @compiled
 def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digests: IntArray) -> None:
-    """`words` are the bits of `ir`; `digests` are of all partitions of the stages, one after the other."""
+    """Transform an IR into the spectra of all stages. `words` are the bits of `ir`; `digests` covers all partitions of
+    the stages, one after the other."""
     channels, samples = ir.shape
     longest = stages[-1, 1] if len(stages) > 0 else 0
     room = np.zeros((4, longest), np.float32)
@@ -122,8 +125,8 @@ def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digest
 
 @compiled
 def _digest(words: Any, size: int, seed: Any) -> Any:
-    """Of bits, and zeros behind them up to `size`: the same of equal samples and of no others, but for one chance in
-    2^64. Four sums at a time, each step of which can be undone."""
+    """A digest of samples' bits, padded with zeros up to `size`: equal samples give equal digests, and different ones
+    do except with probability 2^-64. It computes four sums in parallel, each step of which is invertible."""
     a, b, c, d = seed, seed ^ _FACTOR, seed + _FACTOR, ~seed
     given = len(words)
     for n in range(0, size, 4):

@@ -1,10 +1,11 @@
 """How an impulse response (IR) is cut for convolution in real time: non-uniform, time-distributed partitions.
 
-Small partitions first, so that nothing is delayed; large ones later, because a partition costs the same per block
-however long it is (Gardner 1995; Wefers 2015, chapters 5 and 6). A stage of partitions of n samples transforms a window
-of 2 n, and has the time of another n to do it, a share in every block: so it may begin 2 n samples into the IR.
+Small partitions come first, so that nothing is delayed, and large ones later, because a partition costs the same per
+block whatever its length (Gardner 1995; Wefers 2015, chapters 5 and 6). A stage with partitions of n samples transforms
+a window of 2 n, and has the time of another n samples to do so, a share in every block. Therefore such a stage may
+begin only 2 n samples into the IR.
 
-Letters: b block size; a stage has partitions of `size` samples, `ticks` = size / b blocks long.
+Letters: b block size; a stage has partitions of `size` samples, which last `ticks` = size / b blocks.
 """
 
 from dataclasses import dataclass
@@ -14,13 +15,14 @@ _GROWTH = 4
 _STAGES = 3
 SMALLEST_BLOCK, LARGEST_BLOCK, BLOCK_STEP = 64, 8192, 16
 BLOCK_SIZES = f"a multiple of {BLOCK_STEP} from {SMALLEST_BLOCK} to {LARGEST_BLOCK}"
-"""What a renderer takes. Of powers of two compiled code convolves; of others, 480 for one, NumPy does, which is slower
-and no path for what has to be in time."""
+"""The block sizes that a renderer accepts. Compiled code convolves blocks of a power of two. NumPy convolves other
+sizes, for example 480, more slowly, and is not meant for real time."""
 TURNS = 4
-"""A source's filter is read once in so many windows, and multiplied for all of them
-(`server.rendering.multiply_accumulate`); the source's number modulo TURNS says when."""
+"""A source's filter is read once in this many windows, and multiplied for all of them
+(`server.rendering.multiply_accumulate`); the source's number modulo TURNS says in which."""
 NEAR = TURNS - 1
-"""First partitions of a stage, which lie by themselves: they are multiplied in the windows between, too."""
+"""How many first partitions of a stage are stored apart from the others: they are also multiplied in the windows
+between two turns."""
 
 
 def is_power_of_two(block_size: int) -> bool:
@@ -28,13 +30,13 @@ def is_power_of_two(block_size: int) -> bool:
 
 
 def is_block_size(block_size: int) -> bool:
-    """Whether a renderer takes it: see `BLOCK_SIZES`."""
+    """Whether a renderer accepts this block size: see `BLOCK_SIZES`."""
     return SMALLEST_BLOCK <= block_size <= LARGEST_BLOCK and block_size % BLOCK_STEP == 0
 
 
 @dataclass(frozen=True)
 class Stage:
-    """`partitions` partitions of `size` samples, the first at sample `start` of the IR."""
+    """One stage: `partitions` partitions of `size` samples each, the first at sample `start` of the IR."""
 
     size: int
     ticks: int
@@ -48,8 +50,8 @@ class Stage:
 
 @dataclass(frozen=True)
 class Partitioning:
-    """The stages of a convolver: b, 4 b and 16 b, as many of them as the longest IR needs. With `any_size`, b need not
-    be a power of two."""
+    """The stages of a convolver, with partitions of b, 4 b and 16 b; only as many stages as the longest IR needs. With
+    `any_size`, b need not be a power of two."""
 
     block_size: int
     ir_samples: int
@@ -80,12 +82,12 @@ class Partitioning:
 
     @property
     def history_blocks(self) -> int:
-        """Blocks of input to keep: three windows' worth of the largest stage, one of which is being filled."""
+        """Blocks of input to keep: three windows of the largest stage, of which one is being filled."""
         return 3 * self.stages[-1].ticks
 
     @property
     def quiet_blocks(self) -> int:
-        """Blocks of silence after which no window of any stage holds anything else, turns included, and nothing is left
-        to come out."""
+        """Blocks of silence after which every window of every stage is silent, turns included, so that no output is
+        left to come."""
         # guard: a convolver hears on until its longest window is empty
         return max(self.history_blocks, *((stage.partitions + 2 * TURNS) * stage.ticks for stage in self.stages))

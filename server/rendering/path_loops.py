@@ -1,6 +1,6 @@
-"""The loops over samples of the direct path, compiled.
+"""The sample loops of the direct path, compiled.
 
-Outputs of `filter_block` are a multiple of `TILE` long: accumulators stay in registers that long.
+Outputs of `filter_block` are a multiple of `TILE` long, so that its accumulators stay in registers.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ _LINE_BYTES = 64
 
 @compiled_in_place
 def filter_block(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None:
-    """out[i] = sum over k of taps[k] samples[i + len(taps) - 1 - k]"""
+    """Filter a block: out[i] = sum over k of taps[k] samples[i + len(taps) - 1 - k]."""
     x, h, y = samples.ctypes.data, taps.ctypes.data, out.ctypes.data
     last = taps.size - 1
     zero = broadcast(np.float32(0))
@@ -65,14 +65,14 @@ def filter_block(samples: FloatArray, taps: FloatArray, out: FloatArray) -> None
 
 
 def transform_tables(size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What `transform` and `synthesise` of `size` bins take."""
+    """The tables that `transform` and `synthesise` need for `size` bins: twist, passes, lanes."""
     tables = odd_fft.tables(size)
     return tables.twist, tables.passes, tables.lanes
 
 
 @compiled_in_place
 def transform(samples: FloatArray, twist: FloatArray, passes: FloatArray, lanes: FloatArray, bins: FloatArray) -> None:
-    """The spectrum (2, f) of the first 2 f samples."""
+    """Write the spectrum (2, f) of the first 2 f samples to `bins`."""
     size = bins.shape[1]
     first = int(samples.ctypes.data)
     second, to = first + 4 * size, int(bins.ctypes.data)
@@ -82,7 +82,8 @@ def transform(samples: FloatArray, twist: FloatArray, passes: FloatArray, lanes:
 
 @compiled_in_place
 def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: FloatArray, out: FloatArray) -> None:
-    """The second half (f,) of a window from its spectrum (2, f), which is used up."""
+    """Transform a spectrum (2, f) back and write the second half (f,) of its window to `out`. The spectrum is
+    overwritten."""
     size = mix.shape[1]
     bins = int(mix.ctypes.data)
     to = int(out.ctypes.data)
@@ -92,7 +93,7 @@ def synthesise(mix: FloatArray, twist: FloatArray, passes: FloatArray, lanes: Fl
 
 @compiled_in_place
 def accumulate(bins: FloatArray, filters: FloatArray, mix: FloatArray) -> None:
-    """Add the product of two spectra (2, f) to a third."""
+    """Multiply two spectra (2, f) and add the product to a third."""
     size = bins.shape[1]
     x, h, y = bins.ctypes.data, filters.ctypes.data, mix.ctypes.data
     for n in range(0, size, 8):
@@ -103,7 +104,7 @@ def accumulate(bins: FloatArray, filters: FloatArray, mix: FloatArray) -> None:
 
 @compiled_in_place
 def accumulate_change(bins: FloatArray, before: FloatArray, after: FloatArray, mix: FloatArray) -> None:
-    """`accumulate` by the difference of two filters, the one before less the one after."""
+    """Multiply a spectrum by the difference of two filters, `before` minus `after`, and add the product to the mix."""
     size = bins.shape[1]
     x, h, g, y = bins.ctypes.data, before.ctypes.data, after.ctypes.data, mix.ctypes.data
     for n in range(0, size, 8):
@@ -117,8 +118,8 @@ def accumulate_change(bins: FloatArray, before: FloatArray, after: FloatArray, m
 def read_at(
     line: FloatArray, first: IntArray, row: IntArray, share: FloatArray, table: FloatArray, out: FloatArray
 ) -> None:
-    """out[i] = the sinc of `row[i]`, and `share[i]` of the way to the next, over line[first[i] :]; for i a multiple
-    of 8."""
+    """Interpolate a delay line: out[i] = the product of line[first[i] :] with the sinc that lies `share[i]` of the way
+    from row `row[i]` of the table to the next. The length of `out` is a multiple of 8."""
     x, t, y = line.ctypes.data, table.ctypes.data, out.ctypes.data
     f, r, s = first.ctypes.data, row.ctypes.data, share.ctypes.data
     for i in range(0, out.size, 8):
@@ -139,7 +140,7 @@ def read_at(
 
 @compiled_in_place
 def _products(x: int, t: int, f: int, r: int, s: int, i: int):  # type: ignore[no-untyped-def]
-    """What the sinc of one sample adds to, in sixteen lanes."""
+    """The products of one sample with its interpolated sinc, in sixteen lanes that are still to be summed."""
     at, row, share = load_short_int(f, i), load_short_int(r, i) * _ROW, _broadcast_wide(s, i)
     total = multiply(multiply_add(share, _load_wide(t, row + TAPS), _load_wide(t, row)), _load_wide(x, at))
     for k in range(16, TAPS, 16):
@@ -160,14 +161,14 @@ def locate(
     row: IntArray,
     share: FloatArray,
 ) -> None:
-    """Where `read_at` reads sample i: (start + i - delay) modulo `ring`, the delay being the polynomial of `a` at
-    i + 1."""
+    """Compute the arguments with which `read_at` reads sample i at (start + i - delay) modulo `ring`, where the delay
+    is the polynomial with coefficients `a` at i + 1."""
     turn, last = float(ring), np.int32(PHASES - 1)
     for i in range(first.size):
         u = i + 1.0
         at = start + i - (a0 + u * (a1 + u * (a2 + u * a3)))
         at += 0.0 if at >= 0.0 else turn
-        # 32 bits, because processors convert several of those at once.
+        # 32 bits, because processors convert several such values at once.
         whole = np.int32(at)
         phase = (at - whole) * PHASES
         step = np.int32(phase)
@@ -179,10 +180,10 @@ def locate(
 
 @compiled_in_place
 def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, sums: FloatArray, taps: FloatArray) -> None:
-    """taps (2, n) of the minimum-phase filters whose folded cepstra are c: h = exp(c) as power series.
+    """Compute the taps (2, n) of minimum-phase filters from their folded cepstra c: h = exp(c) as a power series.
 
-    `cepstra` (2, n + 8) holds c[0] and then k c[k], `reciprocals` (n,) 1 and then 1 / k; `sums` (2, n + 8) is room for
-    n h[n] = sum over k of k c[k] h[n - k].
+    `cepstra` (2, n + 8) holds c[0] and then k c[k], `reciprocals` (n,) 1 and then 1 / k; `sums` (2, n + 8) is a buffer
+    for n h[n] = sum over k of k c[k] h[n - k].
     """
     count = taps.shape[1]
     width = cepstra.shape[1]
@@ -201,8 +202,8 @@ def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, sums: Float
 
 @compiled_in_place
 def fetch(samples: FloatArray, begin: int, end: int) -> None:
-    """Have samples be near when they are read soon: streams as short as a slot's are over before a processor sees that
-    they are streams."""
+    """Prefetch samples that are read soon. The arrays of one slot are so short that they end before a processor
+    recognises them as streams."""
     address = int(samples.ctypes.data)
     for at in range(address + 4 * begin, address + 4 * end, _LINE_BYTES):
         prefetch(at)
@@ -210,7 +211,8 @@ def fetch(samples: FloatArray, begin: int, end: int) -> None:
 
 @compiled_in_place
 def scale(samples: FloatArray, start: float, end: float, ramp: FloatArray) -> None:
-    """Multiply by what goes from `start` to `end` along `ramp` (b,); what is beyond the ramp stays."""
+    """Multiply samples by a gain that goes from `start` to `end` along `ramp` (b,); samples beyond the ramp stay
+    unchanged."""
     first, rise = np.float32(start), np.float32(end - start)
     for i in range(ramp.size):
         samples[i] *= first + rise * ramp[i]
@@ -224,7 +226,7 @@ def copy(values: FloatArray, out: FloatArray) -> None:
 
 @compiled_in_place
 def copy_spectrum(values: FloatArray, out: FloatArray) -> None:
-    """(2, f)"""
+    """Copy a spectrum (2, f) to `out`."""
     for part in range(2):
         copy(values[part], out[part])
 
@@ -257,7 +259,7 @@ def add_scaled(values: FloatArray, factor: float, out: FloatArray) -> None:
 
 @compiled_in_place
 def add_fading(block: FloatArray, fade: FloatArray, out: FloatArray) -> None:
-    """Add a block that fades out as `fade` rises."""
+    """Add a block to `out`, faded out as `fade` rises."""
     for i in range(out.size):
         out[i] += (np.float32(1) - fade[i]) * block[i]
 
@@ -270,14 +272,15 @@ def add_faded(before: FloatArray, after: FloatArray, fade: FloatArray, out: Floa
 
 @compiled_in_place
 def shift(samples: FloatArray, by: int, count: int) -> None:
-    """samples[:count] = what is `by` further on; the two may overlap."""
+    """Set samples[:count] to the values `by` samples further on; the two ranges may overlap."""
     for i in range(count):
         samples[i] = samples[i + by]
 
 
 @compiled_in_place
 def interpolate_reversed(row: FloatArray, share: float, taps: FloatArray) -> None:
-    """A row of the table and `share` of the way to the next, for `filter_block`, which takes the last tap first."""
+    """The taps `share` of the way from a row of the table to the next, in reverse order as `filter_block` needs
+    them."""
     scalar = np.float32(share)
     for k in range(TAPS):
         taps[TAPS - 1 - k] = row[k] + scalar * row[TAPS + k]
@@ -290,5 +293,5 @@ def is_silent(block: FloatArray) -> bool:
     some = np.int32(0)
     for i in range(bits.size):
         some |= bits[i]
-    # The sign apart: doubling drops it.
+    # Doubling drops the sign bit.
     return bool(np.int32(some << np.int32(1)) == 0)

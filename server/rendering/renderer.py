@@ -1,18 +1,18 @@
-"""What one listener hears of many emitters: each one's direct sound, which follows poses in every block, and what
-follows it, convolved with impulse responses (IRs) that come at their own rate.
+"""The sound that one listener receives from many emitters: the direct sound of each, which follows poses in every
+block, and the reflected sound, convolved with impulse responses (IRs) that arrive at their own rate.
 
-The renderer knows neither scenes nor fields. Whoever calls it hands in where sound comes from (`PathTarget`) and IRs
-that begin after the direct sound, with a token that says what they stand for, and asks which token a block was rendered
-with. Its output is a function of the calls and of the blocks between which they were made, to the last bit: a live
-session and an offline render that make the same calls at the same sample clock give the same samples.
+The renderer knows neither scenes nor fields. Its caller passes the path of each direct sound (`PathTarget`) and IRs
+that begin after the direct sound. Each IR comes with a token that identifies it, and the renderer reports which token
+was used in a block. The output depends only on the calls and on the blocks between which they were made, to the last
+bit: a live session and an offline render that make the same calls at the same sample clock give the same samples.
 
-Whatever changes does so without a click: an IR by a crossfade, a path by Doppler and crossfades, a gain by a ramp, a
-removed emitter by a ramp of its input to zero, after which its reverberation rings out. An added emitter begins at the
+Every change is free of clicks: an IR changes by a crossfade, a path by Doppler shift and crossfades, a gain by a ramp.
+A removed emitter's input is ramped to zero, after which its reverberation rings out. An added emitter begins at the
 first sample of its source.
 
-What nobody asked for is not there. The convolver comes with the first IR and goes when the last has rung out; without a
-head, paths and IRs have one channel. Heard with a head and without one, an emitter fades from one to the other at the
-input: what it played before rings out the way it was heard.
+Parts that are not needed do not exist. The convolver is made with the first IR and dropped when the last has rung out;
+without a head, paths and IRs have one channel. When an emitter moves between hearing with and without a head, its input
+fades from one mixer to the other, and what it played before rings out in the old one.
 
 `render_all` renders many listeners in one call without the interpreter's lock.
 """
@@ -38,15 +38,16 @@ from server.rendering.sources import Source
 
 
 class UnknownEmitterError(NafirError):
-    """No emitter of that id is present."""
+    """No emitter has this id."""
 
 
 class DuplicateEmitterError(NafirError):
-    """An emitter of that id is present already."""
+    """An emitter already has this id."""
 
 
 class RendererFullError(NafirError):
-    """No room for one more emitter: the most allowed are present, or removed ones ring out in every spare slot."""
+    """There is no room for another emitter: the maximum is present, or removed ones are still ringing out in every
+    spare slot."""
 
 
 @dataclass
@@ -59,20 +60,22 @@ class _Emitter:
     next_token: int | None = None
     send: float = 1.0
     has_ir: bool = False
-    """Whether it has one that is to be heard; one that is not may still ring out."""
+    """Whether it has an IR that is in use; an IR that was dropped may still ring out."""
     has_path: bool = False
     has_played: bool = False
 
 
 class Renderer:
-    """One listener, at most `max_emitters` emitters, `outputs` channels: two ears (0 is the left one), or one.
+    """Renders one listener with at most `max_emitters` emitters and `outputs` channels: two ears (0 is the left one),
+    or one.
 
-    `filters` are the head that direct paths are heard through, at `sample_rate`; without them there are only IRs, which
-    then carry the direct sound too. `air_db_per_m` (7,) is what air absorbs per octave band. With a `ceiling` no sample
-    of the output is beyond it (`server.rendering.limiter`). `has_head` says whether to begin with a head. Raises
-    ValueError for a `block_size` that is none of `BLOCK_SIZES`.
+    `filters` are the head for direct paths, at `sample_rate`; without them there are only IRs, which must then include
+    the direct sound. `air_db_per_m` (7,) is the absorption of air per octave band. With a `ceiling`, no sample of the
+    output exceeds it (`server.rendering.limiter`). `has_head` says whether to begin with a head. Raises ValueError for
+    a `block_size` that is not one of `BLOCK_SIZES`.
 
-    One thread at a time may use it, except `prepare` and `prepare_hearing`, which one other thread may call meanwhile.
+    Only one thread at a time may use it, except `prepare` and `prepare_hearing`, which one other thread may call
+    meanwhile.
     """
 
     def __init__(
@@ -97,7 +100,7 @@ class Renderer:
         self.ir_samples = ir_samples
         self.max_emitters = max_emitters
         self.outputs = outputs
-        # As many slots again for removed emitters, which hold theirs until their reverberation has rung out.
+        # Twice the number of emitters: a removed emitter keeps its slot until its reverberation has rung out.
         slots = 2 * max_emitters
 
         def direct_of(channels: int) -> DirectPath | None:
@@ -125,12 +128,12 @@ class Renderer:
 
         self._mixers = MixerSet(slots=slots, block_size=block_size, new_direct=direct_of, new_convolver=convolver_of)
         self._mixer = self._mixers.of(2 if has_head else 1)
-        """What new emitters are heard through."""
+        """The mixer for new emitters."""
         self._output = Output(channels=outputs, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
         self._emitters: dict[str, _Emitter] = {}
         self._changed: list[_Emitter] = []  # since the last block
         self.exchanged = False
-        """Whether an IR was exchanged in the block last rendered."""
+        """Whether an IR was exchanged in the last block."""
         self._blocks_rendered = 0
 
     @property
@@ -140,7 +143,7 @@ class Renderer:
 
     @property
     def runs_by_itself(self) -> bool:
-        """Whether several blocks may be rendered in one call: nothing has to be looked after between them."""
+        """Whether several blocks may be rendered in one call, because nothing has to be done between them."""
         return (
             self._mixers.rests
             and all(mixer.is_compiled and mixer.plays_by_itself for mixer in self._mixers)
@@ -149,29 +152,32 @@ class Renderer:
 
     @property
     def samples_silenced(self) -> int:
-        """Rendered so far that were not finite, which none should be; they were made silence."""
+        """How many output samples so far were not finite and were replaced by silence; it should always be 0."""
         limiter = self._output.limiter
         return 0 if limiter is None else limiter.samples_silenced
 
     @property
     def convolvers(self) -> int:
-        """How many there are: one where IRs are heard, for a while two where a head was put on or taken off."""
+        """How many convolvers exist: one while IRs are in use, and two for a while after switching between hearing with
+        and without a head."""
         return sum(mixer.convolver is not None for mixer in self._mixers)
 
     @property
     def channels(self) -> int:
-        """What new emitters are heard with: two ears of a head, or one without."""
+        """The number of channels for new emitters: 2 for a head, 1 for a single ear without one."""
         return self._mixer.channels
 
     def applied(self, emitter_id: str) -> int | None:
-        """Token of the IR in effect, in its head, at the end of the block last rendered; None before the first."""
+        """The token of the IR that the head of the convolver used at the end of the last block; None before the
+        first."""
         return self._emitter(emitter_id).token
 
     def prepare(
         self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None = None, same_from: int = 0
     ) -> PartitionedIr:
-        """Make an IR (1 or 2, 1..ir_samples) ready for `set_ir`: most of its cost, on any thread; less of it where the
-        IR is, from sample `same_from` on, that of which `like` was made. One channel is for ears without a head.
+        """Prepare an IR (1 or 2, 1..ir_samples) for `set_ir`. This is most of its cost, and any thread may do it. It
+        costs less if the IR equals, from sample `same_from` on, the IR from which `like` was made. One channel is for
+        hearing without a head.
 
         Raises ValueError for another shape or a sample that is not finite.
         """
@@ -179,30 +185,32 @@ class Renderer:
 
     @property
     def preparation(self) -> Hashable:
-        """Renderers of which this is equal prepare IRs of two channels alike, and may share them."""
+        """A key that is equal for renderers which prepare IRs of two channels in the same way and may share them."""
         return self._mixers.preparer(2).preparation
 
     def prepare_hearing(self, channels: int) -> None:
-        """Make ready for `set_channels`, on any thread."""
+        """Prepare for `set_channels`, on any thread."""
         self._mixers.prepare_hearing(channels)
 
     def set_channels(self, channels: int) -> None:
-        """Have emitters without IRs, and those to come, be heard by two ears of a head, or by one of none. Those that
-        have an IR follow with the first one of so many channels."""
+        """Switch to hearing with a head (2 channels) or without one (1) for new emitters and those without IRs. An
+        emitter that has an IR follows with its first IR of this number of channels."""
         self._mixer = self._mixers.of(channels)
         for emitter in self._emitters.values():
             if not emitter.has_ir and emitter.mixer is not self._mixer:
                 self._hand_over(emitter, self._mixer)
 
     def can_hear_with(self, channels: int) -> bool:
-        """Whether there is room for every emitter to be heard so: what was heard that way before has rung out."""
+        """Whether there is room for all emitters to be heard with this number of channels: earlier sound in that mixer
+        has rung out."""
         return channels == self._mixer.channels or self._mixers.is_free(channels)
 
     def add_emitter(self, emitter_id: str, source: Source, *, gain: float = 1.0, awaits_ir: bool = True) -> None:
         """Add an emitter that plays `source`, scaled by `gain` (linear amplitude, within `LOUDEST_GAIN`).
 
-        It is silent, its source waiting, until it has an IR, if it `awaits_ir`, and, where direct paths are heard, a
-        path. Raises DuplicateEmitterError, RendererFullError, and ValueError for a gain that would overflow.
+        With `awaits_ir` it is silent and its source waits until it has an IR; where direct paths are rendered, it also
+        waits for a path. Raises DuplicateEmitterError, RendererFullError, and ValueError for a gain that would
+        overflow.
         """
         # guard: a refused gain leaves no emitter behind
         require_gain(gain)
@@ -231,14 +239,14 @@ class Renderer:
         self._mixers.leave(emitter.mixer, emitter.slot, has_played=emitter.has_played)
 
     def set_gain(self, emitter_id: str, gain: float) -> None:
-        """Reach a linear gain by the end of the next block. Raises UnknownEmitterError, and ValueError for a gain that
-        would overflow."""
+        """Set a linear gain, reached by the end of the next block. Raises UnknownEmitterError, and ValueError for a
+        gain that would overflow."""
         emitter = self._emitter(emitter_id)
         self._reach(emitter.mixer.gain, emitter, gain)
 
     def set_reverberation_gain(self, emitter_id: str, gain: float) -> None:
-        """Reach a linear gain of what is convolved, beside that of the emitter, by the end of the next block: an
-        emitter that beams sends a room less than it sends ahead. Raises UnknownEmitterError."""
+        """Set an additional linear gain for the convolved sound only, reached by the end of the next block: a
+        directional emitter sends less into the room than ahead. Raises UnknownEmitterError."""
         emitter = self._emitter(emitter_id)
         emitter.send = gain
         if emitter.has_ir or not emitter.has_played:
@@ -251,10 +259,11 @@ class Renderer:
             gains[0, emitter.slot] = gain
 
     def set_ir(self, emitter_id: str, ir: npt.NDArray[np.floating] | PartitionedIr, token: int | None = None) -> None:
-        """Hand in an IR for the next block, which starts the emitter or, if it sounds already, crossfades to that IR.
+        """Set the IR from the next block on. This starts the emitter or, if it is already playing, crossfades to the
+        new IR.
 
-        Of several handed in before it, the newest counts. One with other channels than the emitter is heard by has it
-        heard by those. Raises UnknownEmitterError, and ValueError as `prepare`.
+        If several are set before the same block, the newest counts. An IR with a different number of channels moves the
+        emitter to the mixer with that number. Raises UnknownEmitterError, and ValueError as `prepare`.
         """
         emitter = self._emitter(emitter_id)
         prepared = ir if isinstance(ir, PartitionedIr) else self.prepare(ir)
@@ -269,7 +278,8 @@ class Renderer:
         self._changed.append(emitter)
 
     def drop_ir(self, emitter_id: str) -> None:
-        """Send an emitter to its IR no more, which rings out; it goes on without. Raises UnknownEmitterError."""
+        """Stop sending an emitter to its IR, which rings out; its direct sound continues. Raises
+        UnknownEmitterError."""
         emitter = self._emitter(emitter_id)
         emitter.awaits_ir = False
         if emitter.has_ir:
@@ -278,11 +288,11 @@ class Renderer:
         self._changed.append(emitter)
 
     def share_tail(self, is_shared: bool) -> None:
-        """Have all emitters share one late tail, or none; only of a renderer that switches tails."""
+        """Make all emitters share one late tail, or give each its own. Only for a renderer that switches tails."""
         self._mixers.share_tail(is_shared)
 
     def set_path(self, emitter_id: str, target: PathTarget) -> None:
-        """Have the direct sound come along a path from the next block on. Raises UnknownEmitterError."""
+        """Set the path of an emitter's direct sound from the next block on. Raises UnknownEmitterError."""
         gains_db = np.asarray(target.band_gain_db)
         self.set_paths(
             [emitter_id], np.array([target.length_m]), np.asarray(target.arrival)[np.newaxis], gains_db[np.newaxis]
@@ -295,7 +305,8 @@ class Renderer:
         arrivals: npt.NDArray[np.floating],
         band_gains_db: npt.NDArray[np.floating],
     ) -> None:
-        """`set_path` of several emitters at once: lengths (n,), unit vectors of arrival (n, 3), gains (n, band)."""
+        """Call `set_path` for several emitters at once: lengths (n,), unit vectors of arrival (n, 3), gains (n,
+        band)."""
         emitters = [self._emitter(emitter_id) for emitter_id in emitter_ids]
         for emitter in emitters:
             if not emitter.has_path:
@@ -312,23 +323,23 @@ class Renderer:
                 mixer.direct.set_targets(slots, lengths_m[rows], arrivals[rows], band_gains_db[rows])
 
     def enable_direct(self, emitter_id: str, *, is_heard: bool = True, distance: bool = True, air: bool = True) -> None:
-        """Whether an emitter's direct sound is heard by itself, and loses anything with distance and to the air; fades
-        over the next block. Raises UnknownEmitterError."""
+        """Set whether an emitter's direct sound is rendered along its path, and whether distance and air attenuate it.
+        The change fades over the next block. Raises UnknownEmitterError."""
         emitter = self._emitter(emitter_id)
         if emitter.mixer.direct is not None:
             emitter.mixer.direct.set_muted(emitter.slot, not is_heard)
             emitter.mixer.direct.set_losses(emitter.slot, distance=distance, air=air)
 
     def set_orientation(self, orientation: Quaternion) -> None:
-        """Turn the listener's head: the direct sound follows with the next block."""
+        """Turn the listener's head from the next block on."""
         self._mixers.set_orientation(orientation)
 
     def process(self) -> FloatArray:
-        """Render the next block (channel, block_size), in an array of its own."""
+        """Render the next block (channel, block_size) into a new array."""
         return render_all([self])[0].samples
 
     def reset(self) -> None:
-        """Drop every emitter and its reverberation, and start the clock again."""
+        """Drop all emitters and their reverberation, and reset the clock to 0."""
         # guard: a reset forgets what sounded
         self._mixers.clear()
         if self._output.limiter is not None:
@@ -339,7 +350,7 @@ class Renderer:
         self._blocks_rendered = 0
 
     def _begin(self) -> tuple[Output, list[Mixer]]:
-        """Put into effect what was handed in since the last block."""
+        """Apply the changes that were requested since the last block."""
         for emitter in self._changed:
             has_response = emitter.has_ir or not emitter.awaits_ir
             if has_response and (emitter.has_path or emitter.mixer.direct is None):
@@ -351,7 +362,7 @@ class Renderer:
         return self._output, list(self._mixers)
 
     def _finish(self, blocks: Sequence[Rendered]) -> None:
-        """Let go of what has rung out."""
+        """Free everything that has rung out."""
         self._blocks_rendered += len(blocks)
         self.exchanged = any(block.is_exchange for block in blocks)
         if self._mixers.rests:
@@ -361,8 +372,7 @@ class Renderer:
         self._mixers.let_go({self._mixer, *(emitter.mixer for emitter in emitters)}, sending)
 
     def _hand_over(self, emitter: _Emitter, mixer: Mixer) -> None:
-        """Have an emitter be heard through another mixer: over the next block its sound fades out of the one and into
-        the other."""
+        """Move an emitter to another mixer: over the next block its sound fades out of the one and into the other."""
         slot = mixer.take_slot()
         if slot is None:
             raise RendererFullError("too many emitters heard this way before still ring out")
@@ -385,9 +395,9 @@ class Renderer:
 
 
 def render_all(renderers: Sequence[Renderer]) -> list[Rendered]:
-    """Render the next block of each, all in one call without the interpreter's lock. One that `runs_by_itself` may
-    stand there several times, in a row, and gets as many blocks: of all that they read, those after the first find much
-    in the caches."""
+    """Render the next block of each renderer, all in one call without the interpreter's lock. A renderer that
+    `runs_by_itself` may be listed several times in a row, and then renders that many blocks: the later ones find much
+    of their data in the caches."""
     runs = [(renderer, sum(1 for _ in same)) for renderer, same in groupby(renderers)]
     made = mix_all([(*renderer._begin(), count) for renderer, count in runs])
     for (renderer, _), blocks in zip(runs, made, strict=True):

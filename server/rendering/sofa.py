@@ -1,4 +1,4 @@
-"""Head-related impulse responses as a SOFA file holds them (AES69, convention SimpleFreeFieldHRIR).
+"""Head-related impulse responses in a SOFA file (AES69, convention SimpleFreeFieldHRIR).
 
 Directions are unit vectors in the head's frame: x ahead, y left, z up.
 """
@@ -33,7 +33,8 @@ class HrtfError(NafirError):
 
 @dataclass(frozen=True)
 class HeadMeasurements:
-    """`directions` (d, 3), no two the same; `responses` (d, receiver, sample), `Data.Delay` applied."""
+    """Measured responses of a head: `directions` (d, 3), all different; `responses` (d, receiver, sample), with
+    `Data.Delay` applied."""
 
     directions: _Floats
     responses: _Floats
@@ -41,7 +42,8 @@ class HeadMeasurements:
 
 
 def read_sofa(path: Path) -> HeadMeasurements:
-    """Of directions measured at several distances, the farthest is taken: the closest to a plane wave.
+    """Read the measurements of a file. If a direction was measured at several distances, the farthest is used, which is
+    the closest to a plane wave.
 
     Raises HrtfError for anything but finite two-ear responses of at least `FEWEST_DIRECTIONS` directions.
     """
@@ -71,7 +73,8 @@ def read_sofa(path: Path) -> HeadMeasurements:
 
 
 def _responses(sofa: SofaFile) -> _Floats:
-    """(measurement, ear, sample), shifted by `Data.Delay` (1 or measurement, ear), the least delay being 0."""
+    """The responses (measurement, ear, sample), shifted by `Data.Delay` (1 or measurement, ear) such that the least
+    delay is 0."""
     responses = sofa.numbers("Data_IR")
     sofa.require("Data_IR", responses.ndim == 3 and 0 not in responses.shape, f"has shape {responses.shape}")
     count, ears, samples = responses.shape
@@ -84,18 +87,18 @@ def _responses(sofa: SofaFile) -> _Floats:
     if not delays.any():
         return responses
     longest = delays.max()
-    sofa.require("Data_Delay", longest < 10 * samples + 10_000, "is not finite, or too long")  # NaN too
+    sofa.require("Data_Delay", longest < 10 * samples + 10_000, "is not finite, or too long")  # false for NaN too
     return np.concatenate([delay_rows(responses[part], delays[part], longest) for part in portions(count)])
 
 
 def portions(count: int) -> list[slice]:
-    """Of `count` directions: what is computed of all of them is computed of some at a time, in bounded memory."""
+    """Slices that cover `count` directions, so that work on all of them is done in portions of bounded memory."""
     return [slice(start, start + _PORTION) for start in range(0, count, _PORTION)]
 
 
 def _offsets(sofa: SofaFile, measurements: int) -> _Floats:
-    """(measurement, xyz) from the listener to the source, in the listener's frame."""
-    # Some files leave the distance at zero.
+    """Vectors (measurement, xyz) from the listener to the source, in the listener's frame."""
+    # Some files set the distance to zero.
     source = sofa.points("SourcePosition", measurements, default="spherical", unknown_radius_m=1.0)
     listener = sofa.points("ListenerPosition", measurements, fallback=[0.0, 0.0, 0.0], default="cartesian")
     return np.asarray(np.einsum("mx,mxa->ma", source - listener, sofa.frames("Listener", measurements)))
@@ -103,9 +106,9 @@ def _offsets(sofa: SofaFile, measurements: int) -> _Floats:
 
 def _farthest(directions: _Floats, distance: _Floats) -> npt.NDArray[np.int64]:
     """Indices of one measurement per direction, in the order of the file."""
-    from scipy.spatial import cKDTree  # a tenth of a second
+    from scipy.spatial import cKDTree  # takes a tenth of a second
 
-    # Of those that agree to rounding, which may be very many, one is left to compare with its neighbours.
+    # Of directions that are equal after rounding, which may be very many, only one is compared with its neighbours.
     order = np.lexsort((np.arange(len(directions)), -distance))
     _, first = np.unique(np.round(directions[order] / _ROUNDING), axis=0, return_index=True)
     chosen = np.sort(order[first])

@@ -1,9 +1,9 @@
-"""A SOFA file (AES69), variable by variable, each by its own Type and Units.
+"""A reader for SOFA files (AES69), variable by variable, each with its own Type and Units.
 
 Published files differ from the defaults of their convention, and from its spelling.
 
 Axes as in the standard: x ahead, y left, z up; azimuth counter-clockwise from +x, elevation from the horizontal plane.
-`sofar` takes a third of a second to import, so it is imported where a file is read.
+`sofar` takes a third of a second to import, so it is imported only where a file is read.
 """
 
 import threading
@@ -19,13 +19,13 @@ from server.core.errors import NafirError
 _Floats = npt.NDArray[np.float64]
 
 SLOWEST_RATE_HZ, FASTEST_RATE_HZ = 4_000.0, 768_000.0
-"""No response of audio was measured at another rate; what says so has its unit wrong."""
+"""Real responses are measured at rates in this range; a file with another rate has its unit wrong."""
 MOST_BYTES = 8 * 2**30
-"""Of a file's variables, unpacked to 64 bits."""
+"""The maximum size of a file's variables, unpacked to 64 bits."""
 
 _ONE_READER = threading.Lock()
-"""HDF5's C library keeps global state without a lock of its own (unless it is built thread-safe, and the wheels of
-netCDF4 are not): two threads in it at once end the process now and then."""
+"""HDF5's C library keeps global state without a lock of its own (unless it is built thread-safe, which netCDF4's wheels
+are not): two threads in it at once sometimes crash the process."""
 
 _LENGTHS_M = {
     **dict.fromkeys(("metre", "metres", "meter", "meters", "m"), 1.0),
@@ -46,7 +46,7 @@ _FARTHEST_ROUND_RAD = 4 * np.pi + 0.01
 
 
 class SofaError(NafirError):
-    """A SOFA file that cannot be read as one; names the variable and what is wrong with it."""
+    """A file that cannot be read as SOFA; names the variable and what is wrong with it."""
 
     def __init__(self, path: Path, variable: str, problem: str) -> None:
         super().__init__(f"{path}: {variable}: {problem}")
@@ -57,15 +57,15 @@ class SofaError(NafirError):
 
 @dataclass(frozen=True)
 class SofaFile:
-    """The variables of a file as stored. Every method raises SofaError that names the variable."""
+    """The variables of a file as stored. Every method raises SofaError, which names the variable."""
 
     path: Path
     content: Any
 
     @classmethod
     def open(cls, path: Path) -> "SofaFile":
-        """Of threads that open files at once, each waits for the one before."""
-        if path.suffix != ".sofa":  # sofar would open another file: it replaces any other suffix
+        """Open a file; only one thread at a time does so, and others wait."""
+        if path.suffix != ".sofa":  # sofar replaces any other suffix, and would open another file
             raise SofaError(path, "file", "a SOFA file's name ends in .sofa")
         if not path.is_file():
             raise SofaError(path, "file", "no such file")
@@ -82,29 +82,30 @@ class SofaFile:
                 claimed = sum(8 * int(variable.size) for variable in file.variables.values())
             if claimed > MOST_BYTES:
                 raise SofaError(path, "file", f"its variables claim {claimed / 1e9:.1f} GB; split the file")
-            # As stored: sofar's check of a whole file refuses harmless faults that published files are full of.
+            # Read it as stored: sofar's check of a whole file refuses harmless faults that are common in published
+            # files.
             return cls(path, sofar.read_sofa_as_netcdf(str(path)))
-        except (OSError, ValueError, RuntimeError) as exc:  # netCDF's own are RuntimeErrors
+        except (OSError, ValueError, RuntimeError) as exc:  # netCDF's own errors are RuntimeErrors
             raise SofaError(path, "file", f"not a readable SOFA file ({exc})") from exc
 
     def has(self, name: str) -> bool:
         return hasattr(self.content, name)
 
     def text(self, name: str) -> str:
-        """An attribute, without what surrounds it; empty where there is none."""
+        """A text attribute without surrounding blanks; empty if it is missing."""
         return str(getattr(self.content, name, "")).strip(_BLANKS)
 
     def numbers(self, name: str, default: npt.ArrayLike | None = None) -> _Floats:
         value = getattr(self.content, name, default)
         self.require(name, value is not None, "is missing")
         try:
-            # What a file leaves out is masked when read.
+            # Values that a file leaves out are masked when read.
             return np.ma.filled(np.ma.asarray(value, dtype=np.float64), np.nan)
         except (TypeError, ValueError) as exc:
             raise SofaError(self.path, _dotted(name), f"is not of numbers ({exc})") from exc
 
     def sampling_rate_hz(self) -> float:
-        """`Data.SamplingRate`, one for all, by its Units."""
+        """`Data.SamplingRate` in Hz, converted from its Units; it must be the same for all measurements."""
         name = "Data_SamplingRate"
         units = self.text(f"{name}_Units").lower() or "hertz"
         self.require(name, units in _RATES_HZ, f"Units are {units!r}, not hertz or kilohertz")
@@ -128,10 +129,11 @@ class SofaFile:
         default: str | None = None,
         unknown_radius_m: float | None = None,
     ) -> _Floats:
-        """(..., 3) metres, by the Type and Units of the variable `described_by`, or the variable's own.
+        """Convert values to (..., 3) metres by the Type and Units of the variable `described_by`, or of the variable
+        `name` itself.
 
-        A missing Type is told from Units, or else is `default`; missing Units are those of the standard. Spherical
-        coordinates of no radius are taken to be `unknown_radius_m` away, if that is given.
+        A missing Type is inferred from the Units, or else is `default`; missing Units are those of the standard.
+        Spherical coordinates with radius 0 are placed `unknown_radius_m` away, if that is given.
         """
         owner = described_by or name
         stored = self.text(f"{owner}_Units").lower()
@@ -188,15 +190,16 @@ class SofaFile:
         default: str | None = None,
         unknown_radius_m: float | None = None,
     ) -> _Floats:
-        """(measurement, 3) of a variable stored once or for each; `fallback` where the file has none. The others as of
-        `cartesian`."""
+        """Points (measurement, 3) of a variable that is stored once or per measurement; `fallback` if the file has
+        none. The other parameters are those of `cartesian`."""
         values = np.atleast_2d(self.numbers(name, fallback))
         self.require(name, values.shape in {(1, 3), (measurements, 3)}, f"has shape {values.shape}")
         places = self.cartesian(name, values, default=default, unknown_radius_m=unknown_radius_m)
         return np.broadcast_to(places, (measurements, 3))
 
     def parts(self, name: str, count: int, measurements: int) -> _Floats:
-        """(measurement, part, 3) of receivers or emitters, stored (part, 3), (part, 3, 1) or (part, 3, measurement)."""
+        """Positions (measurement, part, 3) of receivers or emitters, stored as (part, 3), (part, 3, 1) or (part, 3,
+        measurement)."""
         values = self.numbers(name)
         if values.ndim == 2:
             values = values[..., np.newaxis]
@@ -205,13 +208,14 @@ class SofaFile:
         return np.broadcast_to(self.cartesian(name, np.moveaxis(values, -1, 0)), (measurements, count, 3))
 
     def frames(self, owner: str, measurements: int) -> _Floats:
-        """(measurement, xyz, axis) of the room's frame; columns are ahead, left and up of a listener or source."""
+        """Axes (measurement, xyz, axis) of a listener or source in the room's frame; the columns point ahead, left and
+        up."""
         view, up = f"{owner}View", f"{owner}Up"
         if not self.has(view):
             return np.broadcast_to(np.eye(3), (measurements, 3, 3))
         ahead = self._directions(view, measurements, view)
         ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
-        # Up shares the type of View in published files, and says so in none.
+        # In published files, Up has the Type of View but does not state it.
         says_type = bool(self.text(f"{up}_Type") or self.text(f"{up}_Units"))
         upward = self._directions(up, measurements, up if says_type else view)
         left = np.cross(upward, ahead)
@@ -235,12 +239,12 @@ class SofaFile:
 
 
 def _dotted(name: str) -> str:
-    """As the standard has it: sofar writes Data_IR for Data.IR."""
+    """The standard's spelling of a variable's name, such as Data.IR; sofar writes Data_IR."""
     return name.replace("_", ".")
 
 
 def delay_rows(responses: _Floats, delays: _Floats, most: float) -> _Floats:
-    """(..., sample) shifted by delays (...) of 0 to `most` in samples, and longer by that many."""
+    """Shift rows (..., sample) by delays (...) of 0 to `most` in samples; the rows become `most` samples longer."""
     samples = responses.shape[-1] + int(np.ceil(most))
     n_fft = 2 * samples
     shift = np.exp(-2j * np.pi * np.fft.rfftfreq(n_fft) * delays[..., np.newaxis])

@@ -1,6 +1,6 @@
-"""Where an emitter's dry signal comes from: a clip, or a client that makes it as it goes.
+"""Sources of an emitter's dry signal: a clip, or live samples from a client.
 
-Mono float32 at the scene's rate, full scale 1. A source fills one block at a time, on the thread that renders.
+Samples are mono float32 at the scene's rate, full scale 1. A source fills one block at a time, on the rendering thread.
 """
 
 from typing import Protocol
@@ -17,19 +17,19 @@ FADE_SAMPLES = 64
 
 
 class Source(Protocol):
-    """What the renderer asks for an emitter's next block."""
+    """The interface through which the renderer gets the next block of an emitter."""
 
     def process(self, out: FloatArray) -> None:
-        """Fill `out` (b,)."""
+        """Fill `out` (b,) with the next samples."""
 
     def reset(self) -> None:
-        """Begin again."""
+        """Start again from the beginning."""
 
 
 class ClipPlayer:
-    """Plays mono samples (n,), n >= 1, block by block: once and then silence, or round and round without a gap.
+    """Plays mono samples (n,), n >= 1, block by block: once followed by silence, or in a loop without a gap.
 
-    An array goes through the door here, which takes a while where it is long.
+    An array is checked here (`server.rendering.ingest`), which takes a while if it is long.
     """
 
     def __init__(self, clip: DryAudio | FloatArray, *, loop: bool) -> None:
@@ -46,7 +46,7 @@ class ClipPlayer:
         written = 0
         while written < out.size:
             piece = self.clip[self._position : self._position + out.size - written]
-            if piece.size == 0:  # only once, and over
+            if piece.size == 0:  # a clip that does not loop is over
                 out[written:] = 0
                 return
             out[written : written + piece.size] = piece
@@ -60,17 +60,17 @@ class ClipPlayer:
 
 
 class LiveSource:
-    """Samples on their way from a client to the renderer: first in, first out, `capacity` of them at most.
+    """A queue of samples from a client to the renderer, of at most `capacity` samples.
 
-    It plays once `lead` samples wait, so that they may come unevenly. Where too few wait for a block, those fade out
-    and silence follows: one underrun. It goes on once twice as many wait as it waited for before, up to half the
-    capacity, and with the newest of them: what a stall held up would only be delay. Where too many wait, the oldest are
-    dropped, and sound crossfades over the gap.
+    It starts to play when `lead` samples are queued, so that samples may arrive unevenly. If too few are queued for a
+    block, the rest fades out and silence follows: this is one underrun. Playing resumes with the newest samples when
+    twice the previous number is queued, up to half the capacity; older samples would only add delay. If the queue is
+    full, the oldest samples are dropped, with a crossfade over the gap.
 
-    What is no audio becomes silence and is counted (`server.rendering.ingest`).
+    Samples that are not valid audio become silence and are counted (`server.rendering.ingest`).
 
-    Everything happens on the thread that renders: what a client sends reaches it with the other messages. Blocks to
-    fill have at least `FADE_SAMPLES`.
+    Everything happens on the rendering thread, which receives the samples with the client's other messages. Blocks must
+    have at least `FADE_SAMPLES` samples.
     """
 
     def __init__(self, *, capacity: int, lead: int) -> None:
@@ -82,19 +82,19 @@ class LiveSource:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what waits, and every count."""
+        """Drop the queue and set every count to zero."""
         self.queued = 0
-        """Samples that wait."""
+        """The number of queued samples."""
         self.underruns = 0
         self.samples_dropped = 0
         self.samples_gated = 0
         self._read = 0
         self._is_playing = False
         self._waits_for = self._lead
-        self._overtaken: FloatArray | None = None  # what would have come next, had it not been dropped
+        self._overtaken: FloatArray | None = None  # the samples that would have come next, had they not been dropped
 
     def push(self, samples: FloatArray) -> None:
-        """Take in what a client sent, (n,)."""
+        """Queue samples (n,) from a client."""
         audio = DryAudio(samples)
         # guard: what a client sends goes through the door
         clean = audio.samples
@@ -110,11 +110,11 @@ class LiveSource:
         self.queued += clean.size
 
     def process(self, out: FloatArray) -> None:
-        """Fill `out` (b,) with the next samples, or with silence where there are none."""
+        """Fill `out` (b,) with the next samples, or with silence if there are not enough."""
         if not self._is_playing:
             self._start(out)
         elif self.queued >= out.size + FADE_SAMPLES:
-            # That many stay behind at least, for the fade-out should nothing follow.
+            # FADE_SAMPLES stay in the queue, for a fade-out in case nothing follows.
             self._take(out)
             if self._overtaken is not None:
                 head = out[:FADE_SAMPLES]
@@ -146,7 +146,7 @@ class LiveSource:
         self.underruns += 1
 
     def _drop(self, count: int) -> None:
-        """Let go of the `count` oldest samples, of those waiting and then of those coming."""
+        """Drop the `count` oldest samples: from the queue first, then from the samples that are arriving."""
         if count <= 0:
             return
         self.samples_dropped += count
@@ -157,7 +157,7 @@ class LiveSource:
         self.queued -= waiting
 
     def _take(self, out: FloatArray) -> None:
-        """Move the oldest samples to `out`, which has room for no more than wait."""
+        """Move the oldest samples to `out`, which must not be longer than the queue."""
         first = self._ring[self._read : self._read + out.size]
         out[: first.size] = first
         out[first.size :] = self._ring[: out.size - first.size]

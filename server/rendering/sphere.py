@@ -1,7 +1,7 @@
-"""Directions on the sphere: what lies between measured ones, and how much of it is nearest to each.
+"""Directions on the sphere: interpolation between measured directions, and the share of the sphere nearest to each.
 
-A direction d in the triangle of corners v is d = w0 v0 + w1 v1 + w2 v2 with all w positive; each corner counts by its
-share of w0 + w1 + w2. That is continuous over the whole sphere, and at a corner only that corner counts.
+A direction d in the triangle with corners v is d = w0 v0 + w1 v1 + w2 v2 with all w positive; the weight of each corner
+is its share of w0 + w1 + w2. The weights are continuous over the whole sphere, and at a corner only this corner counts.
 
 Directions are unit vectors in the head's frame: x ahead, y left, z up.
 """
@@ -24,16 +24,16 @@ _SPHERE_POINTS = 20_000
 
 
 class CoverageError(NafirError):
-    """Directions that leave some others without a triangle."""
+    """The measured directions cannot be triangulated to cover the whole sphere."""
 
 
 class Triangulation(NamedTuple):
     triangles: npt.NDArray[np.int64]
-    """(t, 3) corners: indices of directions."""
+    """(t, 3) the corners of each triangle, as indices of directions."""
     across: npt.NDArray[np.int64]
     """(t, 3) the triangle on the other side of the edge opposite each corner."""
     inverses: _Floats
-    """(t, 3, 3) from a direction to its w."""
+    """(t, 3, 3) matrices that convert a direction to its weights w."""
 
 
 @compiled_in_place
@@ -44,10 +44,11 @@ def find_triangle(
     start: int,
     weights: _Floats,
 ) -> int:
-    """The triangle that `direction` (3,) points into, and the weights (3,) of its corners, which sum to one.
+    """Find the triangle that contains `direction` (3,), and write the weights (3,) of its corners, which sum to one.
 
-    Walks from `start` across the edge that the direction lies furthest beyond. In a triangulation of a convex hull such
-    a walk arrives; it is cut short all the same, and the weights made positive, so that rounding cannot trap it.
+    The search walks from `start`, each time across the edge that the direction is furthest beyond. In a triangulation
+    of a convex hull such a walk arrives. Its length is limited all the same, and the weights are made positive, so that
+    rounding cannot trap it.
     """
     triangle = start
     for _ in range(across.shape[0]):
@@ -76,14 +77,14 @@ def find_triangle(
 
 
 def fill_gaps(measured: _Floats) -> tuple[_Floats, _Floats]:
-    """(d + gap, 3) directions that leave no wide gap, and (gap, d) what each measured one contributes to the added.
+    """(d + gap, 3) directions without wide gaps, and (gap, d) the weight of each measured direction for each added one.
 
-    What is heard from a gap, such as below KEMAR, is about what is heard from elsewhere on the same cone around the
-    axis of the ears: it has the same delay and nearly the same level difference.
+    The response from a gap, such as below KEMAR, is about the response from elsewhere on the same cone around the axis
+    of the ears: it has the same delay and nearly the same level difference.
     """
     lattice = np.array([corner for corner in product((0, 1, -1), repeat=3) if any(corner)], dtype=np.float64)
     lattice /= np.linalg.norm(lattice, axis=-1, keepdims=True)
-    # The axes first: straight down is where most files have their gap.
+    # The axes come first: most files have their gap straight down.
     lattice = lattice[np.argsort(-np.abs(lattice).max(axis=-1), kind="stable")]
     directions = measured
     shares = []
@@ -101,8 +102,8 @@ def fill_gaps(measured: _Floats) -> tuple[_Floats, _Floats]:
 
 
 def triangulate(directions: _Floats) -> Triangulation:
-    """Raises CoverageError if some direction has no triangle, or a measured one no corner."""
-    from scipy.spatial import ConvexHull, QhullError  # a tenth of a second, which a prepared head does not need
+    """Triangulate the sphere. Raises CoverageError if some direction has no triangle, or a measured one no corner."""
+    from scipy.spatial import ConvexHull, QhullError  # takes a tenth of a second, and a prepared head does not need it
 
     try:
         hull = ConvexHull(directions)
@@ -119,13 +120,13 @@ def triangulate(directions: _Floats) -> Triangulation:
 
 
 def solid_angles(directions: _Floats) -> _Floats:
-    """(direction,) share of the sphere to which each direction is the nearest; measured grids crowd at the poles."""
-    from scipy.spatial import cKDTree  # a tenth of a second
+    """(direction,) share of the sphere that is nearest to each direction; measured grids are denser at the poles."""
+    from scipy.spatial import cKDTree  # takes a tenth of a second
 
     index = np.arange(_SPHERE_POINTS) + 0.5
     height = 1 - 2 * index / _SPHERE_POINTS
     azimuth = np.pi * (1 + np.sqrt(5)) * index
     ring = np.sqrt(1 - height**2)
-    sphere = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=-1)  # Fibonacci's
+    sphere = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=-1)  # a Fibonacci lattice
     _, nearest = cKDTree(directions).query(sphere)
     return np.bincount(nearest, minlength=len(directions)) / _SPHERE_POINTS

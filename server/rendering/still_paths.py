@@ -1,6 +1,6 @@
-"""Impulse responses of many paths at rest, heard through one head and added up.
+"""Impulse responses of many static paths, filtered by one head and summed.
 
-Where `DirectPath` follows motion block by block, this is for paths that are exchanged as a whole: reflections inside
+`DirectPath` follows motion block by block; this module is for paths that are exchanged as a whole: reflections inside
 impulse responses, and single responses.
 """
 
@@ -25,7 +25,8 @@ def _band_cepstra(sample_rate: int, taps: int) -> FloatArray:
 
 
 class StillPaths:
-    """A head and the air around it; safe to share between threads. `air_db_per_m` (band,) >= 0.
+    """Adds responses of static paths for one head and the air around it; threads may share it. `air_db_per_m` (band,)
+    >= 0.
 
     Without a head there is one ear, and responses have one channel.
     """
@@ -58,10 +59,11 @@ class StillPaths:
         orientation: Sequence[float],
         out: FloatArray,
     ) -> None:
-        """Add to `out` (ear, sample), where sample 0 is emission, what a head turned by the quaternion `orientation`
-        hears of paths: lengths (n,), unit vectors (n, 3) in the world towards where they come from, gains (n, band)
-        beside distance and air. What would be heard before sample 0 or after the last is left out."""
-        # One layout of each, so that one version is ever compiled.
+        """Add the responses of paths to `out` (ear, sample), where sample 0 is emission. The unit quaternion
+        `orientation` turns the head. Paths have lengths (n,), unit vectors (n, 3) in world axes towards the direction
+        of arrival, and gains (n, band) without distance and air. Samples before 0 or after the end of `out` are left
+        out."""
+        # One memory layout for each array, so that only one version is compiled.
         add_still_paths(
             self._tables,
             axes_of(orientation),

@@ -1,6 +1,6 @@
-"""Impulse responses of paths at rest, in compiled code.
+"""Impulse responses of static paths, in compiled code.
 
-The same steps as in one block of a direct path: delays and minimum-phase filters of head, air and surfaces, and the
+The steps are those of one block of a direct path: delays and minimum-phase filters of head, air and surfaces, and the
 windowed sinc. Letters: n taps, e ears.
 """
 
@@ -20,14 +20,14 @@ IntArray = npt.NDArray[np.int64]
 
 
 class StillPathTables(NamedTuple):
-    """What `add_still_paths` reads."""
+    """The tables that `add_still_paths` reads."""
 
     cepstra: FloatArray  # (direction, e, n)
     head_delays_s: DoubleArray  # (direction, e)
     triangles: IntArray
     across: IntArray
     inverses: DoubleArray
-    band_cepstra: FloatArray  # (band, n) of one decibel
+    band_cepstra: FloatArray  # (band, n) for a gain of one decibel
     orders: FloatArray  # (n,) 1, 1, 2, 3 ...
     reciprocals: FloatArray  # (n,) of `orders`
     sinc: FloatArray
@@ -46,7 +46,8 @@ def add_still_paths(
     gains_db: DoubleArray,
     out: FloatArray,
 ) -> None:
-    """Add to `out` (e, sample) what paths (path,), (path, 3), (path, band) make of a unit impulse at sample 0."""
+    """Add to `out` (e, sample) the responses of paths to a unit impulse at sample 0: lengths (path,), arrivals (path,
+    3), gains (path, band)."""
     ears, count, bands = tables.cepstra.shape[1], tables.cepstra.shape[2], tables.band_cepstra.shape[0]
     wide = -(-(count + TAPS - 1) // loops.TILE) * loops.TILE
     cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)
@@ -88,6 +89,6 @@ def add_still_paths(
             padded[TAPS - 1 : TAPS - 1 + count] = taps[ear]
             loops.filter_block(padded, still_taps, heard)
             begin = whole + BEFORE - (TAPS - 1)
-            # Beyond the filter and the sinc, there are zeros only.
+            # Outside the reach of filter and sinc there are only zeros.
             for i in range(max(0, -begin), min(count + TAPS - 1, out.shape[1] - begin)):
                 out[ear, begin + i] += gain * heard[i]

@@ -1,4 +1,4 @@
-"""What rendering needs before it is quick: compiled code, and the constants of each block size."""
+"""Preparation for rendering without delays: compile code and compute the constants of each block size."""
 
 from collections.abc import Iterable
 
@@ -14,13 +14,13 @@ from server.rendering.still_paths import StillPaths
 
 
 def warm_up(block_sizes: Iterable[int]) -> None:
-    """Compile what renders, or load it from disk, and compute the constants of each block size: a renderer, or a
-    response of paths at rest, made after this costs nothing more."""
+    """Compile the rendering code, or load it from disk, and compute the constants of each block size: later renderers
+    and responses of static paths have no start-up cost."""
     sample_rate = 24_000
     filters = kemar(sample_rate)
     flat, ahead = np.zeros(len(OCTAVE_BANDS_HZ)), np.array([(1.0, 0.0, 0.0)])
     for block_size in block_sizes:
-        longest = 64 * block_size  # every stage
+        longest = 64 * block_size  # long enough for every stage
         renderer = Renderer(
             block_size=block_size,
             ir_samples=longest,
@@ -35,6 +35,6 @@ def warm_up(block_sizes: Iterable[int]) -> None:
         renderer.set_ir("", np.ones((2, longest), np.float32))
         renderer.set_path("", PathTarget(1.0, (1.0, 0.0, 0.0), flat))
         renderer.process()
-    # Last: at a first start another process compiles responses meanwhile.
+    # This comes last: at a first start another process compiles responses meanwhile.
     still = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=flat)
     still.add(np.ones(1), ahead, flat[None], (0.0, 0.0, 0.0, 1.0), np.zeros((2, 1), np.float32))
