@@ -1,5 +1,5 @@
-"""Spectrograms to responses in NumPy, for codecs of a size that compiled code does not take: windows that are no power
-of two, a few frames or cells of them.
+"""Decoding of spectrograms to responses in NumPy, for codec sizes that compiled code does not support: windows that are
+no power of two, or very few frames or cells.
 
 Axes as in `server.field.decoder`.
 """
@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class AnySizeDecoder:
-    """See `server.field.decoder.Decoder`; `frames` are those that count. Thread-safe."""
+    """Decodes as `server.field.decoder.Decoder` documents; only the first `frames` frames are used. Thread-safe."""
 
     def __init__(
         self, parameters: CodecParameters, noise: FrozenNoise, *, ir_samples: int, phase: Phase, frames: int
@@ -59,7 +59,7 @@ class AnySizeDecoder:
         return responses
 
     def _first_frames(self, predicted: Spectrograms) -> Spectrograms:
-        """With no more known frames than there are frames."""
+        """The same predictions with no more known frames than used frames."""
         frequency, certainty = predicted.instantaneous_frequency, predicted.certainty
         known = self._known
         return Spectrograms(
@@ -68,14 +68,14 @@ class AnySizeDecoder:
 
 
 def add_from(part: Float32, response: Float32, at: int) -> None:
-    """Adds (ear, sample) `part` to the response from sample `at` on, as far as both reach."""
+    """Add `part` (ear, sample) to the response from sample `at` on; samples outside the response are dropped."""
     first, last = max(0, at), min(response.shape[-1], at + part.shape[-1])
     if last > first:
         response[:, first:last] += part[:, first - at : last - at]
 
 
 def resized(signals: npt.NDArray[np.floating], samples: int) -> Float32:
-    """(..., sample) cut, or silent from where they end."""
+    """Signals (..., sample) cut or padded with zeros to `samples`."""
     short = max(0, samples - signals.shape[-1])
     padded = np.pad(signals[..., :samples], [(0, 0)] * (signals.ndim - 1) + [(0, short)])
     return padded.astype(np.float32)

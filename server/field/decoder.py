@@ -1,4 +1,4 @@
-"""Spectrograms as a network predicts them to impulse responses, at one choice of phase.
+"""Decoding of a network's spectrograms to impulse responses, with one choice of phase.
 
 Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample).
 """
@@ -30,20 +30,21 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 _POOL = ArrayPool(16 * 1024 * 1024)
-"""A request's responses wait for those of the next."""
+"""Freed responses of one request are reused for the next."""
 
 
 def is_compiled_size(parameters: CodecParameters) -> bool:
-    """Whether compiled code decodes what is coded so; of other sizes, NumPy does, which is slower."""
+    """Whether compiled code can decode spectrograms of this size. NumPy decodes all others, more slowly."""
     n_fft = parameters.n_fft
     return n_fft & (n_fft - 1) == 0 and parameters.codec.frames >= LANES and parameters.columns >= FEWEST
 
 
 class Decoder:
-    """Thread-safe: every call works in arrays of its own, kept for later ones.
+    """Decodes predicted spectrograms to impulse responses. Thread-safe: every call uses its own buffers, which are kept
+    for later calls.
 
-    `ir_samples` are what a response has whatever the codec's length; of a prediction the first `frames` count, by
-    default all, and what follows them is silent.
+    Responses have `ir_samples` samples, whatever the codec's length. Only the first `frames` frames of a prediction are
+    used (default: all), and silence follows them.
     """
 
     def __init__(
@@ -79,10 +80,10 @@ class Decoder:
         self._workspaces: list[Workspace] = []
 
     def decode(self, predicted: Spectrograms, aligned: Floats, near: Sequence[Float32 | None] | None = None) -> Float32:
-        """(B, 2, ir_samples) of predictions, of frames or of their cells, whose first sample is at `aligned` (B,),
-        whole or not, of the response.
+        """Decode predictions, given per frame or per cell, to responses (B, 2, ir_samples). The first sample of each
+        prediction lies at sample `aligned` (B,) of its response, which may be a fraction.
 
-        `near` (B) are responses to take over the phase from, where there are any and the phase is warm.
+        `near` (B) are responses of nearby poses, or None; a warm phase starts from them.
         """
         near = near or [None] * len(aligned)
         if self._any_size is not None:

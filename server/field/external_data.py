@@ -1,14 +1,15 @@
-"""Weights that an ONNX graph keeps in other files, which a bundle's graphs must not.
+"""A check for ONNX weights that are stored in other files, which a bundle's graphs must not have.
 
-ONNX Runtime would look for them beside the process' working directory, where nobody has hashed them. The server does
-not know the `onnx` package, so this walks the protobuf itself (https://protobuf.dev/programming-guides/encoding/), by
-the field numbers of https://github.com/onnx/onnx/blob/main/onnx/onnx.proto; weights are stepped over, not read.
+ONNX Runtime would look for such files relative to the process' working directory, where they are not covered by the
+bundle's hashes. The server does not use the `onnx` package, so this module reads the protobuf itself
+(https://protobuf.dev/programming-guides/encoding/), by the field numbers of
+https://github.com/onnx/onnx/blob/main/onnx/onnx.proto; it skips the weights without reading them.
 """
 
 from collections.abc import Iterator
 
 _VARINT, _EIGHT_BYTES, _LENGTH, _FOUR_BYTES = 0, 1, 2, 5
-_DEEPEST = 100  # as in protobuf's own readers
+_DEEPEST = 100  # the same limit as in protobuf's own readers
 _EXTERNAL_DATA, _DATA_LOCATION, _EXTERNAL = 13, 14, 1
 _PARTS: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
@@ -19,12 +20,12 @@ _PARTS: dict[str, dict[int, str]] = {
     "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
     "sparse": {1: "tensor", 2: "tensor"},
 }
-"""Which fields of a message may hold tensors, and as what message."""
+"""The fields of each type of message that may contain tensors, and the message type of each field."""
 
 
 def refers_to_other_files(model: bytes) -> bool:
-    """Whether any tensor of the model is kept elsewhere. Raises ValueError for bytes that are no protobuf, and for
-    graphs nested deeper than `_DEEPEST`."""
+    """Whether any tensor of the model is stored in another file. Raises ValueError for bytes that are no protobuf, and
+    for graphs nested deeper than `_DEEPEST`."""
     waiting = [(memoryview(model), "model", 0)]
     while waiting:
         message, kind, depth = waiting.pop()
@@ -40,7 +41,7 @@ def refers_to_other_files(model: bytes) -> bool:
 
 
 def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """Number and value of each field: a view of those with a length, a number of the others."""
+    """The number and value of each field: a view of the bytes for fields with a length, otherwise an int."""
     at = 0
     while at < len(message):
         key, at = _varint(message, at)
@@ -63,7 +64,7 @@ def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """A number of seven bits a byte, and where it ends."""
+    """A variable-length integer (seven bits per byte), and the index after it."""
     value = 0
     for shift in range(0, 70, 7):
         if at >= len(message):

@@ -1,8 +1,8 @@
-"""A trained acoustic field: poses in, impulse responses of the reflected sound out.
+"""A trained acoustic field: it takes poses and returns impulse responses of the reflected sound.
 
-Reflected sound is all that follows the direct sound, which is not in here: it is computed from geometry
-(`server.responses.full_response` adds it). So are the first reflections, where the bundle's `image_order` is 1. Of
-measured scenes, whose `direct_sound` is the field's, responses are whole.
+Reflected sound is everything after the direct sound, which `server.responses.full_response` adds from geometry. If the
+bundle's `image_order` is 1, the first reflections are computed from geometry too. For measured scenes, whose
+`direct_sound` is the field's, responses are complete.
 
 Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
 """
@@ -38,23 +38,24 @@ Floats = npt.NDArray[np.float64]
 
 _CHUNK = 32
 _NEVER = 2.0**31
-"""Samples: no index reaches as far."""
+"""Samples: larger than any index of a response."""
 _EAR_AHEAD_S = 0.00026
-"""Sound reaches the nearer ear at most so much sooner than the middle of the head, 87.5 mm away."""
+"""Seconds: the nearer ear is 87.5 mm from the middle of the head, so sound reaches it at most this much earlier."""
 _RISE_AFTER_FIRST_S = 0.003
-"""From the onset on, where geometry computes the first reflections: what follows those sets in bit by bit. Sooner, it
-errs more of interaural time differences; later, of the direct-to-reverberant ratio."""
+"""Length of the gate's rise from the onset, where geometry computes the first reflections: the predicted sound after
+them is faded in gradually. A shorter rise gives larger errors of the interaural time difference, a longer one of the
+direct-to-reverberant ratio."""
 
 
 class AcousticField:
-    """One scene's field at one quality level. Thread-safe: every call works on its own arrays.
+    """The field of one scene at one quality level. Thread-safe: every call uses its own arrays.
 
-    `noise` is that of the graph's codec, where somebody has it already. A level that reuses responses keeps them in
-    `node_cache`, shared with other levels of the scene.
+    `noise` is the frozen noise of the graph's codec, if the caller already has it. A level that reuses responses keeps
+    them in `node_cache`, which it shares with the other levels of the scene.
     """
 
     source: ResponseSource
-    """Where this level has responses computed: at every pose, or at nodes that stand for many."""
+    """Where this level gets responses: computed for every pose, or taken from nodes that each represent many poses."""
 
     def __init__(
         self,
@@ -69,7 +70,7 @@ class AcousticField:
         self.graph = graph
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
         is_whole = bundle.manifest.direct_sound == "field"
-        # Measured sound may arrive before geometry has it: the gate opens with the first sample that is coded.
+        # Measured sound may arrive earlier than geometry predicts: the gate opens with the first coded sample.
         self._lead = 0 if is_whole else graph.parameters.lead_samples
         self._first_echo: FirstEcho | None = None
         if not is_whole and not graph.gives_responses:
@@ -99,7 +100,7 @@ class AcousticField:
 
     @classmethod
     def load(cls, bundle: Bundle, *, level: str | None = None, threads: int = 1) -> "AcousticField":
-        """The named quality level, by default the first. Raises BundleError for a graph that does not fit the
+        """Load the named quality level, by default the first. Raises BundleError for a graph that does not fit the
         manifest."""
         manifest = bundle.manifest
         chosen = next((entry for entry in manifest.levels if level in (None, entry.name)), None)
@@ -112,7 +113,7 @@ class AcousticField:
 
     @cached_property
     def kind(self) -> LevelKind:
-        """What its level shares between poses, and what follows from that."""
+        """The kind of its quality level, which says what poses share."""
         return kind_of(self.level)
 
     @property
@@ -130,12 +131,14 @@ class AcousticField:
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike, *, remember: bool = False
     ) -> Float32:
-        """(B, channel, ir_samples) without what geometry adds; sample 0 is emission, unit pressure at one metre.
+        """Responses (B, channel, ir_samples) without the parts that geometry adds. Sample 0 is emission; the source has
+        unit pressure at one metre.
 
-        The same for the same poses, always; but with `remember` a level whose phase is warm starts from the phase that
-        it last found near a pose, and leaves its own to the next: for streams, which go from each pose to one near it.
+        Equal poses always give equal responses, except with `remember`: a level with warm phase then starts from the
+        phase that it last found near each pose, and stores its own phase for later calls. This suits streams, in which
+        each pose is near the one before it.
 
-        Raises ValueError for poses that are not finite, and FieldError where a response would not be.
+        Raises ValueError for poses that are not finite, and FieldError if a response would not be finite.
         """
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
         # guard: poses that are not finite reach no field
@@ -144,11 +147,13 @@ class AcousticField:
         return self.source.responses(listeners, emitters, yaws, remember=remember)
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
-        """What stands for a pair of poses at this level: they themselves, unless it reuses responses."""
+        """The node that represents a pair of poses at this level: the poses themselves, unless the level reuses
+        responses."""
         return self.source.snap(listener, emitter, yaw)
 
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
-        """As `snap`, and for which listeners else: none for certain, unless the level reuses responses."""
+        """As `snap`, and also the other listener poses that certainly have the same result: none, unless the level
+        reuses responses."""
         return self.source.find(listener, emitter, yaw)
 
     def _compute_all(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
@@ -162,25 +167,26 @@ class AcousticField:
         return responses
 
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
-        """What is decoded to responses, of a field that gives spectrograms; positions (B, 3), yaws (B,)."""
+        """Spectrograms that the network predicts, before they are decoded to responses. Only for a field that gives
+        spectrograms. Positions (B, 3), yaws (B,)."""
         return self.graph.spectrograms(listeners, emitters, yaws)
 
     def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:
-        """(B, channel) sum of the squared samples of each, as predicted: without decoding where there is something
-        to decode."""
+        """(B, channel) sum of the squared samples of each predicted response, from the spectrograms if there are any,
+        without decoding."""
         poses = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
         listeners, emitters, yaws = self.source.computed_for(*poses)
         if self.graph.gives_responses:
             aligned = self.graph.impulse_responses(listeners, emitters, yaws)
             return np.asarray(np.sum(aligned.astype(np.float64) ** 2, axis=-1))
         codec = self.graph.parameters.codec
-        # Bins between DC and Nyquist stand for two.
+        # Bins between DC and Nyquist count twice, for negative frequencies.
         weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
         magnitude = codec.magnitude(self.graph.spectrograms(listeners, emitters, yaws).log_magnitude)
         return np.asarray(np.einsum("bcft,f->bc", magnitude[..., : self.level.frames] ** 2, weight))
 
     def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
-        """(B,) time at which sound can first arrive, round corners where it must."""
+        """(B,) time at which the first sound can arrive, around corners if necessary."""
         pairs = zip(np.asarray(listeners), np.asarray(emitters)[:, None], strict=True)
         length_m = [self._paths.find(*pair).length_m for pair in pairs]
         return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
@@ -212,26 +218,27 @@ class AcousticField:
         aligned: Floats,
         cache: PhaseCache | None,
     ) -> Float32:
-        """(B, channel, ir_samples) with what windows smear to before the onset."""
+        """Decoded responses (B, channel, ir_samples), including the energy that windows smear to before the onset."""
         predicted = self.graph.predictions(listeners, emitters, yaws)
         if self.channels == 1:
-            # Decoders have two ears; a lone microphone is the left one.
+            # Decoders expect two ears; a single microphone is stored as the left one.
             predicted = predicted.twice()
         if cache is None:
             responses = self._finite(decoder.decode(predicted, aligned), listeners, emitters)
             return np.ascontiguousarray(responses[:, : self.channels])
         responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
-        # One after the other: each may start from the one before it.
+        # One after the other, because each may start from the one before it.
         for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
             rows = slice(row, row + 1)
             responses[rows] = decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
-            self._finite(responses[rows], listeners[rows], emitters[rows])  # before others start from it
+            self._finite(responses[rows], listeners[rows], emitters[rows])  # check before later poses start from it
             cache.keep(*pose, responses[row])
         return np.ascontiguousarray(responses[:, : self.channels])
 
     def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
-        """The responses. Raises FieldError naming the first that is not finite."""
-        # A sum is quicker to look at than its parts; what overflows it is no response either.
+        """Return the responses unchanged. Raises FieldError naming the first that is not finite."""
+        # One sum of squares per response is quicker to check than all samples; if it overflows, the response is invalid
+        # too.
         flat = responses.reshape(len(responses), -1)
         # guard: responses that are not finite are handed to nobody
         wrong = ~np.isfinite(np.vecdot(flat, flat))
@@ -244,8 +251,8 @@ class AcousticField:
         return responses
 
     def _placed(self, coded: Float32, aligned: Floats) -> Float32:
-        """Responses whose first sample belongs at `aligned`: later by whole samples and a fraction of one."""
-        from scipy.fft import rfft  # a third of a second; NumPy's gives other bits in single precision
+        """Responses with the first coded sample placed at `aligned`, by a shift of whole samples and a fraction."""
+        from scipy.fft import rfft  # takes a third of a second; NumPy's rfft gives other bits in single precision
 
         start = np.floor(aligned).astype(int)
         size = next_fast_length(coded.shape[-1] + 1)
@@ -258,14 +265,14 @@ class AcousticField:
 
 
 def frozen_noise(bundle: Bundle, graph: FieldGraph) -> FrozenNoise:
-    """The scene's noise as the graph's codec transforms it; silent where the codec's responses are longer than the
-    scene's, of which nothing is heard."""
+    """The scene's noise, transformed by the graph's codec. It is padded with zeros if the codec's responses are longer
+    than the scene's; these samples are never heard."""
     codec = graph.parameters.codec
     return FrozenNoise.from_signal(codec, resized(bundle.frozen_noise, codec.samples))
 
 
 class Silence(AcousticField):
-    """What there is after the direct sound and the first reflections in a scene without a field."""
+    """The field of a scene without a network: silence after the direct sound and the first reflections."""
 
     def __init__(self, bundle: Bundle, level: QualityLevel) -> None:
         self.bundle = bundle

@@ -1,4 +1,4 @@
-"""All quality levels of a scene: one field each, and one session per graph between them."""
+"""All quality levels of a scene: one field per level, and one ONNX session per graph, shared between levels."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -14,16 +14,16 @@ from server.scene.manifest import CodecParameters
 
 
 class FieldsByLevel(Mapping[str, AcousticField]):
-    """Quality levels by name, in the manifest's order; the first is the default."""
+    """The fields by the name of their quality level, in the manifest's order; the first is the default."""
 
     def __init__(self, fields: Sequence[AcousticField], node_cache: NodeCache | None = None) -> None:
-        """`fields` of one bundle, one at least; those that reuse responses keep them in `node_cache`."""
+        """`fields` are of one bundle, at least one; levels that reuse responses keep them in `node_cache`."""
         self.node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
         self._fields = {field.level.name: field for field in fields}
 
     @classmethod
     def load(cls, bundle: Bundle, threads: int = 1) -> "FieldsByLevel":
-        """Raises BundleError for a graph that does not fit the manifest."""
+        """Load all levels. Raises BundleError for a graph that does not fit the manifest."""
         if not bundle.manifest.fields:
             return cls([Silence(bundle, level) for level in bundle.manifest.levels])
         sessions: dict[str, InferenceSession] = {}
@@ -62,7 +62,8 @@ class FieldsByLevel(Mapping[str, AcousticField]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Cheapest first, by the mean cost measured for each; where one was not, the manifest's order reversed."""
+        """The levels' names, cheapest first by their measured mean cost; if one has no measurement, the manifest's
+        order reversed."""
         costs = {name: field.level.cost for name, field in self._fields.items()}
         measured = {name: cost.ms_mean for name, cost in costs.items() if cost is not None}
         if len(measured) < len(costs):
@@ -70,12 +71,14 @@ class FieldsByLevel(Mapping[str, AcousticField]):
         return tuple(sorted(measured, key=measured.__getitem__))
 
     def choose(self, name: str | None) -> AcousticField:
-        """The level a client named, or the default. Raises RequestError `unknown_level` with the names there are."""
+        """The field of the level that a client named, or the default. Raises RequestError `unknown_level`, which lists
+        the names."""
         return self.default if name is None else self[require_level(self.bundle, name)]
 
 
 def require_level(bundle: Bundle, name: str) -> str:
-    """The name, if the bundle has such a quality level. Raises RequestError `unknown_level` with those there are."""
+    """Return the name if the bundle has this quality level. Raises RequestError `unknown_level`, which lists the
+    names."""
     names = [level.name for level in bundle.manifest.levels]
     if name not in names:
         problem = f"scene {bundle.id} has no quality level {name!r}, only {', '.join(names)}"

@@ -1,8 +1,9 @@
-"""The gate that a decoded response begins with.
+"""The gate at the beginning of a decoded response.
 
-A codec's windows are longer than the first reflections take, and smear energy to where there cannot be any: before
-sound arrives, and before a surface can have answered. It would count, and be heard, as direct sound. The gate takes it,
-and gives it back to what follows, where it belongs; else early energy would be half a decibel to one too low.
+A codec's windows are longer than the time up to the first reflections, so they smear energy to times at which there
+cannot be any: before sound arrives, and before a surface can have reflected it. This energy would be measured and heard
+as direct sound. The gate removes it and adds it to the sound that follows, where it belongs; otherwise early energy
+would be half a decibel to one decibel too low.
 
 Axes: B poses; responses (B, channel, sample).
 """
@@ -18,15 +19,17 @@ Indices = npt.NDArray[np.int64]
 
 RISE_S = 0.0003
 MOST_GIVEN = 15.0
-"""Times a sample's square. A response that begins late, after what was taken, is not made up of it."""
+"""Upper limit of the energy added to a sample, as a multiple of its square. Otherwise a response that begins late,
+after the removed energy, would consist of that energy only."""
 
 
 class Gate:
-    """Thread-safe. Silence until sound can arrive, and a rise of `rise_s` from there on, a raised cosine: of a slow one
-    hardly anything is heard in the first millisecond, which tells where the direct sound comes from.
+    """Silences each response until sound can arrive, then fades it in along a raised cosine of `rise_s`. With a slow
+    rise hardly anything is heard in the first millisecond, which determines where the direct sound seems to come from.
+    Thread-safe.
 
-    Of a gate that `gives_back`, the energy it took at an ear is in what follows within one window of the codec, most of
-    it at once and less and less of it then: of each sample's square, one plus a share of a falling raised cosine.
+    With `gives_back`, the energy removed at an ear is added to the sound that follows within one window of the codec,
+    most of it at the beginning: each sample's square is multiplied by one plus a share of a falling raised cosine.
     """
 
     def __init__(self, parameters: CodecParameters, *, rise_s: float = RISE_S, gives_back: bool = False) -> None:
@@ -34,13 +37,13 @@ class Gate:
         self._answer = _rise(round(RISE_S * parameters.sample_rate))
         fall = np.arange(parameters.n_fft if gives_back else 0) / parameters.n_fft
         self._given = (0.5 + 0.5 * np.cos(np.pi * fall)).astype(np.float32)
-        # Compiled here, where it may take its time, and not for the first pose.
+        # Compile here, where it may take long, and not for the first pose.
         self.open(np.zeros((1, 1, 1), np.float32), np.zeros(1, np.int64))
 
     def open(self, responses: Float32, onsets: Indices, echoes: Indices | None = None) -> None:
-        """Changes responses in place. Sound arrives with sample `onsets` (B,); a surface can have answered by sample
-        `echoes` (B,), where there are any: the last RISE_S before it rise from silence. Raises ValueError for other
-        numbers of them than of responses."""
+        """Apply the gate to responses in place. Sound arrives with sample `onsets` (B,). `echoes` (B,), if given, are
+        the samples by which a surface can have reflected it: the response rises from silence over the last RISE_S
+        before them. Raises ValueError if their numbers differ from that of the responses."""
         begins = onsets if echoes is None else echoes
         if not len(onsets) == len(begins) == len(responses):
             raise ValueError(f"{len(onsets)} onsets and {len(begins)} echoes of {len(responses)} responses")

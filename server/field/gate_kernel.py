@@ -1,4 +1,4 @@
-"""The compiled part of `server.field.gate`."""
+"""The compiled code of `server.field.gate`."""
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +13,9 @@ Indices = npt.NDArray[np.int64]
 def open_gates(
     rise: Float32, answer: Float32, given: Float32, most: float, onsets: Indices, begins: Indices, responses: Float32
 ) -> None:
-    """Of each of (B, channel, sample), with `onsets` and `begins` (B,): `rise` begins at the onset and `answer` at the
-    other, both silent before; energy taken is given back by the weights `given` from the later of the two on."""
+    """Apply gates to responses (B, channel, sample) in place. The gain is `rise` from sample `onsets` (B,) on times
+    `answer` from sample `begins` (B,) on, both zero before. The removed energy is added with the weights `given`,
+    starting at the later of the two."""
     for row in range(responses.shape[0]):
         onset, begin = onsets[row], begins[row]
         opens, size = max(0, onset, begin), responses.shape[2]

@@ -1,12 +1,12 @@
 """The network of a field: one ONNX graph, opened and checked against the manifest.
 
-A graph answers in one of two ways. Most give spectrograms, to be decoded; some give impulse responses outright. Either
-is aligned: sample `lead_samples` of the coded response is the earliest arrival.
+A graph gives one of two outputs: spectrograms, which must be decoded (most graphs), or impulse responses. Both are
+aligned: sample `lead_samples` of the coded response is the earliest arrival.
 
-Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians. Of scenes heard by
-one microphone there is one channel in place of the ears, and no coherence between them. A graph may tell cells of
-frames (`CodecParameters.frame_cells`) in place of frames: late sound is smooth, and most of the time would go into
-copying what is one number.
+Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample). Metres, radians. Scenes recorded
+with one microphone have one channel in place of the ears, and no coherence between them. A graph may give cells of
+several frames (`CodecParameters.frame_cells`) in place of frames: late sound is smooth, and copying equal numbers would
+take most of the time.
 """
 
 from collections.abc import Mapping
@@ -25,19 +25,19 @@ from server.scene.manifest import CodecParameters
 Float32 = npt.NDArray[np.float32]
 
 INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
-"""Inputs of a graph, and their shapes after the batch axis."""
+"""The inputs of a graph, with their shapes after the batch axis."""
 OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
-"""Outputs of a graph that gives spectrograms."""
+"""The outputs of a graph that gives spectrograms."""
 RESPONSE = "impulse_response"
-"""The output of one that gives responses."""
+"""The output of a graph that gives impulse responses."""
 _TENSOR = "tensor(float)"
 
 
 @dataclass(frozen=True)
 class Spectrograms:
-    """What the network says: `log_magnitude` (B, channel, frequency, frame); `instantaneous_frequency` and `certainty`
-    of the first frames (B, channel, frequency, known frame); `interaural` (B, 2, frequency, frame) the coherence
-    between the ears, real part and imaginary, nothing where there is one channel."""
+    """Predictions of the network: `log_magnitude` (B, channel, frequency, frame); `instantaneous_frequency` and
+    `certainty` of the first frames (B, channel, frequency, known frame); `interaural` (B, 2, frequency, frame), the
+    real and imaginary parts of the coherence between the ears, zero if there is one channel."""
 
     log_magnitude: Float32
     instantaneous_frequency: Float32
@@ -45,7 +45,7 @@ class Spectrograms:
     interaural: Float32
 
     def spread(self, axis: Axis | None) -> "Spectrograms":
-        """Of every frame, where these are of an axis' cells."""
+        """Predictions for every frame, from predictions for the cells of `axis`; unchanged if it is None."""
         if axis is None:
             return self
         to_frames = axis.spread()
@@ -53,11 +53,11 @@ class Spectrograms:
 
     @property
     def coherence(self) -> npt.NDArray[np.complex64]:
-        """(B, frequency, frame)"""
+        """(B, frequency, frame) complex coherence between the ears."""
         return np.asarray(self.interaural[:, 0] + 1j * self.interaural[:, 1], dtype=np.complex64)
 
     def twice(self) -> "Spectrograms":
-        """Of one channel: as of two ears that have nothing to do with each other."""
+        """Predictions for two ears with zero coherence, both copied from one channel."""
         return Spectrograms(
             np.repeat(self.log_magnitude, 2, axis=1),
             np.repeat(self.instantaneous_frequency, 2, axis=1),
@@ -75,7 +75,7 @@ class Spectrograms:
 
 
 def open_graph(bundle: Bundle, file: str, *, threads: int = 1) -> InferenceSession:
-    """A session for one of the bundle's files. Raises BundleError for one that is no graph."""
+    """Open a session for one of the bundle's files. Raises BundleError for a file that is no usable graph."""
     try:
         return open_session(bundle.models[file], threads=threads)
     except KeyError as exc:
@@ -85,7 +85,7 @@ def open_graph(bundle: Bundle, file: str, *, threads: int = 1) -> InferenceSessi
 
 
 class FieldGraph:
-    """The graph of field `name` of a bundle, in a session that others may share. Thread-safe.
+    """The graph of field `name` of a bundle, in a session that several objects may share. Thread-safe.
 
     Raises BundleError for a graph that does not fit the manifest.
     """
@@ -98,7 +98,7 @@ class FieldGraph:
         self._path = bundle.folder / entry.file
         outputs = {output.name: output.type for output in session.get_outputs()}
         self.gives_responses = RESPONSE in outputs
-        """Impulse responses and not spectrograms."""
+        """Whether the graph gives impulse responses and not spectrograms."""
         self.channels = len(bundle.manifest.channels)
         self._outputs = (RESPONSE,) if self.gives_responses else OUTPUTS[: 2 + self.channels]
         inputs = {given.name: given.shape[1:] for given in session.get_inputs()}
@@ -117,16 +117,16 @@ class FieldGraph:
         return self._path
 
     def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> list[Float32]:
-        """The outputs, OUTPUTS (of one channel without the last) or RESPONSE alone, for B poses; positions (B, 3),
-        yaws (B,)."""
+        """Run the network for B poses: positions (B, 3), yaws (B,). Returns the outputs named in OUTPUTS (for one
+        channel without the last), or RESPONSE alone."""
         return list(self._session.run(self._outputs, _feed(listeners, emitters, yaws)))
 
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
-        """Of every frame. Not of a graph that gives responses."""
+        """Predictions for every frame. Only for a graph that gives spectrograms."""
         return self.predictions(listeners, emitters, yaws).spread(self.parameters.frame_axis)
 
     def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
-        """As the graph tells them: of every frame or of their cells. Not of a graph that gives responses."""
+        """Predictions as the graph gives them, per frame or per cell. Only for a graph that gives spectrograms."""
         said = self.run(listeners, emitters, yaws)
         if self.channels == 1:
             rows, _, *axes = said[0].shape
@@ -134,11 +134,11 @@ class FieldGraph:
         return Spectrograms(*said)
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
-        """(B, channel, samples), aligned. Only of a graph that gives responses."""
+        """(B, channel, samples), aligned. Only for a graph that gives responses."""
         return self.run(listeners, emitters, yaws)[0]
 
     def _check_outputs(self, bundle: Bundle) -> None:
-        """Runs the graph once, in the middle of the bounds."""
+        """Run the graph once, in the middle of the bounds, and check the shapes of its outputs."""
         bounds = bundle.manifest.bounds
         middle = (np.asarray(bounds.minimum) + np.asarray(bounds.maximum))[None] / 2
         try:
@@ -151,7 +151,7 @@ class FieldGraph:
 
     @property
     def _shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Of the outputs for one pose."""
+        """The shape of each output for one pose."""
         if self.gives_responses:
             return {RESPONSE: (1, self.channels, self.parameters.samples)}
         codec, known = self.parameters.codec, self.parameters.known_frames
@@ -165,7 +165,7 @@ def _feed(listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
     return {
         "listener": np.asarray(listeners, dtype=np.float32),
         "emitter": np.asarray(emitters, dtype=np.float32),
-        # Whole turns come off in double precision: in single, large angles lose their heading, or overflow.
+        # Subtract whole turns in double precision: in single precision, large angles lose their heading, or overflow.
         "yaw": np.remainder(np.asarray(yaws, dtype=np.float64) + np.pi, 2 * np.pi).astype(np.float32)
         - np.float32(np.pi),
     }

@@ -1,10 +1,11 @@
-"""Nodes that stand for the poses around them: where a quality level that reuses responses has them computed.
+"""A lattice of nodes that represent the poses around them. A quality level that reuses responses computes them only at
+nodes.
 
-A node has other walls about it than a pose on the far side of a corner, so poses are never given a node that they
-cannot see, or whose ends see each other where theirs do not. Poses along a wall's edge find none in the cell they are
-in, and are given one of a smaller cell; within centimetres of it, they are nodes themselves.
+Around a corner, a node would have other walls near it than the pose. Therefore a pose only gets a node that it can see,
+and listener and emitter see each other in the node if and only if they do in the poses. Poses close to a wall may find
+no such node in their cell, and get one of a smaller cell; within centimetres of the wall, they are nodes themselves.
 
-Metres, radians; positions in the world's axes.
+Metres, radians; positions in world axes.
 """
 
 import math
@@ -21,16 +22,16 @@ from server.scene.bundle import Bundle
 from server.scene.manifest import Reuse
 
 _LEAST_STEP_M = 0.25
-"""Responses are moved in time by no less than what sound takes for this: 0.4 ms off at most is less than anybody hears
-of reflected sound, and every step is an exchange."""
+"""Responses are shifted in time in steps of at least the time that sound takes for this distance. An error of at most
+0.4 ms is inaudible in reflected sound, while every step costs an exchange of responses."""
 _ARRIVALS = 4096
 _LEAST_M, _LEAST_RAD = 1e-6, 1e-9
-"""Nearer to where a number is rounded to another, nothing is certain."""
+"""Margins to the points at which rounding changes the result; within them, a neighbourhood is not certain."""
 _MOST_MOVED_M = 0.25
 
 
 class Node(NamedTuple):
-    """Where listener and emitter stand, and where the listener looks."""
+    """The positions of listener and emitter, and the heading of the listener."""
 
     listener: Vector3
     emitter: Vector3
@@ -38,16 +39,16 @@ class Node(NamedTuple):
 
 
 class Snapped(NamedTuple):
-    """What stands for a pair of poses: the response of `node`, so many samples later (or earlier, negative), so that
-    reflected sound follows the direct sound of the poses as it does there."""
+    """What represents a pair of poses: the response of `node`, delayed by `later_samples` (negative: earlier), so that
+    the time from direct to reflected sound is the same as at the node."""
 
     node: Node
     later_samples: int
 
 
 class Neighbourhood(NamedTuple):
-    """Poses of a listener that are sure to be given what the one in their middle was, of an emitter that stays where it
-    is: places within a ball and between two distances from the emitter, headings within an arc."""
+    """Listener poses that certainly get the same node and delay as the pose in their middle, while the emitter does not
+    move: positions within a ball and between two distances from the emitter, headings within an arc."""
 
     listener: Vector3
     radius_m: float
@@ -56,10 +57,11 @@ class Neighbourhood(NamedTuple):
     farthest_m: float
     yaw: float
     arc_rad: float
-    """To either side."""
+    """Half of the arc: this far to either side."""
 
     def holds(self, pose: Pose) -> bool:
-        """In less than a microsecond, where finding out takes several."""
+        """Whether a pose is in the neighbourhood. This takes less than a microsecond, while `Lattice.find` takes
+        several."""
         if math.dist(pose.position, self.listener) >= self.radius_m:
             return False
         if not self.nearest_m < math.dist(pose.position, self.emitter) < self.farthest_m:
@@ -70,8 +72,8 @@ class Neighbourhood(NamedTuple):
 class Lattice:
     """The nodes of one scene for one `Reuse`; safe to share between threads.
 
-    Cells fill the bounds evenly, nodes are in their middles. `offset` (3,) moves them, by less than half a cell, and
-    `turned` turns their headings.
+    Cells fill the bounds evenly, and nodes are in the middle of cells. `offset` (3,) moves the nodes by less than half
+    a cell, and `turned` turns their headings.
     """
 
     def __init__(
@@ -96,15 +98,17 @@ class Lattice:
         self._bent_m = lru_cache(_ARRIVALS)(self._length_m)
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
-        """What stands for poses within the bounds; a function of them alone, in a few microseconds."""
+        """The node and delay for poses within the bounds. They depend only on the poses; this takes a few
+        microseconds."""
         return self._find(listener, emitter, yaw, looks_about=False)[0]
 
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
-        """As `snap`, and for which listeners else."""
+        """As `snap`, and also the other listener poses that certainly have the same result."""
         return self._find(listener, emitter, yaw, looks_about=True)
 
     def moved(self, rng: np.random.Generator) -> "Lattice":
-        """The same with nodes elsewhere, by up to 25 cm or half a cell, and headings turned by any angle."""
+        """The same lattice with its nodes moved at random, by up to 25 cm or half a cell, and its headings turned by
+        any angle."""
         most_m = min(_MOST_MOVED_M, self._reuse.spacing_m / 2)
         x, y, z = map(float, rng.uniform(-most_m, most_m, 3))
         turned = rng.uniform(-math.pi, math.pi)
@@ -130,7 +134,7 @@ class Lattice:
         else:
             way_m, there_m = self._length_m(listener, emitter), self._bent_m(there, node.emitter)
             steps = round((way_m - there_m) / self._step_m)
-            # A way round corners is longer by no more than the listener moves.
+            # A path around corners becomes longer by at most the distance that the listener moves.
             radius_m = min(radius_m, reach_m - abs(way_m - there_m - steps * self._step_m))
         arc_rad = math.inf if self._turns == 1 else (0.5 - abs(turns - heading)) * self._turn_rad - _LEAST_RAD
         around = Neighbourhood(listener, radius_m, emitter, nearest_m, farthest_m, yaw, arc_rad)
@@ -143,8 +147,8 @@ class Lattice:
 def delay_response(
     response: npt.NDArray[np.float32], later_samples: int, result: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.float32]:
-    """(channel, sample) a response so many samples later, silent before; what comes after its end or before its
-    beginning is lost. Written to `result` where there is one."""
+    """Delay a response (channel, sample) by `later_samples`, padded with zeros; samples beyond its end or before its
+    beginning are lost. Written to `result` if that is given."""
     later_samples = max(-response.shape[1], min(later_samples, response.shape[1]))
     if result is None:
         result = np.empty_like(response)

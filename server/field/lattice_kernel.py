@@ -1,4 +1,4 @@
-"""The node of a lattice that stands for a pair of places, in compiled code.
+"""The node of a lattice that represents a pair of positions, in compiled code.
 
 `corners` is (corner, 2), the polygon of a floor plan; `low`, `high` and `offset` (3,) metres.
 """
@@ -16,15 +16,15 @@ Coordinates = tuple[float, float, float, float, float, float]
 
 _HALVINGS = 5
 _SLACK_M = 1e-3
-"""By which what is said to be certain keeps away from where rounding decides."""
+"""Safety margin of distances that are reported as certain, for rounding errors."""
 _ON_A_WALL_M = 1e-5
-"""From a wall so near, what one sees through it is for rounding to decide."""
+"""So close to a wall, rounding decides what is visible through it."""
 
 
 @compiled
 def _nearest(at: float, low: float, high: float, offset: float, spacing: float) -> tuple[float, float]:
-    """Along one axis: the middle of the cell that `at` is in, or, where that is out of bounds, of the next one; and how
-    far it is to the end of the cell."""
+    """Find the cell along one axis: the middle of the cell that contains `at` (of the next cell, if that middle is out
+    of bounds), and the distance from `at` to the nearer end of the cell."""
     step = (high - low) / max(1, math.ceil((high - low) / spacing - 1e-9))
     origin = low + offset
     cell = math.floor((at - origin) / step)
@@ -39,7 +39,7 @@ def _nearest(at: float, low: float, high: float, offset: float, spacing: float) 
 
 @compiled
 def _distance(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
-    """Of a point from the line that ends at two others."""
+    """Distance of point p from the line segment between a and b."""
     along_x, along_y = bx - ax, by - ay
     squared = along_x**2 + along_y**2
     share = 0.0
@@ -60,8 +60,9 @@ def _from_walls(corners: Floats, px: float, py: float) -> float:
 
 @compiled
 def _clearance(corners: Floats, px: float, py: float, qx: float, qy: float) -> float:
-    """How far p may move, and no wall's end comes to lie between it and q: what q sees of it stays as it is as long as
-    p goes through no wall. Wall's ends throw shadows, straight away from q; that is how far their edges are."""
+    """How far p may move without the end of a wall coming between p and q: within this distance q's view of p stays the
+    same, as long as p passes through no wall. Each wall end casts a shadow straight away from q; the result is the
+    distance to the nearest edge of a shadow."""
     least = math.inf
     for x, y in corners:
         away_x, away_y = x - qx, y - qy
@@ -88,11 +89,12 @@ def find_node(
     ez: float,
     looks_about: bool,
 ) -> tuple[bool, Coordinates, float]:
-    """Whether listener and emitter see each other, the places of listener and emitter in the node for them, and how far
-    the listener may move for certain without either being another: 0 unless it `looks_about`.
+    """Whether listener and emitter see each other; their positions in the node that represents them; and how far the
+    listener may move while both certainly stay the same (0 unless `looks_about`).
 
-    Each sees its place in the node, and those see each other if and only if these do. Where the cells of the lattice
-    hold no such node, those of half the size are asked, and so on; in the end, they are their own node.
+    Listener and emitter each see their position in the node, and these two see each other if and only if listener and
+    emitter do. If there is no such node among the cells of the lattice, cells of half the size are tried, and so on; in
+    the end, the positions are their own node.
     """
     in_sight = is_visible(corners, lx, ly, ex, ey)
     certain = 0.0

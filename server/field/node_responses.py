@@ -1,4 +1,4 @@
-"""Responses that are kept to be used again for poses near those that they were computed for.
+"""A cache of responses at nodes, reused for poses near them.
 
 Axes: B poses; responses (B, channel, sample). Metres, radians.
 """
@@ -16,14 +16,16 @@ from server.kernels.array_pool import ArrayPool
 from server.scene.manifest import QualityLevel
 
 NodeCache = BoundedCache[tuple[object, ...], object]
-"""Responses of nodes, and what was prepared of them, of all levels of a scene, by whatever they depend on."""
+"""Responses of the nodes of all levels of a scene, and objects prepared from them, each by a key of everything that it
+depends on."""
 
 NODE_CACHE_BYTES = 64 * 1024 * 1024
 _POOL = ArrayPool(16 * 1024 * 1024)
 
 
 class Nodes(Protocol):
-    """Says which node stands for a pair of poses; `server.field.lattice.Lattice` is one. A function of poses alone."""
+    """Maps a pair of poses to the node that represents it, depending only on the poses; for example
+    `server.field.lattice.Lattice`."""
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped: ...
 
@@ -33,14 +35,14 @@ class Nodes(Protocol):
 
 
 class NodeResponses(ResponseSource):
-    """The responses of one level at its nodes. They are a function of the poses alone: whether a response was kept, or
-    with which others it was asked for, makes no difference to a bit."""
+    """The responses of one level at its nodes. They depend only on the poses: it makes no difference, not even to the
+    last bit, whether a response was cached or which others were requested with it."""
 
     def __init__(self, level: QualityLevel, nodes: Nodes, compute: Compute, cache: NodeCache) -> None:
         self._nodes = nodes
         self._compute = compute
         self._cache = cache
-        # Levels that differ in their nodes alone share those that they have in common.
+        # Levels that differ only in their nodes share the responses of common nodes.
         self._made_by = (level.field, level.phase, level.frames)
 
     def responses(
@@ -75,17 +77,17 @@ class NodeResponses(ResponseSource):
         return delay_response(self._at(snapped.node), snapped.later_samples)
 
     def moved(self, rng: np.random.Generator) -> "NodeResponses":
-        """Keeps responses in the same cache."""
+        """The same with moved nodes and the same cache."""
         moved = copy.copy(self)
         moved._nodes = self._nodes.moved(rng)
         return moved
 
     def _at(self, node: Node) -> Float32:
-        """(channel, sample); not to be written to."""
+        """The response (channel, sample) of a node; read-only."""
         key = (self._made_by, node)
         response = self._cache.get(key)
         if not isinstance(response, np.ndarray):
-            # One by one: in a batch the last bits depend on the others.
+            # One by one, because in a batch the last bits depend on the other poses.
             response = self._compute(np.array([node.listener]), np.array([node.emitter]), np.array([node.yaw]))[0]
             self._cache.put(key, response, response.nbytes)
         return response

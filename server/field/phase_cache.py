@@ -1,4 +1,4 @@
-"""Responses found lately, for the phases of the next ones near them.
+"""A cache of recent responses, whose phases are the starting points for nearby poses.
 
 Metres, radians.
 """
@@ -14,10 +14,10 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 CELL_M = 0.05
-"""One response is kept of all poses that agree so closely, the newest."""
+"""Of poses that agree within this distance, only the newest response is kept."""
 RADIUS_M = 0.5
-"""Within it poses are near: the lengths of the listener's way, the emitter's, and an ear's as the head turns, squared
-and added up."""
+"""Poses within this distance are near. The distance is the root of a sum of squares: of the listener's motion, the
+emitter's motion, and the motion of an ear as the head turns."""
 CAPACITY = 64
 
 _EAR_M = 0.0875
@@ -25,7 +25,7 @@ _NOWHERE = math.inf
 
 
 class PhaseCache:
-    """The last `capacity` responses by pose; safe to share between threads. The one unused for longest makes room."""
+    """The last `capacity` responses by pose; safe to share between threads. The least recently used one is replaced."""
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         self._lock = threading.Lock()
@@ -34,7 +34,7 @@ class PhaseCache:
         self._responses: list[Float32 | None] = [None] * capacity
 
     def nearest(self, listener: Floats, emitter: Floats, yaw: float) -> Float32 | None:
-        """Of the responses within RADIUS_M, the nearest pose's; not to be written to."""
+        """The response of the nearest pose within RADIUS_M, or None; read-only."""
         pose = _pose(listener, emitter, yaw)
         with self._lock:
             distance = np.linalg.norm(self._poses - pose, axis=-1)
@@ -46,7 +46,7 @@ class PhaseCache:
             return self._responses[place]
 
     def keep(self, listener: Floats, emitter: Floats, yaw: float, response: Float32) -> None:
-        """Copies the response; one that is silent has no phase to give, and is not kept."""
+        """Store a copy of a response; a silent one has no phase and is not stored."""
         # guard: a silent response gives no phase
         if not response.any():
             return
@@ -66,7 +66,8 @@ class PhaseCache:
 
 
 def _pose(listener: Floats, emitter: Floats, yaw: float) -> Floats:
-    """(8,) metres: two poses are as far apart as these, and headings as an ear on a head's circle."""
+    """(8,) metres: coordinates of the poses, with the heading as the position of an ear, such that their Euclidean
+    distance measures how far two pairs of poses are apart."""
     return np.array([*listener, *emitter, _EAR_M * math.cos(yaw), _EAR_M * math.sin(yaw)])
 
 

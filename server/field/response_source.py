@@ -1,4 +1,4 @@
-"""Where a quality level takes the responses of poses from: computed anew for each, or from elsewhere.
+"""The interface through which a quality level gets responses: computed for each pose, or taken from nodes.
 
 Axes: B poses; responses (B, channel, sample). Metres, radians.
 """
@@ -17,35 +17,36 @@ Floats = npt.NDArray[np.float64]
 
 
 class Compute(Protocol):
-    """Has the network compute responses, in an array of their own."""
+    """A function that computes responses with the network, in a new array."""
 
     def __call__(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
-        """Listeners (B, 3), emitters (B, 3), yaws (B,). With `remember`, a warm phase starts from the ones before."""
+        """Compute responses for listeners (B, 3), emitters (B, 3) and yaws (B,). With `remember`, a warm phase starts
+        from earlier responses."""
 
 
 class ResponseSource(ABC):
-    """One level's, in one scene. Safe to share between threads."""
+    """The source of responses of one level in one scene. Safe to share between threads."""
 
     @abstractmethod
     def responses(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
-        """(B, channel, sample), an array of their own."""
+        """The responses (B, channel, sample), in a new array."""
 
     @abstractmethod
     def computed_for(self, listeners: Floats, emitters: Floats, yaws: Floats) -> tuple[Floats, Floats, Floats]:
-        """The poses that the network is asked for in place of these."""
+        """The poses for which the network is run in place of these."""
 
     @abstractmethod
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
-        """What stands for a pair of poses: those that have the same share a response."""
+        """The node that represents a pair of poses: pairs with the same result share a response."""
 
     @abstractmethod
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
-        """As `snap`, and which other listeners are sure to have the same."""
+        """As `snap`, and also the other listener poses that certainly have the same result."""
 
     @abstractmethod
     def response(self, snapped: Snapped) -> Float32:
-        """(channel, sample), an array of its own."""
+        """The response (channel, sample) in a new array."""
 
     @abstractmethod
     def moved(self, rng: np.random.Generator) -> "ResponseSource":
-        """With what stands for poses elsewhere, so that errors are measured at poses like any other."""
+        """The same source with randomly moved nodes, so that errors are measured at typical poses."""

@@ -1,11 +1,11 @@
-"""ONNX Runtime as Nafir uses it: on the CPU, with few threads, telling nobody.
+"""ONNX Runtime as Nafir uses it: on the CPU, with few threads, without telemetry.
 
-Every other module takes its sessions from here.
+All other modules get their sessions from this one.
 """
 
 import os
 
-# Recent builds report usage to their vendor unless told otherwise; the variable is read once, as the library is loaded.
+# Recent builds report usage to their vendor unless this variable is set; it is read once, when the library is loaded.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 from onnxruntime import InferenceSession, SessionOptions
@@ -24,18 +24,19 @@ SESSION_ERRORS: tuple[type[Exception], ...] = (
     _state.NotImplemented,
     _state.RuntimeException,
 )
-"""What opening or running a session may raise; they have no base of their own."""
+"""The errors that opening or running a session may raise; they have no common base class."""
 
 _ERRORS_ONLY = 3
 
 
 def open_session(model: bytes, *, threads: int = 1) -> InferenceSession:
-    """A session for the bytes of an ONNX file. Raises ValueError for bytes that are no usable graph, or not all of
-    one."""
+    """Open a session for the bytes of an ONNX file. Raises ValueError for bytes that are no usable graph, and for a
+    graph whose weights are in other files."""
     # guard: a graph has its weights in it
     if refers_to_other_files(model):
         raise ValueError("it keeps weights in other files; save it with all of them inside")
-    # Not session.set_denormal_as_zero: it reaches the runtime's own threads, and a session of one thread has none.
+    # session.set_denormal_as_zero would not do: it affects only the runtime's own threads, and a session of one thread
+    # has none.
     options = SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

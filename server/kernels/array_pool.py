@@ -1,7 +1,7 @@
-"""Large arrays that come and go many times a second, without asking the system for pages each time.
+"""A pool of large arrays that are needed many times a second, without requesting pages from the system each time.
 
-Fresh pages are cleared where they are first written, which on a virtual machine takes longer than what is computed into
-them, and are taken away again on the thread that lets go.
+The system clears fresh pages when they are first written, which on a virtual machine takes longer than the computation
+that fills them. It also unmaps them on the thread that frees the array.
 """
 
 import math
@@ -17,15 +17,16 @@ from server.kernels.cache_lines import LINE_BYTES
 Bytes = npt.NDArray[np.uint8]
 
 _LARGE_BYTES = 96 * 1024
-"""From which on arrays have pages of their own (`server.runtime.memory`)."""
+"""Arrays from this size on have pages of their own (`server.runtime.memory`)."""
 _FEWEST = 2
-"""Arrays of the largest size that may wait."""
+"""The pool has room for at least this many arrays of the largest size that it keeps."""
 
 
 class ArrayPool:
-    """Arrays that were let go of, for the next that are as large; at most `most_bytes` wait for that.
+    """Keeps freed arrays and reuses them for requests of the same size; at most `most_bytes` are kept.
 
-    Any thread may take one and let go of it, and none waits for another: where two meet, one does without.
+    Any thread may take and free arrays, and no thread waits for another: if two threads access the pool at once, one
+    goes without it.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -36,24 +37,25 @@ class ArrayPool:
 
     @property
     def nbytes(self) -> int:
-        """Of those that wait."""
+        """The size of the arrays that are kept for reuse."""
         return self._bytes
 
     def take(self, size: int) -> Bytes:
-        """(size,) of anything, at the start of a cache line. It comes back by itself, once no view of it is left."""
+        """An uninitialised array (size,) that begins on a cache line. It returns to the pool by itself when its last
+        view is gone."""
         if size < _LARGE_BYTES:
             return _aligned(size)
         found = self._find(size)
         return np.asarray(_Lent(self, _aligned(size) if found is None else found))
 
     def floats(self, *shape: int) -> npt.NDArray[np.float32]:
-        """As `take`."""
+        """As `take`, for float32 of any shape."""
         return self.take(math.prod(shape) * np.dtype(np.float32).itemsize).view(np.float32).reshape(shape)
 
     def _find(self, size: int) -> Bytes | None:
         if self._lock.acquire(blocking=False):
             try:
-                # The newest first: it may still be in a cache.
+                # Try the newest first: it may still be in a cache.
                 for back in range(1, len(self._waiting) + 1):
                     if self._waiting[-back].size == size:
                         found = self._waiting[-back]
@@ -66,9 +68,9 @@ class ArrayPool:
 
     def _keep(self, array: Bytes) -> None:
         if array.size > self._most_bytes // _FEWEST:
-            return  # it would drive out all the others
-        superfluous = []  # let go of without the lock
-        # It may come from a collection of garbage amid `_find` on this very thread.
+            return  # too large: it would displace all the others
+        superfluous = []  # freed after the lock is released
+        # The garbage collector may call this during `_find`, on this very thread.
         if self._lock.acquire(blocking=False):
             try:
                 self._waiting.append(array)
@@ -81,7 +83,7 @@ class ArrayPool:
 
 
 class _Lent:
-    """What every view of an array of a pool rests on."""
+    """The base object of all views of an array from a pool; when it is deleted, the array returns to the pool."""
 
     def __init__(self, pool: ArrayPool, array: Bytes) -> None:
         self._pool = pool

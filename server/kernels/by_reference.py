@@ -1,8 +1,8 @@
-"""Named tuples of many arrays, handed to compiled code by reference.
+"""Named tuples of many arrays, passed to compiled code by reference.
 
-Numba passes a tuple by value: every array of it, field by field, at every call. With tens of arrays that takes longer
-than what is done with them, and longer still to compile. A `Reference` is one address there, and has the attributes of
-the tuple, as it has in Python.
+Numba passes a tuple by value: every array of it, field by field, at every call. With tens of arrays this takes longer
+than the work itself, and longer still to compile. In compiled code a `Reference` is one address with the attributes of
+the tuple, the same as in Python.
 """
 
 from typing import Any, NamedTuple
@@ -19,15 +19,15 @@ _WORD = ir.IntType(64)
 
 
 class Reference:
-    """To a named tuple of contiguous arrays, floats and ints, which it keeps alive.
+    """A reference to a named tuple of contiguous arrays, floats and ints. It keeps the tuple alive.
 
-    `address` may be handed to compiled code as well, which makes a reference of it with `reference_at`.
+    Compiled code can also take `address` and turn it back into a reference with `reference_at`.
     """
 
     def __init__(self, value: NamedTuple) -> None:
         self.value = value
         self.kind = ReferenceType(typeof(value))
-        # As numba lays arrays out: who owns them (nobody, here), sizes, address, shape and strides, a word each.
+        # Numba's layout of arrays, one word each: two owner fields (here 0), size, item size, address, shape, strides.
         words = [word for field in value for word in _words(field)]
         self._words = np.array(words, np.int64)
         self.address = int(self._words.ctypes.data)
@@ -55,7 +55,7 @@ class ReferenceType(types.Type):
         return int(self.to.fields.index(name))
 
     def offset(self, name: str) -> int:
-        """Bytes before a field."""
+        """Offset of a field in bytes."""
         return 8 * sum(_word_count(kind) for kind in self.to.types[: self.index(name)])
 
 
@@ -100,7 +100,7 @@ def _lower_attribute(context: Any, builder: Any, kind: ReferenceType, value: Any
 
 @intrinsic
 def reference_at(_context: Any, _address: Any, like: Any) -> Any:
-    """The reference whose `address` is given, of the type of `like`."""
+    """Return the reference at `address`, of the same type as `like`."""
 
     def generate(_context: Any, _builder: Any, _signature: Any, args: Any) -> Any:
         return args[0]

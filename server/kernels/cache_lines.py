@@ -1,4 +1,4 @@
-"""Arrays that begin where a line of the cache does: vectors that lie across two lines take twice as long."""
+"""Arrays that begin on a cache line: vectors that cross the boundary of two lines take twice as long."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,8 +9,8 @@ LINE_BYTES = 64
 
 
 def zeros_on_lines(*lengths: int) -> Float32:
-    """As `numpy.zeros`, which promises 16 bytes. Pages are mapped when first written, so what is not used costs
-    nothing."""
+    """As `numpy.zeros`, but on a cache line; NumPy aligns to 16 bytes only. Memory pages are mapped when first written,
+    so unused parts cost nothing."""
     size = int(np.prod(lengths))
     line = LINE_BYTES // np.float32().itemsize
     whole = np.zeros(size + line, dtype=np.float32)
@@ -19,7 +19,7 @@ def zeros_on_lines(*lengths: int) -> Float32:
 
 
 def on_lines(values: npt.NDArray[np.floating]) -> Float32:
-    """A copy."""
+    """A copy of an array that begins on a cache line."""
     copy = zeros_on_lines(*values.shape)
     copy[...] = values
     return copy

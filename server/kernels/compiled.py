@@ -1,9 +1,9 @@
-"""Compilation of hot loops, and its results on disk.
+"""Compilation of hot loops, with a cache on disk.
 
-Compiled code runs without the interpreter's lock, follows NumPy's rules for division by zero, and is kept on disk: in
-NUMBA_CACHE_DIR if that is set, else beside the source, else in the user's cache folder. Numba by itself would take code
-for fresh as long as the one file is unchanged that a function is written in; here it is fresh as long as no module that
-holds compiled code has changed. A folder that cannot be written, as in a container, is read all the same.
+Compiled code runs without the interpreter's lock, follows NumPy's rules for division by zero, and is stored on disk: in
+NUMBA_CACHE_DIR if that is set, else beside the source, else in the user's cache folder. Numba by itself would reuse
+cached code as long as the file of the function is unchanged; here it is reused only as long as no module with compiled
+code has changed. A cache in a read-only folder, as in a container, is still read.
 """
 
 import contextlib
@@ -26,13 +26,14 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Compile on first call."""
+    """Compile a function on its first call."""
     return _compile(function)
 
 
 def compiled_in_place(function: Function) -> Function:
-    """As `compiled`, of what makes no array and keeps none, but works in those of others: where short loops take their
-    turns over many arrays, counting references is a tenth of all work. What would allocate does not compile."""
+    """As `compiled`, for functions that allocate no arrays and store none, but only work in arrays of their callers. In
+    short loops over many arrays, reference counting is a tenth of all work, and is left out here. A function that
+    allocates does not compile."""
     return _compile(function, _nrt=False)
 
 
@@ -43,23 +44,24 @@ def _compile(function: Function, **options: bool) -> Function:
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Whether code of a compiled function for this processor is on disk already."""
+    """Whether the code of a compiled function for this processor is already on disk."""
     processor = cpu_target.target_context.codegen().magic_tuple()
     return any(key[1] == processor for key in function._cache._cache_file._load_index())  # type: ignore[attr-defined]
 
 
 def functions_compiled() -> int:
-    """How many functions this process has compiled so far, and not loaded from disk."""
+    """How many functions this process has compiled so far; functions loaded from disk do not count."""
     return _Cache.compiled
 
 
 def _look_for_no_blas() -> None:
-    """Numba imports SciPy's linear algebra before it reads or compiles anything, for products of matrices that nothing
-    here compiles: a fifth of what a process that convolves, and needs no SciPy besides, takes to its first block.
-    Others find it still, but for `np.convolve` and `np.correlate`, which then do their own sums."""
+    """Stop numba from importing SciPy's linear algebra before it loads or compiles anything. Numba needs it for matrix
+    products, which no code here compiles; importing it takes a fifth of the time to the first block, in a process that
+    convolves and needs no SciPy otherwise. Other code can still import it; only `np.convolve` and `np.correlate` in
+    compiled code then do without it."""
     if {"scipy.linalg", "numba.np.arraymath"} & sys.modules.keys():
         return
-    # Of numba's inner parts; where a later one has others, it takes its time.
+    # These are internals of numba; if a later version differs, the import just takes its time.
     with contextlib.suppress(ImportError, AttributeError):
         linalg: Any = importlib.import_module("numba.np.linalg")
         ensure_blas = linalg.ensure_blas
@@ -76,7 +78,7 @@ def _there_is_no_blas() -> None:
 
 @cache
 def _digest_of_sources() -> str:
-    """Of every module of the server that says "compiled"."""
+    """A digest of every module of the server that contains the word "compiled"."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].glob("**/*.py")):
         source = path.read_bytes()
@@ -130,13 +132,14 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        # Read before anything is unpickled, which of other sources may name modules that are no more.
+        # The version is compared before anything is unpickled: code from other sources may refer to modules that no
+        # longer exist.
         self._cache_file._version = f"{self._cache_file._version} {_digest_of_sources()}"
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """As numba has it, less the rules of typing and lowering: they take a third of a second to set up, and only
-        compiling needs them, which sets them up itself."""
-        rtsys.initialize(target)  # what compiled code allocates with
+        """As in numba, but without the rules of typing and lowering. Setting them up takes a third of a second, and
+        only compiling needs them, which then sets them up itself."""
+        rtsys.initialize(target)  # sets up the memory allocation of compiled code
         with self._guard_against_spurious_io_errors():
             loaded = self._load_overload(signature, target)
         if loaded is None:

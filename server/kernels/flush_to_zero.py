@@ -1,9 +1,9 @@
-"""Denormal numbers as zeros while compiled code runs: they are inaudible, and a multiplication by one takes some CPUs a
-hundred times as long as any other.
+"""A mode of the processor that treats denormal numbers as zeros in compiled code. They are inaudible, and multiplying
+by one takes some CPUs a hundred times as long as by any other number.
 
-The mode belongs to a thread. It is entered and left within one compiled call, so that whatever else runs on the thread
-computes as ever, and the same call gives the same samples on every thread. On processors that are neither x86-64 nor
-ARM64 nothing changes.
+The mode belongs to a thread. It is set and reset within one compiled call. Other code on the thread is therefore not
+affected, and the same call gives the same samples on every thread. On processors other than x86-64 and ARM64 nothing
+changes.
 """
 
 import platform
@@ -19,13 +19,13 @@ _X86 = _MACHINE in {"x86_64", "amd64"}
 _ARM = _MACHINE in {"aarch64", "arm64"}
 # guard: denormal products are zero
 _FLUSH_X86 = 0x8040
-"""MXCSR: flush results to zero (bit 15), and take denormal operands for zero (bit 6)."""
+"""Bits of the MXCSR register: flush results to zero (bit 15), and treat denormal operands as zero (bit 6)."""
 _FLUSH_ARM = 1 << 24
-"""FPCR: both."""
+"""The bit of the FPCR register that does both."""
 
 
 def _read(builder: Any) -> Any:
-    """The control word, 64 bits."""
+    """Read the control register, as 64 bits."""
     if _X86:
         place = builder.alloca(_WORD32)
         store = builder.module.declare_intrinsic(
@@ -52,7 +52,7 @@ def _write(builder: Any, word: Any) -> None:
 
 @intrinsic
 def flush_to_zero(_context: Any) -> Any:
-    """Enter the mode; what `restore` takes to leave it."""
+    """Switch the mode on; returns the value that `restore` takes to switch it off."""
 
     def generate(_context: Any, builder: Any, _signature: Any, _args: Any) -> Any:
         before = _read(builder)
@@ -64,7 +64,7 @@ def flush_to_zero(_context: Any) -> Any:
 
 @intrinsic
 def restore(_context: Any, _before: Any) -> Any:
-    """Leave the mode."""
+    """Switch the mode off."""
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         _write(builder, args[0])

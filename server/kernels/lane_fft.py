@@ -1,8 +1,9 @@
-"""Eight complex transforms at once, one per lane: the Fourier transform for compiled code.
+"""Eight complex Fourier transforms at once, one per lane, for compiled code.
 
-`values` are (2, n, 8) float32 at an address: real parts, then imaginary parts, of n points in eight lanes. Radix 4,
-decimation in frequency, in place; what comes out is in an order of its own (digits reversed), which callers undo where
-they move data anyway. With real and imaginary parts exchanged on both sides it is the inverse, n times too large.
+`values` are (2, n, 8) float32 at an address: real parts, then imaginary parts, of n points in eight lanes. The
+transform is radix 4, decimation in frequency, in place; its output is in digit-reversed order, which callers undo when
+they move the data anyway. With real and imaginary parts exchanged in input and output it is the inverse, n times too
+large.
 """
 
 from functools import cache
@@ -26,7 +27,8 @@ from server.kernels.simd import (
 
 @cache
 def twiddles(points: int) -> npt.NDArray[np.float32]:
-    """Of each pass in turn: six floats per butterfly of radix 4, two of radix 2; `points` is a power of two."""
+    """The twiddle factors of each pass in turn: six floats per butterfly of radix 4, two per butterfly of radix 2.
+    `points` must be a power of two."""
     passes = [np.zeros(0)]
     if is_odd_power(points):
         turn = np.exp(-2j * np.pi * np.arange(points // 2) / points)
@@ -41,7 +43,7 @@ def twiddles(points: int) -> npt.NDArray[np.float32]:
 
 @cache
 def order(points: int) -> npt.NDArray[np.int64]:
-    """(points,) the frequency that each position holds after the transform."""
+    """(points,) the frequency at each position after the transform."""
     frequencies, length = np.arange(1), 1
     while length < points:
         radix = 2 if length * 2 == points and is_odd_power(points) else 4
@@ -52,13 +54,14 @@ def order(points: int) -> npt.NDArray[np.int64]:
 
 @compiled
 def first_span(points: int) -> int:
-    """Of the radix-4 passes: a quarter of what is left to transform after the pass of radix 2, where there is one."""
+    """The span of the first radix-4 pass: a quarter of the points that remain after the radix-2 pass, if there is
+    one."""
     return points // 8 if is_odd_power(points) else points // 4
 
 
 @compiled
 def is_odd_power(points: int) -> bool:
-    """Of two: whether the first pass is one of radix 2."""
+    """Whether `points` is an odd power of two, so that the first pass is of radix 2."""
     power = 0
     while points > 1:
         points >>= 1
@@ -68,7 +71,7 @@ def is_odd_power(points: int) -> bool:
 
 @compiled
 def transform_lanes(values: int, points: int, passes: int) -> None:
-    """Forward, in place; `passes` is the address of `twiddles(points)`."""
+    """Transform in place, forward; `passes` is the address of `twiddles(points)`."""
     if is_odd_power(points):
         _halve(values, points, passes)
     transform_halved(values, points, passes)
@@ -76,7 +79,7 @@ def transform_lanes(values: int, points: int, passes: int) -> None:
 
 @compiled
 def transform_halved(values: int, points: int, passes: int) -> None:
-    """What `transform_lanes` does after the pass of radix 2, where there is one."""
+    """Do the part of `transform_lanes` after the pass of radix 2, if there is one."""
     _turned_passes(values, points, passes)
     size = LANES * points
     if first_span(points) == 0:
@@ -95,7 +98,7 @@ def transform_halved(values: int, points: int, passes: int) -> None:
 
 @compiled
 def transform_but_last(values: int, points: int, passes: int) -> None:
-    """All passes but the last, whose butterflies are of four neighbours each and turn nothing."""
+    """Do all passes except the last, whose butterflies each combine four neighbours without twiddles."""
     if is_odd_power(points):
         _halve(values, points, passes)
     _turned_passes(values, points, passes)
@@ -103,13 +106,13 @@ def transform_but_last(values: int, points: int, passes: int) -> None:
 
 @compiled
 def _turned_passes(values, points, passes) -> None:
-    """Of radix 4, but for the last."""
+    """Do the radix-4 passes except the last."""
     size = LANES * points
     table = points if is_odd_power(points) else 0
     span = first_span(points)
     while span > 1:
         for j in range(span):
-            # A range of such a step would divide to find its length.
+            # A range with this step would need a division to find its length.
             at = LANES * j
             while at < size:
                 _turned_butterfly(values, size, at, LANES * span, passes, table + 6 * j)
@@ -120,7 +123,7 @@ def _turned_passes(values, points, passes) -> None:
 
 @compiled
 def _halve(values, points, passes) -> None:
-    """The pass of radix 2."""
+    """Do the pass of radix 2."""
     size, half = LANES * points, points // 2
     for j in range(half):
         at, to = 8 * j, 8 * (j + half)
@@ -132,7 +135,7 @@ def _halve(values, points, passes) -> None:
 
 @compiled
 def butterfly(values: int, size: int, at: int, step: int):
-    """Four points `step` apart, real and imaginary part of each: their transform."""
+    """Transform four points that are `step` apart; returns the real and imaginary part of each."""
     p1, p2, p3 = at + step, at + 2 * step, at + 3 * step
     ar, ai, br, bi = load(values, at), load(values, size + at), load(values, p1), load(values, size + p1)
     cr, ci, dr, di = load(values, p2), load(values, size + p2), load(values, p3), load(values, size + p3)
@@ -163,8 +166,8 @@ def _turned_butterfly(values, size, at, step, passes, t) -> None:
 
 @compiled
 def store_turned(values, size, at, re, im, passes, t) -> None:
-    """A point, multiplied by the twiddle at `t`."""
-    # Loaded where they are needed, factors take no registers in the meantime.
+    """Store a point, multiplied by the twiddle factor at `t`."""
+    # Loading the factors just before use keeps registers free until then.
     c, s = load_broadcast(passes, t), load_broadcast(passes, t + 1)
     store(values, at, multiply_subtract(im, s, multiply(re, c)))
     store(values, size + at, multiply_add(im, c, multiply(re, s)))

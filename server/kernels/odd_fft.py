@@ -1,16 +1,17 @@
-"""The transform of the compiled convolver: the odd-frequency Fourier transform of real samples, in place, in no
-particular order of bins.
+"""The transform of the compiled convolver: the odd-frequency Fourier transform of real samples, in place, with bins in
+an unspecified order.
 
-Its bins lie halfway between those of an ordinary transform. A window of 2 n real samples x is a polynomial modulo
-z^2n = -1; at the n roots of z^n = -i it takes the values of the n complex numbers x[j] - i x[n + j], j < n, twisted by
+Its bins lie halfway between those of an ordinary transform. A window of 2 n real samples x is a polynomial modulo z^2n
+= -1. At the n roots of z^n = -i its values are those of the n complex numbers x[j] - i x[n + j], j < n, twisted by
 exp(-i pi j / 2 n) and transformed by an ordinary complex FFT of size n (Nussbaumer 1981; the "right-angle" convolution
 of Krot and Minervina 1992). The other n roots give the conjugates. So 2 n real samples need n complex bins, all alike:
-no bin is real, and nothing has to be untangled as after an ordinary FFT of real samples. Products of such bins convolve
-negacyclically: what wraps round has the other sign. Overlap-save does not mind, since it drops what wrapped.
+no bin is real, and no bins have to be separated as after an ordinary FFT of real samples. Products of such bins
+convolve negacyclically: samples that wrap around change their sign. This does not matter for overlap-save, which drops
+these samples.
 
-The FFT splits n = 8 m: m-point transforms in every lane (`lane_fft`), twiddles, then 8 points
-across the lanes after a transposition of eight vectors. Bins stay where that leaves them, since only products of bins
-follow, and the inverse undoes the steps in reverse.
+The FFT splits n = 8 m: m-point transforms in every lane (`lane_fft`), twiddles, then 8 points across the lanes after a
+transposition of eight vectors. The resulting order of bins is kept, since only products of bins follow, and the inverse
+undoes the steps in reverse.
 """
 
 from dataclasses import dataclass
@@ -52,7 +53,7 @@ SMALLEST = LANES * LANES
 class Tables:
     """Constants of size n = `size`, a power of two from `SMALLEST` on; float32, real parts then imaginary parts.
 
-    `twist` (2, n) is exp(-i pi j / 2 n), `lanes` (2, n) the twiddles before the transform across lanes, in the order of
+    `twist` (2, n) is exp(-i pi j / 2 n); `lanes` (2, n) the twiddles before the transform across lanes, in the order of
     the bins; `passes` the twiddles of each radix-4 pass, six per butterfly.
     """
 
@@ -64,7 +65,7 @@ class Tables:
 
 @cache
 def tables(size: int) -> Tables:
-    """Raises ValueError for a size that is no power of two, or below `SMALLEST`."""
+    """The tables of a size. Raises ValueError for a size that is no power of two, or below `SMALLEST`."""
     if size < SMALLEST or size & (size - 1):
         raise ValueError(f"the transform has a size of {SMALLEST} or more, a power of two, not {size}")
     vectors = size // LANES
@@ -92,8 +93,9 @@ def forward(
 ) -> None:
     """Transform the window whose halves (n,) are at addresses `first` and `second`; all arrays are addresses.
 
-    Real parts go, eight at a time, to every `step`-th float32 from `to` on, and imaginary ones `imaginary` behind them.
-    `bins` (2, n), room for them, may be the same place, where eight follow on eight: step 8, imaginary n.
+    Real parts are written, eight at a time, to every `step`-th float32 from `to` on, and imaginary parts `imaginary`
+    floats after them. `bins` (2, n) is a buffer, which may be the same as `to` if vectors are contiguous: step 8,
+    imaginary n.
     """
     vectors = size // 8
     if is_odd_power(vectors):
@@ -139,13 +141,13 @@ def inverse(
     passes: int,
     lanes: int,
 ) -> None:
-    """Write the second half (n,) of the window, the half overlap-save keeps, to `out`. A spectrum lies as `forward`
-    leaves it; `bins` (2, n), room for it, may be the same place, and are used up."""
+    """Write the second half (n,) of the window, which overlap-save keeps, to `out`. The spectrum is laid out as
+    `forward` writes it; `bins` (2, n) is a buffer, which may be the same as the spectrum and is overwritten."""
     vectors = size // 8
     _invert_across_lanes(spectrum, step, imaginary, bins, size, lanes)
     largest = first_span(vectors)
     is_odd = 4 * largest != vectors
-    # The twiddles of a span come after those of all larger ones, six floats per butterfly.
+    # The twiddles of a span come after those of all larger spans, six floats per butterfly.
     table = 2 * (4 * largest - 4) + (vectors if is_odd else 0)
     span = 1
     while span <= largest:
@@ -162,10 +164,10 @@ def inverse(
 
 @compiled
 def _invert_across_lanes(spectrum, step, imaginary, bins, size, lanes) -> None:
-    """Undo the eight points across the lanes, and the twiddles before them."""
+    """Undo the eight-point transforms across the lanes, and the twiddles before them."""
     for at in range(0, size, 64):
         im, re = _load_8(spectrum, imaginary + at // 8 * step, step), _load_8(spectrum, at // 8 * step, step)
-        im, re = _eight_points(im, re)  # parts swapped: the inverse
+        im, re = _eight_points(im, re)  # real and imaginary parts swapped: the inverse
         re, im = transpose(re), transpose(im)
         cos, sin = _load_8(lanes, at, 8), _load_8(lanes, size + at, 8)
         re, im = _multiply_conjugate_8(re, im, cos, sin)
@@ -175,14 +177,14 @@ def _invert_across_lanes(spectrum, step, imaginary, bins, size, lanes) -> None:
 
 @compiled
 def _invert_pass(bins, size, span, passes, table) -> None:
-    """Undo a pass of radix 4, whose butterflies' points are `span` apart; `table` is where its twiddles are."""
+    """Undo a pass of radix 4, whose butterflies' points are `span` apart; `table` is the index of its twiddles."""
     vectors = size // 8
     for j in range(span):
         t = table + 6 * j
         c1, s1 = load_broadcast(passes, t), load_broadcast(passes, t + 1)
         c2, s2 = load_broadcast(passes, t + 2), load_broadcast(passes, t + 3)
         c3, s3 = load_broadcast(passes, t + 4), load_broadcast(passes, t + 5)
-        group = j  # a range of such a step would divide to find its length
+        group = j  # a range with this step would need a division to find its length
         while group < vectors:
             p0, p1 = 8 * group, 8 * (group + span)
             p2, p3 = 8 * (group + 2 * span), 8 * (group + 3 * span)
@@ -206,14 +208,14 @@ def _invert_pass(bins, size, span, passes, table) -> None:
 
 @compiled
 def _turned_back(bins, size, at, cos, sin):
-    """A point, multiplied by the conjugate of a twiddle."""
+    """Multiply a point by the conjugate of a twiddle factor."""
     re, im = load(bins, at), load(bins, size + at)
     return multiply_add(im, sin, multiply(re, cos)), multiply_subtract(re, sin, multiply(im, cos))
 
 
 @compiled
 def _untwist_halves(bins, size, twist, passes, scale, out) -> None:
-    """Undo the pass of radix 2, and the twist."""
+    """Undo the pass of radix 2 and the twist."""
     half = size // 2
     for n in range(0, half, 8):
         m = half + n
@@ -321,15 +323,15 @@ def _four_points(ar: Any, ai: Any, br: Any, bi: Any, cr: Any, ci: Any, dr: Any, 
 
 @compiled
 def _eight_points(re: Any, im: Any) -> Any:
-    """The transform of eight points, in order, in every lane."""
+    """The transform of eight points in every lane, in order of frequency."""
     half = broadcast(np.float32(np.sqrt(0.5)))
     er, ei = _four_points(re[0], im[0], re[2], im[2], re[4], im[4], re[6], im[6])
     odd_r, odd_i = _four_points(re[1], im[1], re[3], im[3], re[5], im[5], re[7], im[7])
-    # Turned by exp(-i pi k / 4): k = 1 and 3 need a rotation, k = 2 is -i.
+    # Multiplied by exp(-i pi k / 4): k = 1 and 3 need a rotation, k = 2 is -i.
     ar, ai = odd_r[0], odd_i[0]
     br, bi = multiply(add(odd_r[1], odd_i[1]), half), multiply(subtract(odd_i[1], odd_r[1]), half)
     cr, ci = odd_i[2], odd_r[2]  # the imaginary part with the other sign
-    dr, di = multiply(subtract(odd_i[3], odd_r[3]), half), multiply(add(odd_r[3], odd_i[3]), half)  # so here
+    dr, di = multiply(subtract(odd_i[3], odd_r[3]), half), multiply(add(odd_r[3], odd_i[3]), half)  # the same here
     return (
         (
             add(er[0], ar),

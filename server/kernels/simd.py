@@ -1,11 +1,13 @@
-"""Vectors of float32 for compiled code: what a loop over contiguous samples becomes when it must.
+"""Vectors of float32 for compiled code, for loops over contiguous samples that must be vectorised.
 
-LLVM vectorises simple loops by itself, but keeps no accumulators in registers and gives up where it cannot prove that
-arrays do not overlap. The inner loops of the convolver, and of decoding, decide what a host can carry, so they say
-what they mean. A vector is one of LLVM: of eight lanes, one register with AVX, two with SSE or NEON.
+LLVM vectorises simple loops by itself, but it keeps no accumulators in registers and gives up where it cannot prove
+that arrays do not overlap. The inner loops of the convolver and the decoder determine how many sessions a host can
+serve, so they use vectors explicitly. A vector is an LLVM vector: of eight lanes, it is one register with AVX and two
+with SSE or NEON.
 
-`lanes` makes what makes vectors of so many lanes; what works on vectors takes those of any. Memory is addressed as
-(byte address, index of a float32): inside a compiled function, of an array, by `.ctypes.data`.
+`lanes` returns the functions that make vectors with a given number of lanes; all other functions take vectors of any
+size. Memory is addressed as (byte address, index of a float32); inside a compiled function, the address of an array is
+its `.ctypes.data`.
 """
 
 import math
@@ -22,15 +24,16 @@ _FLOAT = ir.FloatType()
 _INT32 = ir.IntType(32)
 _INT64 = ir.IntType(64)
 
-# Split so that small multiples of the first parts are exact (Cody and Waite 1980).
+# Split so that small multiples of the first part are exact (Cody and Waite 1980).
 _LN_2 = (0.693359375, math.log(2) - 0.693359375)
-# (exp(x) - 1 - x) / x**2, the highest power first: nearest to exp within half of ln 2, relative, to 1.05e-7.
+# (exp(x) - 1 - x) / x**2, the highest power first. The result is exp within half of ln 2, with a relative error of at
+# most 1.05e-7.
 _EXPONENTIAL = [8.31250137619232e-3, 4.1890331599848334e-2, 0.16667115387827203, 0.49999230308875753]
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
 
 class Vector(types.Type):
-    """So many float32."""
+    """The numba type of a vector of `count` float32."""
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
@@ -48,8 +51,8 @@ def _floats(lanes: int) -> Any:
 
 
 def _same(first: Any, *others: Any) -> Vector | None:
-    """The type that all values have; None, which numba takes for no function of such values, where it is no vector's,
-    or not that of all."""
+    """The vector type that all values have. If they differ or are no vectors it is None, which tells numba that there
+    is no such function."""
     return first if isinstance(first, Vector) and all(other == first for other in others) else None
 
 
@@ -71,11 +74,11 @@ def _in_every_lane(builder: Any, value: Any, lanes: int) -> Any:
     return _shuffle(builder, first, undefined, [0] * lanes)
 
 
-# What makes vectors.
+# Functions that make vectors.
 
 
 class Lanes(NamedTuple):
-    """What makes vectors of so many float32."""
+    """The functions that make vectors with a given number of lanes."""
 
     load: Any
     """`load(address, index)`: the floats from `index` on."""
@@ -84,15 +87,15 @@ class Lanes(NamedTuple):
     broadcast: Any
     """`broadcast(value)`: one float32 in every lane."""
     load_twice: Any
-    """`load_twice(address, index)`: half as many floats from `index` on, in either half."""
+    """`load_twice(address, index)`: half as many floats from `index` on, repeated in both halves."""
     load_opposed: Any
-    """`load_opposed(address, index)`: half as many floats from `index` on in the second half, and what they are the
-    negatives of in the first."""
+    """`load_opposed(address, index)`: half as many floats from `index` on in the second half, and their negatives in
+    the first half."""
 
 
 @cache
 def lanes(count: int) -> Lanes:
-    """Of a power of two."""
+    """The functions that make vectors of `count` lanes, which must be a power of two."""
     vector, half = Vector(count), count // 2
 
     @intrinsic
@@ -137,17 +140,17 @@ def lanes(count: int) -> Lanes:
 
 
 LANES = 8
-"""Of the vectors that most loops work on."""
+"""The number of lanes in most loops."""
 _usual = lanes(LANES)
 load, load_broadcast, broadcast = _usual.load, _usual.load_broadcast, _usual.broadcast
 
 
-# What reads memory otherwise.
+# Other functions that read memory.
 
 
 @intrinsic
 def pointer(_context: Any, _address: Any) -> Any:
-    """An address as `numba.carray` takes it."""
+    """An address as a pointer for `numba.carray`."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
@@ -157,7 +160,7 @@ def pointer(_context: Any, _address: Any) -> Any:
 
 @intrinsic
 def prefetch(_context: Any, _address: Any) -> Any:
-    """Have the cache line at an address be near when it is read soon."""
+    """Prefetch the cache line at an address."""
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         to = ir.IntType(8).as_pointer()
@@ -172,7 +175,7 @@ def prefetch(_context: Any, _address: Any) -> Any:
 
 @intrinsic
 def load_int(_context: Any, _address: Any, _index: Any) -> Any:
-    """One int64; `index` counts int64."""
+    """Load one int64; `index` counts int64."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.load(_pointer(builder, *args, _INT64, 8), align=8)
@@ -182,7 +185,7 @@ def load_int(_context: Any, _address: Any, _index: Any) -> Any:
 
 @intrinsic
 def load_short_int(_context: Any, _address: Any, _index: Any) -> Any:
-    """One int32; `index` counts int32."""
+    """Load one int32; `index` counts int32."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.sext(builder.load(_pointer(builder, *args, _INT32, 4), align=4), _INT64)
@@ -190,12 +193,12 @@ def load_short_int(_context: Any, _address: Any, _index: Any) -> Any:
     return types.int64(types.int64, types.int64), generate
 
 
-# What works on vectors, all of as many lanes.
+# Functions of vectors, all with the same number of lanes.
 
 
 @intrinsic
 def store(_context: Any, _address: Any, _index: Any, value: Any) -> Any:
-    """Write a vector from `index` on."""
+    """Write a vector to memory from `index` on."""
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         builder.store(args[2], _pointer(builder, args[0], args[1], _floats(value.lanes), 4), align=4)
@@ -240,7 +243,7 @@ multiply_subtract = _fused(negate_product=True)
 
 
 def _call(builder: Any, name: str, *args: Any) -> Any:
-    """A function of LLVM of vectors."""
+    """Call an LLVM function on vectors."""
     kind = args[0].type
     function = ir.FunctionType(kind, [kind] * len(args))
     return builder.call(cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.v{kind.count}f32"), args)
@@ -259,7 +262,7 @@ def _integers(like: Any) -> Any:
 
 
 def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
-    """The highest power first."""
+    """Evaluate a polynomial; coefficients with the highest power first."""
     value = _constant(x, coefficients[0])
     for coefficient in coefficients[1:]:
         value = _call(builder, "fma", value, x, _constant(x, coefficient))
@@ -267,8 +270,9 @@ def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
 
 
 def _nearest_multiple(builder: Any, x: Any, parts: tuple[float, ...], inverse: float) -> tuple[Any, Any]:
-    """How often the period, a sum of `parts`, goes into x, as integers modulo 2**22, and the remainder."""
-    # Added to 1.5 * 2**23, a number is rounded to an integer, which then is in the low bits.
+    """Divide x by a period, given as a sum of `parts`: returns the nearest integer quotient modulo 2**22, and the
+    remainder."""
+    # Adding 1.5 * 2**23 rounds a number to an integer, which is then in the low bits.
     shifted = _call(builder, "fma", x, _constant(x, inverse), _constant(x, 12582912.0))
     times = builder.fneg(builder.fsub(shifted, _constant(x, 12582912.0)))
     for part in parts:
@@ -278,7 +282,7 @@ def _nearest_multiple(builder: Any, x: Any, parts: tuple[float, ...], inverse: f
 
 @intrinsic
 def at_least(_context: Any, x: Any, limit: Any) -> Any:
-    """max(x, limit); what is not a number stays so."""
+    """max(x, limit); NaN stays NaN."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         value, least = args
@@ -312,7 +316,7 @@ def any_above(_context: Any, x: Any, limit: Any) -> Any:
 
 @intrinsic
 def rotate(_context: Any, x: Any) -> Any:
-    """The last value first."""
+    """Rotate the lanes by one: the last value becomes the first."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return _shuffle(builder, args[0], args[0], [x.lanes - 1, *range(x.lanes - 1)])
@@ -322,7 +326,7 @@ def rotate(_context: Any, x: Any) -> Any:
 
 @intrinsic
 def with_first(_context: Any, first: Any, x: Any) -> Any:
-    """x but for its first value, which is that of the other."""
+    """`x` with its first value replaced by that of `first`."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return _shuffle(builder, *args, [0, *range(x.lanes + 1, 2 * x.lanes)])
@@ -332,7 +336,7 @@ def with_first(_context: Any, first: Any, x: Any) -> Any:
 
 @intrinsic
 def swap_halves(_context: Any, x: Any) -> Any:
-    """The second half first."""
+    """Swap the halves: the second half becomes the first."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         half = x.lanes // 2
@@ -351,7 +355,7 @@ def square_root(_context: Any, x: Any) -> Any:
 
 @intrinsic
 def exponential(_context: Any, x: Any) -> Any:
-    """exp(x) to 2.2e-7; of less than -87 or more than 88 that of these."""
+    """exp(x) to 2.2e-7; x is limited to the range from -87 to 88."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         (value,) = args
@@ -359,7 +363,8 @@ def exponential(_context: Any, x: Any) -> Any:
         value = builder.select(builder.fcmp_ordered("<", value, low), low, value)
         value = builder.select(builder.fcmp_ordered(">", value, high), high, value)
         halvings, rest = _nearest_multiple(builder, value, _LN_2, 1 / math.log(2))
-        # Its halves side by side: one after the other, powers would wait for each other.
+        # The two halves of the polynomial are evaluated side by side, because powers one after the other would wait for
+        # each other.
         square = builder.fmul(rest, rest)
         high = _polynomial(builder, rest, _EXPONENTIAL[:2])
         value = _call(builder, "fma", square, high, _polynomial(builder, rest, _EXPONENTIAL[2:]))
@@ -373,7 +378,7 @@ def exponential(_context: Any, x: Any) -> Any:
 
 @intrinsic
 def cosine_sine(_context: Any, x: Any) -> Any:
-    """cos(x) and sin(x) to 2e-7, of x within some hundred turns."""
+    """cos(x) and sin(x) to 2e-7, for x within some hundred turns."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         quarters, rest = _nearest_multiple(builder, args[0], _QUARTER_TURN, 2 / math.pi)
@@ -396,7 +401,7 @@ def cosine_sine(_context: Any, x: Any) -> Any:
 
 @intrinsic
 def transpose(_context: Any, rows: Any) -> Any:
-    """As many vectors as they have lanes, the rows of a matrix; its columns."""
+    """Transpose a square matrix: as many vectors as each has lanes."""
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return context.make_tuple(builder, rows, _transposed(builder, cgutils.unpack_tuple(builder, args[0])))
@@ -405,16 +410,17 @@ def transpose(_context: Any, rows: Any) -> Any:
 
 
 def _count(rows: Any) -> int:
-    """Of the vectors in a tuple; 0 where it is none of vectors."""
+    """The number of vectors in a tuple; 0 if it is no tuple of vectors."""
     return rows.count if isinstance(rows, types.UniTuple) and _same(rows.dtype) else 0
 
 
 def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
-    """Pairs of rows, then of pairs and so on; up to the last steps within fours of lanes, where that takes least."""
+    """Transpose by pairing rows, then pairs of rows, and so on; up to the last steps within groups of four lanes, where
+    it takes the fewest instructions."""
     count = len(rows)
 
     def paired(a: Any, b: Any, lanes: list[int], step: int) -> list[Any]:
-        """What two vectors have in some lanes, and in those `step` on."""
+        """Combine two vectors: the given lanes of each, and the lanes `step` after them."""
         return [_shuffle(builder, a, b, [lane + further for lane in lanes]) for further in (0, step)]
 
     fours = range(0, count, 4)
@@ -438,13 +444,14 @@ def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
 
 @intrinsic
 def sum_each(_context: Any, rows: Any) -> Any:
-    """Half as many vectors as they have lanes; their sums, one after the other, in a vector of half as many lanes."""
+    """Sum the lanes of each vector of a tuple, whose length is half the number of lanes; the sums are the lanes of a
+    vector of that length."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         vectors = cgutils.unpack_tuple(builder, args[0])
         count = 2 * len(vectors)
         width = count
-        while len(vectors) > 1:  # each holds partial sums of ever more of them, in ever fewer lanes
+        while len(vectors) > 1:  # each vector holds partial sums of twice as many rows as before
             width //= 2
             low = [lane for lane in range(2 * count) if lane // width % 2 == 0]
             high = [lane + width for lane in low]

@@ -1,4 +1,4 @@
-"""The kinds of quality level there are."""
+"""A list of all kinds of quality level."""
 
 from typing import Final
 
@@ -9,9 +9,9 @@ from server.field.kinds.whole_node import WholeNode
 from server.scene.manifest import QualityLevel
 
 KINDS: Final[tuple[type[LevelKind], ...]] = (LatticeReverberation, WholeNode, EveryPose)
-"""A level is of the first kind that has it. The last one has all."""
+"""A level is of the first kind that matches it. The last kind matches all levels."""
 
 
 def kind_of(level: QualityLevel) -> LevelKind:
-    """The level as its kind serves it."""
+    """The level as an object of its kind."""
     return next(kind(level) for kind in KINDS if kind.matches(level))

@@ -30,7 +30,7 @@ class EveryPose(LevelKind):
 
 
 class ComputedResponses(ResponseSource):
-    """Every pose stands for itself."""
+    """The source of responses that are computed for every pose: each pose represents itself."""
 
     def __init__(self, compute: Compute) -> None:
         self._compute = compute

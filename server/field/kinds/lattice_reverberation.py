@@ -1,4 +1,5 @@
-"""Levels whose reverberation is that of the nearest node of a lattice; first reflections are each pose's own."""
+"""Levels that take reverberation from the nearest node of a lattice, and compute the first reflections for each
+pose."""
 
 from collections.abc import Iterator
 from typing import ClassVar, Final, Literal
@@ -26,13 +27,13 @@ _LATTICES: Final = (
     (5.0, 120),
     (5.0, 360),
 )
-"""Spacing in metres, step of the heading in degrees: from a spacing of centimetres to one node per room."""
+"""Spacing in metres and step of the heading in degrees: from spacings of centimetres up to one node per room."""
 
 
 class LatticeReverberation(LevelKind):
     reuses_responses = True
     _first_reflections: ClassVar[Literal["pose", "node"]] = "pose"
-    """As the manifest has it."""
+    """The value in the manifest."""
     _suffix: ClassVar[str] = ""
     _renewed: ClassVar[str] = "reverberation"
 

@@ -1,4 +1,4 @@
-"""The questions that a kind of quality level answers."""
+"""The interface of a kind of quality level."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -12,14 +12,14 @@ from server.scene.manifest import QualityLevel
 
 
 class LevelKind(ABC):
-    """One quality level. A subclass says which poses share a response, and what follows from that for the rest of the
-    server; limits that a level of any kind may have are here."""
+    """One quality level. A subclass says which poses share a response, and what this means for the rest of the server;
+    limits that apply to levels of every kind are in this class."""
 
     reuses_responses: ClassVar[bool]
-    """Whether poses share what the field holds. It is kept for them then, and most poses of a walk cost next to
+    """Whether poses share the field's responses. The server then caches them, and most poses of a walk cost almost
     nothing."""
     shares_reflections: ClassVar[bool] = False
-    """Whether poses that share a response share the first reflections from geometry too, or each pose has its own."""
+    """Whether poses that share a response also share its first reflections from geometry, or each pose has its own."""
 
     def __init__(self, level: QualityLevel) -> None:
         self.level = level
@@ -31,21 +31,21 @@ class LevelKind(ABC):
 
     @abstractmethod
     def open(self, bundle: Bundle, paths: SoundPathFinder, compute: Compute, cache: NodeCache) -> ResponseSource:
-        """Where the level takes responses from in a scene. What it keeps of them goes into `cache`, which all levels of
+        """Open the level's source of responses in a scene. Responses that it keeps go into `cache`, which all levels of
         the scene share."""
 
     @property
     def shares_tail(self) -> bool:
-        """Whether all emitters of a listener share one late tail. Such levels are the last to step down to."""
+        """Whether all emitters of a listener share one late tail. Under load, such levels are used last."""
         return self.level.shared_tail
 
     def shares_whole_responses(self, *, has_reflections: bool) -> bool:
-        """Whether poses share all that follows the direct sound, in a scene that `has_reflections` from geometry."""
+        """Whether poses share everything after the direct sound, in a scene that `has_reflections` from geometry."""
         return self.reuses_responses and (self.shares_reflections or not has_reflections)
 
     @property
     def title(self) -> str:
-        """What the level leaves out, in words for people."""
+        """A title for people, which says what the level leaves out."""
         parts = [self._title] if self._title else []
         if self.shares_tail:
             parts.append("shared late reverberation")
@@ -58,15 +58,15 @@ class LevelKind(ABC):
 
     @property
     def _title(self) -> str:
-        """What poses share, without a capital; empty where they share nothing."""
+        """What poses share, beginning with a lower-case letter; empty if they share nothing."""
         return ""
 
     @property
     def detail(self) -> str:
-        """What tells two levels of one title apart, as far as the kind knows."""
+        """What distinguishes two levels with the same title, as far as the kind knows."""
         return ""
 
     @classmethod
     def candidates(cls, field: str) -> Iterator[QualityLevel]:  # noqa: ARG003  none, unless a kind has some
-        """Levels of this kind that are worth measuring, of a field; the field's name begins theirs."""
+        """Levels of this kind for a field that are worth measuring; their names begin with the field's name."""
         return iter(())

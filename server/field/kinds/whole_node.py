@@ -1,4 +1,4 @@
-"""Levels whose responses, first reflections and all, are those of the nearest node of a lattice."""
+"""Levels that take the whole response, with first reflections, from the nearest node of a lattice."""
 
 from server.field.kinds.lattice_reverberation import LatticeReverberation
 
