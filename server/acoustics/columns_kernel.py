@@ -1,4 +1,5 @@
-"""Columns of a prediction that stand for cells of frames, to frames: eight at a time, as `decode` asks for them."""
+"""Conversion of a prediction from cells to frames, eight frames at a time as `decode` needs them. A cell is a group of
+frames with one column of the prediction."""
 
 from typing import NamedTuple
 
@@ -13,15 +14,16 @@ from server.kernels.simd import LANES, broadcast, load, load_broadcast, multiply
 Float32 = npt.NDArray[np.float32]
 
 FEWEST = 3
-"""Columns that eight frames are made of, if only with no weight: those of eight frames each, of which most are."""
+"""The least number of columns that are read for eight frames, some with weight 0. Most cells are eight frames long, and
+then three columns suffice."""
 NOTHING = -1e30
-"""Logarithm of the magnitude where nothing is predicted."""
+"""Log magnitude where nothing is predicted."""
 
 
 class Columns(NamedTuple):
-    """What eight frames are made of, from each frame on and from eight before the first: of so many (`number`) columns
-    from `first` on, with `weights` (frame, most, 8). `nothing` (frame, 8) is what logarithms begin with. Of no frames,
-    where each has a column of its own."""
+    """The columns from which eight frames in a row are made, for each first frame from -8 on: `number` columns from
+    `first` on, with `weights` (frame, most, 8). `nothing` (frame, 8) is the initial value of log magnitudes. All arrays
+    are empty if every frame has its own column."""
 
     first: npt.NDArray[np.int64]
     number: npt.NDArray[np.int64]
@@ -30,7 +32,7 @@ class Columns(NamedTuple):
 
     @classmethod
     def of(cls, axis: Axis | None, used: int) -> "Columns":
-        """Of an axis' cells, FEWEST at least, where of their frames the first `used` count."""
+        """The columns for the cells of an axis (at least FEWEST), of whose frames only the first `used` are used."""
         if axis is None:
             none = np.zeros(0, np.int64)
             return cls(none, none, zeros_on_lines(0, FEWEST, LANES), zeros_on_lines(0, LANES))
@@ -51,7 +53,8 @@ class Columns(NamedTuple):
 
 @compiled
 def spread_columns(columns, j, log_magnitude, interaural, eight) -> None:
-    """Eight frames from `j` on of (2, bin, column) logarithms and coherences, to `eight` (4, bin, 8)."""
+    """Write eight frames from frame `j` on to `eight` (4, bin, 8), from log magnitudes and coherences (2, bin,
+    column)."""
     row = min(max(j + LANES, 0), columns.first.size - 1)
     nothing = load(columns.nothing[row].ctypes.data, 0)
     first, count, weights = columns.first[row], columns.number[row], columns.weights[row].ctypes.data

@@ -25,8 +25,8 @@ _WINDOW_S = 0.010
 _TAIL_SHARE = 0.1  # the part of the response that serves as the first noise estimate
 _NOISE_MARGIN_DB = 10.0  # ISO 3382-1 5.3.3: noise at least 10 dB below the range that is evaluated
 _FIT_RANGE_DB = 20.0
-_NOTHING_DB = -120.0  # under the largest sample; float16 storage leaves specks here
-_NOISE_EXCESS = 1.25  # power in the tail over what the decay explains
+_NOTHING_DB = -120.0  # relative to the largest sample; below it, float16 storage leaves only rounding errors
+_NOISE_EXCESS = 1.25  # ratio of the power in the tail to the power of the fitted decay
 _ITERATIONS = 5
 
 
@@ -36,9 +36,9 @@ class EnergyDecay:
 
     energy: (..., sample), never rising. onset: (...), in samples; -1 where the response is silent.
 
-    lowest_db: (...), the level relative to the onset down to which the curve may be evaluated. That is 10 dB above the
-    noise, or the end of the response if there is no noise. If no decay can be told from noise, the whole response is
-    taken as noise of the level at its end; noise throughout has 0.
+    lowest_db: (...), the level relative to the onset down to which the curve may be evaluated. It is 10 dB above the
+    noise, or the level at the end of the response if there is no noise. If no decay can be distinguished from noise,
+    the whole response counts as noise with the level of its end; a response that is noise throughout has 0.
     """
 
     energy: _Floats
@@ -47,7 +47,8 @@ class EnergyDecay:
 
 
 def onset_sample(ir: npt.ArrayLike, *, threshold_db: float = ONSET_THRESHOLD_DB) -> _Integers:
-    """First sample within `threshold_db` of the largest (ISO 3382-1:2009, A.3.4: 20 dB): `(...)`, -1 where silent.
+    """(...) the first sample within `threshold_db` of the largest (ISO 3382-1:2009, A.3.4: 20 dB); -1 where the
+    response is silent.
 
     Raises ValueError for a response that is empty or not finite.
     """
@@ -66,7 +67,7 @@ def onset_sample(ir: npt.ArrayLike, *, threshold_db: float = ONSET_THRESHOLD_DB)
 
 
 def energy_decay(ir: npt.ArrayLike, sample_rate: float) -> EnergyDecay:
-    """Energy decay of each response `(..., sample)`; before the onset the curve is flat.
+    """The energy decay of each response `(..., sample)`; before the onset the curve is flat.
 
     Raises ValueError for a response that is empty or not finite.
     """
@@ -96,7 +97,7 @@ def energy_decay(ir: npt.ArrayLike, sample_rate: float) -> EnergyDecay:
 
 
 def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Floats, _Floats, _Floats]:
-    """Where each row `(row, sample)` of squared pressure ends.
+    """Find where the decay of each row `(row, sample)` of squared pressure ends.
 
     Returns the end of integration (samples), the noise power per sample, the energy beyond the end, and the lowest
     energy of the decay curve that may be evaluated.
@@ -118,8 +119,8 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
             continue
         tail = _tail(block_power[row, first:stop], levels[row, first:stop])
         if tail is None:
-            # The end of the response may be noise or a truncated decay. Noise of that level from the onset on is an
-            # upper bound of both.
+            # The end of the response may be noise or a truncated decay. In both cases, noise with the level of the end,
+            # from the onset on, is an upper bound.
             late = block_power[row, stop - max(1, round(_TAIL_SHARE * (stop - first))) : stop].mean()
             # guard: what does not decay may be noise
             lowest[row] = late * (last[row] - onset[row]) * db_to_power(_NOISE_MARGIN_DB)
@@ -139,11 +140,11 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
 
 @dataclass(frozen=True)
 class _Tail:
-    """Line through the late decay of one response, on windows counted from the first whole one after the onset."""
+    """A line through the late decay of one response. Windows are counted from the first whole one after the onset."""
 
     level_db: float  # of the line at window 0
-    decay_db: float  # per window, positive
-    noise_power: float  # 0 where none is seen before the response ends
+    decay_db: float  # fall per window, positive
+    noise_power: float  # 0 if the response ends before noise is visible
 
 
 def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:

@@ -1,9 +1,9 @@
-"""Predicted spectrograms to responses in one go, in compiled code.
+"""Decoding of predicted spectrograms to responses in one pass, in compiled code.
 
-Eight frames are worked on at a time, from prediction to response, so that what is between them never leaves the nearest
-cache. Predictions are read as much earlier as they are delayed, so that frozen noise meets them at its own time; of a
-frame's share that is left, each bin keeps what its last eight frames were. Letters: t frames from emission on, j frames
-of the aligned prediction.
+It works on eight frames at a time, from prediction to response, so that intermediate results stay in the nearest cache.
+The frozen noise is not delayed; therefore predictions are read earlier by the delay. For the fractional part of the
+delay, each bin keeps its values of the last eight frames. Letters: t frames counted from emission, j frames of the
+aligned prediction.
 """
 
 import math
@@ -37,11 +37,12 @@ from server.kernels.simd import (
 Float32 = npt.NDArray[np.float32]
 
 WHOLE, START, TARGETS = 0, 1, 2
-"""What `decode` is for: a response; what iterations can start from, and their targets; targets alone."""
+"""The purposes of `decode`: a response; the start and the targets of an iteration; targets only."""
 
 
 class Shape(NamedTuple):
-    """Of a prediction of `frames` the first `used` count, and of `known` of these the phase is known."""
+    """The sizes of a prediction: only the first `used` of its `frames` are used, and for the first `known` of these the
+    phase is known."""
 
     bins: int
     frames: int
@@ -54,13 +55,16 @@ class Shape(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """`eight` (4, bin, 8) are a prediction's frames where it begins or ends, or tells cells: logarithms left and right,
-    coherence real and imaginary; `magnitudes` are (bin, 2, 8). `last` (bin, 6, 8) has what the next eight frames need
-    of the last: the noise's magnitudes left and right, its coherence real and imaginary, targets left and right.
-    `known` (bin, 6, frame) are phasors left and right, real and imaginary, and certainties, with eight zeros before and
-    after them; `known_row` phases and certainties of both ears for one bin. `frames`, `carried` and `rows` are
-    `synthesise_next`'s, `sounded` (2, sample) what it gives where that is not all heard. `targets` are (bin, ear,
-    frame); the totals (2, sample)."""
+    """Buffers of `decode`, reused between calls.
+
+    `eight` (4, bin, 8) are frames at the beginning or end of a prediction, or made from cells: log magnitudes left and
+    right, coherence real and imaginary. `magnitudes` are (bin, 2, 8). `last` (bin, 6, 8) are the last values that the
+    next eight frames need: the noise's magnitudes left and right, its coherence real and imaginary, targets left and
+    right. `known` (bin, 6, frame) are phasors left and right, real and imaginary, and certainties, with eight zeros
+    before and after them; `known_row` holds the phases and certainties of both ears for one bin. `synthesise_next` uses
+    `frames`, `carried` and `rows`; `sounded` (2, sample) is its output where only a part of it is needed. `targets` are
+    (bin, ear, frame); `total` is (2, sample).
+    """
 
     eight: Float32
     magnitudes: Float32
@@ -118,9 +122,9 @@ def decode(
     work: Workspace,
     output: Float32,
 ) -> None:
-    """Predictions as of `server.field.graph.Spectrograms`, of frames or of `columns`; `aligned` (B,) the sample, not
-    necessarily whole, at which each of them starts; to `output` (B, 2, sample). Targets are left in `work`, those of
-    the last row."""
+    """Decode predictions, as in `server.field.graph.Spectrograms`, per frame or per cell (`columns`), and write the
+    responses to `output` (B, 2, sample). Each prediction starts at sample `aligned` (B,), which may be a fraction. The
+    targets of the last row remain in `work`."""
     for row in range(output.shape[0]):
         start = math.floor(aligned[row])
         turn = -2.0 * math.pi / windows.n_fft * (aligned[row] - start)
@@ -143,7 +147,8 @@ def decode(
 
 @compiled
 def delay_of(aligned, shape, hop):
-    """Whole frames and a share of one; the first frame that can sound, in whole vectors, and the one after the last."""
+    """Split a delay into whole frames and a fraction of one. Returns both, the first frame that can sound (rounded down
+    to whole vectors), and the frame after the last."""
     limit = float((shape.frames + 1) * hop)
     delay = min(limit, max(-limit, aligned)) / hop
     whole = math.floor(delay)
@@ -153,8 +158,8 @@ def delay_of(aligned, shape, hop):
 
 @compiled
 def _know(frequency, certainty, turn, shape, work) -> None:
-    """Phasors, bin k turned by k `turn`, and certainties of the frames whose phase is known, summed up from its
-    advances."""
+    """Write the phasors and certainties of the frames whose phase is known to `work`. Phases are sums of the predicted
+    advances, and bin k is turned by k times `turn`."""
     rows, row = work.known_row.ctypes.data, work.known_row.shape[1]
     width = work.known.shape[2]
     for bin_ in range(shape.bins):
@@ -163,7 +168,7 @@ def _know(frequency, certainty, turn, shape, work) -> None:
             for j in range(shape.known):
                 phase += frequency[ear, bin_, j]
                 phase -= 2 * math.pi * math.floor(phase * (0.5 / math.pi) + 0.5)
-                # Four hops are one window: a bin's centre advances by whole quarters of a turn.
+                # Four hops are one window, so a bin's centre advances by whole quarters of a turn.
                 work.known_row[ear, j] = phase + 0.5 * math.pi * (bin_ * j % 4) + bin_ * turn
                 work.known_row[2 + ear, j] = 1.0 if shape.all_is_certain else certainty[ear, bin_, j]
         known = work.known[bin_].ctypes.data
@@ -178,8 +183,9 @@ def _know(frequency, certainty, turn, shape, work) -> None:
 
 @compiled
 def _predicted(log_magnitude, interaural, j, columns, shape, work):
-    """Where eight frames from `j` on are: addresses of the left ear's logarithms and of the coherence's real part, how
-    far those of the other ear and the imaginary part are from these, and one bin from the next."""
+    """Find eight frames from frame `j` on. Returns the addresses of the left ear's log magnitudes and of the
+    coherence's real part, the distance from these to the right ear and the imaginary part, and the distance from one
+    bin to the next."""
     if columns.first.size > 0:
         spread_columns(columns, j, log_magnitude, interaural, work.eight)
     elif j >= 0 and j + LANES <= shape.used:
@@ -202,7 +208,8 @@ def _copy_what_is_there(log_magnitude, interaural, j, used, eight) -> None:
 
 @compiled
 def _find_magnitudes(levels, other, step, shape, work) -> None:
-    """Of eight frames, from logarithms at `levels`: by themselves, for the constants take most registers."""
+    """Compute the magnitudes of eight frames from log magnitudes at address `levels`. This is a loop of its own,
+    because its constants occupy most registers."""
     zero, floor = broadcast(np.float32(0.0)), broadcast(np.float32(shape.log_floor))
     magnitudes = work.magnitudes.ctypes.data
     for bin_ in range(shape.bins):
@@ -213,14 +220,15 @@ def _find_magnitudes(levels, other, step, shape, work) -> None:
 
 @compiled
 def _later(last, at, now, share):
-    """Between a bin's eight values and those one frame before; they are kept in place of the eight before them."""
+    """Interpolate between a bin's eight values and the values one frame before each. The values are then stored as the
+    last eight."""
     before = one_before(last, at, now)
     return multiply_add(subtract(before, now), share, now)
 
 
 @compiled
 def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, noise, purpose, work, response) -> None:
-    """To a response that is nothing as yet."""
+    """Write the noise part to a response, whose old content is overwritten."""
     hop = windows.n_fft // 4
     whole, share, first, stop = delay_of(aligned, shape, hop)
     end = min(shape.samples, response.shape[1])
@@ -229,7 +237,7 @@ def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, nois
     _clear(work.carried)
     if purpose != TARGETS:
         silence(response, 0, at)
-    if whole < 0:  # what sounds at once is preceded by what would have sounded before
+    if whole < 0:  # the first frames are interpolated with frames before emission
         _compose(-LANES, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, work)
     for t in range(first, stop, LANES):
         _compose(t, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, work)
@@ -249,8 +257,9 @@ def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, nois
 
 @compiled
 def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, noise, purpose, work) -> None:
-    """Eight frames, from frame `t` on, of frozen noise that makes up the rest, as `server.acoustics.phase.separate` and
-    `correlated_noise` do, delayed by `whole` frames and a share of one; and of targets, if any are asked for."""
+    """Compute eight frames, from frame `t` on, of the frozen noise that fills the unknown part, as
+    `server.acoustics.phase.separate` and `correlated_noise` do. The prediction is delayed by `whole` frames and a
+    `share` of one. Targets are computed too, depending on `purpose`."""
     zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
     undecided, most = broadcast(np.float32(UNDECIDED)), broadcast(np.float32(MOST_COHERENT))
     later = broadcast(share)
@@ -260,7 +269,7 @@ def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, 
     magnitudes = work.magnitudes.ctypes.data
     is_known = -LANES < j < shape.known
     known_width, width = work.known.shape[2], work.targets.shape[2]
-    heard = max(0, t)  # what comes of frames before is overwritten
+    heard = max(0, t)  # frames before 0 are stored at 0 and overwritten later
     frames, white = work.frames.ctypes.data, noise[heard // LANES].ctypes.data
     for bin_ in range(shape.bins):
         at = bin_ * step
@@ -285,7 +294,7 @@ def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, 
             ci = divide(multiply_add(al, br, multiply_subtract(bl, ar, ci)), both)
             ml, mr = multiply(ml, ul), multiply(mr, ur)
         scale, square = most, multiply_add(cr, cr, multiply(ci, ci))
-        if any_above(square, one):  # hardly ever
+        if any_above(square, one):  # rarely true
             scale = divide(most, square_root(at_least(square, one)))
         ml, mr = _later(last, 0, ml, later), _later(last, LANES, mr, later)
         cr = _later(last, 2 * LANES, multiply(cr, scale), later)
@@ -301,7 +310,7 @@ def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, 
 
 @compiled
 def _add_known(log_magnitude, interaural, start, columns, shape, windows, work, response) -> None:
-    """The known part from sample `start` of the response on, as far as both reach."""
+    """Add the known part to the response from sample `start` on; samples outside the response are dropped."""
     frames = work.frames.ctypes.data
     magnitudes = work.magnitudes.ctypes.data
     width = work.known.shape[2]
@@ -331,8 +340,8 @@ def _add_known(log_magnitude, interaural, start, columns, shape, windows, work, 
 
 @compiled
 def _sound(at, begin, end, is_added, windows, work, response):
-    """What is complete with eight frames more, to the response from sample `at` on, or what of it lies between `begin`
-    and `end`; the sample after it."""
+    """Synthesise eight more frames and write the samples that are now complete to the response from sample `at` on,
+    within `begin` and `end`. Returns the sample after the last."""
     frames, carried, rows = work.frames.ctypes.data, work.carried.ctypes.data, work.rows.ctypes.data
     sounded, stop = work.sounded, at + work.sounded.shape[1]
     if not is_added and at >= begin and stop <= end:
@@ -347,14 +356,14 @@ def _sound(at, begin, end, is_added, windows, work, response):
 
 @compiled
 def _clear(values) -> None:
-    """A whole number of vectors."""
+    """Set all values to zero; their number is a multiple of LANES."""
     for n in range(0, values.size, LANES):
         store(values.ctypes.data, n, broadcast(np.float32(0.0)))
 
 
 @compiled
 def silence(signals, begin, end) -> None:
-    # A slice set to zero would do the same, and take seconds to compile.
+    # Assigning zero to a slice would do the same, but takes seconds to compile.
     for channel in range(signals.shape[0]):
         for n in range(begin, end):
             signals[channel, n] = 0

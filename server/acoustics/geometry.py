@@ -22,7 +22,7 @@ TOUCH_M = 1e-9
 COINCIDENT_M = 1e-9
 
 FARTHEST_M = 1e7
-"""Largest coordinate, a quarter of the Earth's circumference. Squares of much larger numbers overflow."""
+"""The largest coordinate, a quarter of the Earth's circumference. Squares of much larger numbers overflow."""
 _SHORTEST, _LONGEST = 1e-6, 1e12
 """Limits of a given quaternion's length. Shorter ones are rounding errors; longer ones lose their direction when
 squared."""
@@ -55,8 +55,8 @@ class Quaternion(_Components):
 
     @classmethod
     def from_yaw(cls, yaw_rad: float) -> "Quaternion":
-        """Rotation by `yaw_rad` counter-clockwise about the vertical; 0 looks along +x. Raises ValueError if it is not
-        finite."""
+        """A rotation by `yaw_rad` counter-clockwise about the vertical; 0 looks along +x. Raises ValueError if it is
+        not finite."""
         # guard: a yaw is finite
         if not math.isfinite(yaw_rad):
             raise ValueError("yaw must be a finite number")
@@ -67,9 +67,9 @@ LEVEL = Quaternion(0.0, 0.0, 0.0, 1.0)
 
 
 def axes_of(orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(3, 3) matrix from the world to the frame of a head or emitter with this orientation (x, y, z, w)."""
+    """The (3, 3) matrix from world axes to the axes of a head or emitter with this orientation (x, y, z, w)."""
     x, y, z, w = map(float, orientation)
-    # The transpose of the usual matrix, as a flat tuple: nested rows take NumPy twice as long.
+    # This is the transpose of the usual matrix, as a flat tuple: nested rows take NumPy twice as long.
     return np.array(
         (
             *(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
@@ -92,7 +92,7 @@ class Pose:
     def __post_init__(self) -> None:
         if len(self.position) != 3:
             raise ValueError("position must be three finite numbers")
-        x, y, z = map(float, self.position)  # no loops: poses come hundreds of times a second
+        x, y, z = map(float, self.position)  # no loops, because poses arrive hundreds of times a second
         # guard: a position is finite
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             raise ValueError("position must be three finite numbers")
@@ -113,7 +113,7 @@ class Pose:
 
     @property
     def yaw(self) -> float:
-        """Heading of the look direction in the horizontal plane, radians in [-pi, pi]."""
+        """The heading of the look direction in the horizontal plane, radians in [-pi, pi]."""
         x, y, z, w = self.orientation
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
@@ -128,7 +128,8 @@ class FloorPlan:
 
     @cached_property
     def walls(self) -> npt.NDArray[np.float64]:
-        """(wall, end, 2) end points. Wall i runs from corner i to corner i + 1, with the inside on its left."""
+        """(wall, end, 2) end points of the walls. Wall i runs from corner i to corner i + 1, with the inside on its
+        left."""
         corners = np.asarray(self.corners, dtype=np.float64)
         return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
@@ -168,7 +169,8 @@ class FloorPlan:
         return np.asarray((inside | touches) & (points[..., 2] >= self.floor_m) & (points[..., 2] <= self.height_m))
 
     def holds(self, position: Vector3) -> bool:
-        """Whether one point is inside the room or on its surfaces: `contains` in scalars, twenty times as fast."""
+        """Whether one point is inside the room or on its surfaces. This is `contains` in scalars, twenty times as
+        fast."""
         x, y, z = position
         if not self.floor_m <= z <= self.height_m:
             return False
@@ -197,7 +199,7 @@ class FloorPlan:
     def is_visible(self, a: Points, b: Points) -> npt.NDArray[np.bool_]:
         """(...,) whether no wall stands between a and b. A line that grazes a wall or a corner is not blocked.
 
-        Both points have to be inside. Walls run from floor to ceiling, so only x and y count.
+        Both points must be inside. Walls run from floor to ceiling, so only x and y matter.
         """
         a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
         start, end = self.walls[:, 0], self.walls[:, 1]
@@ -239,9 +241,9 @@ class FloorPlan:
 
 
 def _shortest(direct: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(n, n) lengths of the shortest ways over steps of lengths `direct` (n, n), infinite where there is none.
+    """(n, n) lengths of the shortest paths over steps of lengths `direct` (n, n), infinite where there is no path.
 
-    Dijkstra's algorithm from all points at once. `scipy.sparse.csgraph` takes a tenth of a second to import.
+    Dijkstra's algorithm from all points at once. `scipy.sparse.csgraph` would take a tenth of a second to import.
     """
     steps = np.minimum(direct, direct.T)
     start = np.arange(len(steps))

@@ -1,5 +1,5 @@
-"""Iterations of Griffin and Lim, compiled: from the targets that `server.acoustics.decoding_kernel` leaves in its
-workspace to responses."""
+"""The iterations of Griffin and Lim, compiled. They start from the targets that `server.acoustics.decoding_kernel`
+leaves in its workspace, and give responses."""
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +22,9 @@ def iterate(
     work: Workspace,
     response: Float32,
 ) -> None:
-    """As `server.acoustics.phase.griffin_lim`, in place: the phases of the response's transform, or none, the
-    magnitudes of the targets in `work`, and a response again."""
+    """Do the iterations of `server.acoustics.phase.griffin_lim` in place. Each takes the phases of the response's
+    transform (the first may start from zero phase), combines them with the target magnitudes in `work`, and transforms
+    back to a response."""
     _, _, first, stop = delay_of(aligned, shape, windows.n_fft // 4)
     if from_zero_phase:
         _synthesise_targets(first, stop, windows, work)
@@ -33,7 +34,7 @@ def iterate(
 
 @compiled
 def _synthesise_targets(first, stop, windows, work) -> None:
-    """With zero phase."""
+    """Synthesise the targets with zero phase into the total."""
     silence(work.total, 0, work.total.shape[1])
     zero = broadcast(np.float32(0.0))
     width = work.targets.shape[2]

@@ -18,7 +18,7 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Metric:
-    """Description of an error: its key, its label in tables, its unit, and whether it needs the direct sound."""
+    """A description of an error: its key, its label in tables, its unit, and whether it needs the direct sound."""
 
     name: str
     label: str
@@ -28,13 +28,14 @@ class Metric:
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterMetric(Metric):
-    """Error of a room parameter; `error` takes those of the reference and of the estimate."""
+    """The error of a room parameter; `error` takes the parameters of the reference and of the estimate."""
 
     error: Callable[[RoomParameters, RoomParameters], _Floats]
 
 
 def _over_ears(parameter: str, *, scale: float = 1.0) -> Callable[[RoomParameters, RoomParameters], _Floats]:
-    """Mean of both ears' differences, in units of 1 / `scale`."""
+    """An error function: the absolute difference of `parameter`, mean over both ears, times `scale` (1e3 gives ms for
+    seconds)."""
 
     def error(reference: RoomParameters, estimate: RoomParameters) -> _Floats:
         difference = np.abs(getattr(estimate, parameter) - getattr(reference, parameter))
@@ -73,12 +74,12 @@ PARAMETER_METRICS = (
 
 
 def parameter_errors(reference: RoomParameters, estimate: RoomParameters) -> dict[str, _Floats]:
-    """Error of each of PARAMETER_METRICS, `(...)`, in its unit."""
+    """The error `(...)` of each of PARAMETER_METRICS, in its unit."""
     return {metric.name: metric.error(reference, estimate) for metric in PARAMETER_METRICS}
 
 
 def spectral_loss(reference: npt.ArrayLike, estimate: npt.ArrayLike) -> _Floats:
-    """Mean absolute difference `(...)` of log-magnitude spectrograms `(..., channel, frequency, frame)`.
+    """The mean absolute difference `(...)` of log-magnitude spectrograms `(..., channel, frequency, frame)`.
 
     Logarithms are natural, with the codec's floor, as in Luo et al. (NeurIPS 2022): 0.1 is about 0.9 dB. Raises
     ValueError if the shapes differ or a value is not finite.
@@ -94,7 +95,8 @@ def spectral_loss(reference: npt.ArrayLike, estimate: npt.ArrayLike) -> _Floats:
 
 @dataclass(frozen=True)
 class Summary:
-    """Mean and median of `count` measured errors; None if there are none. `missing` errors could not be measured."""
+    """The mean and median of `count` measured errors; None if there are none. `missing` is the number of errors that
+    could not be measured."""
 
     mean: float | None
     median: float | None

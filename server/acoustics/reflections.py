@@ -35,11 +35,11 @@ class FirstEcho:
         self._normals = np.concatenate([inward, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]])
         offsets = -np.sum(inward[:, :2] * start, axis=-1)
         self._offsets = np.concatenate([offsets, [-plan.floor_m, plan.height_m]])
-        # Compiles the kernel now, so that the first pose need not wait for it.
+        # Compile here, so that the first pose need not wait for it.
         self.length_m(np.zeros((1, 3)), np.zeros((1, 3)))
 
     def length_m(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
-        """(n,) lower bounds for pairs of points (n, 3) inside the room."""
+        """(n,) lower bounds of the path length for pairs of points (n, 3) inside the room."""
         listeners = np.ascontiguousarray(listeners, dtype=np.float64)
         emitters = np.ascontiguousarray(emitters, dtype=np.float64)
         length_m = np.empty(len(listeners))
@@ -48,19 +48,19 @@ class FirstEcho:
 
 
 def mirror_gain_db(absorption: npt.ArrayLike, scattering: npt.ArrayLike) -> Floats:
-    """(...) level of the specular reflection, at least -100 dB. `absorption` is the share of energy absorbed, and
-    `scattering` the share of the rest that is scattered."""
+    """(...) levels of specular reflections, at least -100 dB. `absorption` is the share of energy absorbed, and
+    `scattering` the share of the reflected energy that is scattered."""
     mirrored = (1 - np.asarray(absorption, dtype=np.float64)) * (1 - np.asarray(scattering, dtype=np.float64))
     return power_to_db(np.maximum(mirrored, _LEAST_POWER))
 
 
 @dataclass(frozen=True)
 class Reflections:
-    """m paths of early reflections, ordered by emitter.
+    """The m paths of early reflections, ordered by emitter.
 
     `emitter` (m,) is the index of the emitter. `arrival` (m, 3) points from the listener along the arriving path,
     `departure` (m, 3) from the emitter along the departing path. `gain_db` (m, band) <= 0 is the gain of the surface,
-    on top of 1 / length.
+    in addition to 1 / length.
     """
 
     emitter: Integers
@@ -78,11 +78,11 @@ class ReflectionFinder:
         self._height_m = plan.height_m
         self._gains_db = np.array(gains_db, dtype=np.float64)
         self._corners = np.ascontiguousarray(plan.walls[:, 0])
-        # Compiles the kernel now, so that the first pose need not wait for it.
+        # Compile here, so that the first pose need not wait for it.
         self.find(np.zeros(3), np.zeros((1, 3)))
 
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections:
-        """Paths to `listener` (3,) from `emitters` (n, 3), all inside the room."""
+        """Find the reflections at `listener` (3,) from `emitters` (n, 3), all inside the room."""
         listener = np.ascontiguousarray(listener, dtype=np.float64)
         emitters = np.ascontiguousarray(emitters, dtype=np.float64)
         room = len(emitters) * (len(self._corners) + 2)

@@ -1,7 +1,7 @@
-"""The compiled part of `server.acoustics.reflections`, one emitter after the other.
+"""The compiled code of `server.acoustics.reflections`, for one emitter after the other.
 
-Points are (x, y, z) in metres; `corners` is (corner, 2), the polygon of a floor plan, wall i running from corner i to
-the next with the room on its left.
+Points are (x, y, z) in metres; `corners` is (corner, 2), the polygon of a floor plan. Wall i runs from corner i to the
+next, with the room on its left.
 """
 
 import math
@@ -26,8 +26,8 @@ def _aim(vector: Floats, x: float, y: float, z: float, length: float) -> None:
 
 @compiled
 def find_first_echoes(normals: Floats, offsets: Floats, listeners: Floats, emitters: Floats, length_m: Floats) -> None:
-    """Fills `length_m` (n,) for points (n, 3), given the inward normals (surface, 3) of planes and their offsets; see
-    FirstEcho."""
+    """Fill `length_m` (n,) for pairs of points (n, 3), from the inward normals (surface, 3) of planes and their
+    offsets; see FirstEcho."""
     for row in range(len(listeners)):
         lx, ly, lz = listeners[row, 0], listeners[row, 1], listeners[row, 2]
         ex, ey, ez = emitters[row, 0], emitters[row, 1], emitters[row, 2]
@@ -38,7 +38,8 @@ def find_first_echoes(normals: Floats, offsets: Floats, listeners: Floats, emitt
             from_emitter = x * ex + y * ey + z * ez + offsets[plane]
             if from_listener > -TOUCH_M and from_emitter > -TOUCH_M:
                 least = min(least, from_listener * from_emitter)
-        # The square of the way to an image is longer by four times the product of both ends' distances from the mirror.
+        # The square of the path from the image exceeds that of the straight path by four times the product of both
+        # distances from the mirror.
         length_m[row] = math.sqrt(max((ex - lx) ** 2 + (ey - ly) ** 2 + (ez - lz) ** 2 + 4 * least, 0.0))
 
 
@@ -54,8 +55,8 @@ def find_reflections(
     arrival: Floats,
     departure: Floats,
 ) -> int:
-    """Fills the beginnings of the last five and returns how many reflections there are; see Reflections. There is room
-    for as many as walls, floor and ceiling to each emitter."""
+    """Fill the first rows of the last five arrays and return the number of reflections; see Reflections. The arrays
+    need one row per emitter and surface: walls, floor and ceiling."""
     count = len(corners)
     lx, ly, lz = listener[0], listener[1], listener[2]
     found = 0
@@ -67,7 +68,7 @@ def find_reflections(
             x1, y1 = corners[wall + 1 if wall + 1 < count else 0]
             extent = math.hypot(x1 - x0, y1 - y0)
             ux, uy = (x1 - x0) / extent, (y1 - y0) / extent
-            # How far into the room each end is from the wall, and how far along it.
+            # The distance of listener and emitter from the wall, into the room, and their positions along it.
             l_off, e_off = ux * (ly - y0) - uy * (lx - x0), ux * (ey - y0) - uy * (ex - x0)
             if l_off < -TOUCH_M or e_off < -TOUCH_M or l_off + e_off < COINCIDENT_M:
                 continue

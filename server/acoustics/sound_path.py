@@ -1,7 +1,8 @@
-"""The way the first sound takes from each emitter to a listener: straight in sight, else round the walls' corners.
+"""The path of the first sound from each emitter to a listener: straight if visible, otherwise around the corners of
+walls.
 
 Walls run from floor to ceiling, so a path bends in plan and rises evenly along its length. Points and unit vectors are
-(..., xyz) of the world in metres; bands are OCTAVE_BANDS_HZ.
+(..., xyz) in world axes, in metres; bands are OCTAVE_BANDS_HZ.
 """
 
 from dataclasses import dataclass
@@ -19,11 +20,11 @@ Flags = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SoundPaths:
-    """The shortest paths of n emitters; every number is finite, and follows the poses without jumps.
+    """The shortest paths of n emitters. Every number is finite, and changes without jumps as the poses move.
 
-    `length_m` (n,); `excess_m` (n,) what it is longer than the straight line, 0 in sight. `arrival` (n, 3) points from
-    the listener along the end of the path, `departure` (n, 3) from the emitter along its beginning; any direction where
-    the two are one point. `screen_db` (n, band) <= 0 is the gain of the walls' edges, on top of 1 / length.
+    `length_m` (n,); `excess_m` (n,), the length beyond the straight line, 0 if visible. `arrival` (n, 3) points from
+    the listener along the end of the path, `departure` (n, 3) from the emitter along its beginning; both are arbitrary
+    if the two points coincide. `screen_db` (n, band) <= 0 is the gain of the walls' edges, in addition to 1 / length.
     """
 
     length_m: Floats
@@ -35,7 +36,7 @@ class SoundPaths:
 
     @classmethod
     def empty(cls, count: int) -> "SoundPaths":
-        """To be filled."""
+        """Allocate uninitialised arrays for `count` emitters, which `SoundPathFinder.find` fills."""
         return cls(
             np.empty(count),
             np.empty((count, 3)),
@@ -47,20 +48,21 @@ class SoundPaths:
 
 
 class SoundPathFinder:
-    """Finds the shortest paths through one floor plan; safe to share between threads."""
+    """Finds the shortest paths in one floor plan; safe to share between threads."""
 
     def __init__(self, plan: FloorPlan, speed_of_sound: float) -> None:
         self._wavelengths_m = speed_of_sound / np.asarray(OCTAVE_BANDS_HZ, dtype=np.float64)
         self._corners = np.ascontiguousarray(plan.walls[:, 0])
         self._bends = np.ascontiguousarray(plan.bend_corners)
         self._bend_lengths_m = np.ascontiguousarray(plan.bend_lengths_m)
-        # Compiled here, where it may take its time, and not on the audio thread at the first pose.
+        # Compile here, where it may take long, and not on the audio thread at the first pose.
         self.find(np.zeros(3), np.zeros((1, 3)))
 
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike, into: SoundPaths | None = None) -> SoundPaths:
-        """Paths to `listener` (3,) from `emitters` (n, 3), all inside the room; put `into` as many, where given.
+        """Find the paths to `listener` (3,) from `emitters` (n, 3), all inside the room. They are written to `into`,
+        which must have n rows, if it is given.
 
-        From a point that is not, where nothing leads, sound goes straight through the walls.
+        From a point outside the room, which no path reaches, sound travels straight through the walls.
         """
         listener = np.ascontiguousarray(listener, dtype=np.float64)
         emitters = np.ascontiguousarray(emitters, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The compiled part of `server.acoustics.sound_path`, one emitter after the other.
+"""The compiled code of `server.acoustics.sound_path`, for one emitter after the other.
 
 Points are scalars (x, y in plan, metres); `corners` is (corner, 2), the polygon of a floor plan.
 """
@@ -18,7 +18,7 @@ Flags = npt.NDArray[np.bool_]
 
 @compiled
 def contains(corners: Floats, x: float, y: float) -> bool:
-    """As FloorPlan.contains, in plan."""
+    """Compute `FloorPlan.contains` for one point in plan."""
     inside = False
     x0, y0 = corners[-1]
     for x1, y1 in corners:
@@ -39,7 +39,7 @@ def contains(corners: Floats, x: float, y: float) -> bool:
 
 @compiled
 def is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> bool:
-    """As FloorPlan.is_visible."""
+    """Compute `FloorPlan.is_visible` for one pair of points."""
     ray_x, ray_y = qx - px, qy - py
     x0, y0 = corners[-1]
     start = ray_x * (y0 - py) - ray_y * (x0 - px)
@@ -57,12 +57,13 @@ def is_visible(corners: Floats, px: float, py: float, qx: float, qy: float) -> b
 
 @compiled
 def _clearance_m(bends: Floats, from_listener: Floats, listener: Floats, emitter: Floats) -> float:
-    """How much farther than the straight line it is over the nearest corner, for an emitter in sight.
+    """How much longer the path over the nearest corner is than the straight line, for a visible emitter.
 
-    Divided by the cosine of the turn at the corner: next to 1 where the line grazes it, and without end where one would
-    turn by a right angle or more, since such a corner is beside the line and screens nothing. The nearest corner
-    changes without a jump, and it is enough to ask which corners the listener sees: whatever hides one from the emitter
-    stands in the triangle of the three, so it has a corner that is nearer and that both see.
+    The difference is divided by the cosine of the turn at the corner. The cosine is almost 1 where the line grazes the
+    corner. If the path would turn by a right angle or more, the corner is beside the line and screens nothing; its
+    result is infinite. The result has no jump when the nearest corner changes. It is enough to test which corners the
+    listener sees: a wall that hides a corner from the emitter lies in the triangle of the three points, so it has a
+    nearer corner that both see.
     """
     plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
     rise = emitter[2] - listener[2]
@@ -97,9 +98,10 @@ def find_sound_paths(
     in_sight: Flags,
     screen_db: Floats,
 ) -> None:
-    """Fills the last six, one row per emitter; see SoundPaths."""
+    """Fill the last six arrays, one row per emitter; see SoundPaths."""
     count = len(bends)
-    # Over plan: to each corner that the listener sees, and to each corner round whichever others, the first of them.
+    # Lengths in plan from the listener: to each visible corner, and to each corner by the shortest path over others;
+    # `first` is the first corner of this path.
     from_listener, to_bend = np.full(count, np.inf), np.full(count, np.inf)
     first = np.zeros(count, np.int64)
     for bend in range(count):

@@ -1,8 +1,8 @@
 """Short-time Fourier transforms of both ears for compiled code, eight frames at a time.
 
-The two ears are the real and the imaginary part of one complex transform. `frames` is workspace at an address, float32:
-(2, n_fft, 8), real and imaginary parts of n_fft bins or samples of eight neighbouring frames. `total` (2, length) holds
-each ear's signal in the way of overlap-add: frame t spans the samples from t * hop on. Four frames overlap.
+The two ears are the real and the imaginary part of one complex transform. `frames` is the address of a float32 buffer
+(2, n_fft, 8): real and imaginary parts of n_fft bins or samples of eight neighbouring frames. `total` (2, length) is
+each ear's overlap-add signal: frame t spans the samples from t * hop on. Four frames overlap.
 """
 
 from typing import NamedTuple
@@ -39,8 +39,9 @@ Float32 = npt.NDArray[np.float32]
 
 
 class Windows(NamedTuple):
-    """Constants of one codec: `analysis` and `synthesis` (n_fft,), the latter with the inverse's 1 / n_fft; `passes`
-    and `places` of the transform, the latter where each bin or sample lies after it."""
+    """The constants of one codec: `analysis` and `synthesis` windows (n_fft,), where the latter includes the inverse's
+    factor 1 / n_fft; `passes` and `places` of the transform, where the latter gives the position of each bin or sample
+    after it."""
 
     n_fft: int
     analysis: Float32
@@ -61,8 +62,9 @@ class Windows(NamedTuple):
 
 @compiled
 def place_bin(frames: int, n_fft: int, bin_: int, left_re, left_im, right_re, right_im) -> None:
-    """Of eight frames, as `synthesise` takes it."""
-    # The sum left + i right, with parts exchanged for the inverse transform; negative frequencies are conjugate.
+    """Store one bin of eight frames in `frames` as `synthesise` needs it."""
+    # The bin of left + i right, with real and imaginary parts exchanged for the inverse transform; negative frequencies
+    # use the conjugates of both ears.
     size = LANES * n_fft
     at = LANES * bin_
     if bin_ == 0 or 2 * bin_ == n_fft:
@@ -78,7 +80,7 @@ def place_bin(frames: int, n_fft: int, bin_: int, left_re, left_im, right_re, ri
 
 @compiled
 def synthesise(frames: int, windows: Windows, total: Float32, first: int) -> None:
-    """Add eight frames, from frame `first` on, to `total`; what was placed in `frames` is lost."""
+    """Transform eight frames back and add them to `total`, from frame `first` on. `frames` is overwritten."""
     n_fft = windows.n_fft
     hop, size = n_fft // 4, LANES * n_fft
     transform_lanes(frames, n_fft, windows.passes.ctypes.data)
@@ -121,10 +123,10 @@ def synthesise(frames: int, windows: Windows, total: Float32, first: int) -> Non
 
 @compiled
 def synthesise_next(frames: int, windows: Windows, carried: int, rows: int, to: int, other: int) -> None:
-    """Eight frames, those after the last eight: what is complete with them, eight hops of the left ear to address `to`
-    and of the right `other` floats on. What was placed in `frames` is lost.
+    """Synthesise the eight frames after the last eight, and write the samples that are now complete: eight hops of the
+    left ear to address `to`, and of the right ear `other` floats after it. `frames` is overwritten.
 
-    `carried` (hop, 2, 3, 8) keeps what their neighbours will add to, and `rows` (2, 8, 8) is room.
+    `carried` (hop, 2, 3, 8) keeps the sums to which the next frames will be added, and `rows` (2, 8, 8) is a buffer.
     """
     transform_but_last(frames, windows.n_fft, windows.passes.ctypes.data)
     add_up(frames, windows, carried, rows, to, other)
@@ -132,12 +134,13 @@ def synthesise_next(frames: int, windows: Windows, carried: int, rows: int, to: 
 
 @compiled
 def add_up(frames: int, windows: Windows, carried: int, rows: int, to: int, other: int) -> None:
-    """Of `synthesise_next`, what follows on all but the last pass of the transform."""
+    """Do the part of `synthesise_next` after all but the last pass of the transform."""
     hop, size = windows.n_fft // 4, LANES * windows.n_fft
     window, places = windows.synthesis.ctypes.data, windows.places.ctypes.data
     for n in range(0, hop, LANES):
         for i in range(LANES):
-            # The last pass finds the samples that lie a hop apart; of the inverse, parts are exchanged.
+            # The last pass gives the samples that lie a hop apart; real and imaginary parts are exchanged, because it
+            # is the inverse.
             r0, l0, r1, l1, r2, l2, r3, l3 = butterfly(frames, size, LANES * load_int(places, n + i), LANES)
             w0, w1 = load_broadcast(window, n + i), load_broadcast(window, hop + n + i)
             w2, w3 = load_broadcast(window, 2 * hop + n + i), load_broadcast(window, 3 * hop + n + i)
@@ -150,7 +153,8 @@ def add_up(frames: int, windows: Windows, carried: int, rows: int, to: int, othe
 
 @compiled
 def one_before(last: int, at: int, now):
-    """Of a row's eight values those one before each; what is needed for the next eight is kept in `last` at `at`."""
+    """Shift a row of eight values by one: each value is replaced by the one before it, and the first by the last value
+    of the previous eight. `last` keeps at `at` what the next call needs."""
     turned = rotate(now)
     before = with_first(load(last, at), turned)
     store(last, at, turned)
@@ -159,8 +163,8 @@ def one_before(last: int, at: int, now):
 
 @compiled
 def _overlapped(carried, at, x0, x1, x2, x3, w0, w1, w2, w3):
-    """One sample of each of eight hops, from those of eight frames' four hops: the second adds to the first of the
-    frame after it, and so on."""
+    """One sample of each of eight hops, by overlap-add of the four hops of each of eight frames: the second hop is
+    added to the first hop of the next frame, and so on."""
     total = multiply_add(x2, w2, one_before(carried, at, multiply(x3, w3)))
     total = multiply_add(x1, w1, one_before(carried, at + LANES, total))
     return multiply_add(x0, w0, one_before(carried, at + 2 * LANES, total))
@@ -192,7 +196,7 @@ def _store_columns(rows, first, to, at, step) -> None:
 
 @compiled
 def analyse(frames: int, windows: Windows, total: Float32, first: int) -> None:
-    """Transform eight frames of `total`, from frame `first` on; bin k of left + i right is at place k."""
+    """Transform eight frames of `total`, from frame `first` on; bin k of left + i right is stored at `places[k]`."""
     n_fft = windows.n_fft
     hop, size = n_fft // 4, LANES * n_fft
     window = windows.analysis.ctypes.data
@@ -227,7 +231,7 @@ def analyse(frames: int, windows: Windows, total: Float32, first: int) -> None:
 
 @compiled
 def _with_magnitude(re, im, magnitude):
-    """That magnitude with the phase of re + i im."""
+    """A complex number of the given magnitude with the phase of re + i im."""
     square = multiply_add(re, re, multiply(im, im))
     tiny = broadcast(np.float32(NO_PHASE))
     scale = divide(magnitude, square_root(at_least(square, tiny)))
@@ -239,7 +243,8 @@ def _with_magnitude(re, im, magnitude):
 
 @compiled
 def impose_magnitudes(analysed: int, placed: int, windows: Windows, target: Float32, first: int) -> None:
-    """Of eight frames, from `first` on: the phases of `analysed`, the magnitudes of `target` (bin, ear, frame)."""
+    """Combine the phases of eight frames in `analysed` with the magnitudes of `target` (bin, ear, frame), from frame
+    `first` on, and store the result in `placed`."""
     n_fft = windows.n_fft
     size = LANES * n_fft
     places = windows.places

@@ -1,8 +1,7 @@
-"""The names of the effects: each is an acoustic phenomenon that a scene may call for.
+"""The names of the effects. Each effect is an acoustic phenomenon that a scene may call for.
 
-An effect is *called for* where leaving it out would change some audible parameter by one just-noticeable difference
-(JND) or more. What each is, and how it is told beforehand whether it can be heard, is in the module of its name in
-`server.planning.effects`.
+An effect is *called for* if leaving it out would change some audible parameter by one just-noticeable difference (JND)
+or more. The module of its name in `server.planning.effects` describes the effect, and predicts whether it is audible.
 """
 
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ from server.core.errors import RequestError
 
 
 class EffectName(StrEnum):
-    """In the order in which gains of the direct sound are multiplied, and plans list them."""
+    """The names of effects, in the order in which gains of the direct sound are multiplied and plans list them."""
 
     DIRECT_PATH = "direct_path"
     DISTANCE_ATTENUATION = "distance_attenuation"
@@ -29,16 +28,16 @@ class EffectName(StrEnum):
 
 
 Overrides = Mapping[EffectName, bool]
-"""On or off whatever the prediction says; effects that are not named are decided by it."""
+"""Effects that are on or off regardless of the prediction, which decides about all others."""
 
 
 def read_overrides(given: Mapping[str, bool]) -> dict[EffectName, bool]:
-    """Overrides by an effect's name as clients and files write it. Raises RequestError `unknown_effect`."""
+    """Convert overrides with effect names as in messages and files. Raises RequestError `unknown_effect`."""
     return {require_effect(name): bool(is_on) for name, is_on in given.items()}
 
 
 def require_effect(name: str) -> EffectName:
-    """Raises RequestError `unknown_effect` with the names there are."""
+    """Convert the name of an effect. Raises RequestError `unknown_effect`, which lists the names."""
     try:
         return EffectName(name)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Geometry of a scene in scene files and bundles: walls, openings and materials."""
+"""The geometry of a scene in scene files and bundles: walls, openings and materials."""
 
 from typing import Annotated
 
@@ -17,18 +17,18 @@ PlanPoint = tuple[Coordinate, Coordinate]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
 MOST_CORNERS = 256
-"""Most corners of a floor plan. The search for paths round corners compares each corner with every other."""
+"""The most corners of a floor plan. The search for paths around corners compares each corner with every other."""
 
 
 class Strict(BaseModel):
-    """Base of models that refuse unknown keys and cannot be changed."""
+    """The base of models that refuse unknown keys and cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Material(Strict):
     """Properties of a surface per octave band, 125 Hz to 8 kHz. `absorption` is the share of energy absorbed,
-    `scattering` the share of the reflected energy that is scattered. The surface mass decides the transmission loss;
+    `scattering` the share of the reflected energy that is scattered. The surface mass determines the transmission loss;
     without one, no sound goes through the wall."""
 
     absorption: PerBand
@@ -43,7 +43,7 @@ class Materials(Strict):
 
 
 class Opening(Strict):
-    """A passage between rooms, given by the line on the floor that one steps over."""
+    """A passage between rooms, given by the line on the floor over which one steps."""
 
     name: str
     start: PlanPoint

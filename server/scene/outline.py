@@ -1,4 +1,4 @@
-"""Check that the corners of a floor plan form a simple polygon.
+"""A check that the corners of a floor plan form a simple polygon.
 
 Edge i runs from corner i to corner i + 1, and the last one back to corner 0. Units are metres.
 """
@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import shapely
 
 SHORTEST_WALL_M = 0.001
-"""Least length of a wall, and least distance between two walls that do not meet. Anything shorter is a corner written
-twice, and geometry divides by the length of a wall."""
+"""The least length of a wall, and the least distance between two walls that do not meet. A shorter wall means that a
+corner was written twice, and geometry divides by the length of a wall."""
 
 _MOST_FAULTS_TOLD = 3
 
@@ -18,8 +18,8 @@ _Corner = tuple[float, float]
 
 
 def faults_of(corners: Sequence[_Corner]) -> list[str]:
-    """The first few reasons why three or more corners are not a simple, counter-clockwise polygon; empty if they
-    are."""
+    """The first few reasons why three or more corners are not a simple, counter-clockwise polygon; empty if they are
+    one."""
     for index, corner in enumerate(corners):
         # guard: a wall has a length
         if math.dist(corner, corners[index - 1]) < SHORTEST_WALL_M:
@@ -35,7 +35,7 @@ def faults_of(corners: Sequence[_Corner]) -> list[str]:
 
 
 def _meetings(corners: Sequence[_Corner]) -> list[str]:
-    """Messages about edges that meet anywhere but in the corner between two neighbours."""
+    """Messages about edges that meet anywhere except in the corner between two neighbours."""
     count = len(corners)
     edges = [shapely.LineString([corners[index], corners[(index + 1) % count]]) for index in range(count)]
     near = shapely.STRtree(edges).query(edges, predicate="dwithin", distance=SHORTEST_WALL_M)
@@ -52,7 +52,7 @@ def _meetings(corners: Sequence[_Corner]) -> list[str]:
 
 
 def _meeting(edge: shapely.LineString, other: shapely.LineString) -> str:
-    """How two edges meet that are not neighbours."""
+    """A message about how two edges that are not neighbours meet."""
     common = edge.intersection(other)
     if common.is_empty:
         return f"touch at {_place(shapely.shortest_line(edge, other).coords[0])}"
@@ -63,7 +63,7 @@ def _meeting(edge: shapely.LineString, other: shapely.LineString) -> str:
 
 
 def _fold(edge: shapely.LineString, other: shapely.LineString, shared: _Corner) -> str:
-    """How a neighbouring edge runs back over the other; empty if it does not."""
+    """A message about how an edge runs back over its neighbour; empty if it does not."""
     shorter, longer = sorted((edge, other), key=lambda each: each.length)
     free = max(shorter.coords, key=lambda end: math.dist(end, shared))
     if longer.distance(shapely.Point(free)) >= SHORTEST_WALL_M:

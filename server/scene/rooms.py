@@ -17,7 +17,8 @@ _LEAST_M2 = 0.001
 
 @dataclass(frozen=True)
 class Room:
-    """One room. `plan` runs straight across the room's openings, whose total width is `passage_m`."""
+    """One room of a floor plan. `plan` is its outline, closed by a straight line at each opening to another room;
+    `passage_m` is the total width of these openings."""
 
     plan: FloorPlan
     passage_m: float
@@ -36,7 +37,7 @@ def rooms_of(geometry: Geometry) -> list[Room]:
                 [opening.end, *_between(corners, last, first), opening.start],
             )
             if min(FloorPlan(tuple(side), geometry.height_m).area_m2 for side in sides) < _LEAST_M2:
-                continue  # along a wall
+                continue  # the opening runs along a wall
             parts[index : index + 1] = sides
             passages.add(frozenset((opening.start, opening.end)))
             break
@@ -50,7 +51,7 @@ def rooms_of(geometry: Geometry) -> list[Room]:
 
 
 def _wall_at(corners: Sequence[PlanPoint], point: PlanPoint) -> int | None:
-    """Index of the wall that the point lies on; None if it lies on none."""
+    """The index of the wall on which the point lies; None if it lies on none."""
     starts = np.array(corners)
     along = np.roll(starts, -1, axis=0) - starts
     share = np.clip(np.sum((point - starts) * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
@@ -60,6 +61,6 @@ def _wall_at(corners: Sequence[PlanPoint], point: PlanPoint) -> int | None:
 
 
 def _between(corners: Sequence[PlanPoint], first: int, last: int) -> list[PlanPoint]:
-    """Corners from the end of wall `first` to the beginning of wall `last`."""
+    """The corners from the end of wall `first` to the beginning of wall `last`."""
     count = (last - first) % len(corners)
     return [corners[(first + 1 + step) % len(corners)] for step in range(count)]
