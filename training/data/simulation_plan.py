@@ -1,7 +1,8 @@
-"""What a simulation computes, and why: an effect is called for where leaving it out would change what is heard.
+"""A plan of what a simulation computes, and why: an effect is called for if leaving it out would audibly change the
+sound.
 
-The names are those of the catalogue in `server.scene.effects` where both have the effect, so that one override in a
-scene file speaks to simulation and rendering alike.
+Effects that also exist in the catalogue in `server.scene.effects` have the same names, so that one override in a scene
+file applies to both simulation and rendering.
 """
 
 from collections.abc import Mapping
@@ -24,28 +25,29 @@ class SimulatedEffect(StrEnum):
 
 
 Overrides = Mapping[SimulatedEffect, bool]
-"""On or off whatever the prediction says."""
+"""Effects that are on or off regardless of the prediction."""
 
 
 def overrides_among(effects: Mapping[str, bool]) -> dict[SimulatedEffect, bool]:
-    """Those that simulations know, of effects by name; the others are rendering's."""
+    """Select the effects that simulations have from effects by name; the others belong to rendering."""
     return {SimulatedEffect(name): is_on for name, is_on in effects.items() if name in list(SimulatedEffect)}
 
 
 @dataclass(frozen=True)
 class SimulationDecision(Decision[SimulatedEffect]):
-    """`cost_s` are seconds of one core for the whole scene that the effect takes, or saves where it is off; None where
-    it costs next to nothing or nobody measured."""
+    """The decision about one effect. `cost_s` are seconds of one core for the whole scene that the effect takes, or
+    saves if it is off; None if they are negligible or were not measured."""
 
     cost_s: float | None = None
 
 
 @dataclass(frozen=True)
 class SimulationPlan:
-    """`rays` per emitter, 0 for none; mirrored paths of up to `image_order` reflections are images.
+    """The plan of a simulation: `rays` per emitter, 0 for none; specular paths of up to `image_order` reflections are
+    computed as images.
 
-    From `tail_start_s` after emission on all receivers hear one tail, of which `tail_rays` tell the decay; None where
-    each has its own.
+    From `tail_start_s` after emission on, all receivers share one tail, whose decay is measured with `tail_rays` rays;
+    None if each receiver has its own tail.
     """
 
     image_order: int
@@ -58,20 +60,20 @@ class SimulationPlan:
     transmission: bool
     decisions: tuple[SimulationDecision, ...] = ()
     cost_s: float | None = None
-    """Seconds of one core that the whole simulation was predicted to take."""
+    """The predicted time of the whole simulation, in seconds of one core."""
     notes: tuple[str, ...] = ()
-    """What the scene file asks for and will not get, in sentences."""
+    """Sentences about requests of the scene file that the simulation cannot fulfil."""
 
     @classmethod
     def everything(
         cls, image_order: int, rays: int, *, diffraction: bool = True, transmission: bool = False
     ) -> "SimulationPlan":
-        """Nothing is left out, and every pair has its own tail."""
+        """A plan that leaves nothing out, in which every pair has its own tail."""
         return cls(image_order, rays, None, 0, True, True, diffraction, transmission)
 
     @property
     def settings(self) -> tuple[object, ...]:
-        """What data depend on; two plans may agree on it for different reasons."""
+        """Everything on which the data depend; two plans may have equal settings for different reasons."""
         return tuple(value for name, value in vars(self).items() if name not in {"decisions", "cost_s", "notes"})
 
     def to_json(self) -> dict[str, Any]:
@@ -79,7 +81,7 @@ class SimulationPlan:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "SimulationPlan":
-        """Raises KeyError, TypeError or ValueError for anything but what `to_json` returns."""
+        """Read a plan from the result of `to_json`. Raises KeyError, TypeError or ValueError for anything else."""
         decisions = tuple(
             SimulationDecision(**{**decision, "name": SimulatedEffect(decision["name"])})
             for decision in content["decisions"]

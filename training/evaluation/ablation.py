@@ -27,7 +27,7 @@ _DECAY_RANGE_DB = 40.0
 
 
 class AblationError(NafirError):
-    """An ablation that has nothing to compare."""
+    """There is nothing to compare."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ class Row:
 
 
 def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) -> dict[str, Configuration]:
-    """The base configuration, and variants of it by name, each with one factor changed, as far as these data allow."""
+    """The base configuration and its variants by name, each with one factor changed; variants that the data do not
+    allow are left out."""
     recipe = base.recipe
     if not isinstance(recipe, FactorisedRecipe):
         raise AblationError(f"field: {base.name} has no factors to vary; the factorised field has")
@@ -64,7 +65,7 @@ def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) 
 def ablate(
     responses: ResponseSet, folder: Path, configurations: dict[str, Configuration], progress: Progress
 ) -> list[Row]:
-    """Trains each configuration in its own folder, unless it is trained already, and measures all.
+    """Train each configuration in its own folder, unless it is already trained, and measure the errors of all.
 
     Raises AblationError if no pair is held out.
     """
@@ -85,7 +86,7 @@ def ablate(
 
 @torch.no_grad()
 def _errors(learner: FactorisedLearner, rows: npt.NDArray[np.int64]) -> tuple[float, float, float]:
-    """Spectral, level and decay error on these rows of the responses."""
+    """The spectral, level and decay errors on these rows of the responses."""
     responses, codec = learner.responses, learner.cells.codec
     graph = ExportedField(learner.field, learner.cells).eval()
     spectral, level, decay = [], [], []
@@ -107,7 +108,7 @@ def _errors(learner: FactorisedLearner, rows: npt.NDArray[np.int64]) -> tuple[fl
 
 
 def _decay_db(power: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(..., frequency, frame) power to (..., frame) energy from each frame on, summed over frequencies."""
+    """Convert power (..., frequency, frame) to energy (..., frame) from each frame on, summed over frequencies."""
     energy = power.sum(axis=-2)
     return np.asarray(10 * np.log10(np.maximum(np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1], 1e-30)))
 

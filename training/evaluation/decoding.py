@@ -1,5 +1,5 @@
-"""Linear decoding: how much of a quantity a ridge regression can predict from features, at places that it was not
-fitted to."""
+"""Linear decoding: how well a ridge regression predicts a quantity from features, at places that were left out of its
+fit."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _PENALTIES = np.logspace(-3, 5, 33)
 
 @dataclass(frozen=True)
 class RidgeRegression:
-    """The prediction is `(features - centre) / scale @ weights + offset`."""
+    """A fitted ridge regression; it predicts `(features - centre) / scale @ weights + offset`."""
 
     centre: _Floats
     scale: _Floats
@@ -25,9 +25,8 @@ class RidgeRegression:
 
     @classmethod
     def fit(cls, features: _Floats, target: _Floats) -> "RidgeRegression":
-        """Fits features (row, feature) to a target (row,). Of several penalties it takes the one with the least
-        leave-one-out error, which has a closed form by the singular values (Golub, Heath and Wahba, Technometrics 21,
-        215, 1979)."""
+        """Fit features (row, feature) to a target (row,). The penalty is the one with the least leave-one-out error,
+        which has a closed form by the singular values (Golub, Heath and Wahba, Technometrics 21, 215, 1979)."""
         centre, scale = features.mean(axis=0), features.std(axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         offset = float(target.mean())
@@ -50,8 +49,9 @@ class RidgeRegression:
 
 @dataclass(frozen=True)
 class Decoding:
-    """explained: (repeat,) share of the variance over places that is predicted at left-out places; at most 1, and below
-    0 if the mean would predict better. predicted: (place,) these predictions, averaged over repeats."""
+    """The result of a cross-validated decoding. explained: (repeat,) share of the variance over places that is
+    predicted at left-out places; at most 1, and below 0 if the mean would predict better. predicted: (place,)
+    predictions at left-out places, averaged over repeats."""
 
     explained: _Floats
     predicted: _Floats
@@ -62,12 +62,12 @@ class Decoding:
 
     @property
     def spread(self) -> float:
-        """Standard deviation over repeats, each of which divides the places into folds in another way."""
+        """The standard deviation over repeats, each of which divides the places into folds differently."""
         return float(self.explained.std(ddof=1))
 
 
 def decode(features: _Floats, place: npt.NDArray[np.integer], target: _Floats, *, seed: int = 0) -> Decoding:
-    """Cross-validated decoding of `target` (place,) from features (row, feature); `place` (row,) is the place of each
+    """Decode `target` (place,) from features (row, feature), with cross-validation; `place` (row,) is the place of each
     row. All rows of a place are left out together, and the prediction for a place is the mean over its rows.
 
     Raises ValueError if there are fewer places than folds.

@@ -34,7 +34,7 @@ from training.simulation.references import GeometricSound
 
 _FOLDER = "draws"
 _FORMAT = 2
-"""Must change whenever simulations, or the parameters that are measured in them, change."""
+"""This number must change whenever simulations, or the parameters measured in them, change."""
 _WORKERS = 2
 # With 20,000 rays, the reverberation time of a small room has an error of 0.9 %, the same for all pairs.
 _TAIL_RAYS = 16
@@ -45,8 +45,8 @@ _Floats = npt.NDArray[np.float64]
 def median_parameters(
     held_out: HeldOut, draws: int, *, decay_db: float = 30.0, track: Track = lambda steps, _: steps
 ) -> list[RoomParameters]:
-    """Parameters of each held-out pair at the evaluated orientations: medians over `draws` simulations, none of which
-    is in the dataset. A value that cannot be measured in more than half of the draws is missing.
+    """The parameters of each held-out pair at the evaluated orientations: medians over `draws` simulations, none of
+    which is in the dataset. A value that cannot be measured in more than half of the draws is missing.
 
     Raises EvaluationError for measured data.
     """
@@ -62,7 +62,8 @@ def median_parameters(
 
 
 class _Draws:
-    """The draws of one dataset. Responses are whole; decay times are measured over `decay_db`."""
+    """Simulates draws for one dataset and stores their parameters. Responses are complete; decay times are measured
+    over `decay_db`."""
 
     def __init__(self, dataset: Dataset, decay_db: float) -> None:
         self._dataset = dataset
@@ -75,7 +76,8 @@ class _Draws:
         self._folder = dataset.folder / _FOLDER / simulated.hexdigest()[:12]
 
     def medians(self, emitters: list[int], draws: int, track: Track) -> dict[tuple[int, int], dict[str, _Floats]]:
-        """Parameters (yaw,) or (yaw, ear) by name, for each held-out pair of these emitters, by (emitter, listener)."""
+        """Median parameters (yaw,) or (yaw, ear) by name, for each held-out pair of these emitters, by (emitter,
+        listener)."""
         steps = [(draw, emitter) for draw in range(draws) for emitter in emitters]
         missing = [step for step in steps if not self._file(*step).exists()]
         if missing:
@@ -128,8 +130,8 @@ class _Draws:
 
 
 def _median(values: _Floats) -> _Floats:
-    """Median over the first axis; NaN where more than half of the values are missing."""
+    """The median over the first axis; NaN where more than half of the values are missing."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # where all values are NaN
+        warnings.simplefilter("ignore", RuntimeWarning)  # raised where all values are NaN
         median = np.nanmedian(values, axis=0)
     return np.where(np.isnan(values).mean(axis=0) > 0.5, np.nan, median)

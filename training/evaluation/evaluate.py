@@ -1,4 +1,4 @@
-"""Evaluates any number of methods on held-out pairs: errors, storage, and time per response.
+"""Evaluation of any number of methods on held-out pairs: errors, storage, and time per response.
 
 Axes: the responses of one held-out pair are `(yaw, channel, sample)`. Errors are those of `server.acoustics.metrics`,
 for each `(pair, yaw)`.
@@ -43,18 +43,18 @@ _SPECTRAL_FLOOR = 1e-5
 
 Kind = Literal["field", "baseline", "simulation", "floor"]
 RATED = frozenset({"field", "baseline"})
-"""The kinds that are compared with each other and timed. Simulations only serve for comparison."""
+"""The kinds of column that are compared with each other and timed. Simulations only serve for comparison."""
 Source = Callable[[int, npt.NDArray[np.integer]], Responses | None]
-"""Takes the index of a held-out pair and indices (n,) of the data's yaws, and gives (n, channel, sample), or None if
-the method has no estimate. It is called from several threads."""
+"""A function that takes the index of a held-out pair and indices (n,) of the data's yaws. It returns responses (n,
+channel, sample), or None if the method has no estimate. Several threads call it."""
 _Errors = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Column:
     """One method. storage_bytes: what it must store for the scene. method: its name in published tables. extra_ms: time
-    per response that `source` does not take because it was spent beforehand. A column of kind "floor" is a second
-    simulation, which is always compared with the first. One of kind "simulation" is compared like a method."""
+    per response that was spent in advance, and that `source` therefore does not take. A column of kind "floor" is a
+    second simulation, which is always compared with the first. One of kind "simulation" is compared like a method."""
 
     name: str
     source: Source
@@ -84,7 +84,7 @@ class Result:
 @dataclass(frozen=True)
 class Evaluation:
     """The result of `nafir-train evaluate`. `held_out` is the number of held-out pairs, `pairs` that of the evaluated
-    ones, `draws` the number of simulations whose median parameters are the reference. The floor is the difference
+    ones, and `draws` the number of simulations whose median parameters are the reference. The floor is the difference
     between two simulations, so with several draws errors are not given in multiples of it."""
 
     data: str
@@ -109,7 +109,7 @@ class Evaluation:
         return next((result for result in self.results if result.kind == "floor"), None)
 
     def to_json(self) -> dict[str, object]:
-        """Plain values for `json.dumps`, without the errors of single entries."""
+        """Convert to plain values for `json.dumps`, without the errors of single entries."""
         floor = self.floor
         columns = {}
         for result in self.results:
@@ -157,7 +157,7 @@ class _PairErrors:
         return spectral_codec(self.held_out.sample_rate, self.held_out.samples)
 
     def of_pair(self, pair: int) -> Errors:
-        """Errors by column, from `stored` if they are there, and put there if not."""
+        """The errors by column; read from `stored` if they are there, otherwise measured and stored."""
         if self.stored is not None and (found := self.stored.get(pair)) is not None:
             return found
         reference = np.asarray(self.held_out.reference(pair), dtype=np.float32)
@@ -176,7 +176,8 @@ class _PairErrors:
         simulated: RoomParameters,
         spectrogram: npt.NDArray[np.floating],
     ) -> dict[str, _Errors]:
-        """Errors (yaw,) by metric. The reference has this `shape`, parameters and log-magnitude spectrogram."""
+        """The errors (yaw,) by metric, compared with a reference of this `shape`, with these parameters and this
+        log-magnitude spectrogram."""
         answer = column.source(pair, self.held_out.yaw_indices)
         if answer is None:
             return {metric.name: np.full(shape[0], np.nan) for metric in METRICS}
@@ -191,7 +192,7 @@ class _PairErrors:
         errors[SPECTRAL_LOSS.name] = spectral_loss(
             spectrogram, self._codec.log_magnitude(self._codec.transform(estimate))
         )
-        if column.kind == "simulation":  # the reference itself
+        if column.kind == "simulation":  # it is the reference itself
             errors[SPECTRAL_LOSS.name][:] = np.nan
         for metric in METRICS:
             if metric.needs_direct_sound and not self.held_out.visible[pair]:
@@ -211,13 +212,13 @@ def evaluate(
     stored: StoredErrors | None = None,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
-    """Measures every held-out pair at every orientation that is evaluated, in every column.
+    """Measure every column on every held-out pair at every evaluated orientation.
 
     If the emitter is not in sight there is no direct sound, and metrics that need one are missing. If a method has no
     estimate, all metrics are missing. The direct sound is searched for within 3 ms of that of the reference.
 
-    of: the number of held-out pairs that these were drawn from. truth: reference parameters by pair, which are medians
-    over `draws` simulations; without it, those of the reference response. Spectra are always compared with the
+    of: the number of held-out pairs from which these were drawn. truth: reference parameters by pair, which are medians
+    over `draws` simulations; by default, those of the reference response. Spectra are always compared with the
     reference response. Sources are called from several `threads` for errors, and one at a time for timing. Pairs in
     `stored` are not measured again. `track` may wrap the loop over pairs in a progress bar.
     """
@@ -249,15 +250,15 @@ def evaluate(
 
 
 def spectral_codec(sample_rate: int, samples: int) -> Codec:
-    """The codec of spectral losses, the same for every method: windows of about 11 ms (256 samples at 24 kHz) at steps
-    of a quarter, and a floor of magnitudes 100 dB below a unit impulse. The paper's windows are twice as long, and its
-    floor is 40 dB higher, which would hide all of our late tails."""
+    """The codec of spectral losses, the same for every method. Windows are about 11 ms long (256 samples at 24 kHz)
+    with a hop of a quarter, and the floor of magnitudes is 100 dB below a unit impulse. The paper's windows are twice
+    as long, and its floor is 40 dB higher, which would hide all of our late tails."""
     n_fft = 2 ** round(np.log2(_SPECTRAL_WINDOW_S * sample_rate))
     return Codec(sample_rate, n_fft, n_fft // 4, samples, _SPECTRAL_FLOOR)
 
 
 def milliseconds_per_response(column: Column, held_out: HeldOut) -> float | None:
-    """Median time of one response, computed alone in this thread. A first run, which loads data from disk, does not
+    """The median time of one response, computed alone in this thread. A first run, which loads data from disk, does not
     count. None if the method has no estimate for any pair."""
     times_s = []
     began = time.perf_counter()
@@ -299,7 +300,7 @@ def _result(
 
 
 def _ratio(summary: Summary, floor: Result | None, metric: Metric) -> float | None:
-    """The mean error over that of the floor."""
+    """The mean error divided by the mean error of the floor; None if either is missing."""
     least = None if floor is None else floor.summaries[metric.name].mean
     return None if summary.mean is None or not least else summary.mean / least
 
@@ -313,7 +314,7 @@ def _beats(ours: _Errors, theirs: _Errors) -> bool:
 
 
 def _surpasses(ours: _Errors, theirs: _Errors) -> bool:
-    """Whether the gain exceeds chance. The entries of one pair are averaged, because they are not independent."""
+    """Whether the difference exceeds chance. The entries of one pair are averaged, because they are not independent."""
     gains = (theirs - ours).reshape(len(ours), -1)
     measured = ~np.isnan(gains)
     gain = np.sum(gains, axis=1, where=measured)[measured.any(axis=1)] / measured.sum(axis=1)[measured.any(axis=1)]

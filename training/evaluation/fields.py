@@ -1,4 +1,4 @@
-"""Fields of scene bundles as columns of an evaluation; writes measured errors into the bundle."""
+"""The fields of scene bundles as columns of an evaluation; also writes measured errors into the bundle."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,11 +16,12 @@ from training.baselines.moved_nodes import with_moved_nodes
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
 
 _LATTICE_POSITIONS = 8
-"""Number of random positions of a lattice, which are used for held-out pairs in turn."""
+"""The number of random positions of a lattice, which are used for held-out pairs in turn."""
 
 
 def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
-    """A column for each quality level of each bundle, named by level, or by bundle folder if there are several bundles.
+    """Make a column for each quality level of each bundle, named by level, or by bundle folder if there are several
+    bundles.
 
     Raises DatasetError or EvaluationError if a bundle does not fit the data.
     """
@@ -51,8 +52,8 @@ def _method(architecture: str) -> str:
 
 
 def field_source(field: AcousticField, held_out: HeldOut) -> Source:
-    """Whole responses as the server gives them: direct sound and first reflections are added, unless the field includes
-    them. Nodes whose responses are reused are moved between pairs."""
+    """Complete responses as the server renders them: direct sound and first reflections are added, unless the field
+    includes them. Nodes whose responses are reused are moved between pairs."""
     codec = field.bundle.manifest.codec.codec
     if codec.sample_rate != held_out.sample_rate:
         raise EvaluationError(
@@ -81,7 +82,7 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
 
 
 def record_accuracy(bundle: Bundle, evaluation: Evaluation) -> Bundle:
-    """Writes the measured errors of each quality level into the bundle's manifest. `evaluation` must be of this bundle
+    """Write the measured errors of each quality level into the bundle's manifest. `evaluation` must be of this bundle
     alone."""
     floor = {} if evaluation.floor is None else _means(evaluation, evaluation.floor.name)
 
@@ -113,7 +114,7 @@ def _name(bundle: Bundle, level: str, *, several: bool, levels: int) -> str:
 
 
 def _of_length(responses: npt.NDArray[np.float32], samples: int) -> npt.NDArray[np.float32]:
-    """The responses, cut or padded with zeros to `samples`, because a measurement may be longer than the training
+    """Cut or pad the responses with zeros to `samples`, because a measurement may be longer than the training
     responses."""
     kept = responses[..., :samples]
     return np.pad(kept, ((0, 0), (0, 0), (0, samples - kept.shape[-1])))

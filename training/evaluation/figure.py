@@ -36,10 +36,10 @@ _KINDS: Mapping[Kind, str] = {
 _REFERENCE_COLOUR, _TEXT = "#222222", "#2b3a42"
 _DECAY_FLOOR_DB = -65.0
 _DPI = 110
-_ACROSS = 5  # panels of errors
+_ACROSS = 5  # panels of errors in a row
 _PERCENTILES = (5, 25, 50, 75, 95)
 _LOGARITHMIC_FROM = 10.0
-"""From this ratio between the largest and the smallest median of a metric on, its axis is logarithmic."""
+"""If the ratio between the largest and the smallest median of a metric is at least this, its axis is logarithmic."""
 _MOST_DECADES = 4.0
 _BELOW: Mapping[str, Any] = {"marker": "<", "markeredgecolor": "white", "markersize": 9}
 
@@ -55,7 +55,7 @@ def draw_figure(
     examples: Sequence[tuple[int, str]],
     sample_rate: float,
 ) -> None:
-    """Writes `figure_of` as a PNG."""
+    """Write `figure_of` as a PNG."""
     figure = figure_of(
         evaluation,
         references=references,
@@ -78,7 +78,7 @@ def figure_of(
     examples: Sequence[tuple[int, str]],
     sample_rate: float,
 ) -> Figure:
-    """Decays above, errors below.
+    """Draw decays above and errors below.
 
     `examples`: held-out pairs whose decays are shown, each with a title. `reference_name`: the label of their own
     responses. `columns`: the estimates that are drawn beside the reference, named as in the evaluation; their first
@@ -109,7 +109,7 @@ def figure_of(
 
 
 def _add_legend(part: SubFigure, panels: Sequence[Axes]) -> None:
-    """One entry per name, whichever panels have it."""
+    """Add one legend entry per name, whichever panels show it."""
     entries: dict[str, Artist] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
@@ -161,7 +161,7 @@ def _draw_all_errors(part: SubFigure, evaluation: Evaluation) -> None:
 
 
 def _counted(evaluation: Evaluation) -> str:
-    """How many pairs and orientations were evaluated, of how many."""
+    """A sentence with the numbers of evaluated pairs and orientations, and of all of them."""
     pairs = (
         f"all {evaluation.pairs}"
         if evaluation.pairs == evaluation.held_out
@@ -172,8 +172,7 @@ def _counted(evaluation: Evaluation) -> str:
 
 
 def _draw_errors(axes: Axes, results: Sequence[Result], metric: Metric) -> bool:
-    """A row for each method. Where a median lies below a logarithmic axis, an arrow marks it; returns whether there is
-    one."""
+    """Draw a row for each method. An arrow marks medians below a logarithmic axis; returns whether there is one."""
     present = [result.errors[metric.name][~np.isnan(result.errors[metric.name])] for result in results]
     spreads = {row: np.percentile(values, _PERCENTILES) for row, values in enumerate(present) if len(values)}
     low, is_logarithmic = _lower_end(list(spreads.values()))
@@ -197,7 +196,7 @@ def _draw_errors(axes: Axes, results: Sequence[Result], metric: Metric) -> bool:
 
 
 def _lower_end(spreads: Sequence[npt.NDArray[np.floating]]) -> tuple[float, bool]:
-    """Where the axis for these percentiles begins, and whether it is logarithmic."""
+    """The lower end of the axis for these percentiles, and whether the axis is logarithmic."""
     medians = [spread[2] for spread in spreads if spread[2] > 0]
     if not medians or max(medians) < _LOGARITHMIC_FROM * min(medians):
         return 0.0, False

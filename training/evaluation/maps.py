@@ -1,7 +1,7 @@
 """Loudness maps side by side, as in the paper's figure: simulated on a grid, predicted by the field, and interpolated
 between the training listeners.
 
-Level is energy per ear, averaged over ears and two opposite head orientations, in dB relative to the emitter's free
+The level is energy per ear, averaged over ears and two opposite head orientations, in dB relative to the emitter's free
 field at one metre, as in `server.responses.loudness`. Grids are (row, column), row 0 the southernmost, NaN outside the
 room. Metres.
 """
@@ -40,8 +40,8 @@ _CLEARANCE_M = 0.08
 
 @dataclass(frozen=True)
 class EmitterMaps:
-    """Maps of one emitter by method, the simulation first, all on the grid of `grid`. `listeners` (n, 3) are the
-    training listeners between which responses are interpolated; `corners` (n, 2) are those of the floor plan."""
+    """The maps of one emitter by method, the simulation first, all on the grid of `grid`. `listeners` (n, 3) are the
+    training listeners between which responses are interpolated; `corners` (n, 2) are the corners of the floor plan."""
 
     corners: _Floats
     emitter: _Floats
@@ -50,14 +50,14 @@ class EmitterMaps:
     levels_db: dict[str, _Floats]
 
     def errors_db(self, method: str) -> float:
-        """Mean absolute error over all cells."""
+        """The mean absolute error over all cells, in dB."""
         truth, *_ = self.levels_db.values()
         return float(np.nanmean(np.abs(self.levels_db[method] - truth)))
 
 
 def spread_out(points: _Floats, start: _Floats, count: int) -> list[int]:
-    """Indices of `count` points (point, 3): the point nearest to `start`, then always the one farthest from those
-    chosen so far."""
+    """Indices of `count` points (point, 3): the point nearest to `start`, then always the one farthest from all chosen
+    so far."""
     chosen = [int(np.argmin(np.linalg.norm(points - start, axis=-1)))]
     while len(chosen) < min(count, len(points)):
         nearest = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)
@@ -73,8 +73,8 @@ def map_emitters(
     spacing_m: float,
     track: Callable[[Sequence[int], str], Iterable[int]] = lambda steps, _: steps,
 ) -> list[EmitterMaps]:
-    """Maps for `emitters` probes as emitters. Raises EvaluationError for measured data, whose walls are unknown, and
-    DatasetError if the field is of another scene."""
+    """Make the maps of `emitters` probes as emitters. Raises EvaluationError for measured data, whose walls are
+    unknown, and DatasetError if the field is of another scene."""
     dataset = held_out.simulated
     if dataset is None:
         raise EvaluationError(f"{held_out.name}: maps need a simulated scene, whose walls are known")
@@ -127,8 +127,8 @@ def _maps(
 
 
 def _training_gram(pairs: TrainingPairs, yaws: _Floats, emitter: int) -> tuple[_Floats, _Floats]:
-    """(n, 3) training listeners of this emitter, and (n, n) dot products of their waveforms, per ear. They give the
-    energy of any weighted sum of the waveforms."""
+    """The training listeners (n, 3) of this emitter, and the dot products (n, n) of their waveforms, per ear. The
+    energy of any weighted sum of the waveforms follows from them."""
     known = np.flatnonzero(pairs.training & (pairs.pair_emitter == emitter))
     opposite = [int(np.argmin(np.abs(np.angle(np.exp(1j * (yaws - yaw)))))) for yaw in _YAWS]
     waves = np.stack([pairs.response(int(pair))[opposite] for pair in known]).reshape(len(known), -1)
@@ -137,8 +137,9 @@ def _training_gram(pairs: TrainingPairs, yaws: _Floats, emitter: int) -> tuple[_
 
 
 def _interpolated_power(listeners: _Floats, gram: _Floats, cells: _Floats) -> tuple[_Floats, _Floats]:
-    """(cell,) energies of the nearest waveform, and of linear interpolation in plan (the nearest listener in plan
-    outside the listeners' hull)."""
+    """(cell,) energies of two baselines: the nearest listener's waveform, and waveforms interpolated linearly in the
+    horizontal plane (outside the listeners' hull: the horizontally nearest). `gram` holds the inner products of all
+    waveforms."""
     nearest = np.argmin(np.linalg.norm(cells[:, None] - listeners, axis=-1), axis=-1)
     linear = np.empty(len(cells))
     for number, cell in enumerate(cells):
@@ -170,7 +171,7 @@ def _simulated_power(dataset: Dataset, emitter: _Floats, cells: _Floats) -> _Flo
 
 
 def draw_maps(maps: Sequence[EmitterMaps], path: Path) -> None:
-    """Writes a PNG with a row per emitter, a column per method and a common colour scale."""
+    """Write a PNG with a row per emitter, a column per method and a common colour scale."""
     methods = list(maps[0].levels_db)
     walls = maps[0].corners
     width, height = np.ptp(walls, axis=0)

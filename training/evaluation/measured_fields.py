@@ -1,7 +1,7 @@
-"""Fields trained on measured responses, read from their run folders. A bundle cannot hold them, because their walls are
-unknown.
+"""Fields trained on measured responses, read from their run folders. A bundle cannot contain them, because their walls
+are unknown.
 
-A field predicts magnitudes, and phase as far as it is known. The other part of the phase is frozen noise, as in the
+A field predicts magnitudes, and phase as far as it is known. The rest of the phase is that of frozen noise, as in the
 server. Measured responses include direct sound, so nothing is added.
 
 Axes: B poses; (B, channel, frequency, frame) and (B, channel, sample).
@@ -33,8 +33,8 @@ _BYTES_PER_PARAMETER = 4
 
 
 def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
-    """Raises RunError for a run that is missing, unfinished or of other data, and EvaluationError for a run on
-    simulated responses, whose direct sound and levels are part of a bundle."""
+    """Make the column of a run. Raises RunError for a run that is missing, unfinished or of other data, and
+    EvaluationError for a run on simulated responses, whose direct sound and levels are part of a bundle."""
     if isinstance(responses, SimulatedResponses):
         raise EvaluationError(f"{run}: was trained on a simulated scene; export it and evaluate the bundle")
     learner = load_learner(responses, run)
@@ -74,8 +74,8 @@ def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
 
 
 def decoded(outputs: Outputs, codec: Codec, noise: FrozenNoise) -> npt.NDArray[np.float32]:
-    """Aligned responses from a field's outputs: the responses themselves, or log-magnitude, instantaneous frequency,
-    certainty and, for two ears, interaural coherence (real and imaginary parts)."""
+    """Decode a field's outputs to aligned responses. The outputs are the responses themselves, or log magnitude,
+    instantaneous frequency, certainty and, for two ears, interaural coherence (real and imaginary parts)."""
     if len(outputs) == 1:
         return outputs[0]
     log_magnitude, frequency, certainty, *interaural = outputs
@@ -105,7 +105,7 @@ def _with_phase(
 
 
 def undo_alignment(aligned: npt.NDArray[np.float32], samples: float) -> npt.NDArray[np.float32]:
-    """The inverse of alignment: (..., sample) delayed by a fractional number of samples, silent before, and cut at the
+    """Undo the alignment: delay (..., sample) by a fractional number of samples, with silence before, and cut at the
     end."""
     count = aligned.shape[-1]
     room = np.pad(aligned, [(0, 0)] * (aligned.ndim - 1) + [(0, max(0, int(np.ceil(samples))))])

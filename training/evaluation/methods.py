@@ -1,4 +1,4 @@
-"""Methods by name, with which a field is compared."""
+"""The methods with which a field is compared, by name."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ _BYTES_PER_SAMPLE = 2  # float16, as in simulated datasets
 
 
 def method_columns(names: Sequence[str], held_out: HeldOut, track: Track = lambda steps, _: steps) -> list[Column]:
-    """A column for each name. `track` may show the progress of preparations that take long.
+    """Make a column for each name. `track` may show the progress of preparations that take long.
 
     Raises EvaluationError for an unknown name, or for a method that does not work with these data.
     """
@@ -35,7 +35,7 @@ def method_columns(names: Sequence[str], held_out: HeldOut, track: Track = lambd
 
 
 def floor_columns(held_out: HeldOut) -> list[Column]:
-    """A column for the second take of the held-out pairs; none if there is no second take."""
+    """Make a column for the second take of the held-out pairs; none if there is no second take."""
     repeats = held_out.repeats
     if repeats is None:
         return []
@@ -43,7 +43,7 @@ def floor_columns(held_out: HeldOut) -> list[Column]:
 
 
 def simulation_column(held_out: HeldOut) -> Column:
-    """A column for the errors of one simulation, when the reference is a median over several."""
+    """Make a column for the errors of one simulation, when the reference is a median over several."""
     return Column(
         ONE_SIMULATION,
         at_pairs(held_out, lambda pair, yaw_indices: held_out.pairs.response(pair)[yaw_indices]),
@@ -52,7 +52,7 @@ def simulation_column(held_out: HeldOut) -> Column:
 
 
 class _Prepared:
-    """Data that methods share, computed when the first of them needs it."""
+    """Data that several methods use, computed on first use."""
 
     def __init__(self, held_out: HeldOut, track: Track) -> None:
         self.held_out = held_out
@@ -80,7 +80,7 @@ def _aligned(name: str, prepared: _Prepared) -> Column:
 
 
 def _of_stored(name: str, held_out: HeldOut, answer: Answer) -> Column:
-    """A method that stores the training responses as they are."""
+    """Make the column of a method that stores the training responses as they are."""
     stored = int(held_out.pairs.training.sum()) * len(held_out.yaws) * held_out.channels * held_out.samples
     return Column(name, at_pairs(held_out, answer), "baseline", stored * _BYTES_PER_SAMPLE, name)
 
@@ -134,7 +134,7 @@ def _image_sources(name: str, prepared: _Prepared) -> Column:
 
 
 def at_pairs(held_out: HeldOut, answer: Answer) -> Source:
-    """The source of a method that takes the number of a pair in the dataset."""
+    """The source of a method, for an `answer` that takes the number of a pair in the dataset."""
     return lambda index, yaw_indices: answer(int(held_out.held_out[index]), yaw_indices)
 
 

@@ -19,7 +19,7 @@ _FLOOR = 1e-12
 
 
 def mel(frequency_hz: npt.ArrayLike) -> _Floats:
-    """2595 log10(1 + f / 700 Hz) (O'Shaughnessy, Speech Communication, 1987)."""
+    """The mel scale: 2595 log10(1 + f / 700 Hz) (O'Shaughnessy, Speech Communication, 1987)."""
     return np.asarray(2595.0 * np.log10(1.0 + np.asarray(frequency_hz, dtype=np.float64) / 700.0))
 
 
@@ -38,8 +38,8 @@ def mel_filters(sample_rate: int, n_fft: int) -> _Floats:
 
 
 def mfcc(signal: npt.ArrayLike, sample_rate: int) -> _Floats:
-    """(..., sample) to (..., coefficient, frame). Frames have 25 ms and begin every 10 ms, the first with the
-    signal."""
+    """The coefficients (..., coefficient, frame) of a signal (..., sample). Frames are 25 ms long and begin every 10
+    ms, the first with the signal."""
     samples = np.asarray(signal, dtype=np.float64)
     window, step = round(WINDOW_S * sample_rate), round(STEP_S * sample_rate)
     if samples.shape[-1] < window:

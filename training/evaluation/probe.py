@@ -1,5 +1,6 @@
-"""What a field has learned about walls: the distance from the listener to the nearest wall, decoded linearly from its
-hidden features, compared with decoding from MFCC of the true responses (Luo et al., NeurIPS 2022, section 4.4).
+"""A probe of what a field has learned about walls: the distance from the listener to the nearest wall, decoded linearly
+from its hidden features, compared with decoding from MFCC of the true responses (Luo et al., NeurIPS 2022, section
+4.4).
 
 Rows are pairs of probes, places are their listeners. If a field predicts point by point in time and frequency, the
 features of a pose are the mean over all points. Metres, radians.
@@ -26,7 +27,7 @@ Track = Callable[[Sequence[int], str], Iterable[int]]
 
 HIDDEN = "hidden_features"
 _PRODUCTS = {"MatMul", "Gemm"}
-_MOST_AXES = 3  # of a layer's input; the products that spread bands and frames have more
+_MOST_AXES = 3  # of a layer's input; products that convert bands and frames have more
 _CHUNK = 64
 _YAWS = 2
 _MAPPED_EMITTERS = 4
@@ -34,7 +35,7 @@ _SPACING_M = 0.2
 
 
 def with_hidden_output(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The graph with an additional output HIDDEN: the input of its last linear layer.
+    """Return the graph with an additional output HIDDEN: the input of its last linear layer.
 
     Raises EvaluationError for a graph without one, for example with integer weights.
     """
@@ -55,7 +56,7 @@ def with_hidden_output(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def _last_layer_input(graph: onnx.GraphProto) -> tuple[str, int]:
-    """Name and number of axes of the input of the last product with constant weights."""
+    """The name and the number of axes of the input of the last product with constant weights."""
     constant = {tensor.name for tensor in graph.initializer}
     axes = {value.name: len(value.type.tensor_type.shape.dim) for value in (*graph.value_info, *graph.input)}
     last: tuple[str, int] | None = None
@@ -74,14 +75,14 @@ def _last_layer_input(graph: onnx.GraphProto) -> tuple[str, int]:
 
 
 class HiddenFeatures:
-    """Computes features of poses with one of a bundle's fields."""
+    """Computes the features of poses with one of a bundle's fields."""
 
     def __init__(self, bundle: Bundle, field: str) -> None:
         model = onnx.load_model_from_string(bundle.models[bundle.manifest.fields[field].file])
         self._session: InferenceSession = open_session(with_hidden_output(model).SerializeToString())
 
     def of(self, listeners: _Floats, emitters: _Floats, yaws: _Floats) -> _Floats:
-        """Listeners (B, 3), emitters (B, 3) and yaws (B,) to features (B, feature)."""
+        """Compute features (B, feature) for listeners (B, 3), emitters (B, 3) and yaws (B,)."""
         features = []
         for start in range(0, len(yaws), _CHUNK):
             part = slice(start, start + _CHUNK)
@@ -93,8 +94,9 @@ class HiddenFeatures:
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """places: (place, 3) listeners; distance_m: (place,) to the nearest wall, in plan. The map has cells (cell, 2) in
-    the room, at steps of spacing_m, with their true distances and those decoded from the field's features."""
+    """The result of a probe. places: (place, 3) listeners; distance_m: (place,) to the nearest wall, in plan. The map
+    has cells (cell, 2) in the room, at steps of spacing_m, with their true distances and those decoded from the field's
+    features."""
 
     field: str
     plan: FloorPlan
@@ -131,7 +133,7 @@ def probe(
     seed: int = 0,
     track: Track = lambda steps, _: steps,
 ) -> ProbeResult:
-    """Decodes the distance to the nearest wall at each probe of the dataset from the features of a field (by default
+    """Decode the distance to the nearest wall at each probe of the dataset from the features of a field (by default
     that of the first quality level), for `emitters` random probes as emitters, or all.
 
     Raises EvaluationError for measured data, whose walls are unknown, for too few probes, and for a field that the
@@ -183,14 +185,14 @@ def probe(
 
 
 def _features(hidden: HiddenFeatures, listeners: _Floats, emitter: _Floats, yaws: _Floats) -> _Floats:
-    """(listener, feature) mean over yaws."""
+    """(listener, feature) features, mean over yaws."""
     positions, heads = np.repeat(listeners, len(yaws), axis=0), np.tile(yaws, len(listeners))
     features = hidden.of(positions, np.broadcast_to(emitter, positions.shape), heads)
     return np.asarray(features.reshape(len(listeners), len(yaws), -1).mean(axis=1))
 
 
 def _cells(plan: FloorPlan) -> _Floats:
-    """(cell, 2) centres of those cells of a grid over the plan that are in the room."""
+    """(cell, 2) centres of the cells of a grid over the plan that are in the room."""
     low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
     x, y = (np.arange(a + _SPACING_M / 2, b, _SPACING_M) for a, b in zip(low, high, strict=True))
     cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -16,7 +16,7 @@ _MAP = "viridis"
 
 
 def draw_probe(probing: ProbeResult, path: Path) -> None:
-    """Writes a PNG with four panels: a map of the true distance, a map of the distance decoded from features, distances
+    """Write a PNG with four panels: a map of the true distance, a map of the distance decoded from features, distances
     decoded from MFCC at left-out places, and decoded against true distances at left-out places."""
     figure = Figure(figsize=(15.5, 3.9), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)

@@ -1,7 +1,7 @@
-"""Figures that others have published for the methods in our tables, with the data that they were measured on.
+"""Results that others have published for the methods in our tables, with the data on which they were measured.
 
-None is for our scenes. Rooms, source-listener distances and definitions differ, so the figures only give orientation
-and are never a reference. Figures that the authors did not print are absent.
+None is for our scenes. Rooms, source-listener distances and definitions differ, so these numbers only give orientation
+and are never a reference. Numbers that the authors did not print are absent.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """errors: by method, then by metric of `server.acoustics.metrics`, in its unit."""
+    """A table of published results. errors: by method, then by metric of `server.acoustics.metrics`, in its unit."""
 
     data: str
     source: str
@@ -53,5 +53,5 @@ MESHRIR = PublishedTable(
 
 
 def published_table(*, simulated: bool) -> PublishedTable:
-    """The table for data of the same kind."""
+    """The published results on data of the same kind: simulated or measured."""
     return SOUNDSPACES if simulated else MESHRIR

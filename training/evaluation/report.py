@@ -1,4 +1,4 @@
-"""Tables of an evaluation, with a row per method and a column per metric, as in Luo et al. (NeurIPS 2022)."""
+"""The tables of an evaluation, with a row per method and a column per metric, as in Luo et al. (NeurIPS 2022)."""
 
 from collections.abc import Iterator
 
@@ -119,7 +119,8 @@ def _figure(result: Result, metric: Metric) -> str:
 
 
 def _unexpected(evaluation: Evaluation, result: Result, metric: Metric) -> int:
-    """The number of missing entries, without those that every method lacks for want of direct sound or a second ear."""
+    """The number of missing entries, except those that every method lacks because there is no direct sound or no second
+    ear."""
     summary = result.summaries[metric.name]
     if summary.count == 0:
         return 0
@@ -145,5 +146,5 @@ def _time(result: Result) -> str:
 
 
 def short(value: float) -> str:
-    """Three significant digits, without an exponent."""
+    """The value with three significant digits, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:#.3g}".rstrip(".")

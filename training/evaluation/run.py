@@ -32,11 +32,11 @@ def evaluate_bundles(
     keep: Path | None = None,
     track: Track = lambda steps, _: steps,
 ) -> tuple[Evaluation, PublishedTable]:
-    """Evaluates each quality level of each bundle, and the field of each run folder on measured data, beside `methods`
-    and the floor. All are evaluated on the same held-out pairs and orientations: all of them, or as many as `pairs` and
-    `yaws` say. Parameters are compared with medians over `draws` simulations, or with those of the dataset's own
-    simulation. `figure` is a PNG to draw. Errors are stored in the file `keep` pair by pair, so that an interrupted
-    evaluation can be resumed; the file is removed at the end.
+    """Evaluate each quality level of each bundle, and the field of each run folder on measured data, beside `methods`
+    and the floor. All are evaluated on the same held-out pairs and orientations: all of them, or the numbers given by
+    `pairs` and `yaws`. Parameters are compared with medians over `draws` simulations, or with those of the dataset's
+    own simulation. `figure` is the path of a PNG to draw. Errors are stored in the file `keep` pair by pair, so that an
+    interrupted evaluation can be resumed; the file is removed at the end.
 
     Raises EvaluationError, DatasetError if the dataset and a bundle are of different scenes, and RunError for a run on
     other data.
@@ -87,7 +87,7 @@ def _draw(evaluation: Evaluation, path: Path, held_out: HeldOut, columns: Sequen
 
 
 def _drawn(columns: Sequence[Column]) -> list[Column]:
-    """The first field and the first baseline. A second level of a field would hide the first."""
+    """The columns to draw: the first field and the first baseline. A second level of a field would hide the first."""
     first: dict[Kind, Column] = {}
     for column in columns:
         first.setdefault(column.kind, column)

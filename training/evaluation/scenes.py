@@ -1,7 +1,7 @@
 """A table over scenes: errors of the default level of each bundle, beside the paper's network (for late reverberation
-and for whole responses), the nearest response and the repeatability floor, with times.
+and for complete responses), the nearest response and the repeatability floor, with times.
 
-Reads the files that `nafir-train evaluate --json` writes for each scene.
+It is made from the files that `nafir-train evaluate --json` writes for each scene.
 """
 
 import json
@@ -24,13 +24,13 @@ _NOT_METHODS = {ONE_SIMULATION, FLOOR}
 
 
 class ResultError(NafirError):
-    """A file that is not the evaluation of a bundle."""
+    """The file is not the evaluation of a bundle."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """Mean errors by metric, as far as they could be measured; for each metric the methods with a significantly smaller
-    error; and milliseconds per response."""
+    """The results of one method: mean errors by metric, as far as they could be measured; for each metric the methods
+    with a significantly smaller error; and milliseconds per response."""
 
     errors: Mapping[str, float]
     surpassed_by: Mapping[str, Sequence[str]]
@@ -39,13 +39,14 @@ class Method:
 
     @property
     def megabytes(self) -> float:
-        """NaN if nothing is stored."""
+        """The stored data in MB; NaN if nothing is stored."""
         return math.nan if self.storage_bytes is None else self.storage_bytes / 1e6
 
 
 @dataclass(frozen=True)
 class SceneResult:
-    """`methods` by their names in the table; the default level is first, under its own name."""
+    """The results of one scene. `methods` are by their names in the table; the default level is first, under its own
+    name."""
 
     scene: str
     pairs: int
@@ -57,18 +58,18 @@ class SceneResult:
 
     @classmethod
     def read(cls, path: Path) -> "SceneResult":
-        """Raises ResultError."""
+        """Read the JSON of an evaluation. Raises ResultError."""
         try:
             values = json.loads(path.read_text())
             columns: dict[str, dict[str, Any]] = values["columns"]
             fields = [name for name, column in columns.items() if column["kind"] == "field"]
             nafs = {name: columns[name]["method"] for name in fields if columns[name]["method"] in {NAF, NAF_WHOLE}}
             ours = next(name for name in fields if name not in nafs)
-            # Of several bundles, columns are named by folder and level.
+            # With several bundles, columns are named by folder and level.
             level = ours.split()[-1]
             names = {ours: level}
             for name, method in nafs.items():
-                if method not in names.values():  # the first of several
+                if method not in names.values():  # only the first of several
                     names[name] = method
             methods = {names.get(name, name): _method(column, names) for name, column in columns.items()}
             scene = str(values["data"]).removesuffix(" (simulated)")
@@ -101,11 +102,11 @@ class SceneResult:
         }
 
     def worse_than(self, other: str) -> list[str]:
-        """Metrics in which the default level has a significantly larger error."""
+        """The metrics in which the default level has a significantly larger error than `other`."""
         return [name for name, surpassing in self.ours.surpassed_by.items() if other in surpassing]
 
     def larger_than(self, other: str) -> list[str]:
-        """Metrics in which the default level has a larger mean error, significantly or not."""
+        """The metrics in which the default level has a larger mean error than `other`, significantly or not."""
         theirs = self.methods[other].errors
         return [name for name, error in self.ours.errors.items() if error > theirs.get(name, math.inf)]
 
@@ -121,9 +122,10 @@ def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
 
 
 def markdown(results: Sequence[SceneResult]) -> str:
-    """A row for each scene and method. Bold is the best of the default level, the paper's network and the nearest
-    response, and every method that is not worse by two standard errors of the difference over pairs. Then come means
-    over the scenes, with the smallest in bold, and for each scene the metrics in which the paper's network is better.
+    """The table as Markdown, with a row for each scene and method. Bold marks the best of the default level, the
+    paper's network and the nearest response, and every method that is not worse by two standard errors of the
+    difference over pairs. Then follow means over the scenes, with the smallest in bold, and for each scene the metrics
+    in which the paper's network is better.
 
     Raises ResultError if scenes are compared with medians of different numbers of draws.
     """
@@ -161,7 +163,7 @@ def _cell(result: SceneResult, name: str, metric: Metric) -> str:
 
 
 def _number(value: float, *, is_bold: bool = False) -> str:
-    """Empty for NaN."""
+    """The value as text; empty for NaN."""
     if not math.isfinite(value):
         return ""
     return f"**{short(value)}**" if is_bold else short(value)
@@ -172,7 +174,7 @@ def _finite(value: float | None) -> float:
 
 
 def _mean_rows(results: Sequence[SceneResult]) -> list[str]:
-    """Means over the scenes, for methods that all scenes have."""
+    """Rows of means over the scenes, for methods that all scenes have."""
     means: dict[str, list[float]] = {}
     for name in _shown(results[0]):
         of_scenes = [result.ours if name == results[0].level else result.methods.get(name) for result in results]
@@ -225,7 +227,7 @@ def _beside(result: SceneResult, naf: str) -> str:
 
 @dataclass(frozen=True)
 class StepTime:
-    """Seconds that one step of one scene took, summed over interrupted parts."""
+    """The seconds that one step of one scene took, summed over interrupted parts."""
 
     step: str
     wall_s: float
@@ -233,7 +235,7 @@ class StepTime:
 
 
 def step_times(log: Path) -> list[StepTime]:
-    """Times from a log of `training.cli.stopwatch`, in order of first appearance. Raises ResultError."""
+    """The times in a log of `training.cli.stopwatch`, in order of first appearance. Raises ResultError."""
     totals: dict[str, list[float]] = {}
     try:
         for line in log.read_text().splitlines():
@@ -248,7 +250,8 @@ def step_times(log: Path) -> list[StepTime]:
 
 
 def times_markdown(times: Mapping[str, Sequence[StepTime]]) -> str:
-    """A row for each scene and a column for each step: minutes of wall time, CPU minutes in parentheses, and sums."""
+    """The times as a Markdown table, with a row for each scene and a column for each step: minutes of wall time, CPU
+    minutes in parentheses, and sums."""
     steps = list(dict.fromkeys(step.step for of_scene in times.values() for step in of_scene))
     rows = {scene: {step.step: step for step in of_scene} for scene, of_scene in times.items()}
     lines = ["| minutes | " + " | ".join([*steps, "all"]) + " |", "| --- |" + " ---: |" * (len(steps) + 1)]

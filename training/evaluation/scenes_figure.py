@@ -22,7 +22,7 @@ _STYLES = {
     ONE_SIMULATION: ("x", "#8d6a9f", "one simulation"),
     _DEFAULT: ("o", "#0b6e99", "default level"),
 }
-"""Marker, colour and label of each method; the last is drawn on top."""
+"""The marker, colour and label of each method; the last is drawn on top."""
 _FLOOR_COLOUR, _TEXT = "#8d6a9f", "#2b3a42"
 # Early IACC behaves like IACC, and the onset is exact because it comes from geometry.
 _SHOWN = [metric for metric in METRICS if metric.name not in {"iacc_early", "onset"}]
@@ -30,15 +30,15 @@ _ACROSS = 4
 
 
 def draw_scenes(results: Sequence[SceneResult], path: Path) -> None:
-    """Writes the figure as a PNG."""
+    """Write the figure as a PNG."""
     figure = figure_of(results)
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=110)
 
 
 def figure_of(results: Sequence[SceneResult]) -> Figure:
-    """A panel per metric: scenes from left to right, and the mean error over the floor's mean error upwards. Values
-    that could not be measured, or have no floor, are left out."""
+    """Draw a panel per metric: scenes from left to right, and the mean error divided by the floor's mean error upwards.
+    Values that could not be measured, or have no floor, are left out."""
     down = math.ceil(len(_SHOWN) / _ACROSS)
     width = max(11.5, 0.5 * len(results) * _ACROSS)
     figure = Figure(figsize=(width, 2.9 * down + 1.0), layout="constrained", facecolor="white")

@@ -1,4 +1,4 @@
-"""Stores the errors that an evaluation has measured, so that an interrupted evaluation can be resumed."""
+"""Storage for the errors that an evaluation has measured, so that an interrupted evaluation can be resumed."""
 
 import hashlib
 import json
@@ -18,14 +18,14 @@ Errors = Sequence[Mapping[str, npt.NDArray[np.float64]]]
 
 
 class StoredErrors:
-    """A file with a line of JSON per pair, after a first line with a digest of everything the errors depend on. Several
-    threads may use it.
+    """A file with a line of JSON per pair, after a first line with a digest of everything on which the errors depend.
+    Several threads may use it.
 
     A file with another digest, or from other code, is started again.
     """
 
     def __init__(self, path: Path, depends_on: Any) -> None:
-        """`depends_on` is everything besides the code that decides the errors, in plain values for `json.dumps`."""
+        """`depends_on` is everything besides the code on which the errors depend, in plain values for `json.dumps`."""
         self._path = path
         self._lock = threading.Lock()
         key = hashlib.sha256(json.dumps([depends_on, _code()]).encode()).hexdigest()
@@ -49,12 +49,12 @@ class StoredErrors:
             file.write(json.dumps([pair, values]) + "\n")
 
     def discard(self) -> None:
-        """Removes the file, when the evaluation is finished."""
+        """Remove the file when the evaluation is finished."""
         self._path.unlink(missing_ok=True)
 
 
 def signature(folder: Path) -> list[tuple[str, int, int]]:
-    """Name, size and modification time of each file in a folder."""
+    """The name, size and modification time of each file in a folder."""
     files = sorted(path for path in folder.iterdir() if path.is_file())
     return [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
 

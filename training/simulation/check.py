@@ -1,7 +1,8 @@
-"""Checks that a plan leaves out nothing audible: a few emitters of a scene are simulated by the plan, and with every
+"""A check that a plan leaves out nothing audible: a few emitters of a scene are simulated by the plan, and with every
 effect on for two seeds.
 
-The difference between the latter two is the repeatability floor. An error within it cannot be told from randomness.
+The difference between the latter two is the repeatability floor. An error within it cannot be distinguished from
+randomness.
 """
 
 from collections.abc import Callable, Iterable
@@ -32,11 +33,11 @@ _YAWS_HEARD = 4
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """`errors` compares the plan with every effect on; `floor` compares every effect on with a second random draw. Both
-    are means by metric, in its unit. Plan and reference use the same random numbers until the plan's shared tail sets
-    in. Until then, errors are caused by what the plan leaves out; later, the random numbers differ too. `everything_s`
-    and `plan_s` are seconds of one core for the emitters that were simulated. `once_s` is what the plan prepares once
-    for all `probes` of a whole simulation."""
+    """The result of a check. `errors` compares the plan with every effect on; `floor` compares every effect on with a
+    second random draw. Both are means by metric, in its unit. Plan and reference use the same random numbers until the
+    plan's shared tail sets in. Until then, errors are caused by what the plan leaves out; later, the random numbers
+    differ too. `everything_s` and `plan_s` are seconds of one core for the emitters that were simulated. `once_s` is
+    the time of the plan's preparations, which are done once for all `probes` of a whole simulation."""
 
     scene: str
     emitters: int
@@ -50,7 +51,7 @@ class PlanCheck:
 
     @property
     def speedup(self) -> float:
-        """How many times as fast a whole simulation is by the plan."""
+        """The time of a whole simulation with every effect on, divided by its time by the plan."""
         everything, plan = (seconds / self.emitters * self.probes for seconds in (self.everything_s, self.plan_s))
         return everything / (plan + self.once_s)
 
@@ -67,7 +68,8 @@ def check_plan(
     seed: int,
     track: Callable[[Iterable[int]], Iterable[int]],
 ) -> PlanCheck:
-    """Second takes, as of held-out pairs, are also simulated and timed, but not compared."""
+    """Simulate `emitters` emitters by the plan and with every effect on, and compare. Second takes, as of held-out
+    pairs, are also simulated and timed, but not compared."""
     probes = scene.probe_positions(seed)
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
     settings = {"everything": (everything, seed), "again": (everything, seed + 1), "plan": (plan, seed)}
@@ -75,7 +77,7 @@ def check_plan(
     for name, (of, drawn) in settings.items():  # the plan last, because the first simulation also loads code
         began = process_time()
         simulations[name] = PairSimulation.prepare(scene, probes, yaws, seed=drawn, plan=of)
-        for _ in simulations[name].own(0, np.array([1]), 0):  # computes what all emitters share
+        for _ in simulations[name].own(0, np.array([1]), 0):  # computes everything that all emitters share
             pass
         once_s = process_time() - began
     seconds = dict.fromkeys(simulations, 0.0)
@@ -107,7 +109,7 @@ def check_plan(
 
 
 class GeometricResponses:
-    """The direct sound and the first reflections, which datasets do not store, at the orientations that are
+    """Computes the direct sound and the first reflections, which datasets do not store, at the orientations that are
     compared."""
 
     def __init__(self, scene: SceneFile, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
@@ -138,7 +140,7 @@ class GeometricResponses:
 
 
 def _mean_errors(reference: list[RoomParameters], estimate: list[RoomParameters]) -> dict[str, float]:
-    """Mean errors by metric, without metrics that could not be measured."""
+    """The mean errors by metric, without metrics that could not be measured."""
     each = [parameter_errors(first, second) for first, second in zip(reference, estimate, strict=True)]
     means = {name: summarise(np.concatenate([of_one[name] for of_one in each])).mean for name in each[0]}
     return {name: mean for name, mean in means.items() if mean is not None}

@@ -1,4 +1,4 @@
-"""Predicts how long a simulation takes on this host, in seconds of one core, from short runs of its parts."""
+"""A prediction of how long a simulation takes on this host, in seconds of one core, from short runs of its parts."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,12 +20,12 @@ _LONGEST_TRIAL_S = 1.0
 
 
 def predicted_s(simulation: PairSimulation) -> float:
-    """Seconds of one core for all emitters and pairs, with preparation. Measuring takes a fraction of a second, or more
-    if code must be compiled first."""
+    """Predict the seconds of one core for all emitters and pairs, with preparation. Measuring takes a fraction of a
+    second, or more if code must be compiled first."""
     plan, probes = simulation.plan, len(simulation.probes)
     brief = replace(simulation, plan=replace(plan, rays=min(plan.rays, _RAYS_TRIED)))
     many, few = (np.arange(1, 1 + min(count, probes - 1)) for count in (_LISTENERS_TRACED, _LISTENERS_TRIED))
-    for _ in brief.own(0, few[:1], 0):  # the first pair computes what all pairs share
+    for _ in brief.own(0, few[:1], 0):  # the first pair also computes what all pairs share
         pass
     many_traced_s = _seconds(lambda: brief.energies(0, many, np.random.default_rng(0)))
     few_traced_s = _seconds(lambda: brief.energies(0, few, np.random.default_rng(0)))
@@ -34,7 +34,7 @@ def predicted_s(simulation: PairSimulation) -> float:
     per_listener_s = (many_traced_s - few_traced_s) / max(1, len(many) - len(few))
     tracing_s = many_traced_s + per_listener_s * (probes - 1 - len(many))
     pairs = probes * (probes - 1) * (1 + simulation.scene.simulation.held_out_share)
-    # The second take has the held-out listeners only.
+    # The second take has only the held-out listeners.
     traced_s = probes * (tracing_s + few_traced_s) * plan.rays / max(brief.plan.rays, 1)
     return simulation.prepared_s + traced_s + pairs * max(0.0, taking_s - few_traced_s) / len(few)
 
@@ -47,7 +47,7 @@ def is_brief(scene: SceneFile) -> bool:
 
 
 def with_costs(simulation: PairSimulation) -> SimulationPlan:
-    """The simulation's plan, with what each effect costs, or saves if it is off."""
+    """The simulation's plan, with the seconds that each effect costs, or saves if it is off."""
     plan, settings = simulation.plan, simulation.scene.simulation
     takes_s = predicted_s(simulation)
     images = settings.image_order if plan.image_order == GEOMETRIC_ORDER else GEOMETRIC_ORDER
@@ -65,7 +65,7 @@ def with_costs(simulation: PairSimulation) -> SimulationPlan:
 
 
 def _seconds(work: Callable[[], object]) -> float:
-    """The least of a few times, because compilation and other processes make some of them too long."""
+    """The least time of a few runs, because compilation and other processes make some of them too long."""
     times = []
     for _ in range(_TIMES):
         began = thread_time()

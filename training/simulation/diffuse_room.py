@@ -83,20 +83,20 @@ class DiffuseRoom:
 
     @property
     def mixing_time_s(self) -> float:
-        """From this time after the direct sound on, 95 % of listeners cannot tell the late sound of different places
-        apart: Lindau, Kosanke and Weinzierl, "Perceptual evaluation of model- and signal-based predictors of the mixing
-        time in binaural room impulse responses", J. Audio Eng. Soc. 60(11), 2012. The formula is for nearly rectangular
-        rooms."""
+        """The time after the direct sound from which 95 % of listeners cannot distinguish the late sound of different
+        places: Lindau, Kosanke and Weinzierl, "Perceptual evaluation of model- and signal-based predictors of the
+        mixing time in binaural room impulse responses", J. Audio Eng. Soc. 60(11), 2012. The formula is for nearly
+        rectangular rooms."""
         return 0.0117e-3 * self.volume_m3 + 50.1e-3
 
     def images_per_s(self, time_s: float) -> float:
-        """Number of image sources per second that are heard `time_s` after emission in a rectangular room (Kuttruff,
-        4.1)."""
+        """The number of image sources per second that are heard `time_s` after emission in a rectangular room
+        (Kuttruff, 4.1)."""
         return 4 * np.pi * self.speed_of_sound**3 * time_s**2 / self.volume_m3
 
     def clarity_spread_db(self, early_s: float) -> float:
-        """Standard deviation of the early-to-late ratio over random draws of noise-like reverberation: the energy in a
-        band of width B that lasts for T varies by 1 / sqrt(B T) (Lubman, J. Acoust. Soc. Am. 44, 1968)."""
+        """The standard deviation of the early-to-late ratio over random draws of noise-like reverberation: the energy
+        in a band of width B that lasts for T varies by 1 / sqrt(B T) (Lubman, J. Acoust. Soc. Am. 44, 1968)."""
         decay_per_s = _SIXTY_DB / self.reverberation_time_s
         power = self.reflected_power(1)
         bandwidth_hz = (power @ _BANDWIDTHS_HZ) ** 2 / (power**2 @ _BANDWIDTHS_HZ)

@@ -1,4 +1,4 @@
-"""The direct sound of a pair, as the renderer computes it: a straight path in sight, otherwise a path round corners,
+"""The direct sound of a pair, as the renderer computes it: a straight path in sight, otherwise a path around corners,
 and a path through thin walls.
 
 Each path is given as an image source: (image, xyz) apparent positions and (image, band) pressures at the receiver.

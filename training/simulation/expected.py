@@ -25,7 +25,7 @@ _STEPS_PER_HOP = 4
 
 
 class ExpectedSpectrograms:
-    """Expected spectrograms of a dataset's late reverberation, in the frames of a codec."""
+    """The expected spectrograms of a dataset's late reverberation, in the frames of a codec."""
 
     def __init__(self, dataset: Dataset, codec: Codec) -> None:
         """Raises ValueError if the codec has another sample rate than the dataset."""
@@ -57,14 +57,14 @@ class ExpectedSpectrograms:
 
     @cached_property
     def _window(self) -> _Singles:
-        """(step,)"""
+        """(step,) the codec's window on the grid of `_times_s`."""
         window = np.hanning(self._times_s.shape[1] + 2)[1:-1] ** 2
         return np.asarray(self._codec.window_energy * window / window.sum(), dtype=np.float32)
 
     def specular(self, emitter: int, listener: int) -> _Singles:
         """(yaw, ear, sample) the specular part of the stored response, which is the same in every draw."""
         if self._images is None or self._images[0] != emitter:
-            # The images for all listeners take as long as those for one, and pairs come in the order of emitters.
+            # Images for all listeners take as long as images for one, and pairs come in the order of emitters.
             self._images = emitter, self._tracer.images(self._dataset.probes[emitter])
         positions, amplitudes = self._images[1][listener]
         return self._synthesis.specular(positions, amplitudes, self._dataset.probes[listener])

@@ -1,4 +1,4 @@
-"""Converts single to half precision with IEEE 754 rounding (to nearest, ties to even).
+"""Conversion of single to half precision with IEEE 754 rounding (to nearest, ties to even).
 
 NumPy's own conversion takes tens of nanoseconds for each subnormal number. The ends of decays consist of such numbers,
 and their conversion would take longer than their simulation.
@@ -23,7 +23,7 @@ _ALIGNING_BITS = _ALIGNING.view(np.uint32)
 
 
 def to_half(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float16]:
-    """The same numbers as `values.astype(np.float16)`, but numbers that are too large become infinite without a
+    """Return the same numbers as `values.astype(np.float16)`, but numbers that are too large become infinite without a
     warning."""
     single = np.ascontiguousarray(values, dtype=np.float32)
     half = np.empty(single.shape, dtype=np.float16)

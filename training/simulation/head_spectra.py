@@ -1,5 +1,5 @@
-"""Spectra of a wave at the ears, from each direction: minimum phase and a delay per ear. The band gains of the wave's
-path are applied as a minimum-phase filter, too.
+"""The spectra of a wave at the ears, from each direction: minimum phase and a delay per ear. The band gains of the
+wave's path are applied as a minimum-phase filter, too.
 
 Logarithms of spectra are interpolated between measured directions and added. So each wave takes one exponential and one
 sine per bin, computed eight bins at a time.
@@ -42,7 +42,7 @@ def band_weights(frequencies_hz: _Floats) -> _Floats:
 
 @dataclass(frozen=True)
 class HeadSpectra:
-    """Spectra of a head at the frequencies of a transform of `n_fft` samples."""
+    """The spectra of a head at the frequencies of a transform of `n_fft` samples."""
 
     head: HeadFilters
     n_fft: int
@@ -103,8 +103,8 @@ class HeadSpectra:
 
 @numba.njit(cache=True, nogil=True)
 def _spectra(corners, shares, turns, path_logs, logs, numbers, spectra):
-    """Fills `spectra` (wave, yaw, ear and bin). `turns` (direction, ear) are radians per bin; a direction is a wave at
-    a yaw."""
+    """Fill `spectra` (wave, yaw, ear and bin). `turns` (direction, ear) are radians per bin; a direction is a wave at a
+    yaw."""
     waves, yaws, _ = spectra.shape
     padded = logs.shape[-1]
     bins = spectra.shape[2] // 2

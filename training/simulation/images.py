@@ -39,8 +39,9 @@ def images_in_height(z: float, height_m: float, order: int) -> tuple[_Floats, _C
 def images_in_plan(
     plan: FloorPlan, emitter: _Floats, receivers: _Floats, order: int
 ) -> tuple[_Counts, _Floats, _Counts]:
-    """The images of an emitter (2,) that each receiver (receiver, 2) sees, with the emitter itself: (path,) receivers,
-    (path, 2) image positions, and (path,) numbers of reflecting walls. A path that touches a corner is valid."""
+    """The images of an emitter (2,) that each receiver (receiver, 2) sees, including the emitter itself: (path,)
+    receivers, (path, 2) image positions, and (path,) numbers of reflecting walls. A path that touches a corner is
+    valid."""
     corners = np.asarray(plan.corners, dtype=np.float64)
     paths = _see(corners, emitter.astype(np.float64), np.ascontiguousarray(receivers, dtype=np.float64), order)
     # A path through a corner is found twice, once for each of the corner's walls.
@@ -120,7 +121,7 @@ def _see(corners, emitter, receivers, order):
         while depth > 0:
             wall = walls[depth - 1] + 1
             while wall < count:
-                # An image is mirrored only in a wall whose front side it is on.
+                # An image is mirrored only in walls that face it.
                 cx, cy = corners[wall, 0], corners[wall, 1]
                 following = (wall + 1) % count
                 ex, ey = corners[following, 0] - cx, corners[following, 1] - cy

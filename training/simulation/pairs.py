@@ -1,4 +1,4 @@
-"""Simulates responses between the probes of a scene, emitter by emitter, by a simulation plan.
+"""The simulation of responses between the probes of a scene, emitter by emitter, by a simulation plan.
 
 Axes: energy (direction, band, bin), responses (yaw, ear, sample); sample 0 is the emission. The same seed and plan give
 the same numbers, in whatever order and process emitters are simulated.
@@ -56,8 +56,8 @@ class PairSimulation:
         plan: SimulationPlan,
         most_tail_rays: int | None = None,
     ) -> "PairSimulation":
-        """With `most_tail_rays`, the tail is traced with at most this many rays, to predict how long all of them would
-        take."""
+        """Prepare a simulation. With `most_tail_rays`, the tail is traced with at most this many rays, to predict how
+        long all of them would take."""
         began_s = process_time()
         simulation = cls(scene, probes, yaws, seed, plan)
         if plan.tail_start_s is None:
@@ -66,7 +66,7 @@ class PairSimulation:
         with ThreadPoolExecutor(len(TAKES)) as pool:
             rays = min(plan.tail_rays, most_tail_rays or plan.tail_rays)
             traced = pool.map(partial(_tail_energy, scene, probes, replace(plan, tail_rays=rays)), generators)
-            synthesis = simulation._synthesis  # reads the head meanwhile
+            synthesis = simulation._synthesis  # loads the head in the meantime
             energies, seconds = zip(*traced, strict=True)
         noise = np.random.default_rng([seed, 4])
         tail = draw_tail(synthesis, np.stack(energies), start_s=plan.tail_start_s, rng=noise)
@@ -76,7 +76,7 @@ class PairSimulation:
     def take(
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
     ) -> Iterator[tuple[int, _Singles, _Singles]]:
-        """Yields each listener, the energy that its diffuse sound is drawn from, and its late reverberation."""
+        """Yield each listener, the energy from which its diffuse sound is drawn, and its late reverberation."""
         for listener, energy, own in self.own(emitter, listeners, take):
             joined = energy if self.tail is None else self.tail.join(take, energy)
             yield listener, joined, self.whole(take, own)
@@ -90,10 +90,10 @@ class PairSimulation:
     def own(
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
     ) -> Iterator[tuple[int, _Singles, OwnResponse]]:
-        """Yields each listener with its own energy and response: all of both, or the part before the shared tail.
+        """Yield each listener with its own energy and response: all of both, or the part before the shared tail.
 
         The TAKES are independent. Until a shared tail sets in, the noise depends on pair and take but not on the plan.
-        So responses of two plans differ there only by what the plans change.
+        So responses of two plans differ there only by the plans' effects.
         """
         place, receivers = self.probes[emitter], self.probes[listeners]
         images = self._tracer(receivers).images(place)
@@ -137,7 +137,7 @@ class PairSimulation:
 
     @cached_property
     def _own_amplitude(self) -> _Singles:
-        """(sample,) the fade-out at the start of the shared tail; one before it."""
+        """(sample,) the gain of a listener's own response: one, then a fade-out at the start of the shared tail."""
         times_s = np.arange(self._own_synthesis.samples) / self.scene.simulation.sample_rate
         if self.plan.tail_start_s is None:
             return np.ones(len(times_s), dtype=np.float32)
@@ -147,8 +147,8 @@ class PairSimulation:
 def _tail_energy(
     scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator
 ) -> tuple[_Floats, float]:
-    """(direction, band, bin) mean energy between pairs of probes all over the room, and the seconds of one core that it
-    took."""
+    """The mean energy (direction, band, bin) between pairs of probes all over the room, and the time of its computation
+    in seconds of one core."""
     began_s = thread_time()
     some = probes[np.unique(np.linspace(0, len(probes) - 1, _TAIL_PROBES).astype(int))]
     rays = -(-plan.tail_rays // len(some))

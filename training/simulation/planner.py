@@ -1,7 +1,7 @@
-"""Decides what the simulation of a scene computes.
+"""Decisions about what the simulation of a scene computes.
 
-An effect is called for where leaving it out would change some parameter by a quarter of a just-noticeable difference:
-errors of the data add to those of the fields trained on them, which are two to three times as large.
+An effect is called for if leaving it out would change some parameter by a quarter of a just-noticeable difference or
+more: errors of the data add to the errors of the fields trained on them, which are two to three times as large.
 """
 
 from server.planning.decision import Threshold
@@ -15,14 +15,14 @@ THRESHOLD = Threshold(enter_jnd=0.25, leave_jnd=0.25)
 
 
 def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
-    """For the probes that a dataset of this seed has. Raises SceneFileError for a scene of which nobody could simulate
-    that much, or that is too large for its responses."""
+    """Make the planner for the probes of a dataset with this seed. Raises SceneFileError for a scene that is too large
+    to simulate, or whose duration is too short for its longest path."""
     SimulationSize(scene).require_reasonable()
     return SimulationPlanner(Predictions(scene, scene.probe_positions(seed)))
 
 
 class SimulationPlanner:
-    """What is predicted of one scene does not depend on what is asked for."""
+    """Plans the simulation of one scene. The predictions depend only on the scene, not on the overrides."""
 
     def __init__(self, predictions: Predictions) -> None:
         self._predictions = predictions
@@ -35,13 +35,14 @@ class SimulationPlanner:
 
     @property
     def everything(self) -> SimulationPlan:
-        """With nothing left out that the scene file allows."""
+        """A plan that leaves out nothing that the scene file allows."""
         has_mass = self._predictions.scene.geometry.materials.walls.surface_mass_kg_m2 is not None
         never = {SimulatedEffect.DIRECTIVITY: False, SimulatedEffect.TRANSMISSION: has_mass}
         return self.plan({**dict.fromkeys(SimulatedEffect, True), **never})
 
     def plan(self, overrides: Overrides) -> SimulationPlan:
-        """Raises SceneFileError for an override that the scene cannot follow."""
+        """Decide each effect by its prediction or override. Raises SceneFileError for an override that is impossible in
+        the scene."""
         predicted = self._predictions
         self._refuse_what_cannot_be(overrides)
         order, images = self._images(overrides)
@@ -82,7 +83,8 @@ class SimulationPlanner:
         )
 
     def _images(self, overrides: Overrides) -> tuple[int, Prediction]:
-        """The highest order that is called for, and what leaving out all beyond those left to geometry would change."""
+        """The highest order of reflections that is called for, and the change if all orders beyond the geometric ones
+        were left out."""
         called_for = [order for order, each in self._by_order.items() if THRESHOLD.is_reached(each.change_jnd)]
         order = max(called_for, default=GEOMETRIC_ORDER)
         if SimulatedEffect.EARLY_REFLECTIONS in overrides:

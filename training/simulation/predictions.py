@@ -1,7 +1,7 @@
-"""What leaving an effect out of a simulation would change, told from geometry, statistical acoustics and a trial of few
-rays before anything else is simulated: in just-noticeable differences, with a reason in words.
+"""Predictions of the change if an effect is left out of a simulation, in just-noticeable differences, with a reason in
+words. They follow from geometry, statistical acoustics and a trial with few rays, before anything else is simulated.
 
-Axes: (pair, band); metres. Power is squared pressure beside that of the direct sound at one metre.
+Axes: (pair, band); metres. Power is squared pressure relative to that of the direct sound at one metre.
 """
 
 import math
@@ -34,15 +34,15 @@ _Floats = npt.NDArray[np.float64]
 _EARLY_S = 0.050
 # Rays may widen the spread of clarity over draws of the noise by a tenth.
 _RAY_VARIANCE = 1.1**2 - 1
-# Mean of the square over the square of the mean of chords of a sphere that parallel lines cut.
+# For chords that parallel lines cut from a sphere: the mean of the square divided by the square of the mean.
 _CHORDS = 9 / 8
 _LEVEL_DB = JND_THRESHOLDS["level"].amount
 _EMITTERS_TRIED = 16
-# Standard error of a shared tail's reverberation time, as a share: a just-noticeable difference.
+# The allowed standard error of a shared tail's reverberation time, relative: one just-noticeable difference.
 _TAIL_ERROR = JND_THRESHOLDS["t60"].amount / 100
-# Of a shared tail, times the rays of an emitter.
+# The most rays of a shared tail, as a multiple of the rays of an emitter.
 _MOST_TAIL_RAYS = 16
-# Of sequences of walls, each by a receiver, and of paths round corners, each by a wall.
+# The most tests: of sequences of walls, each for a receiver; and of paths around corners, each for a wall.
 _MOST_IMAGE_TESTS, _MOST_PATH_TESTS = 30_000_000, 20_000_000
 
 
@@ -55,7 +55,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Predictions:
-    """Of one scene and its probes (probe, xyz)."""
+    """The predictions for one scene and its probes (probe, xyz)."""
 
     scene: SceneFile
     probes: _Floats
@@ -70,19 +70,20 @@ class Predictions:
 
     @cached_property
     def longest_onset_s(self) -> float:
-        """From probe to probe."""
+        """The longest time that the first sound takes from one probe to another."""
         return float(self._paths.length_m.max() / SPEED_OF_SOUND)
 
     @cached_property
     def longest_way_s(self) -> float:
-        """From probe to probe, or between the places that a visit starts at."""
+        """The longest time that the first sound takes from one probe to another, or between the start positions of a
+        visit."""
         start = self.scene.start
         start_m = self.floor_plan.path_length_m(np.array(start.emitter), np.array(start.listener))
         return max(self.longest_onset_s, float(start_m) / SPEED_OF_SOUND)
 
     @property
     def is_one_room(self) -> bool:
-        """Whether from every place every other is seen."""
+        """Whether every place can be seen from every other place."""
         return len(self.floor_plan.bend_corners) == 0
 
     @cached_property
@@ -94,8 +95,8 @@ class Predictions:
         return _told(self.trial.without_late(), reason)
 
     def early_reflections(self, order: int) -> Prediction:
-        """Of mirrored paths by so many surfaces, at the pair that they matter most to: drawn from noise of the same
-        energy instead, octaves of them vary in level."""
+        """Predict the change if specular paths of this many reflections were replaced by noise of the same energy,
+        whose levels in octave bands vary. The result is for the pair with the largest change."""
         settings = self.scene.simulation
         everything = SimulationPlan.everything(settings.image_order, settings.rays)
         shares = []
@@ -110,7 +111,8 @@ class Predictions:
             beside = distance[:, None] ** -2 + self.room.reflected_power(1)
             power = np.array([(amplitudes**2).sum(axis=0) for _, amplitudes in tracer.images(emitter)])
             shares.append(power / beside)
-        # They have all come after about one mean free path; noise of that length varies by 1 / sqrt(B T) in a band.
+        # All of these paths arrive within about one mean free path; noise of this length varies by 1 / sqrt(B T) in a
+        # band.
         lasting_s = self.room.mean_free_path_m / SPEED_OF_SOUND
         spread = 1 / np.sqrt(np.maximum(1.0, np.asarray(OCTAVE_BANDS_HZ) / np.sqrt(2) * lasting_s))
         changes_db = power_to_db(1 + np.concatenate(shares) * spread)
@@ -128,7 +130,8 @@ class Predictions:
         return _told(self.trial.without_scattering(), reason)
 
     def air_absorption(self, *, has_rays: bool, scatters: bool) -> Prediction:
-        """Of what the plan has; of it all parameters, in trial."""
+        """Predict the change without absorption by the air, for the sound that the plan includes; a trial compares all
+        parameters."""
         reason = "without the air's share reverberation lasts longer, by a trial"
         if not has_rays:
             reason = "on the way of direct sound and first reflections; nothing reverberates"
@@ -154,7 +157,7 @@ class Predictions:
 
     @property
     def tail_start_s(self) -> float:
-        """After emission, wherever the receiver is."""
+        """The time after emission from which the tail can be shared, for every receiver."""
         return self.room.mixing_time_s + self.longest_onset_s
 
     @property
@@ -163,8 +166,8 @@ class Predictions:
 
     @property
     def reverberation_s(self) -> tuple[float, float]:
-        """How long it lasts for 60 dB, in the octave band (Hz) in which it lasts longest; inf where it does not end in
-        a trial."""
+        """The longest reverberation time (60 dB) over octave bands, in seconds, and the centre frequency of its band in
+        Hz; inf if it cannot be measured in a trial."""
         audible = bands_within(self.scene.simulation.sample_rate)
         times_s = np.nan_to_num(self.trial.reverberation_time_s[:audible], nan=np.inf)
         longest = int(np.argmax(times_s))
@@ -172,7 +175,7 @@ class Predictions:
 
     @property
     def needed_s(self) -> float:
-        """Of a response that holds 60 dB of decay wherever the receiver is."""
+        """The length of a response that contains a decay of 60 dB for every receiver."""
         return self.longest_way_s + self.reverberation_s[0]
 
     def notes(self, *, has_rays: bool) -> tuple[str, ...]:
@@ -225,10 +228,10 @@ class Predictions:
         return Prediction(change_jnd, "level", reason)
 
     def rays(self) -> int:
-        """As many per emitter as keep their part in the spread of clarity small, on average over receivers, up to
-        those the scene file allows.
+        """The least number of rays per emitter that adds little to the spread of clarity, on average over receivers; at
+        most the number in the scene file.
 
-        A ray that fills the room crosses a sphere of radius r so often per metre: pi r**2 / V.
+        A ray that fills the room crosses a sphere of radius r pi r**2 / V times per metre, on average.
         """
         most = self.scene.simulation.rays
         if not self.is_one_room:
@@ -240,10 +243,11 @@ class Predictions:
         return min(most, int(np.ceil(rays / 100)) * 100)
 
     def tail_rays(self) -> int:
-        """Of a shared tail: as many as one emitter has, or as many more as its reverberation time needs to be known.
+        """The number of rays of a shared tail: the number of one emitter, or more if its reverberation time would
+        otherwise be too inaccurate.
 
-        The tail is part of every response. So what chance makes of it is one error of all pairs, and no number of pairs
-        evens it out.
+        The tail is part of every response. So its random error is the same for all pairs, and averaging over pairs does
+        not reduce it.
         """
         rays = self.scene.simulation.rays
         needed = self.trial.tail_rays(self.tail_start_s, _TAIL_ERROR)
@@ -251,7 +255,8 @@ class Predictions:
 
     @cached_property
     def _ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """(pair,) probes at either end: each couple once, or, where walls and probes are many, those of some."""
+        """(pair,) the probes at both ends of each pair: every pair of probes once or, if there are many walls and
+        probes, all pairs of some probes."""
         count = len(self.probes)
         tried = int(_MOST_PATH_TESTS / (count * len(self.floor_plan.corners)))
         if tried >= count:
@@ -263,13 +268,13 @@ class Predictions:
 
     @property
     def _pairs(self) -> tuple[_Floats, _Floats]:
-        """(pair, xyz) ends."""
+        """(pair, xyz) the positions of both ends."""
         first, second = self._ends
         return self.probes[first], self.probes[second]
 
     @cached_property
     def _paths(self) -> SoundPaths:
-        """(pair,) in the order of `_pairs`."""
+        """The shortest paths (pair,), in the order of `_pairs`."""
         finder, (first, second) = SoundPathFinder(self.floor_plan, SPEED_OF_SOUND), self._ends
         found = [finder.find(self.probes[at], self.probes[second[first == at]]) for at in np.unique(first)]
         return SoundPaths(
@@ -278,17 +283,18 @@ class Predictions:
 
     @property
     def _direct_power(self) -> _Floats:
-        """(pair, 1) round corners where it must, without what they take."""
+        """(pair, 1) power of the first sound, around corners if necessary, without the loss at the corners."""
         return np.asarray(self._paths.length_m[:, None] ** -2)
 
     @property
     def _straight_power(self) -> _Floats:
-        """(pair, 1) through whatever stands between."""
+        """(pair, 1) power along the straight line, through any walls, without their loss."""
         return np.asarray((self._paths.length_m - self._paths.excess_m)[:, None] ** -2)
 
     @property
     def _passage_m2(self) -> float:
-        """Of the openings; where none is named, of the narrowest way past a corner that stands out."""
+        """The mean area of the openings; if the scene names none, the area of the narrowest passage at a reflex
+        corner."""
         geometry = self.scene.geometry
         widths = [np.subtract(opening.start, opening.end) for opening in geometry.openings]
         if widths:
@@ -297,8 +303,9 @@ class Predictions:
 
     @cached_property
     def _reverberant_power(self) -> _Floats:
-        """(pair, band); behind a corner that of a room coupled by the passage (Cremer & Mueller, Principles and
-        Applications of Room Acoustics, vol. 1, 1982, sec. II.1): the share S / (S + A)."""
+        """(pair, band) reverberant power. For pairs that do not see each other, it is that of a room coupled by the
+        passage (Cremer & Mueller, Principles and Applications of Room Acoustics, vol. 1, 1982, sec. II.1): multiplied
+        by the share S / (S + A)."""
         power = np.tile(self.room.reflected_power(1), (len(self._paths.length_m), 1))
         if not self.is_one_room:
             passage, area = self._passage_m2, self.room.surface_m2 * self.room.absorption / 2
@@ -311,12 +318,12 @@ def _told(change: Change, reason: str) -> Prediction:
 
 
 def _level_change_jnd(more: _Floats, other: _Floats) -> float:
-    """The most that adding a power to another changes the level of."""
+    """The greatest change of level, in JND, when one power is added to another."""
     return float(np.max(power_to_db(1 + more / other))) / _LEVEL_DB
 
 
 def _narrowest_m(plan: FloorPlan) -> float:
-    """Of the ways from corners that stand out to walls they are no end of."""
+    """The shortest distance from a reflex corner to a wall that does not end at this corner."""
     start, end = plan.walls[:, 0], plan.walls[:, 1]
     along = end - start
     narrowest = np.inf

@@ -30,7 +30,7 @@ _Floats = npt.NDArray[np.float64]
 
 _BANDS = len(OCTAVE_BANDS_HZ)
 _LARGEST_RADIUS_M = 0.4
-# A crossing nearer than this to the start of a ray is one with the wall that it comes from.
+# A crossing nearer than this to the start of a ray is the wall from which the ray comes.
 _OVERLAP = 1e-9
 # As energy falls, fewer rays are followed and each counts for more: their number falls with this power of the energy.
 _THINNING = 0.1
@@ -49,7 +49,7 @@ def sphere_directions(count: int) -> _Floats:
 
 
 def surface_shares(geometry: Geometry) -> tuple[_Floats, _Floats]:
-    """(surface, band) share of the energy that is reflected, and the share of the reflected energy that is
+    """(surface, band) the share of the energy that is reflected, and the share of the reflected energy that is
     scattered."""
     surfaces = (geometry.materials.walls, geometry.materials.floor, geometry.materials.ceiling)
     reflected = 1 - np.array([surface.absorption for surface in surfaces])
@@ -78,8 +78,9 @@ class _Room(NamedTuple):
 
 
 class _Receivers(NamedTuple):
-    """Positions (receiver, xyz) and radii of the spheres that count rays. `sides` (receiver, wall) tells by its sign on
-    which side of a wall's line a receiver is. `nearest` is the number of the nearest arrival direction, by `_cell`."""
+    """The receivers. Positions (receiver, xyz) and radii of the spheres that count rays. The sign of `sides` (receiver,
+    wall) says on which side of a wall's line a receiver is. `nearest` is the number of the nearest arrival direction,
+    by `_cell`."""
 
     positions: _Floats
     radii: _Floats
@@ -88,14 +89,14 @@ class _Receivers(NamedTuple):
 
 
 class _Histogram(NamedTuple):
-    """Energies (receiver, bin, direction, band), in bins that sound travels `bin_m` in."""
+    """Energies (receiver, bin, direction, band). A bin is the time in which sound travels `bin_m`."""
 
     energy: npt.NDArray[np.float32]
     bin_m: float
 
 
 class RayTracer:
-    """Traces from any emitter to a fixed set of receivers (receiver, xyz). It has no state between traces."""
+    """Traces rays from any emitter to a fixed set of receivers (receiver, xyz). It has no state between traces."""
 
     def __init__(
         self,
@@ -125,7 +126,7 @@ class RayTracer:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(direction, band, bin) of a receiver's energy."""
+        """The shape (direction, band, bin) of a receiver's energy."""
         return self._directions, _BANDS, self._bins
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
@@ -161,7 +162,7 @@ _FAST_MATH = {"contract", "arcp", "reassoc", "nsz"}
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cell(x, y, z):
-    """Row and column in `_nearest_directions` of a direction of any length."""
+    """The row and column in `_nearest_directions` for a direction of any length."""
     scale = 1 / (abs(x) + abs(y) + abs(z))
     u, v = x * scale, y * scale
     if z < 0:
@@ -172,7 +173,7 @@ def _cell(x, y, z):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH)
 def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
-    """Adds the energy of all rays to the histogram."""
+    """Add the energy of all rays to the histogram."""
     walls, rays = len(room.corners), len(directions)
     end_m = histogram.energy.shape[1] * histogram.bin_m
     offsets = np.empty((3, walls + 1))
@@ -190,7 +191,7 @@ def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
             length, hit = _next_surface(room, position, direction, wall)
             surface, wall = hit
             if surface < 0:
-                break  # rounding let it out through a corner
+                break  # the ray left the room through a corner by rounding
             # Scattered energy reaches receivers as diffuse rain, and image sources account for the first reflections.
             if is_mirrored and (was_scattered or reflections > image_order):
                 _add_crossings(receivers, position, direction, length, travelled_m, weight, histogram)
@@ -228,14 +229,14 @@ def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
 def _next_surface(room, position, direction, last):
     """The distance, surface and wall (-1 if none) that a ray meets next; the surface is -1 if it meets none. `last` is
-    the wall that the ray comes from."""
+    the wall from which the ray comes."""
     px, py, pz = position
     dx, dy, dz = direction
     length, surface, hit = np.inf, -1, -1
     for wall in range(len(room.corners)):
         into = dx * room.edge_y[wall] - dy * room.edge_x[wall]
         if into <= 0.0 or wall == last:
-            continue  # it sees the wall from behind
+            continue  # the ray is behind the wall
         to_x, to_y = room.corners[wall, 0] - px, room.corners[wall, 1] - py
         along = (to_x * dy - to_y * dx) / into
         if along < -_OVERLAP or along > 1.0 + _OVERLAP:
@@ -261,7 +262,7 @@ def _normal(room, surface, wall):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
 def _add_crossings(receivers, position, direction, length, travelled_m, weight, histogram):
-    """Adds the energy of a ray to every receiver whose sphere it crosses within `length`."""
+    """Add the energy of a ray to every receiver whose sphere it crosses within `length`."""
     px, py, pz = position
     dx, dy, dz = direction
     for receiver in range(len(receivers.positions)):
@@ -287,7 +288,7 @@ def _add_crossings(receivers, position, direction, length, travelled_m, weight, 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
 def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight, offsets, histogram):
-    """Adds the scattered energy of a reflection to receivers in sight of it: every `_EVERY`th one, from `first` on."""
+    """Add the scattered energy of a reflection to every `_EVERY`th receiver, from `first` on, if it is in sight."""
     walls = len(room.corners)
     surface, wall = hit
     px, py, pz = position
@@ -331,7 +332,7 @@ def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
 def _weigh(room, surface, is_scattered, kept, chance, weight):
-    """Sets the weight of each band after a reflection, and returns the largest one. `kept` is the share of energy that
+    """Set the weight of each band after a reflection, and return the largest one. `kept` is the share of energy that
     all surfaces so far have reflected. `chance` is the probability of the path if the ray had been drawn for this band,
     up to a common factor."""
     total = 0.0
@@ -349,7 +350,7 @@ def _weigh(room, surface, is_scattered, kept, chance, weight):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
 def _scattered_direction(surface, normal, share, turn):
-    """A direction by Lambert's law, from two uniform random numbers."""
+    """A random direction by Lambert's law, from two uniform random numbers."""
     nx, ny, nz = normal
     azimuth = 2 * math.pi * turn
     out, side = math.sqrt(1.0 - share), math.sqrt(share)

@@ -1,4 +1,4 @@
-"""Whole simulated responses: the stored late reverberation of a pair, its direct sound and its first reflections.
+"""Complete simulated responses: the stored late reverberation of a pair, its direct sound and its first reflections.
 
 Direct sound and first reflections are not stored. They follow from geometry alone, by the same synthesis as the other
 specular reflections.
@@ -42,28 +42,29 @@ class GeometricSound:
 
     @cached_property
     def _images(self) -> list[list[tuple[_Floats, _Floats]]]:
-        """Positions and amplitudes of the first reflections, by emitter and listener."""
+        """The positions and amplitudes of the first reflections, by emitter and listener."""
         dataset = self.dataset
         tracer = RoomTracer.of(dataset.scene, dataset.effects, dataset.probes, image_order=GEOMETRIC_ORDER)
         return [tracer.images(emitter) for emitter in dataset.probes]
 
     def direct(self, emitter: int, listener: int) -> _Responses:
-        """(yaw, ear, sample) direct sound. Behind walls it bends round corners, or is silent if the plan has no
+        """(yaw, ear, sample) direct sound. Behind walls it bends around corners, or is silent if the plan has no
         diffraction."""
         ends = self.dataset.probes[emitter], self.dataset.probes[listener]
         return self._synthesis.specular(*self._direct_paths.images(*ends), ends[1])
 
     def first_reflections(self, emitter: int, listener: int) -> _Responses:
-        """(yaw, ear, sample)"""
+        """(yaw, ear, sample) first reflections."""
         return self._synthesis.specular(*self._images[emitter][listener], self.dataset.probes[listener])
 
     def complete(self, emitter: int, listener: int, stored: _Responses) -> _Responses:
-        """(yaw, ear, sample) the whole response, from the stored late reverberation."""
+        """(yaw, ear, sample) the complete response, from the stored late reverberation."""
         return stored + self.direct(emitter, listener) + self.first_reflections(emitter, listener)
 
 
 class References:
-    """Whole responses of an open dataset, by the flat index emitter * probes + listener; `take` is one of the TAKES."""
+    """The complete responses of an open dataset, by the flat index emitter * probes + listener; `take` is one of the
+    TAKES."""
 
     def __init__(self, dataset: Dataset, file: h5py.File, take: str = "reflected") -> None:
         self._stored = StoredResponses(dataset, file, take)
@@ -71,7 +72,7 @@ class References:
         self._probes = len(dataset.probes)
 
     def __getitem__(self, pair: int) -> _Responses:
-        """(yaw, ear, sample)"""
+        """(yaw, ear, sample) the response of a pair."""
         emitter, listener = divmod(int(pair), self._probes)
         return self._geometric.complete(emitter, listener, self._stored[emitter, listener])
 
@@ -84,7 +85,7 @@ class WholeResponses(SimulatedResponses):
         self._geometric = GeometricSound(dataset)
 
     def read(self, rows: npt.ArrayLike) -> _Responses:
-        """(n, ear, sample)"""
+        """(n, ear, sample) the responses of these rows."""
         responses = super().read(rows)
         for response, row in zip(responses, np.asarray(rows, dtype=np.int64), strict=True):
             emitter, listener = self.ends(row)

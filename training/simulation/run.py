@@ -1,5 +1,5 @@
-"""Simulates the late reverberation between all pairs of probes of a scene. A simulation can be resumed emitter by
-emitter, and gives the same result for the same seed.
+"""The simulation of late reverberation between all pairs of probes of a scene. It can be resumed emitter by emitter,
+and gives the same result for the same seed.
 
 Emitters are simulated in threads; the compiled code releases the interpreter's lock.
 """
@@ -21,7 +21,7 @@ from training.simulation.planner import planner_of
 
 
 def prepared(scene: SceneFile, *, seed: int, plan: SimulationPlan, most_tail_rays: int | None = None) -> PairSimulation:
-    """The simulation of all pairs of probes in a dataset of this seed; `most_tail_rays` as in
+    """Prepare the simulation of all pairs of probes in a dataset of this seed; `most_tail_rays` as in
     `PairSimulation.prepare`."""
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
     probes = scene.probe_positions(seed)
@@ -37,10 +37,10 @@ def simulate(
     progress: Progress,
     simulation: PairSimulation | None = None,
 ) -> Dataset:
-    """Fills the dataset folder, and resumes an earlier run. Without a prepared `simulation`, it simulates what the
-    scene calls for.
+    """Fill the dataset folder, or resume an earlier run. Without a prepared `simulation`, all effects that the scene
+    calls for are simulated.
 
-    Raises SceneFileError for a bad scene file, and DatasetError for a folder that holds another scene.
+    Raises SceneFileError for a bad scene file, and DatasetError for a folder that contains another scene.
     """
     scene = SceneFile.read(scene_path)
     plan = planner_of(scene, seed).plan(overrides_among(scene.effects)) if simulation is None else simulation.plan
@@ -64,7 +64,7 @@ def simulate(
                 dataset.write(*future.result())
                 progress.advance(task)
         except BaseException:
-            # An interrupt or a full disk does not wait for the emitters in progress.
+            # After an interrupt or a full disk, do not wait for the emitters in progress.
             is_over.set()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -74,8 +74,8 @@ def simulate(
 def _simulate_emitter(
     simulation: PairSimulation, emitter: int, repeated: npt.NDArray[np.int64], is_over: threading.Event
 ) -> tuple[int, list[dict[int, OwnResponse]], npt.NDArray[np.float16]]:
-    """The emitter, its responses by take and listener (the second take has the `repeated` listeners only), and the log
-    energies that the first take was drawn from. Raises CancelledError once `is_over` is set."""
+    """Return the emitter, its responses by take and listener (the second take has only the `repeated` listeners), and
+    the log energies from which the first take was drawn. Raises CancelledError once `is_over` is set."""
     listeners = np.flatnonzero(np.arange(len(simulation.probes)) != emitter)
     takes: list[dict[int, OwnResponse]] = []
     logarithms = {}
@@ -86,7 +86,7 @@ def _simulate_emitter(
                 raise CancelledError
             takes[number][listener] = response
             if number == 0:
-                with np.errstate(divide="ignore"):  # where no ray arrived
+                with np.errstate(divide="ignore"):  # the logarithm is -inf where no ray arrived
                     logarithms[listener] = to_half(np.log(energy))
     log_energy = np.full((len(simulation.probes), *next(iter(logarithms.values())).shape), -np.inf, np.float16)
     log_energy[list(logarithms)] = list(logarithms.values())

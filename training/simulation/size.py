@@ -10,15 +10,15 @@ from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.scene_file import SceneFile, SceneFileError
 
 MOST_PROBES = 2_000
-"""Each probe is heard from every other: four million pairs."""
+"""The most probes. Each is heard from every other: four million pairs."""
 MOST_CELLS = 100_000
-"""Cells of the grid around the floor plan, most of which may lie outside the walls."""
+"""The most cells of the grid around the floor plan, many of which may lie outside the walls."""
 MOST_DATASET_GB = 200.0
 MOST_MEMORY_GB = 8.0
-"""Memory for one emitter; each worker simulates one at a time."""
+"""The most memory for one emitter; each worker simulates one at a time."""
 MOST_CORE_MINUTES = 14 * 24 * 60.0
 MOST_WALL_SEQUENCES = 3_000_000
-"""Sequences of walls that may mirror a path one after the other; each is tried for every emitter."""
+"""The most sequences of walls that may mirror a path one after the other; each is tested for every emitter."""
 
 # Measured on a core of 2.5 GHz. They are right to a factor of three, which is enough to refuse a scene.
 _HIT_S, _WALL_S, _RECEIVER_S = 60e-9, 3e-9, 5e-9
@@ -107,7 +107,7 @@ class SimulationSize:
 
     @property
     def mean_free_path_m(self) -> float:
-        """Four times the volume over the surface."""
+        """The mean free path: four times the volume divided by the surface."""
         plan = self.scene.geometry.floor_plan
         around_m = sum(math.dist(*wall) for wall in plan.walls.tolist())
         return 4 * plan.area_m2 * plan.height_m / (2 * plan.area_m2 + around_m * plan.height_m)
@@ -126,7 +126,7 @@ class SimulationSize:
         return f"{self.extent}, and up to {takes} of one core"
 
     def require_reasonable(self) -> None:
-        """Raises SceneFileError, with the field to change, if the scene is too large."""
+        """Raise SceneFileError, with the field to change, if the scene is too large."""
         checks = (
             (self.scene.grid_cells > MOST_CELLS, f"at most {MOST_CELLS:,} cells of a grid", "probes.spacing_m"),
             (self.probes > MOST_PROBES, f"at most {MOST_PROBES:,} probes", "probes.spacing_m"),
@@ -174,5 +174,5 @@ class SimulationSize:
 
 
 def _rounded(value: float) -> str:
-    """Rounded to two digits, and not finer than hundredths."""
+    """The value rounded to two digits, but not finer than hundredths."""
     return f"{max(value, 0.01):.2g}" if value < 10 else f"{value:,.0f}"

@@ -1,12 +1,12 @@
-"""Synthesises binaural impulse responses from image sources and traced energies.
+"""The synthesis of binaural impulse responses from image sources and traced energies.
 
-Specular paths are exact: each is a delayed and filtered head-related impulse response. The diffuse part is noise, which
-is shaped in time, frequency and direction by the energy of rays, and filtered by the head for each direction of arrival
+Specular paths are exact: each is a delayed and filtered head-related impulse response. The diffuse part is noise. It is
+shaped in time, frequency and direction by the energy of rays, and filtered by the head for each direction of arrival
 (Schroeder, "Physically based real-time auralization of interactive virtual environments", 2011, ch. 5). All head
 orientations of a pair share one noise, so that turning the head changes the ears' signals and not the room's.
 
-The head is the one of the renderer: minimum phase and a delay per ear. What else a measured head has is mostly the
-phase of the loudspeaker.
+The head is the one of the renderer: minimum phase and a delay per ear. The rest of a measured head's response is mostly
+the phase of the loudspeaker.
 
 Axes: responses (yaw, ear, sample) in single precision; spectra have bins last.
 """
@@ -38,15 +38,16 @@ _LEAD_S = 0.001
 
 
 def rotate_into_head(directions: _Floats, yaws: _Floats) -> _Floats:
-    """(direction, yaw, xyz) world directions relative to a level head that is turned counter-clockwise by each yaw
-    (radians)."""
+    """Rotate world directions into level heads that are turned counter-clockwise by each yaw (radians); returns
+    (direction, yaw, xyz)."""
     x, y, z = (directions[:, None, axis] for axis in range(3))
     cos, sin = np.cos(yaws), np.sin(yaws)
     return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(yaws)))], axis=-1)
 
 
 def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
-    """(..., bin) energies of a histogram to (..., time) energies per second, linear between the middles of its bins."""
+    """Convert the energies (..., bin) of a histogram to energies per second (..., time), linear between the middles of
+    its bins."""
     position = np.clip(times_s / HISTOGRAM_BIN_S - 0.5, 0, energy.shape[-1] - 1)
     before = np.minimum(position.astype(int), energy.shape[-1] - 2)
     share = (position - before).astype(np.float32)
@@ -102,7 +103,8 @@ class BinauralSynthesis:
         )
         frequencies_hz = np.linspace(0, self._sample_rate / 2, products.shape[0])
         power = np.einsum("dbt,bn->ndt", per_sample, band_weights(frequencies_hz).astype(np.float32), optimize=True)
-        # Overlapping windows shape the same noise: their amplitudes add up, so neighbours have a product, too.
+        # Overlapping windows shape the same noise. Their amplitudes add up, so neighbouring windows also contribute a
+        # product.
         position = np.clip(times_s / step_s, 0, frames - 1)
         before = np.minimum(position.astype(int), frames - 2)
         share = np.sin(np.pi / 2 * (position - before)) ** 2
@@ -117,7 +119,7 @@ class BinauralSynthesis:
         own_weights, shared_weights = ((part.T @ weights).astype(np.float32) for part in (own, shared))
         neighbours = np.sqrt(power[..., :-1] * power[..., 1:])
         over_cells = np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
-        # Einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
+        # einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
         return np.einsum("bpyd,bdc->bpyc", products, over_cells)
 
     def arrival_products(self, bins: int) -> _Singles:
@@ -168,12 +170,12 @@ class BinauralSynthesis:
 
     @property
     def _n_fft(self) -> int:
-        """Long enough for a head-related impulse response after the filter of a wall."""
+        """The length of the transform, enough for a head-related impulse response after the filter of a wall."""
         return 2 ** int(np.ceil(np.log2(_WINDOW_S * self._sample_rate)))
 
     @cached_property
     def _band_weights(self) -> _Singles:
-        """(band, bin)"""
+        """(band, bin) weights that interpolate between octave bands."""
         return band_weights(np.asarray(np.fft.rfftfreq(self._n_fft, 1 / self._sample_rate), np.float64)).astype(
             np.float32
         )
@@ -189,7 +191,7 @@ class BinauralSynthesis:
 
     @cached_property
     def _arrival_spectra(self) -> npt.NDArray[np.complex64]:
-        """(bin, direction, yaw and ear)"""
+        """(bin, direction, yaw and ear) spectra of waves from the directions of arrival."""
         spectra = self._ears.arriving(rotate_into_head(self.arrival_directions, self.yaws))
         return np.ascontiguousarray(np.moveaxis(spectra.reshape(len(spectra), -1, spectra.shape[-1]), -1, 0))
 
@@ -210,7 +212,7 @@ class BinauralSynthesis:
         sections *= self._window
         late = sections[:, :-1, step:] + sections[:, 1:, :step]
         response = late.reshape(len(self.yaws), 2, -1)[..., : self.samples]
-        # Windows smear energy to before the direct sound, when no scattered sound can arrive.
+        # Windows smear energy to times before the direct sound, when no scattered sound can arrive.
         begins, risen = (round(time_s * self._sample_rate) for time_s in (onset_s, onset_s + _DIFFUSE_RISE_S))
         response[..., :begins] = 0
         rise = np.sin(np.pi / 2 * np.linspace(0, 1, risen - begins, endpoint=False)) ** 2
@@ -232,8 +234,8 @@ class BinauralSynthesis:
 
 @numba.njit(cache=True, nogil=True)
 def _add_at(starts, taps, response):
-    """Adds the `taps` (wave, channel, tap) to the response (channel, sample) from each wave's start on, and cuts them
-    at both ends of the response."""
+    """Add the `taps` (wave, channel, tap) to the response (channel, sample) from each wave's start on, and cut them at
+    both ends of the response."""
     samples, size = response.shape[1], taps.shape[2]
     for wave in range(len(starts)):
         first, last = max(0, -starts[wave]), min(size, samples - starts[wave])

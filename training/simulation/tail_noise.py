@@ -16,8 +16,8 @@ _STEPS = 4096
 def draw_tail(
     synthesis: BinauralSynthesis, energies: npt.NDArray[np.float64], *, start_s: float, rng: np.random.Generator
 ) -> SharedTail:
-    """The shared tail for (take, direction, band, bin) `energies`, of which the part before `start_s` is not used. The
-    noise is quantised band by band."""
+    """Draw the shared tail for `energies` (take, direction, band, bin), of which the part before `start_s` is not used.
+    The noise is quantised band by band."""
     sample_rate = synthesis.head.sample_rate
     late = energies[..., int(start_s / HISTOGRAM_BIN_S) :].sum(axis=(0, -1))
     total = late.sum(axis=0)

@@ -45,7 +45,8 @@ def _absorption_db_per_m(air: Air | None) -> _Floats:
 
 
 class RoomTracer:
-    """Traces from any emitter to a fixed set of receivers (receiver, xyz). It has no state between traces."""
+    """Finds images and traces rays from any emitter to a fixed set of receivers (receiver, xyz). It has no state
+    between traces."""
 
     def __init__(
         self,
@@ -100,7 +101,8 @@ class RoomTracer:
         )
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> list[Arrivals]:
-        """One entry per receiver. The result depends only on the emitter and the random numbers of `rng`."""
+        """Trace one emitter; returns one entry per receiver. The result depends only on the emitter and the random
+        numbers of `rng`."""
         energy = self.energy(emitter, rays=rays, rng=rng)
         return [Arrivals(*images, late) for images, late in zip(self.images(emitter), energy, strict=True)]
 
@@ -114,7 +116,7 @@ class RoomTracer:
         return energy
 
     def images(self, emitter: _Floats) -> list[tuple[_Floats, _Floats]]:
-        """Image positions (image, xyz) and amplitudes (image, band) for each receiver. Images that are heard after the
+        """Image positions (image, xyz) and amplitudes (image, band) for each receiver. Images that arrive after the
         duration are left out."""
         order = self._image_order
         heights, level = images_in_height(float(emitter[2]), self._plan.height_m, order)

@@ -38,7 +38,7 @@ _Floats = npt.NDArray[np.float64]
 
 _TAKES = 2
 _EMITTERS, _RECEIVERS = 6, 12
-# Bins of all pairs of a take together, in each band.
+# The most bins of all pairs of a take together, in each band.
 _MOST_BINS = 100_000
 # Total reflections of an emitter's rays in a take: at first, growth factor, and at most. Ten million take a second.
 _FIRST_HITS, _MORE, _MOST_HITS = 400_000, 4, 6_400_000
@@ -46,7 +46,7 @@ _FIRST_HITS, _MORE, _MOST_HITS = 400_000, 4, 6_400_000
 _SAME_SHARE = 0.05
 # With more walls than this, each reflection takes longer.
 _FEW_WALLS = 20
-# Fewest and most rays at the first number of reflections.
+# The fewest and most rays at the first number of reflections.
 _FEWEST_RAYS, _MOST_RAYS = 50, 2_000
 _EARLY_S = 0.050
 # First duration in reverberation times by Eyring's formula, and growth factor: smooth rooms decay more slowly.
@@ -58,8 +58,8 @@ _SILENCE = 1e-14
 
 @dataclass(frozen=True)
 class Energies:
-    """`direct` and `first` (first reflections) are (pair, band, bin), the same in all takes; `late` is (take, pair,
-    band, bin). `onset` (pair,) is the bin of the direct sound."""
+    """The energies of a trial. `direct` and `first` (first reflections) are (pair, band, bin), the same in all takes;
+    `late` is (take, pair, band, bin). `onset` (pair,) is the bin of the direct sound."""
 
     direct: _Floats
     first: _Floats
@@ -116,12 +116,12 @@ class Trial:
 
     @property
     def scattered(self) -> Energies:
-        """Energies of the scene as it is, without absorption by the air."""
+        """The energies of the scene with scattering, without absorption by the air."""
         return self._settled[1]
 
     @cached_property
     def mirrored(self) -> Energies:
-        """Energies without scattering, and without absorption by the air."""
+        """The energies without scattering, and without absorption by the air."""
         return self._energies(self.scene.geometry.without_scattering(), self._settled[0])
 
     @cached_property
@@ -152,7 +152,7 @@ class Trial:
         times = decay_times_s(self.in_air(energies).whole, energies.onset, *_DECAY_DB)
         by_band = np.moveaxis(times, -1, 0).reshape(times.shape[-1], -1)
         is_known = np.isfinite(by_band).sum(axis=-1) > by_band.shape[-1] / 2
-        # With an even number of pairs, a usual median might average a time and a missing one.
+        # With an even number of pairs, the usual median might average a time and a missing value.
         middle = np.sort(np.nan_to_num(by_band, nan=np.inf), axis=-1)[:, by_band.shape[-1] // 2]
         return np.where(is_known & np.isfinite(middle), middle, np.nan)
 
@@ -181,7 +181,8 @@ class Trial:
         own = self.in_air(self.scattered)
         late = own.late.copy()
         first = self._bins_before(start_s)
-        # The mean is that of the other take, so that random errors of rays do not look like differences between places.
+        # The mean is taken from the other take, so that random errors of rays do not look like differences between
+        # places.
         late[..., first:] = own.late[::-1, :, :, first:].mean(axis=1, keepdims=True)
         return self.change(own, Energies(own.direct, own.first, late, own.onset))
 
@@ -210,7 +211,7 @@ class Trial:
 
     def change(self, reference: Energies, other: Energies) -> Change:
         """The greatest change of level, clarity, early and late decay: root mean square over pairs, in the band in
-        which it is greatest. A parameter that neither of the two has does not change."""
+        which it is greatest. A parameter that is missing in both does not change."""
         audible = bands_within(self.scene.simulation.sample_rate)
         before, after = (parameters(each) for each in (reference, other))
         found = Change(0.0, "level")
@@ -225,7 +226,7 @@ class Trial:
         return found
 
     def _energies(self, geometry: Geometry, reflections: int) -> Energies:
-        """Energies without absorption by the air."""
+        """Simulate the energies, without absorption by the air."""
         plan = SimulationPlan(GEOMETRIC_ORDER, 1, None, 0, True, False, True, False)
         scene = self.scene.model_copy(update={"geometry": geometry})
         paths, bins = DirectPaths.of(scene, plan), round(self.duration_s / HISTOGRAM_BIN_S)
@@ -285,7 +286,8 @@ def _bin_of(length_m: _Floats) -> npt.NDArray[np.int64]:
 
 
 def parameters(energies: Energies) -> dict[str, _Floats]:
-    """(take, pair, band) level in dB, C50 in JND, EDT and T60 in seconds; NaN where there is none."""
+    """(take, pair, band) parameters by name: level in dB, C50 in JND, EDT and T60 in seconds; NaN where a parameter is
+    missing."""
     whole, bins = energies.whole, energies.late.shape[-1]
     early = np.arange(bins) <= energies.onset[:, None] + round(_EARLY_S / HISTOGRAM_BIN_S)
     early_energy = np.sum(whole * early[:, None], axis=-1) + _SILENCE
