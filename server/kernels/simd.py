@@ -26,14 +26,14 @@ _INT64 = ir.IntType(64)
 
 # Split so that small multiples of the first part are exact (Cody and Waite 1980).
 _LN_2 = (0.693359375, math.log(2) - 0.693359375)
-# (exp(x) - 1 - x) / x**2, the highest power first. The result is exp within half of ln 2, with a relative error of at
-# most 1.05e-7.
+# (exp(x) - 1 - x) / x**2, the highest power first. For x within half of ln 2, the resulting exp(x) has a relative error
+# of at most 1.05e-7.
 _EXPONENTIAL = [8.31250137619232e-3, 4.1890331599848334e-2, 0.16667115387827203, 0.49999230308875753]
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
 
 class Vector(types.Type):
-    """The numba type of a vector of `count` float32."""
+    """The numba type of a vector of `lanes` float32."""
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
@@ -401,7 +401,7 @@ def cosine_sine(_context: Any, x: Any) -> Any:
 
 @intrinsic
 def transpose(_context: Any, rows: Any) -> Any:
-    """Transpose a square matrix: as many vectors as each has lanes."""
+    """Transpose a square matrix, whose rows are vectors: there must be one for each lane."""
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return context.make_tuple(builder, rows, _transposed(builder, cgutils.unpack_tuple(builder, args[0])))

@@ -69,9 +69,9 @@ class Convolver:
 
     `block_size` is a power of two from 64 up. With `any_size` it may be any size that a renderer accepts, and NumPy
     does the work. With `shared_tail` the last stage convolves one mix of all sources with one tail. This tail comes
-    from the first source that has one, and each source is scaled to the level of its own tail: later than twice the
-    longest partition, tails differ in little but level. A shared tail makes many sources cheaper. With `switches_tail`
-    the convolver begins with separate tails, and `share_tail` switches between shared and separate ones with the same
+    from the first source that has one, and each source is scaled to the level of its own tail: from twice the longest
+    partition on, tails differ in little but level. A shared tail makes many sources cheaper. With `switches_tail` the
+    convolver begins with separate tails, and `share_tail` switches between shared and separate ones with the same
     crossfades as an IR exchange.
 
     Only one thread at a time may use it, except `prepare`, which any thread may call. Raises ValueError for sizes that

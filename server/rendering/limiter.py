@@ -47,8 +47,8 @@ _AT_REST = 1e-5
 
 
 def _interpolators() -> FloatArray:
-    """(phase, tap) filters that interpolate a quarter, a half and three quarters of a sample after tap `_TAPS` / 2
-    - 1."""
+    """(phase, tap) filters for the points a quarter, a half and three quarters of a sample after tap `_TAPS` / 2 -
+    1."""
     offset = np.arange(_TAPS) - (_TAPS // 2 - 1) - np.arange(1, _PHASES + 1)[:, None] / (_PHASES + 1)
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1 - (offset / (_TAPS / 2)) ** 2)))
     rows = np.sinc(offset) * window

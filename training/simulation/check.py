@@ -74,7 +74,7 @@ def check_plan(
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
     settings = {"everything": (everything, seed), "again": (everything, seed + 1), "plan": (plan, seed)}
     simulations, once_s = {}, 0.0
-    for name, (of, drawn) in settings.items():  # the plan last, because the first simulation also loads code
+    for name, (of, drawn) in settings.items():  # the plan comes last, because the first simulation also loads code
         began = process_time()
         simulations[name] = PairSimulation.prepare(scene, probes, yaws, seed=drawn, plan=of)
         for _ in simulations[name].own(0, np.array([1]), 0):  # computes everything that all emitters share
@@ -123,7 +123,7 @@ class GeometricResponses:
         self._tracer = RoomTracer.of(scene, plan, probes, image_order=GEOMETRIC_ORDER)
 
     def responses(self, emitter: int, listeners: npt.NDArray[np.integer]) -> _Responses:
-        """(listener, yaw, ear, sample)"""
+        """(listener, yaw, ear, sample) direct sound and first reflections of one emitter."""
         place, reflections = self._probes[emitter], self._tracer.images(self._probes[emitter])
 
         def response(images: tuple[_Floats, _Floats], receiver: _Floats) -> npt.NDArray[np.float32]:

@@ -15,7 +15,7 @@ from training.simulation.size import SimulationSize
 _RAYS_TRIED = 500
 _LISTENERS_TRIED, _LISTENERS_TRACED = 4, 64
 _TIMES = 3
-# Seconds of one core that a plan may take to find out its cost.
+# Seconds of one core that the prediction of a cost may take.
 _LONGEST_TRIAL_S = 1.0
 
 
@@ -30,7 +30,7 @@ def predicted_s(simulation: PairSimulation) -> float:
     many_traced_s = _seconds(lambda: brief.energies(0, many, np.random.default_rng(0)))
     few_traced_s = _seconds(lambda: brief.energies(0, few, np.random.default_rng(0)))
     taking_s = _seconds(lambda: list(brief.own(0, few, 0)))
-    # All listeners take the same time.
+    # Every listener takes the same time.
     per_listener_s = (many_traced_s - few_traced_s) / max(1, len(many) - len(few))
     tracing_s = many_traced_s + per_listener_s * (probes - 1 - len(many))
     pairs = probes * (probes - 1) * (1 + simulation.scene.simulation.held_out_share)

@@ -82,7 +82,7 @@ class PairSimulation:
             yield listener, joined, self.whole(take, own)
 
     def whole(self, take: int, own: OwnResponse) -> _Singles:
-        """The response with the shared tail."""
+        """The whole response of a listener: its own part and the shared tail."""
         if self.tail is None:
             return own.samples.astype(np.float32)
         return self.tail.extend(take, own.samples, own.tail_begin)

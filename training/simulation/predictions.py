@@ -256,7 +256,7 @@ class Predictions:
     @cached_property
     def _ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """(pair,) the probes at both ends of each pair: every pair of probes once or, if there are many walls and
-        probes, all pairs of some probes."""
+        probes, only the pairs of a few probes with all others."""
         count = len(self.probes)
         tried = int(_MOST_PATH_TESTS / (count * len(self.floor_plan.corners)))
         if tried >= count:

@@ -107,7 +107,8 @@ class RayTracer:
         image_order: int,
         arrival_directions: _Floats,
     ) -> None:
-        """Direct sound and specular paths of up to `image_order` reflections are left to image sources."""
+        """Prepare tracing for `duration_s`. Direct sound and specular paths of up to `image_order` reflections are left
+        out, because image sources give them."""
         plan = geometry.floor_plan
         corners = np.asarray(plan.corners, dtype=np.float64)
         edge_x, edge_y = np.ascontiguousarray((np.roll(corners, -1, axis=0) - corners).T)

@@ -78,7 +78,7 @@ class References:
 
 
 class WholeResponses(SimulatedResponses):
-    """A simulated dataset's responses with direct sound and first reflections, like measured ones."""
+    """The responses of a simulated dataset with direct sound and first reflections, like measured ones."""
 
     def __init__(self, dataset: Dataset) -> None:
         super().__init__(dataset)
