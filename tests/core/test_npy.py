@@ -58,7 +58,7 @@ UNREADABLE = {
     "a null byte": (_file("{'descr': '\0'"), "header"),
     "objects": (_file(_header(descr="'|O8'"), b"\x80\x04N."), "not numbers"),
     "records": (_file(_header(descr="[('a', '<f4')]")), "header"),
-    "no such type": (_file(_header(descr="'<f3'")), "no type"),
+    "no such type": (_file(_header(descr="'<f3'")), "not a type of numbers"),
     "a negative shape": (_file(_header(shape="(-2, 3)")), "header"),
     "too few samples": (_file(_header(), bytes(23)), "claims 24 bytes .* and has 23"),
     "too many samples": (_file(_header(), bytes(25)), "claims 24 bytes .* and has 25"),

@@ -349,4 +349,4 @@ def test_a_predictions_faults_are_counted(ill):
     predictions.energies(np.array([[*EAST, *EMITTER_AT, 0.0], [*WEST, *EMITTER_AT, 0.0]]))
     codec = predictions.graph.parameters.codec
     assert predictions.faults == 2 * codec.bins * codec.frames
-    assert predictions.asked == 2
+    assert predictions.poses == 2

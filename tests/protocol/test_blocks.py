@@ -68,7 +68,7 @@ GOOD = DryBlock("a", 0, np.zeros(4, np.float32)).serialize("f32")
     ("data", "field"),
     [
         (GOOD[:11], "header"),
-        (b"\x03\x02" + GOOD[2:], "encoding"),
+        (b"\x03\xff" + GOOD[2:], "encoding"),
         (GOOD[:12] + b"\xff" + GOOD[13:], "id"),
         (GOOD[:-1], "frames"),
         (GOOD + b"\0", "frames"),

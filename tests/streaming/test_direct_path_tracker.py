@@ -114,12 +114,12 @@ def test_a_gain_that_is_handed_over_is_of_those_alone_whose_effects_have_it(soun
         return paths.length_m[:, None] * np.arange(7.0) - paths.screen_db / 2
 
     def found_db(*with_gain):
-        emitters = emitters_at(*PLACES)
-        emitters["3"].pattern = CARDIOID
+        states = {name: emitter.state for name, emitter in emitters_at(*PLACES).items()}
+        states["3"] = replace(states["3"], pattern=CARDIOID)
         for name in with_gain:
-            emitters[name].effects = replace(ALL_ON, path_gains=(gain_db,))
-        (ways,) = sound.ways_from(emitters.items())
-        return ways.find(Pose((7.5, 0.5, 1.5))).gain_db.copy()
+            states[name] = replace(states[name], effects=replace(ALL_ON, path_gains=(gain_db,)))
+        (paths,) = sound.ways_from(states.items())
+        return paths.find(Pose((7.5, 0.5, 1.5))).gain_db.copy()
 
     plain, changed = found_db(), found_db("2", "3")
     paths = SoundPathFinder(CORNER, 343.0).find(np.array((7.5, 0.5, 1.5)), np.array(PLACES))
