@@ -1,4 +1,4 @@
-"""An error of energies to train on: clarity, decay times and levels are made of energies.
+"""A loss on energies, from which clarity, decay times and levels follow.
 
 Errors of single bins that have the same sign do not average out in a sum, and listeners hear sums. So the loss also
 compares energies of runs of frames, and the energy still to come after each frame, by octave and over all octaves.

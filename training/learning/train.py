@@ -188,7 +188,7 @@ class _Loop:
         return patience is not None and self._state.stale >= patience
 
     def _measure(self) -> float:
-        """How far training is, in rounds."""
+        """The number of rounds done, with fractions."""
         if self._configuration.minutes is None:
             return self._state.step / self._steps_per_epoch
         return self._fraction() * _ROUNDS

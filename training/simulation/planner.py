@@ -15,14 +15,14 @@ THRESHOLD = Threshold(enter_jnd=0.25, leave_jnd=0.25)
 
 
 def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
-    """For the probes that a dataset of this seed has. Raises SceneFileError for a scene of which nobody could simulate
-    that much, or that is too large for its responses."""
+    """Return the planner for the probes of a dataset with this seed. Raises SceneFileError if the scene is too large to
+    be simulated, or too large for its responses."""
     SimulationSize(scene).require_reasonable()
     return SimulationPlanner(Predictions(scene, scene.probe_positions(seed)))
 
 
 class SimulationPlanner:
-    """What is predicted of one scene does not depend on what is asked for."""
+    """A planner for one scene. Its predictions do not depend on overrides, so plans share them."""
 
     def __init__(self, predictions: Predictions) -> None:
         self._predictions = predictions
@@ -35,13 +35,13 @@ class SimulationPlanner:
 
     @property
     def everything(self) -> SimulationPlan:
-        """With nothing left out that the scene file allows."""
+        """The plan with every effect on that the scene file allows."""
         has_mass = self._predictions.scene.geometry.materials.walls.surface_mass_kg_m2 is not None
         never = {SimulatedEffect.DIRECTIVITY: False, SimulatedEffect.TRANSMISSION: has_mass}
         return self.plan({**dict.fromkeys(SimulatedEffect, True), **never})
 
     def plan(self, overrides: Overrides) -> SimulationPlan:
-        """Raises SceneFileError for an override that the scene cannot follow."""
+        """Make a plan. Raises SceneFileError for an override that the scene cannot follow."""
         predicted = self._predictions
         self._refuse_what_cannot_be(overrides)
         order, images = self._images(overrides)
@@ -82,7 +82,8 @@ class SimulationPlanner:
         )
 
     def _images(self, overrides: Overrides) -> tuple[int, Prediction]:
-        """The highest order that is called for, and what leaving out all beyond those left to geometry would change."""
+        """Return the highest reflection order that is called for, and the change without all orders beyond those
+        computed from geometry."""
         called_for = [order for order, each in self._by_order.items() if THRESHOLD.is_reached(each.change_jnd)]
         order = max(called_for, default=GEOMETRIC_ORDER)
         if SimulatedEffect.EARLY_REFLECTIONS in overrides:
