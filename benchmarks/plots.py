@@ -22,7 +22,7 @@ _METHODS: Final = {
     "one simulation": ("x", "#8d6a9f", "one simulation"),
     "default level": ("o", _FIRST, "default level"),
 }
-"""Marker, colour and label of each kind of level; the last is drawn on top."""
+"""Marker, colour and label of each method; the last is drawn on top."""
 _ERRORS: Final = (
     "spectral loss (ln)", "T60 (%)", "EDT (ms)", "C50 (dB)", "DRR (dB)", "IACC", "level (dB)", "ITD (us)",
 )  # fmt: skip

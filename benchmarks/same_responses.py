@@ -3,7 +3,7 @@ NEW`.
 
 Each checkout is a folder with its own `pyproject.toml`; the Python that runs this script runs both. The script calls
 `nafir ir` of each checkout for some poses of every bundled scene at every quality level. It prints one line for each
-level, and exits with 1 if any differs.
+scene and level, and exits with 1 if any differs.
 """
 
 import hashlib

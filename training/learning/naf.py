@@ -137,11 +137,11 @@ class NafLearner:
         """Does nothing."""
 
     def _aligned(self, row: int) -> npt.NDArray[np.float64]:
-        """(ear, sample)"""
+        """Return the response of a row (ear, sample), shifted so that its sound arrives at the beginning."""
         return align(self.responses.read([row])[0], delay_samples(self.responses, row))
 
     def _values(self, aligned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(ear, *axes, outputs)"""
+        """Return the values that the network learns, for an aligned response: (ear, *axes, outputs)."""
         if self.field.shape.domain == "time":
             return aligned[..., None]
         return np.stack(self.codec.encode(aligned), axis=-1)

@@ -194,8 +194,8 @@ class _Loop:
         return self._fraction() * _ROUNDS
 
     def _next_round(self) -> int:
-        """The measure at which the current round ends. It is later than now, however long the last validation took, so
-        that every round trains."""
+        """The number of rounds at which the current round ends. It is later than now, however long the last validation
+        took, so that every round trains."""
         return min(math.floor(self._measure()) + 1, self._total())
 
     def _total(self) -> int:
