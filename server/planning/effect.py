@@ -105,7 +105,8 @@ class EnergyEffect(Effect):
 
 @dataclass(frozen=True, kw_only=True)
 class MotionEffect(Effect):
-    """An effect that only motion shows. `change` returns what leaving it out changes for the emitter of an index."""
+    """An effect that only motion shows. `change` returns what leaving it out changes, for the emitter with the given
+    index."""
 
     change: Callable[[Prediction, int], Change]
 

@@ -1,9 +1,10 @@
-"""Checks a plan of effects: one emitter at one moment, rendered by the plan and with everything on, is compared.
+"""Checks a plan of effects: compares one emitter at one moment, rendered by the plan, with the same rendered with
+everything on.
 
 Full responses at the present poses are compared, in just-noticeable differences (JND). They do not show effects that
 only motion shows (a delay that follows, responses that turn with the head). Effects that a client switched by hand do
-not count. If a check hears a difference, it corrects the plan: of the effects that are off, the one that reduces the
-difference most is on from then on.
+not count. If a check finds an audible difference, it corrects the plan: of the effects that are off, the one that
+reduces the difference most is on from then on.
 """
 
 import dataclasses

@@ -26,7 +26,8 @@ class Asker(Protocol):
 
 
 class RequestQueue:
-    """At most `requests` may be unanswered. First requests of emitters do not count: they are made at once."""
+    """The turns of streams to make requests, of which at most `requests` may be unanswered. First requests of emitters
+    do not count: they are made at once."""
 
     def __init__(self, requests: int) -> None:
         self.requests = requests

@@ -68,6 +68,7 @@ class EnergyError(nn.Module):
 
 
 def _octaves(frequencies_hz: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(octave, frequency) 1 where the centre of this octave band is the nearest on a logarithmic scale, else 0."""
+    """Return a matrix (octave, frequency) with 1 where the centre of this octave band is the nearest on a logarithmic
+    scale, else 0."""
     distance = np.abs(np.log2(np.maximum(frequencies_hz, 1.0)) - np.log2(OCTAVE_BANDS_HZ)[:, None])
     return np.asarray(np.argmin(distance, axis=0) == np.arange(len(OCTAVE_BANDS_HZ))[:, None], dtype=np.float64)

@@ -51,11 +51,11 @@ Normalised targets have errors of about one at first."""
 
 
 class DivergedError(NafirError):
-    """A loss or gradient that is not finite, or far above its first value."""
+    """The error for a loss or gradient that is not finite, or far above its first value."""
 
 
 def train(responses: ResponseSet, run: Path, configuration: Configuration, progress: Progress) -> None:
-    """Trains to the end, and resumes an interrupted run. Under `torchrun`, all processes train together.
+    """Train to the end, or resume an interrupted run. Under `torchrun`, all processes train together.
 
     Raises RunError if the folder holds a run of another configuration or on other data, RecipeError if the
     configuration does not fit the data, and DivergedError if the loss becomes implausible; the last checkpoint stays.
@@ -205,8 +205,8 @@ class _Loop:
     def _step(
         self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, save: bool
     ) -> None:
-        """One training step. With `save`, the parameters before the step are saved, after their loss has shown that
-        they are good."""
+        """Make one training step. With `save`, the parameters before the step are saved, after their loss has shown
+        that they are good."""
         state, configuration = self._state, self._configuration
         beta, share = self._learner.momentum_and_rate(self._fraction())
         for group in self._optimiser.param_groups:
