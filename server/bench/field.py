@@ -15,6 +15,7 @@ from server.bench.report import Goal
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES
+from server.scene.manifest import NO_FIELD
 
 Floats = npt.NDArray[np.float64]
 
@@ -82,10 +83,12 @@ def _summary(rounds: list[list[tuple[float, float]]]) -> dict[str, Any]:
 
 
 def _time(field: AcousticField, listener: Floats, emitter: Floats, yaw: float) -> tuple[float, float]:
-    """Milliseconds for an IR, and for the graph alone right after it."""
+    """Milliseconds for an IR, and for the graph alone right after it; a scene without fields has none."""
     started_s = time.perf_counter()
     field.impulse_responses([listener], [emitter], [yaw], remember=True)
     done_s = time.perf_counter()
+    if field.level.field == NO_FIELD:
+        return (done_s - started_s) * 1000, 0.0
     field.graph.run([listener], [emitter], [yaw])
     return (done_s - started_s) * 1000, (time.perf_counter() - done_s) * 1000
 

@@ -6,7 +6,7 @@ from server.bench.field import measure_levels
 from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES
 from server.scene.bundle import write_bundle
-from server.scene.manifest import Phase, QualityLevel, Reuse
+from server.scene.manifest import ARRAYS_FILE, NO_FIELD, Phase, QualityLevel, Reuse
 from server.streaming.calibration import calibrate
 
 
@@ -41,3 +41,14 @@ def test_where_responses_are_kept_the_room_for_them_is_full(bundle, tmp_path):
     levels = FieldsByLevel.load(write_bundle(tmp_path / "scene", manifest, files))
     measure_levels(levels, rounds=1, poses=2)
     assert levels.node_cache.bytes > 0.9 * NODE_CACHE_BYTES
+
+
+def test_a_scene_without_fields_spends_no_time_in_a_graph(bundle, tmp_path):
+    nothing = QualityLevel(name="geometry", field=NO_FIELD)
+    manifest = bundle.manifest.model_copy(update={"fields": {}, "levels": (nothing,), "image_order": 1})
+    files = {ARRAYS_FILE: (bundle.folder / ARRAYS_FILE).read_bytes()}
+    (level,) = measure_levels(FieldsByLevel.load(write_bundle(tmp_path / "scene", manifest, files)), rounds=1, poses=2)[
+        "levels"
+    ]
+    assert level["graph_ms_p50"] == 0.0
+    assert level["decode_ms_p50"] == level["ms_p50"] > 0.0

@@ -151,6 +151,12 @@ def test_the_end_of_a_decay_in_noise_is_not_measured_as_decay(measured):
     measured("error of T60", np.abs(reverberation_time_s(quieter, RATE) / 0.3 - 1).max(), 0.05)
 
 
+def test_a_gap_of_digital_silence_leaves_the_decay_measurable(measured):
+    gapped = decay(0.8, 0.5)
+    gapped[:, 6_000:6_600] = 0.0  # in what the line through the late decay is fitted to
+    measured("error of T60", np.abs(reverberation_time_s(gapped, RATE) / 0.8 - 1).max(), 0.1)
+
+
 def test_one_silent_ear_leaves_the_other_measurable():
     response = decay(0.4)
     response[0] = 0
