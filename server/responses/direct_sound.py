@@ -45,7 +45,7 @@ class FoundPaths(NamedTuple):
 
 
 class PathBatch(Generic[Key]):
-    """Paths from emitters that share a path finder. It holds as long as the emitters and their states stay the same."""
+    """Paths from emitters that share a path finder, valid as long as the emitters and their states stay the same."""
 
     def __init__(self, finder: SoundPathFinder, emitters: Sequence[tuple[Key, EmitterState]]) -> None:
         self.keys = [key for key, _ in emitters]

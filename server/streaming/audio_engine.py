@@ -110,7 +110,8 @@ class AudioEngine:
             thread.start()
 
     def stop(self) -> None:
-        """Stop the threads and wait until they have ended, which takes one tick; do not wait for a stuck one."""
+        """Stop the threads and wait until they have ended, which takes one tick; give up on a stuck one after a
+        second."""
         for thread in self.threads:
             thread.stop()
         until_s = time.monotonic() + _STOP_S

@@ -132,7 +132,7 @@ class ResponseScheduler:
         self._interval_s = interval_s
 
     def advance(self, pose_id: int) -> None:
-        """Note a new pose. Raises RequestError if a newer one came before."""
+        """Note a new pose of the listener or of an emitter. Raises RequestError if a newer one came before."""
         # guard: an old pose is refused
         if pose_id <= self.newest_pose_id:
             raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")

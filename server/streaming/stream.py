@@ -187,8 +187,7 @@ class Stream:
 
     @property
     def _asks_at_once(self) -> bool:
-        """Whether the stream may request IRs now without waiting for its turn, or because a new emitter needs its
-        first."""
+        """Whether the stream may request IRs at once: turns are left, or a new emitter needs its first IR."""
         return not self.session.awaits_irs and (self._inbox.brings_emitter or self._turns.are_left)
 
     @property

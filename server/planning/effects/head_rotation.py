@@ -12,7 +12,8 @@ from server.planning.scene_acoustics import Emitter, Situation
 from server.scene.effects import EffectName
 
 _EAR_GAIN = 3.0
-"""Energy from one side that an ear gains, in some third-octave band, by turning to it: 6 dB, 3 times as much on top."""
+"""Energy that an ear gains by turning to one side, in some third-octave band, as a multiple of the energy from there:
+3, since it grows by up to 6 dB, to 4 times."""
 
 
 def _change(prediction: Prediction) -> Change:
@@ -43,8 +44,8 @@ def _absence(situation: Situation, _: Emitter | None) -> str:
 
 
 def _responses(measured: Measured) -> Cost:
-    """Return the cost of responses while only the head turns: a walk calls for responses anyway, at the same
-    orientation."""
+    """Return the cost of responses while only the head turns. A listener who walks needs new responses in any case, and
+    they follow the head too."""
     each_us, first_us = measured.response_us
     return Cost(turning_us=each_us, turning_first_us=first_us)
 
