@@ -1,4 +1,4 @@
-"""Measured figures, and the pages that are made from them.
+"""Recorded measurements, and the code that writes them into the documentation.
 
-`results/` holds every table and plot of the documentation, `history/` what `nafir bench --record` adds to.
+`results/` has every table and plot of the documentation; `nafir bench --record` appends to `history/`.
 """

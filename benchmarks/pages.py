@@ -35,11 +35,11 @@ REGION: Final = re.compile(
 )
 _NEWEST: Final = 4
 _SOURCE: Final = "Drawn from"
-"""The entry of a PNG that says from which data it was drawn."""
+"""The metadata entry of a PNG with the digest of its data."""
 
 
 def filled(page: str, results: Mapping[str, Result], histories: Mapping[str, list[Run]]) -> str:
-    """Raises KeyError for a mark that names nothing there is."""
+    """Return the page with its tables filled in. Raises KeyError for a mark that names no result, table or history."""
 
     def region(mark: re.Match[str]) -> str:
         kind, name, table = mark.groups()
@@ -53,7 +53,7 @@ def filled(page: str, results: Mapping[str, Result], histories: Mapping[str, lis
 
 
 def history_table(runs: list[Run]) -> str:
-    """A column for each of the newest runs, the newest last."""
+    """Return a table with a column for each of the newest runs, the newest last."""
     runs = runs[-_NEWEST:]
     rows = {
         "": [f"{run.date:%Y-%m-%d %H:%M}" for run in runs],
@@ -78,7 +78,7 @@ def read_histories() -> dict[str, list[Run]]:
 def plots(
     results: Mapping[str, Result], histories: Mapping[str, list[Run]]
 ) -> Iterator[tuple[Path, str, Callable[[], "Figure"]]]:
-    """Of every plot its file, what its data are told apart by, and how it is drawn."""
+    """Yield for every plot its file, the digest of its data, and a function that draws it."""
     for result in results.values():
         for file, plot in result.plots.items():
             yield PAGES / file, _digest(result.model_dump_json()), partial(_draw, plot, result)
@@ -104,7 +104,7 @@ def _draw_history(runs: list[Run]) -> "Figure":
 
 
 def drawn_from(path: Path) -> str | None:
-    """None where there is no such plot, or one of another origin."""
+    """Return the digest of the data from which a plot was drawn; None without a plot or a digest in it."""
     if not path.exists():
         return None
     with Image.open(path) as image:

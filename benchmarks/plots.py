@@ -1,4 +1,4 @@
-"""Plots of results, and of the history of benchmarks. Each takes what it draws and gives a figure."""
+"""Plots of results, and of the history of benchmarks. Each function takes the data and returns a figure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
@@ -22,19 +22,19 @@ _METHODS: Final = {
     "one simulation": ("x", "#8d6a9f", "one simulation"),
     "default level": ("o", _FIRST, "default level"),
 }
-"""Marker, colour and label; the last is drawn on top."""
+"""Marker, colour and label of each method; the last is drawn on top."""
 _ERRORS: Final = (
     "spectral loss (ln)", "T60 (%)", "EDT (ms)", "C50 (dB)", "DRR (dB)", "IACC", "level (dB)", "ITD (us)",
 )  # fmt: skip
 
 
 def plan_of_effects(result: Result) -> Figure:
-    """What leaving out each effect of a plan would change, beside what it costs."""
+    """Draw the change without each effect of a plan, beside its cost."""
     return figure_of(PlanDocument.model_validate(result.values["plan"]))
 
 
 def error_over_time(result: Result) -> Figure:
-    """Mean error of every level over its mean time, the levels that are offered filled, the floor a line."""
+    """Draw the mean error of every level over its mean time, offered levels as filled markers, the floor as a line."""
     table = result.tables["levels"]
     names = [str(row[0]) for row in table.rows]
     times, errors = table.column("mean ms"), table.column("mean error, JND")
@@ -65,7 +65,7 @@ def error_over_time(result: Result) -> Figure:
 
 
 def times_floor(result: Result) -> Figure:
-    """A panel per metric, scenes from left to right, mean errors over the floor's mean error upwards."""
+    """Draw a panel per metric: scenes from left to right, the mean error divided by the floor's mean error upwards."""
     by_scene = _rows_by_scene(result.tables["errors"])
     figure = Figure(figsize=(11.5, 6.8), layout="constrained", facecolor="white")
     panels = figure.subplots(2, len(_ERRORS) // 2, sharex=True, sharey=True).ravel()
@@ -89,7 +89,8 @@ def times_floor(result: Result) -> Figure:
 
 
 def _rows_by_scene(table: Table) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Numbers by scene, method and column, without the means. A scene's first row is its default level."""
+    """Return the numbers by scene, method and column, without the rows of means. A scene's first row is its default
+    level."""
     found: dict[str, dict[str, dict[str, float | None]]] = {}
     columns = {column.title: table.column(column.title) for column in table.columns}
     scene = ""
@@ -108,7 +109,7 @@ def _ratio(rows: Mapping[str, Mapping[str, float | None]], method: str, metric: 
 
 
 def history(runs: Sequence[Run]) -> Figure:
-    """Every figure of a bench over its runs, in units of the figure's median, hosts apart by their marker."""
+    """Draw every figure of a benchmark over its runs, divided by the figure's median, with a marker for each host."""
     names = list(dict.fromkeys(name for run in runs for name in run.figures))
     hosts = list(dict.fromkeys(run.host.name for run in runs))
     figure, axes = _one_panel(7.5, 2.4 + 0.12 * len(names))
@@ -145,4 +146,4 @@ def _bare(axes: Axes) -> None:
 PLOTS: Final[Mapping[str, Callable[[Result], Figure]]] = {
     each.__name__: each for each in (plan_of_effects, error_over_time, times_floor)
 }
-"""By the name that a result gives."""
+"""Functions that draw a plot, by the name used in results."""

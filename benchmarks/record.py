@@ -1,6 +1,6 @@
-"""The form of `benchmarks/results/*.json`: what was measured, where, when, of which commit, and by which command.
+"""The schema of `benchmarks/results/*.json`: what was measured, where, when, at which commit, and by which command.
 
-What nobody wrote down is "unknown". Numbers keep the digits that were written: 1.40 is not 1.4.
+Facts that were not recorded are "unknown". Numbers keep the digits that were written: 1.40 is not 1.4.
 """
 
 import json
@@ -24,7 +24,7 @@ def _of_days(text: str) -> str:
 
 
 Days = Annotated[str, AfterValidator(_of_days)]
-"""A day, or the first and the last with a stroke between them."""
+"""A day, or the first and the last day separated by a slash."""
 Commit = Annotated[str, Field(pattern=r"^[0-9a-f]{7,40}(\+changes)?$")]
 
 
@@ -33,7 +33,7 @@ class _Form(BaseModel):
 
 
 class Host(_Form):
-    """`cores` are those the command could use."""
+    """The machine of a measurement; `cores` is the number that the command could use."""
 
     processor: str
     instruction_set: str
@@ -51,7 +51,8 @@ def _cores(number: int) -> str:
 
 
 class Value(_Form):
-    """A number with its unit, where the column has none; `is_best` of its row or column; `note` stands in brackets."""
+    """A number in a table. It has a `unit` if its column has none; `is_best` marks the best of a row or column; `note`
+    is printed in brackets."""
 
     value: Decimal
     unit: str = ""
@@ -64,7 +65,7 @@ class Value(_Form):
 
 
 Cell = Value | int | Decimal | str | None
-"""None where nothing was measured; text may have Markdown."""
+"""A cell of a table: None means not measured; text may contain Markdown."""
 
 
 class Column(_Form):
@@ -77,14 +78,14 @@ class Table(_Form):
     rows: tuple[tuple[Cell, ...], ...]
 
     def markdown(self) -> str:
-        """Raises ValueError where a row has not one cell for each column."""
+        """Return the table in Markdown. Raises ValueError if a row does not have one cell for each column."""
         heading = [column.title for column in self.columns]
         rule = ["---:" if column.is_number else "---" for column in self.columns]
         rows = [["" if cell is None else str(cell) for cell in row] for row in self.rows]
         return markdown_table([heading, rule, *rows])
 
     def column(self, title: str) -> list[float | None]:
-        """The numbers of a column; None for a cell that is none."""
+        """Return the numbers of a column; None for a cell without one."""
         at = [column.title for column in self.columns].index(title)
         return [_number(row[at]) for row in self.rows]
 
@@ -95,7 +96,8 @@ def _number(cell: Cell) -> float | None:
 
 
 class Result(_Form):
-    """One run of a command. `facts` say what else one has to know; `tables` by the names that pages give."""
+    """The results of one run of a command. `facts` are further conditions of the run; `tables` are keyed by the names
+    used in pages."""
 
     host: Host
     date: Days
@@ -104,9 +106,9 @@ class Result(_Form):
     facts: Mapping[str, str] = {}
     tables: Mapping[str, Table] = {}
     plots: Mapping[str, str] = {}
-    """How each is drawn, a name in `benchmarks.plots`, by its file below `docs/results/`."""
+    """Plots, as names of functions in `benchmarks.plots` by file below `docs/results/`."""
     values: Mapping[str, object] = {}
-    """What a plot needs beside tables."""
+    """Data for plots that are not in the tables."""
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -124,7 +126,7 @@ class Result(_Form):
 
 
 def markdown_table(rows: list[list[str]]) -> str:
-    """Raises ValueError where rows are of different lengths."""
+    """Return rows as a Markdown table. Raises ValueError if rows have different lengths."""
     if len({len(row) for row in rows}) > 1:
         raise ValueError(f"a table of rows of {sorted({len(row) for row in rows})} cells")
     cells = ([f" {cell} ".replace("|", "\\|") if cell else " " for cell in row] for row in rows)
@@ -132,5 +134,5 @@ def markdown_table(rows: list[list[str]]) -> str:
 
 
 def read_results() -> dict[str, Result]:
-    """By the name of the file."""
+    """Read all results, by file name without suffix."""
     return {path.stem: Result.read(path) for path in sorted(FOLDER.glob("*.json"))}

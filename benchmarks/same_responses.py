@@ -1,8 +1,9 @@
-"""Whether two checkouts compute the same impulse responses, to the bit: `python benchmarks/same_responses.py OLD NEW`.
+"""Checks whether two checkouts compute the same impulse responses, to the bit: `python benchmarks/same_responses.py OLD
+NEW`.
 
-Each checkout is a folder with its own `pyproject.toml`, run by the Python that runs this. Asked for, by each checkout's
-own `nafir ir`, are some poses of every bundled scene at every quality level. One line each; exit code 1 where any
-differs.
+Each checkout is a folder with its own `pyproject.toml`; the Python that runs this script runs both. The script calls
+`nafir ir` of each checkout for some poses of every bundled scene at every quality level. It prints one line for each
+scene and level, and exits with 1 if any differs.
 """
 
 import hashlib
@@ -22,7 +23,7 @@ POSES = {
     ],
     "open-field": [("0.0,0.0,1.5", "3.0,0.0,1.5", 0.0), ("-4.0,2.0,1.6", "5.0,-6.0,1.2", 77.0)],
 }
-"""Of each bundled scene: listener and emitter in metres, heading in degrees."""
+"""Poses in each bundled scene: positions of listener and emitter in metres, and heading in degrees."""
 
 
 def nafir(checkout: Path, *arguments: str) -> subprocess.CompletedProcess[bytes]:
@@ -40,7 +41,7 @@ def levels_of(checkout: Path, scene: str) -> list[str]:
 
 
 def digest(checkout: Path, scene: str, level: str) -> str:
-    """SHA-256 of all poses' responses."""
+    """Return the SHA-256 of the responses at all poses."""
     found = hashlib.sha256()
     with tempfile.TemporaryDirectory() as folder:
         for number, (listener, emitter, yaw_deg) in enumerate(POSES[scene]):

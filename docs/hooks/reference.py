@@ -1,4 +1,4 @@
-"""MkDocs hook: fills the reference pages from the code, so that they cannot say anything else than the code does.
+"""MkDocs hook: generates the reference pages from the code, so that they always agree with it.
 
 A page has `<!-- generated: NAME -->` where the text of `GENERATORS[NAME]` goes.
 """
@@ -31,5 +31,5 @@ _MARK: Final = re.compile(r"^<!-- generated: ([a-z-]+) -->$", re.MULTILINE)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Raises KeyError for a mark that names no generator."""
+    """Replace the marks of a page by generated text. Raises KeyError for a mark that names no generator."""
     return _MARK.sub(lambda mark: GENERATORS[mark[1]](), markdown)

@@ -1,4 +1,4 @@
-"""The command lines, from typer."""
+"""Reference of the command lines, from their typer applications."""
 
 import importlib
 import re
@@ -14,7 +14,7 @@ _DEFAULT = re.compile(r" ?\[default: (.*)\]$")
 
 
 def commands_of(module: str, program: str) -> str:
-    """Every command of the typer application `app` of a module, with its arguments and options."""
+    """Return the reference of every command of the typer application `app` in a module, with arguments and options."""
     root = typer.main.get_command(importlib.import_module(module).app)
     return "\n".join(_described(path, command) for path, command in _walk(program, root))
 

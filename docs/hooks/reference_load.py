@@ -1,4 +1,4 @@
-"""The thresholds of the load policy, as a table."""
+"""Reference of the load policy's thresholds."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 
 
 def load_thresholds() -> str:
-    """Each with its value and the reason for it."""
+    """Return a table of the thresholds, with their values and reasons."""
     reasons = attribute_docstrings(Thresholds)
     rows = [
         (code(each.name), _value(getattr(THRESHOLDS, each.name)), sentence(reasons.get(each.name, "")))

@@ -1,4 +1,4 @@
-"""What imports what: read from the code and drawn, in the order that `import-linter` holds the packages to."""
+"""The packages and their imports, read from the code and drawn in the order of the `import-linter` contracts."""
 
 import ast
 import tomllib
@@ -14,7 +14,7 @@ _CELL, _LEFT, _TOP = 22, 110, 100
 
 
 def packages() -> str:
-    """Every package of both sides, from the ground up, with its modules."""
+    """Return a list of every package of both sides, from the ground up, with its modules."""
     parts = []
     for root in ("server", "training"):
         rows = [(code(f"{root}/{name}/"), _modules(root, name)) for name in reversed(_order(root))]
@@ -30,7 +30,7 @@ def _modules(root: str, package: str) -> str:
 
 
 def package_matrix() -> str:
-    """An SVG for the server and one for the training side: a row imports the columns that are filled in it."""
+    """Return one SVG for the server and one for the training side: a row imports the columns with a filled square."""
     return "\n\n".join(f"**`{root}/`**\n\n{_drawn(root)}" for root in ("server", "training"))
 
 
@@ -62,7 +62,7 @@ def _drawn(root: str) -> str:
 
 @cache
 def _order(root: str) -> Sequence[str]:
-    """Packages from the top down, as the contract in pyproject.toml has them."""
+    """Return the packages from the top down, as in the contract in pyproject.toml."""
     project = tomllib.loads((_ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = project["tool"]["importlinter"]["contracts"]
     (layers,) = (each["layers"] for each in contracts if each.get("containers") == [root])
@@ -71,7 +71,7 @@ def _order(root: str) -> Sequence[str]:
 
 @cache
 def _imports(root: str) -> frozenset[tuple[str, str]]:
-    """Pairs of packages, the first of which imports the second."""
+    """Return pairs of packages: the first imports the second."""
     return frozenset(
         (path.relative_to(_ROOT / root).parts[0], parts[1])
         for path in (_ROOT / root).glob("*/**/*.py")

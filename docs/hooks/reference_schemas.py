@@ -1,4 +1,4 @@
-"""Settings, the bundle's manifest, and any JSON schema, as tables."""
+"""Tables of the settings, of the bundle's manifest, and of any JSON schema."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
@@ -14,12 +14,12 @@ _OF_THE_HOST: Final = {
     "audio_threads": "the processor cores that the process may use",
     "ir_workers": "one less than `NAFIR_AUDIO_THREADS`, and at least 1",
 }
-"""Defaults that differ between machines."""
+"""Descriptions of defaults that differ between machines."""
 _BOUNDS: Final = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
 def settings() -> str:
-    """Every setting by its environment variable."""
+    """Return a table of every setting by its environment variable."""
     properties = Settings.model_json_schema()["properties"]
     meanings = attribute_docstrings(Settings)
     rows = []
@@ -31,7 +31,7 @@ def settings() -> str:
 
 
 def manifest() -> str:
-    """`scene.json` and every object in it, the whole first."""
+    """Return tables of `scene.json` and of every object in it, beginning with the whole."""
     schema = manifests.Manifest.model_json_schema()
     models = {**_models(geometry), **_models(manifests)}
     nested = [models[name] for name in schema["$defs"] if name in models]
@@ -50,7 +50,7 @@ def _described(model: type[BaseModel]) -> str:
 
 
 def schema_rows(schema: Mapping[str, Any], meanings: Mapping[str, str]) -> Iterable[tuple[str, str, str, str]]:
-    """Of an object's schema: each field with its type, whether it may be left out, and what it means."""
+    """Yield a row for each field of an object's schema: name, type, whether it is required, and meaning."""
     required = schema.get("required", ())
     for name, field in schema.get("properties", {}).items():
         default = "required" if name in required else default_text(field["default"]) if "default" in field else ""
@@ -59,7 +59,7 @@ def schema_rows(schema: Mapping[str, Any], meanings: Mapping[str, str]) -> Itera
 
 
 def type_name(schema: Mapping[str, Any]) -> str:
-    """In words, with bounds."""
+    """Return the type of a schema in words, with its bounds."""
     if "$ref" in schema:
         return schema["$ref"].rsplit("/", 1)[-1]
     if "const" in schema:

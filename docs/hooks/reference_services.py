@@ -1,4 +1,4 @@
-"""HTTP, the stream and the metrics, from the documents the server gives out itself and from its source."""
+"""Reference of HTTP, of the stream and of the metrics, from the server's own documents and its source."""
 
 import ast
 import json
@@ -18,11 +18,11 @@ from server.protocol.codes import CLOSE_CODES, ERROR_CODES
 
 _HEADING: Final = ["field", "type", "default", "meaning"]
 _PATTERNED: Final = {"listener": "x,y,z", "emitter": "x,y,z", "effect": "NAME=on or NAME=off"}
-"""What the patterns of parameters come to."""
+"""Short forms of parameters that the schema describes by long patterns."""
 
 
 def http() -> str:
-    """Every route of /openapi.json."""
+    """Return the reference of every route of /openapi.json."""
     document = create_app(Settings()).openapi()
     routes = {
         f"{method.upper()} {path}": operation
@@ -66,7 +66,7 @@ def _operation(name: str, operation: Mapping[str, Any], always: set[str]) -> str
 
 
 def stream() -> str:
-    """Every message of /asyncapi.json."""
+    """Return the reference of every message of /asyncapi.json."""
     document = _asyncapi()
     operations = document["operations"].values()
     said = {_last(each): operation["action"] for operation in operations for each in operation["messages"]}
@@ -117,12 +117,12 @@ def _fields(message: str, schema: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 
 
 def _wrapped(text: str, width: int = 96) -> str:
-    """Hexadecimal digits in lines."""
+    """Wrap hexadecimal digits into lines."""
     return "\n".join(text[start : start + width] for start in range(0, len(text), width))
 
 
 def _json(payload: Mapping[str, Any]) -> str:
-    """In a line where it is short, else a line for each field."""
+    """Return JSON in one line if it is short, else with one line per field."""
     text = json.dumps(payload, ensure_ascii=False)
     if len(text) <= 90:
         return text
@@ -152,7 +152,7 @@ def stream_codes() -> str:
 
 
 def metrics() -> str:
-    """Every metric family that the collector names."""
+    """Return a table of every metric family of the collector."""
     tree = ast.parse(Path(telemetry.__file__).read_text(encoding="utf-8"))
     return table(["metric", "kind", "meaning"], sorted(_families(tree)))
 

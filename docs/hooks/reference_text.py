@@ -1,4 +1,4 @@
-"""Markdown of tables and paragraphs."""
+"""Functions that write tables and paragraphs in Markdown."""
 
 import ast
 import html
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Without the columns in which no row says anything."""
+    """Return a Markdown table, without columns that are empty in all rows."""
     rows = [*rows]
     kept = [column for column in range(len(heading)) if any(row[column] for row in rows)]
     lines = [[line[column] for column in kept] for line in (heading, ["---"] * len(heading), *rows)]
@@ -21,22 +21,22 @@ def _cell(text: str) -> str:
 
 
 def code(text: object) -> str:
-    # In a table a bar ends the cell, in backquotes too.
+    # In a table a bar ends the cell, even inside backquotes.
     return f"<code>{html.escape(str(text)).replace('|', '&#124;')}</code>" if "|" in str(text) else f"`{text}`"
 
 
 def default_text(value: object) -> str:
-    """As it is written in JSON, a text without its quotes."""
+    """Return a default value as in JSON, but text without quotes."""
     return code(value if isinstance(value, str) else json.dumps(value, default=str))
 
 
 def number(value: float) -> str:
-    """Whole ones with all their digits."""
+    """Return a number as text; whole numbers keep all their digits."""
     return str(int(value)) if value == int(value) else f"{value:g}"
 
 
 def sentence(text: str) -> str:
-    """With a capital and a full stop."""
+    """Return the text with a capital letter and a full stop."""
     text = " ".join(text.split())
     if not text:
         return ""
@@ -48,12 +48,12 @@ def paragraphs(docstring: str | None) -> str:
 
 
 def attribute_docstrings(kind: type) -> dict[str, str]:
-    """The text below each field of a class and of its bases, by the field's name."""
+    """Return the docstring below each field of a class and of its bases, by the field's name."""
     found: dict[str, str] = {}
     for each in reversed(kind.__mro__[:-1]):
         try:
             (tree,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
-        except (OSError, TypeError):  # made without a source
+        except (OSError, TypeError):  # a class created at run time has no source
             continue
         assert isinstance(tree, ast.ClassDef)
         for field, text in zip(tree.body, tree.body[1:], strict=False):

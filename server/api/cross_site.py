@@ -23,10 +23,10 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.api.connection_limits import HEALTH_PATHS
 from server.api.problems import Refusal, problem
 from server.api.settings import Settings
 
-_HEALTH = frozenset({"/livez", "/readyz"})
 _ANY = "*"
 _USUAL_PORTS = {"http": 80, "https": 443}
 _EXPOSED = ("ETag", "Retry-After")
@@ -104,7 +104,7 @@ class CrossSiteGate:
             )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in {"http", "websocket"} or scope["path"] in _HEALTH:
+        if scope["type"] not in {"http", "websocket"} or scope["path"] in HEALTH_PATHS:
             await self._app(scope, receive, send)
             return
         refusal = self._policy.refusal(scope["path"], Headers(scope=scope), scheme=scope.get("scheme", "http"))
@@ -124,7 +124,8 @@ class _Cors(CORSMiddleware):
         response = super().preflight_response(request_headers)
         if response.status_code < 400:
             return response
-        detail = f"pages of other sites may send {', '.join(_METHODS)}, with no header of their own but {_HEADERS[0]}"
+        methods, headers = ", ".join(_METHODS), ", ".join(_HEADERS)
+        detail = f"pages of other sites may send {methods}, with no header of their own but {headers}"
         refused = problem(response.status_code, "preflight_refused", detail)
         for name, value in response.headers.items():
             if name not in {"content-type", "content-length"}:

@@ -1,7 +1,8 @@
-"""A first start compiles for minutes of processor time: on two cores at once, and saying how far it is.
+"""The first start compiles for minutes of processor time: on two cores at once, with messages about its progress.
 
-Numba compiles one function at a time in each process. So another process, a plain `nafir ir`, compiles what computes
-responses while this one compiles what renders blocks; each reads from disk what the other has compiled.
+Numba compiles one function at a time in each process. So a second process, a plain `nafir ir`, compiles the code that
+computes responses while this one compiles the code that renders blocks; each reads from disk what the other has
+compiled.
 """
 
 import asyncio
@@ -20,7 +21,7 @@ _TOLD_EVERY_S = 5.0
 
 
 class ResponseCompiler:
-    """Compiles what computes responses in a process of its own. That process ends with the context, at the latest."""
+    """Compiles the code that computes responses, in a process of its own that ends with the context at the latest."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -42,7 +43,8 @@ class ResponseCompiler:
         self._folder.cleanup()
 
     def begin(self, bundle: Bundle, *, cores: int) -> None:
-        """Does nothing on one core, where a scene has no field, or where a start before has compiled all."""
+        """Start compiling. Do nothing on one core, for a scene without a field, or if an earlier start has compiled
+        everything."""
         if cores < 2 or not bundle.manifest.fields or is_kept(mix_listeners):
             return
         start = bundle.manifest.start
@@ -61,13 +63,14 @@ class ResponseCompiler:
                 )
 
     def wait(self) -> None:
-        """Until it has compiled. Where it has failed, whoever needs what it did not compile compiles it."""
+        """Wait until the process has ended. If it failed, functions it did not compile are compiled when they are first
+        called."""
         if self._process is not None:
             self._process.wait()
 
 
 async def tell_while_compiling() -> None:
-    """A line on standard error every few seconds while functions are being compiled, until it is cancelled."""
+    """Write a line to standard error every few seconds while functions are compiled, until cancelled."""
     started_s, known = time.monotonic(), functions_compiled()
     while True:
         await asyncio.sleep(_TOLD_EVERY_S)

@@ -1,15 +1,15 @@
-"""What plans of effects save, and what they get wrong, in six situations.
+"""What plans of effects save, and their errors, in six situations.
 
-Each situation is played by a session three times: by its plan, with every effect on, and with every effect off. Its
-responses by the plan, and with each effect left out that is on, are compared with those of every effect on, in
-just-noticeable differences.
+A session plays each situation three times: with the effects of its plan, with all effects on, and with all effects off.
+The responses with the plan, and those without each single effect of the plan, are compared with those with all effects
+on, in just-noticeable differences.
 
-- `plan_us`, `all_us`, `none_us`: time of the rendering thread per block of 256 samples, median of rounds in which the
-  three take turns, impulse responses and plans included where any are made.
-- `sum_us`: what nothing costs, and what each effect that is on costs on this host, measured anew in each of the same
-  rounds; `ratio` is the median of the plan's time to that, round by round.
-- `error_jnd`: of the parameter in which plan and everything differ most. `least_jnd`: of all effects that are on, the
-  one whose leaving out changes least, in the parameter that it changes most.
+- `plan_us`, `all_us`, `none_us`: time of the rendering thread per block of 256 samples, as a median of rounds in which
+  the three take turns. It includes impulse responses and plans where any are made.
+- `sum_us`: the time with all effects off plus the cost of each effect that is on, measured on this host in each of the
+  same rounds. `ratio` is the median over rounds of the plan's time over that sum.
+- `error_jnd`: difference between the plan and all effects on, in the parameter where it is largest. `least_jnd`: of all
+  effects that are on, the change without the one that matters least, in the parameter that it changes most.
 """
 
 import math
@@ -65,7 +65,7 @@ _SETTLE_S = 3.0
 
 @dataclass(frozen=True)
 class Scenario:
-    """Who is where, and moves how: metres, and metres per second along x."""
+    """Positions and motion of a listener and emitters, in metres and in metres per second along x."""
 
     name: str
     field: Callable[[], AcousticField]
@@ -89,7 +89,7 @@ def _room(name: str, size_m: tuple[float, float, float], absorption: float) -> A
 
 @cache
 def _two_rooms() -> AcousticField:
-    """A wall between them, 0.2 m thick, with a doorway of 0.9 m at one end."""
+    """Return two rooms with a wall between them, 0.2 m thick, and a doorway of 0.9 m at one end of it."""
     rooms = Room((0.0, 0.0), (4.0, 4.0, 2.6), 0.3), Room((4.2, 0.0), (4.0, 4.0, 2.6), 0.3)
     corners = (
         *((0.0, 0.0), (4.0, 0.0), (4.0, 2.9), (4.2, 2.9), (4.2, 0.0)),
@@ -128,7 +128,7 @@ SCENARIOS = (
 
 
 def measure_effects(scenarios: Sequence[Scenario], advance: Callable[[str], None]) -> list[dict[str, Any]]:
-    """One row per scenario."""
+    """Measure all scenarios, and return one row for each."""
     rows = []
     for scenario in scenarios:
         rows.append({"situation": scenario.name, **times_of(scenario), **errors_of(scenario, plan_of(scenario))})
@@ -137,7 +137,7 @@ def measure_effects(scenarios: Sequence[Scenario], advance: Callable[[str], None
 
 
 def situation_of(scenario: Scenario) -> Situation:
-    """As a session would have it while things move as they do."""
+    """Return the situation as a session would give it to the planner during the scenario's motion."""
     field = scenario.field()
     listener = Pose(scenario.listener)
     held: list[Any] = [None] * len(scenario.emitters)
@@ -158,12 +158,12 @@ def plan_of(scenario: Scenario, overrides: Overrides | None = None, *, costs: Co
 
 
 def everything(*, is_on: bool = True) -> dict[EffectName, bool]:
-    """Overrides that switch on all there is, or off."""
+    """Return overrides that switch all effects on or off."""
     return dict.fromkeys(EffectName, is_on)
 
 
 def without(plan: Plan, name: EffectName) -> Plan:
-    """Of a plan with everything on."""
+    """Return the plan with one effect switched off; `plan` has everything on."""
 
     def switched(decisions: Mapping[EffectName, Any]) -> dict[EffectName, Any]:
         return {each: replace(made, called_for=made.called_for and each != name) for each, made in decisions.items()}
@@ -172,15 +172,15 @@ def without(plan: Plan, name: EffectName) -> Plan:
 
 
 def heard(scenario: Scenario, plan: Plan) -> FloatArray:
-    """(emitter, 2, sample) whole responses as the plan has them, everybody being where they begin; a loudspeaker's is
-    the same at both ears."""
+    """Return the full responses (emitter, 2, sample) with a plan, at the initial poses; a mono output is the same at
+    both ears."""
     field = scenario.field()
     direct = _direct_sound(field)
     shared = shared_effects(plan)
     channels = shared.channels
     emitters = []
     for number, place in enumerate(scenario.emitters):
-        # Delays that follow and delays that stand still are the same where nobody has moved yet.
+        # At the initial poses, a fixed delay equals one that follows.
         on = plan.on(str(number)) | {EffectName.PROPAGATION_DELAY}
         if not field.bundle.manifest.fields:
             on -= {EffectName.LATE_REVERBERATION}
@@ -200,7 +200,7 @@ def heard(scenario: Scenario, plan: Plan) -> FloatArray:
 
 
 def errors_of(scenario: Scenario, plan: Plan) -> dict[str, Any]:
-    """Of a plan, and of everything on without each of the effects that it has on."""
+    """Return the error of a plan, and the change without the effect that matters least among those it has on."""
     whole = plan_of(scenario, everything())
     reference = heard(scenario, whole)
     by_parameter = _difference(scenario, reference, heard(scenario, plan))
@@ -221,8 +221,8 @@ def errors_of(scenario: Scenario, plan: Plan) -> dict[str, Any]:
 
 
 def change_without(scenario: Scenario, whole: Plan, name: EffectName, reference: FloatArray) -> float:
-    """JND that leaving out one effect changes, of the parameter that it changes most; as predicted of what only motion
-    tells, since responses do not."""
+    """Return the change in JND without one effect, in the parameter that it changes most. For an effect that only
+    motion shows it is the planner's prediction, since responses do not show it."""
     if CATALOGUE[name] in MOTION_EFFECTS:
         (decision, *_) = whole.about(name)
         return decision.change_jnd
@@ -230,7 +230,7 @@ def change_without(scenario: Scenario, whole: Plan, name: EffectName, reference:
 
 
 def _difference(scenario: Scenario, reference: FloatArray, other: FloatArray) -> dict[str, float]:
-    """The greatest of all emitters, by parameter."""
+    """Return the largest difference over all emitters, by parameter."""
     field = scenario.field()
     onsets_s = field.onset_s([scenario.listener] * len(scenario.emitters), scenario.emitters)
     most: dict[str, float] = {}
@@ -246,7 +246,7 @@ def _direct_sound(field: AcousticField) -> DirectSound:
 
 
 def _with_shared_tail(responses: FloatArray, sample_rate: int) -> FloatArray:
-    """As a renderer plays them whose emitters share one tail."""
+    """Return the responses as a renderer plays them if all emitters share one tail."""
     count, channels, samples = responses.shape
     blocks = -(-samples // BLOCK_SIZE)
     played = np.zeros((count, channels, blocks * BLOCK_SIZE), np.float32)
@@ -273,7 +273,7 @@ def _with_shared_tail(responses: FloatArray, sample_rate: int) -> FloatArray:
 
 
 class _Player:
-    """A session of a scenario that is answered at once; goes back and forth where it moves."""
+    """A session of a scenario whose requests are answered at once; moving objects go back and forth."""
 
     def __init__(self, scenario: Scenario, effects: Overrides) -> None:
         self._scenario = scenario
@@ -330,13 +330,14 @@ class _Player:
 
 
 def _along(start: Vector3, speed_m_s: float, clock_s: float) -> Vector3:
-    """There in two seconds and back in two."""
+    """Return a position that moves away along x for two seconds and back for two."""
     away_s = 2.0 - abs(clock_s % 4.0 - 2.0)
     return start[0] + speed_m_s * away_s, start[1], start[2]
 
 
 def times_of(scenario: Scenario) -> dict[str, float]:
-    """Microseconds per block, in turns, with what effects cost measured in the same turns."""
+    """Measure the microseconds per block of all variants in turns, with the cost of effects measured in the same
+    turns."""
     players = {
         "plan_us": _Player(scenario, {}),
         "all_us": _Player(scenario, everything()),

@@ -17,7 +17,7 @@ _HEADINGS = (
 
 
 def terminal_rows(measured: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows short enough for a terminal: they have the number of effects that are on, not their names."""
+    """Return rows short enough for a terminal, with the number of effects that are on instead of their names."""
     return [
         {
             "situation": row["situation"],

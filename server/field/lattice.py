@@ -39,16 +39,16 @@ class Node(NamedTuple):
 
 
 class Snapped(NamedTuple):
-    """What represents a pair of poses: the response of `node`, delayed by `later_samples` (negative: earlier), so that
-    the time from direct to reflected sound is the same as at the node."""
+    """The response that stands for a pair of poses: that of `node`, shifted by `later_samples` (earlier if negative) so
+    that reflected sound keeps its delay after the direct sound."""
 
     node: Node
     later_samples: int
 
 
 class Neighbourhood(NamedTuple):
-    """Listener poses that certainly get the same node and delay as the pose in their middle, while the emitter does not
-    move: positions within a ball and between two distances from the emitter, headings within an arc."""
+    """The listener poses around one pose that are certain to have the same response for an emitter at rest: positions
+    within a ball and between two distances from the emitter, headings within an arc."""
 
     listener: Vector3
     radius_m: float
@@ -57,7 +57,7 @@ class Neighbourhood(NamedTuple):
     farthest_m: float
     yaw: float
     arc_rad: float
-    """Half of the arc: this far to either side."""
+    """Half the arc, to either side of `yaw`."""
 
     def holds(self, pose: Pose) -> bool:
         """Whether a pose is in the neighbourhood. This takes less than a microsecond, while `Lattice.find` takes
@@ -137,7 +137,15 @@ class Lattice:
             # A path around corners becomes longer by at most the distance that the listener moves.
             radius_m = min(radius_m, reach_m - abs(way_m - there_m - steps * self._step_m))
         arc_rad = math.inf if self._turns == 1 else (0.5 - abs(turns - heading)) * self._turn_rad - _LEAST_RAD
-        around = Neighbourhood(listener, radius_m, emitter, nearest_m, farthest_m, yaw, arc_rad)
+        around = Neighbourhood(
+            listener=listener,
+            radius_m=radius_m,
+            emitter=emitter,
+            nearest_m=nearest_m,
+            farthest_m=farthest_m,
+            yaw=yaw,
+            arc_rad=arc_rad,
+        )
         return Snapped(node, round(steps * self._samples_per_step)), around
 
     def _length_m(self, listener: Vector3, emitter: Vector3) -> float:

@@ -1,4 +1,4 @@
-"""All effects: that of each name is the `EFFECT` of its module in `server.planning.effects`."""
+"""All effects: each is the `EFFECT` of the module in `server.planning.effects` that has its name."""
 
 import importlib
 from collections.abc import Iterable, Mapping
@@ -19,7 +19,7 @@ def _load(name: EffectName) -> Effect:
 CATALOGUE: Mapping[EffectName, Effect] = {name: _load(name) for name in EffectName}
 
 ENERGY_EFFECTS = tuple(effect for effect in CATALOGUE.values() if isinstance(effect, EnergyEffect))
-"""Those that a single moment tells."""
+"""Effects of an emitter that a single moment shows."""
 MOTION_EFFECTS = tuple(effect for effect in CATALOGUE.values() if isinstance(effect, MotionEffect))
 SHARED_EFFECTS = tuple(
     sorted((effect for effect in CATALOGUE.values() if isinstance(effect, SharedEffect)), key=lambda each: each.title)
@@ -31,7 +31,7 @@ _PATH_GAINS = {effect.name: effect.path_gain for effect in ENERGY_EFFECTS if eff
 
 
 def emitter_effects(on: Iterable[EffectName]) -> EmitterEffects:
-    """What an emitter's sound is made of where these effects are on and no others."""
+    """Return what to render of an emitter with these effects on and all others off."""
     on = frozenset(on)
     flags = {flag: name in on for name, flag in _FLAGS.items()}
     return EmitterEffects(**flags, path_gains=tuple(gain for name, gain in _PATH_GAINS.items() if name in on))
@@ -45,7 +45,7 @@ def shared_effects(plan: Plan) -> SharedEffects:
 
 
 def names_on(effects: EmitterEffects) -> set[EffectName]:
-    """The effects of an emitter that are on."""
+    """Return the names of the effects that are on."""
     gains = effects.path_gains
     flagged = {name for name, flag in _FLAGS.items() if getattr(effects, flag)}
     return flagged | {name for name, gain in _PATH_GAINS.items() if gain in gains}

@@ -1,6 +1,6 @@
-"""What an effect costs, and what it is told from: renderers with and without it (`server.planning.effect_costs`).
+"""The cost of an effect, derived from renderers with and without it (`server.planning.effect_costs`).
 
-Microseconds of one core, per block; bytes.
+Times are microseconds of one core per block; memory is in bytes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,9 +13,9 @@ from server.scene.effects import EffectName
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one emitter, where an effect is on: microseconds per block and bytes; `moving_us` more while it or the
-    listener moves, or `turning_us` while only the head turns. What it costs that there is any such emitter, all share:
-    `first_us` and so on."""
+    """The cost of an effect that is on, for one emitter: microseconds per block and bytes. `moving_us` comes on top
+    while the emitter or the listener moves, or `turning_us` while only the head turns. `first_us`, `moving_first_us`
+    and `turning_first_us` are fixed costs that all emitters share."""
 
     us: float = 0.0
     memory_bytes: int = 0
@@ -32,13 +32,13 @@ class Cost:
 NOTHING = Cost()
 
 Costs = Mapping[EffectName, Cost]
-"""As measured on this host; what is not in it was not."""
+"""Costs measured on this host; effects that were not measured are missing."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A renderer to measure: what it makes, whether paths change with every block (`moves`), and whether responses are
-    exchanged as often as those of somebody who walks."""
+    """A renderer to measure: its effects, whether paths change with every block (`moves`), and whether responses are
+    exchanged as often as for a walking listener (`exchanges`)."""
 
     effects: EmitterEffects = field(default_factory=EmitterEffects)
     shared: SharedEffects = field(default_factory=SharedEffects)
@@ -46,7 +46,7 @@ class Variant:
     exchanges: bool = False
 
     def without_responses(self) -> "Variant":
-        """The same in a scene without a field."""
+        """Return the same variant for a scene without a field."""
         own_tails = replace(self.shared, own_tails=True)
         return replace(self, effects=replace(self.effects, late=False), shared=own_tails, exchanges=False)
 
@@ -56,14 +56,14 @@ MOVING = Variant(moves=True)
 EXCHANGING = Variant(exchanges=True)
 
 PerPose = Callable[[Bundle, int], Callable[[], object]]
-"""Of a scene and a number of emitters: work that is done for all of them whenever a pose changes."""
+"""Returns, for a scene and a number of emitters, the work that is done for all of them whenever a pose changes."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Of renderers of one emitter and of `emitters`, by variant. `per_pose_us` of one emitter, by effect. `late_us` and
-    `early_us` are what the two parts of a response take before it is made ready, `responses_per_block` of an emitter
-    that moves. Without a field there are no responses of it."""
+    """Measurements of renderers with one emitter and with `emitters`, by variant. `per_pose_us` is for one emitter, by
+    effect. `late_us` and `early_us` are the times to compute the field's part and the first reflections of a response,
+    and `responses_per_block` is the rate for an emitter that moves. Without a field no responses are computed."""
 
     emitters: int
     us: Mapping[tuple[Variant, int], float]
@@ -75,14 +75,14 @@ class Measured:
     has_field: bool
 
     def between(self, more: Variant, less: Variant) -> tuple[float, float]:
-        """Of each emitter, and of there being any."""
+        """Return the difference in time per emitter, and the fixed part that all emitters share."""
         more, less = self._here(more), self._here(less)
         one, all_ = (self.us[more, count] - self.us[less, count] for count in (1, self.emitters))
         each = max(0.0, (all_ - one) / (self.emitters - 1))
         return each, max(0.0, one - each)
 
     def standing(self, more: Variant, less: Variant) -> Cost:
-        """Of what one variant makes and another does not, whether or not anything moves."""
+        """Return the cost of what one variant renders and the other does not, whether or not anything moves."""
         each, first = self.between(more, less)
         most, least = (self.memory_bytes[self._here(variant)] for variant in (more, less))
         return Cost(each, max(0, most - least) // self.emitters, first_us=first)
@@ -93,7 +93,7 @@ class Measured:
 
     @property
     def response_us(self) -> tuple[float, float]:
-        """Of responses anew of an emitter that moves, what the field holds, and of there being any exchanged."""
+        """The time that new responses take for an emitter that moves, and the fixed part of exchanging any."""
         if not self.has_field:
             return 0.0, 0.0
         exchange_us, first_us = self.between(EXCHANGING, STILL)
@@ -104,6 +104,6 @@ class Measured:
 
 
 def variants_of(pairs: Sequence[tuple[Variant, Variant]], *, has_field: bool) -> list[Variant]:
-    """All to measure, each once."""
+    """Return all variants to measure, each once."""
     needed = dict.fromkeys([STILL, EXCHANGING, *(variant for pair in pairs for variant in pair)])
     return list(needed) if has_field else list(dict.fromkeys(variant.without_responses() for variant in needed))

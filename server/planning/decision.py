@@ -1,4 +1,4 @@
-"""A decision about an effect, and when it is called for: what the planners of rendering and of simulations share."""
+"""A decision about an effect and its threshold, shared by the planners of rendering and of simulations."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,8 +9,8 @@ Name = TypeVar("Name", bound=StrEnum)
 
 @dataclass(frozen=True)
 class Decision(Generic[Name]):
-    """On or off of one effect. `change_jnd` is what leaving it out changes, in just-noticeable differences of the
-    `parameter` that changes most. Where it was `overridden`, `reason` says what was predicted too."""
+    """Whether one effect is on, and why. `change_jnd` is what leaving it out changes, in just-noticeable differences of
+    the `parameter` that changes most. For a decision that was `overridden`, `reason` includes the prediction too."""
 
     name: Name
     called_for: bool
@@ -22,7 +22,7 @@ class Decision(Generic[Name]):
 
 @dataclass(frozen=True)
 class Threshold:
-    """An effect is called for from `enter_jnd` on, and stays so down to `leave_jnd`: nothing flutters about it."""
+    """An effect switches on at `enter_jnd` and stays on down to `leave_jnd`, so that it does not flutter."""
 
     enter_jnd: float
     leave_jnd: float
@@ -31,5 +31,5 @@ class Threshold:
         return change_jnd >= (self.leave_jnd if was_on else self.enter_jnd)
 
     def decides(self, change_jnd: float, wanted: bool | None, *, was_on: bool = False) -> bool:
-        """Whether an effect is on: as it is `wanted`, if anybody wants anything."""
+        """Return whether an effect is on: `wanted` if it is not None, else whether the threshold is reached."""
         return self.is_reached(change_jnd, was_on=was_on) if wanted is None else wanted

@@ -1,11 +1,11 @@
-"""What an effect is to everybody: its words, what it changes of what is heard, what it needs, what it costs, and which
-part of the renderer it switches.
+"""The description of an effect: its words, what it changes in the sound, what it needs, what it costs, and which part
+of the renderer it switches.
 
-There is a module for each in `server.planning.effects`, whose `EFFECT` is one of these:
+Each module in `server.planning.effects` has one `EFFECT`, an instance of one of these classes:
 
-- `EnergyEffect`: of an emitter; it changes energies, and a single moment tells.
-- `MotionEffect`: of an emitter; only motion tells.
-- `SharedEffect`: decided once for all that a listener hears.
+- `EnergyEffect`: an effect of one emitter that changes energies, so a single moment shows it.
+- `MotionEffect`: an effect of one emitter that only motion shows.
+- `SharedEffect`: an effect decided once for all that a listener hears.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,8 @@ ENERGIES = ("level", "spectrum", "drr", "c50")
 
 @dataclass(frozen=True)
 class Need:
-    """What an effect means nothing without: any of some others. `absence` says that none is there."""
+    """A requirement of an effect: at least one of these other effects is on. `absence` is the reason given where none
+    is."""
 
     any_of: frozenset[EffectName]
     absence: str
@@ -40,9 +41,9 @@ RESPONSES = Need(frozenset({EffectName.EARLY_REFLECTIONS, EffectName.LATE_REVERB
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """`parameters` are names of thresholds; `without` is what is rendered where the effect is off, and `prediction`
-    what tells beforehand whether that is heard. `flag` is the part of the renderer that it switches, a field of
-    `EmitterEffects` or, where it is shared, of `SharedEffects`."""
+    """An effect that can be on or off. `parameters` are names in `JND_THRESHOLDS`. `without` describes what is rendered
+    where the effect is off, and `prediction` how its audibility is predicted. `flag` names the part of the renderer
+    that it switches: a field of `EmitterEffects` or, for shared effects, of `SharedEffects`."""
 
     name: EffectName
     title: str
@@ -53,15 +54,16 @@ class Effect:
     flag: str | None = None
     needs: Need | None = None
     may_act: Callable[[Situation], bool] | None = None
-    """Whether there is anything to ask: most situations have no corners, and no emitter that beams."""
+    """Returns whether a situation has anything that the effect acts on; most have no corners and no directional
+    emitter. None: every situation has."""
     absence: Callable[[Situation, Emitter | None], str] | None = None
-    """What is not there for it to act on, in words; empty where something is. Of one emitter, unless it is shared."""
+    """Returns in words what the effect lacks to act on, or an empty string; the emitter is None for shared effects."""
     costs_in: tuple[Variant, Variant] | None = None
-    """A renderer with it and one without, whose difference it costs."""
+    """Two renderers, one with the effect and one without: the difference between them is its cost."""
     costs_more: Callable[[Measured], Cost] | None = None
-    """What that difference does not tell."""
+    """Returns the costs that the difference of `costs_in` does not include."""
     per_pose: PerPose | None = None
-    """What is computed for emitters whenever a pose changes, and costs as long as that takes."""
+    """The work that the effect adds for emitters whenever a pose changes; its time is part of the cost."""
 
     @property
     def is_shared(self) -> bool:
@@ -78,10 +80,11 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class EnergyEffect(Effect):
-    """What it multiplies energies by: of the direct sound along its paths, of the first reflections, and of what the
-    field holds. `held` is told how much of what emitters send ahead they send everywhere, on average.
+    """An effect that multiplies energies: of the direct sound along its paths (`direct`), of the first reflections
+    (`mirrored`), and of the field's responses (`held`). A factor of `held` gets the emitters' power averaged over all
+    directions, relative to that ahead, (emitter, band).
 
-    With a `path_gain`, in decibels, that is what becomes of the direct sound: nothing else needs to know the effect.
+    With a `path_gain`, in decibels, `direct` and `per_pose` follow from it: no other code needs to know the effect.
     """
 
     direct: Factors[Way] = UNTOUCHED
@@ -89,9 +92,9 @@ class EnergyEffect(Effect):
     held: Factors[Floats] = UNTOUCHED
     path_gain: PathGain | None = None
     is_coherent: bool = False
-    """Whether it changes how direct sound and first reflections add up."""
+    """Whether it changes the interference of the direct sound with the first reflections."""
     leads_round: bool = False
-    """Whether the direct sound goes straight through walls without it."""
+    """Whether the direct sound goes straight through walls where the effect is off."""
 
     def __post_init__(self) -> None:
         gain_db = self.path_gain
@@ -102,14 +105,15 @@ class EnergyEffect(Effect):
 
 @dataclass(frozen=True, kw_only=True)
 class MotionEffect(Effect):
-    """`change` is what is heard without it of the emitter of a number."""
+    """An effect that only motion shows. `change` returns what leaving it out changes, for the emitter with the given
+    index."""
 
     change: Callable[[Prediction, int], Change]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedEffect(Effect):
-    """`change` is what is heard without it of all emitters."""
+    """An effect decided for all emitters together. `change` returns what leaving it out changes."""
 
     change: Callable[[Prediction], Change]
 

@@ -1,8 +1,9 @@
-"""What effects cost on this host: renderers with and without each, side by side, for a fraction of a second.
+"""What effects cost on this host, measured in a fraction of a second with renderers with and without each effect.
 
-Microseconds of one core, per block and emitter. Bytes per emitter. They are medians of rounds in which all take turns,
-in time of the thread that measures, so that what else runs meanwhile counts little. Whoever measures beside streams
-hands in `rest`, called every few milliseconds between what is timed, which may take a break.
+Results are microseconds of one core per block and emitter, and bytes per emitter. They are medians of rounds in which
+all renderers take turns, in CPU time of the measuring thread, so that other load has little influence. A caller that
+measures beside running streams passes `rest`: it is called every few milliseconds between timed sections, and may
+pause.
 """
 
 import statistics
@@ -29,7 +30,7 @@ from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs
 
 RESPONSES_PER_S = 30.0
-"""Of an emitter that moves, or a listener."""
+"""New responses per second while the emitter or the listener moves."""
 
 _EMITTERS = 4
 _BLOCKS = 48
@@ -45,7 +46,7 @@ def _no_rest() -> None:
 
 
 class _Lane:
-    """A renderer that plays emitters as a variant has them."""
+    """A renderer that plays emitters with the effects of a variant."""
 
     def __init__(
         self, field: AcousticField, block_size: int, variant: Variant, *, emitters: int, rest: Rest = _no_rest
@@ -97,7 +98,7 @@ class _Lane:
             self._renderer.process()
 
     def _walk(self) -> None:
-        """A centimetre on, and a little turned, block by block."""
+        """Move all paths by about a centimetre and turn them a little, once per block."""
         self._block += 1
         count = len(self._names)
         angle = 0.02 * self._block + np.arange(count)
@@ -108,12 +109,12 @@ class _Lane:
 
 @lru_cache(maxsize=16)
 def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
-    """Of a field's scene, measured once."""
+    """Return the costs in a field's scene, measured once."""
     return measure_costs(field, block_size)
 
 
 def measure_costs(field: AcousticField, block_size: int = 256, *, rest: Rest = _no_rest) -> Costs:
-    """Of a field's scene, now: half a second of work, and longer in the first run of all."""
+    """Measure the costs in a field's scene: half a second of work, and longer in the first run of all."""
     has_field = bool(field.bundle.manifest.fields)
     variants = variants_of([effect.costs_in for effect in CATALOGUE.values() if effect.costs_in], has_field=has_field)
     lanes = {
@@ -143,7 +144,7 @@ def measure_costs(field: AcousticField, block_size: int = 256, *, rest: Rest = _
 
 
 def _bytes(thing: object, seen: set[int] | None = None) -> int:
-    """Of all arrays that something holds, each once."""
+    """Return the bytes of all arrays that an object refers to, each counted once."""
     seen = set() if seen is None else seen
     if id(thing) in seen:
         return 0
@@ -162,8 +163,8 @@ def _bytes(thing: object, seen: set[int] | None = None) -> int:
 
 
 def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: Rest) -> tuple[float, float]:
-    """What one response takes before it is made ready and faded in: of what the field holds, and of the first
-    reflections. Between one and the next sound is rendered, as in streams, so that caches hold something else."""
+    """Return the times to compute the two parts of a response: the field's, and the first reflections. Blocks are
+    rendered between two responses, as in streams, so that caches hold other data."""
     start = field.bundle.manifest.start
     direct = DirectSound.of(field.bundle, kemar(field.sample_rate))
     times_us: dict[bool, list[float]] = {False: [], True: []}
@@ -183,7 +184,7 @@ def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: R
 
 
 def _time_in_turns(lanes: dict[_Key, Callable[[], object]], *, per: int, rest: Rest = _no_rest) -> dict[_Key, float]:
-    """Microseconds of each, divided by `per`; a first round warms up."""
+    """Return the microseconds of each lane, divided by `per`; a first round warms up."""
     times_s: dict[_Key, list[float]] = {name: [] for name in lanes}
     for _ in range(_ROUNDS + 1):
         for name, lane in lanes.items():

@@ -1,6 +1,6 @@
-"""Whether something moves, and how fast: what may happen next is told from what happened last.
+"""Whether something moves, and how fast, estimated from its latest poses.
 
-Metres, seconds; clocks are seconds of sound.
+Lengths are in metres; clocks are in seconds of sound.
 """
 
 import math
@@ -9,14 +9,14 @@ from server.acoustics.geometry import Pose
 from server.planning.scene_acoustics import WALKING_M_S
 
 REST_S = 2.0
-"""So long after the last change of a pose, what moved rests."""
+"""Time after the last change of a pose from which an object counts as at rest."""
 _FASTEST_M_S = 100.0
 _SHORTEST_S = 0.02
-"""Poses that come closer together say nothing of speed."""
+"""Least interval between two poses for an estimate of speed: shorter ones say nothing of it."""
 
 
 class Motion:
-    """Of a listener or an emitter that is at `pose` from `clock_s` on, and rests there until it is moved."""
+    """The motion of a listener or an emitter that is at `pose` from `clock_s` on, and rests there until it is moved."""
 
     def __init__(self, pose: Pose, clock_s: float) -> None:
         self._pose = pose
@@ -25,7 +25,7 @@ class Motion:
         self._speed_m_s = 0.0
 
     def follow(self, pose: Pose, clock_s: float) -> None:
-        """At another pose, or the same, from now on."""
+        """Note a pose from now on, whether or not it has changed."""
         if pose.position != self._pose.position:
             took_s = max(clock_s - self._clock_s, _SHORTEST_S)
             speed_m_s = min(math.dist(pose.position, self._pose.position) / took_s, _FASTEST_M_S)
@@ -43,7 +43,7 @@ class Motion:
         return clock_s - self._turned_s < REST_S
 
     def speed_m_s(self, clock_s: float) -> float:
-        """At most, in steps that double from that of somebody who walks; 0 at rest."""
+        """Return an upper bound of the speed, in steps that double from walking pace; 0 at rest."""
         if not self.moves(clock_s):
             return 0.0
         doublings = math.ceil(math.log2(max(self._speed_m_s / WALKING_M_S, 1.0)))

@@ -1,6 +1,6 @@
-"""Scene bundles as planners of effects see them: where sound travels, and what the scene's field holds.
+"""Scene bundles as the planner of effects needs them: the acoustics of the place, and the reverberation of its field.
 
-Energies as in `server.planning.scene_acoustics`; positions in metres.
+Energies are as in `server.planning.scene_acoustics`; positions are in metres.
 """
 
 import math
@@ -27,19 +27,20 @@ _EARLY_S = 0.050
 _HEADINGS = 4
 _PAIRS = 8
 _LONGEST_S = 0.25
-"""A field that takes so long for a pair or more is asked for no other."""
+"""After this time the field is asked for no further pair."""
 _SHORTEST_T60_S = 0.01
 
 
 @lru_cache(maxsize=16)
 def place_of_field(field: AcousticField, block_size: int = 256) -> SceneAcoustics:
-    """That of a field's scene; asks the field once, for tens of milliseconds."""
+    """Return the acoustics of a field's scene; the first call computes responses for tens of milliseconds."""
     known = reverberations(field) if field.bundle.manifest.fields else ()
     return place_of(field.bundle, known, block_size=block_size)
 
 
 def place_of(bundle: Bundle, known: tuple[Reverberation, ...], *, block_size: int = 256) -> SceneAcoustics:
-    """`known` is what the scene's field holds of emitters all over the place; nothing where it has no field."""
+    """Return the acoustics of a bundle's scene. `known` are reverberations all over the place; empty if it has no
+    field."""
     manifest = bundle.manifest
     stages = Partitioning(block_size, manifest.codec.samples).stages
     return SceneAcoustics(
@@ -60,9 +61,9 @@ def place_of(bundle: Bundle, known: tuple[Reverberation, ...], *, block_size: in
 
 
 def reverberations(field: AcousticField) -> tuple[Reverberation, ...]:
-    """Of pairs of places all over the scene, the first of which are where a visitor starts.
+    """Return the reverberation for pairs of places all over the scene, beginning with the scene's start.
 
-    A field that takes long is asked for one pair alone.
+    A slow field is asked for fewer pairs, but at least for one.
     """
     start, found = field.bundle.manifest.start, []
     began_s = time.perf_counter()
@@ -74,7 +75,7 @@ def reverberations(field: AcousticField) -> tuple[Reverberation, ...]:
 
 
 def _typical(known: tuple[Reverberation, ...]) -> Reverberation:
-    """Means, and of what turning changes the most."""
+    """Return the mean of all reverberations, with the largest `turn_db`."""
     return Reverberation(
         energy=np.mean([each.energy for each in known], axis=0),
         early=float(np.mean([each.early for each in known])),
@@ -85,8 +86,8 @@ def _typical(known: tuple[Reverberation, ...]) -> Reverberation:
 
 
 def reverberation_of(field: AcousticField, listener: Pose, emitters: Sequence[Vector3]) -> list[Reverberation]:
-    """Of emitters that radiate all round, as the field has it at the listener's place: one response for each of four
-    ways to turn the head."""
+    """Return the reverberation of omnidirectional emitters at the listener's place, from one response for each of four
+    orientations of the head."""
     headings = listener.yaw + 2 * math.pi / _HEADINGS * np.arange(_HEADINGS)
     count = len(emitters)
     responses = field.impulse_responses(
@@ -102,7 +103,7 @@ def reverberation_of(field: AcousticField, listener: Pose, emitters: Sequence[Ve
 
 @cache
 def _unit_energy(sample_rate: int, channels: int) -> npt.NDArray[np.float64]:
-    """(band,) of an impulse of energy 1, at a microphone or, coming from everywhere, at an ear."""
+    """Return the energy (band,) of an impulse of energy 1, at a microphone or, coming from everywhere, at an ear."""
     if channels == 2:
         return diffuse_energy(kemar(sample_rate))
     edges = np.clip([0.0, *(np.asarray(OCTAVE_BANDS_HZ[1:]) / np.sqrt(2)), np.inf], 0, sample_rate / 2)
@@ -112,7 +113,8 @@ def _unit_energy(sample_rate: int, channels: int) -> npt.NDArray[np.float64]:
 def _of_responses(
     turned: npt.NDArray[np.float64], arrival_s: float, sample_rate: int, unit: npt.NDArray[np.float64]
 ) -> Reverberation:
-    """`turned` (heading, channel, sample); `unit` (band,) is what an impulse of energy 1 has."""
+    """Return the reverberation in the responses `turned` (heading, channel, sample); `unit` (band,) is the energy of an
+    impulse of energy 1."""
     samples = turned.shape[-1]
     arrival, until = (min(samples, round(time_s * sample_rate)) for time_s in (arrival_s, arrival_s + _EARLY_S))
     per_ear = np.sum(turned**2, axis=-1)
@@ -137,15 +139,16 @@ def _of_responses(
 def _octaves(
     response: npt.NDArray[np.float64], sample_rate: int
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """(band,) energy per channel, of all bands together that of the response; and (band, channel, sample) what filters
-    let through whose slopes are an octave wide, so that they ring for less time than rooms do."""
+    """Return the energy (band,) per channel, which adds up to that of the response, and the response (band, channel,
+    sample) filtered into octaves. The filters have slopes an octave wide, so that they ring for less time than rooms
+    do."""
     samples = response.shape[-1]
     size = next_fast_length(2 * samples)
     spectrum = np.fft.rfft(response, size)
     frequency = np.maximum(np.fft.rfftfreq(size, 1 / sample_rate), 1.0)
     away = np.log2(frequency) - np.log2(np.asarray(OCTAVE_BANDS_HZ))[:, None]
     power = np.mean(np.abs(spectrum) ** 2, axis=0) / size
-    # Bins between DC and Nyquist stand for two.
+    # Bins between DC and Nyquist also stand for negative frequencies.
     power[1 : -1 if size % 2 == 0 else None] *= 2
     energy = np.bincount(np.argmin(np.abs(away), axis=0), power, len(OCTAVE_BANDS_HZ))
     gain = np.cos(np.pi / 2 * np.clip(away, -1, 1)) ** 2
@@ -153,7 +156,8 @@ def _octaves(
 
 
 def _decay_time_s(curve: npt.NDArray[np.float64], sample_rate: int) -> float:
-    """From -5 to -25 dB of an energy decay curve; a hundredth of a second where there is none."""
+    """Return T60 from the slope between -5 and -25 dB of an energy decay curve; a hundredth of a second without a
+    decay."""
     if not len(curve) or curve[0] <= 0:
         return _SHORTEST_T60_S
     first, last = (int(np.argmax(curve <= curve[0] * 10 ** (level_db / 10))) for level_db in (-5, -25))
@@ -161,7 +165,7 @@ def _decay_time_s(curve: npt.NDArray[np.float64], sample_rate: int) -> float:
 
 
 def _pairs(bundle: Bundle) -> list[tuple[Vector3, Vector3]]:
-    """Of random places, the same ones always."""
+    """Return pairs of random places, always the same ones."""
     rng = np.random.default_rng(0)
     bounds = bundle.manifest.bounds
     places: list[Vector3] = []

@@ -1,4 +1,4 @@
-"""What the planner decided: which effects a situation calls for, why, and what that costs and saves."""
+"""A plan of effects: which effects a situation calls for, why, and what they cost and save."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -10,8 +10,9 @@ from server.scene.effects import EffectName
 
 @dataclass(frozen=True)
 class RenderingDecision(Decision[EffectName]):
-    """About `emitter` or, with None, about all that the listener hears. `cost_us` per block and `memory_bytes` are what
-    the effect costs where it is on, and saves where it is off; None where nothing was measured."""
+    """A decision about an effect of `emitter` or, with None, about an effect on all that the listener hears. `cost_us`
+    per block and `memory_bytes` are what the effect costs where it is on, and saves where it is off; None if not
+    measured."""
 
     emitter: str | None = None
     cost_us: float | None = None
@@ -20,24 +21,25 @@ class RenderingDecision(Decision[EffectName]):
 
 @dataclass(frozen=True)
 class Plan:
-    """`shared` are decisions about all that a listener hears, `by_emitter` those about one emitter."""
+    """All decisions of a plan: those shared by all emitters (`shared`), and those about each emitter (`by_emitter`)."""
 
     shared: Mapping[EffectName, RenderingDecision]
     by_emitter: Mapping[str, Mapping[EffectName, RenderingDecision]]
 
     def is_on(self, name: EffectName, emitter: str | None = None) -> bool:
-        """Of an effect decided for each emitter, without one of them: whether it is on for any."""
+        """Return whether an effect is on. For an effect decided per emitter, without a given `emitter`: whether it is
+        on for any."""
         return any(each.called_for for each in self.about(name, emitter))
 
     def about(self, name: EffectName, emitter: str | None = None) -> tuple[RenderingDecision, ...]:
-        """The decisions about one effect; those of one emitter, or of all."""
+        """Return the decisions about one effect, of one emitter or of all."""
         if name in self.shared:
             return (self.shared[name],)
         chosen = self.by_emitter.values() if emitter is None else (self.by_emitter[emitter],)
         return tuple(decisions[name] for decisions in chosen)
 
     def on(self, emitter: str) -> set[EffectName]:
-        """The effects of one emitter that are on."""
+        """Return the effects of one emitter that are on."""
         return {name for name, decision in self.by_emitter[emitter].items() if decision.called_for}
 
     @property
@@ -48,12 +50,12 @@ class Plan:
 
     @property
     def cost_us(self) -> float:
-        """Per block, of what is on, as far as it was measured."""
+        """Cost per block of the effects that are on, as far as it was measured."""
         return sum(each.cost_us or 0.0 for each in self.decisions if each.called_for)
 
     @property
     def saved_us(self) -> float:
-        """Per block, of what is off."""
+        """Cost per block that the effects which are off would have."""
         return sum(each.cost_us or 0.0 for each in self.decisions if not each.called_for)
 
     def to_json(self) -> dict[str, Any]:

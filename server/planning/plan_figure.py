@@ -1,4 +1,4 @@
-"""A plan of effects as a picture: what leaving each out would change, beside what can be heard, and what it costs."""
+"""A plan of effects as a picture: the change without each effect, beside the threshold of hearing it, and its cost."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +15,9 @@ _LEAST_JND, _MOST_JND = 0.02, 150.0
 
 
 def draw(plan: PlanDocument, path: Path) -> None:
-    """Writes a PNG or SVG, by the suffix.
+    """Write a PNG or SVG, by the suffix.
 
-    Raises NafirError where matplotlib, which the server does without, is not installed.
+    Raises NafirError if matplotlib is not installed; the server does not depend on it.
     """
     try:
         figure = figure_of(plan)
@@ -30,7 +30,8 @@ def draw(plan: PlanDocument, path: Path) -> None:
 
 
 def figure_of(plan: PlanDocument) -> "Figure":
-    """Of several emitters the one is drawn for which an effect changes most. Raises ImportError without matplotlib."""
+    """Draw the plan. For each effect, the emitter for which it changes most is drawn. Raises ImportError without
+    matplotlib."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -45,7 +46,7 @@ def figure_of(plan: PlanDocument) -> "Figure":
 
 
 def _rows(plan: PlanDocument) -> list[Decided]:
-    """One per effect, least change first."""
+    """Return one decision per effect, with the smallest change first."""
     most: dict[str, Decided] = {}
     for each in plan.decisions:
         if each.name not in most or each.change_jnd > most[each.name].change_jnd:

@@ -1,6 +1,6 @@
-"""Plans of effects that somebody asks for, over HTTP or on the command line: one way to make them for both.
+"""Plans of effects on request, made in the same way for HTTP and for the command line.
 
-Metres; angles in degrees, since these are human edges.
+Lengths are in metres. Angles are in degrees, since people write and read them.
 """
 
 import json
@@ -24,15 +24,16 @@ from server.planning.scene_acoustics import WALKING_M_S, Emitter, Listener, Outp
 from server.scene.effects import EffectName, read_overrides
 
 EFFECT_PATTERN = f"^({'|'.join(EffectName)})=(on|off)$"
-"""What `parse_effects` takes, as a regular expression of JSON Schema."""
+"""The texts that `parse_effects` accepts, as a regular expression of JSON Schema."""
 OUTPUTS: tuple[Output, ...] = ("headphones", "mono")
 
 
 class Decided(BaseModel):
-    """One effect of one emitter or, with `emitter` null, of all that is heard.
+    """Whether one effect is on, for one emitter or, with `emitter` null, for all that is heard.
 
-    `change_jnd` is what leaving it out would change, in just-noticeable differences of `parameter`. What it costs where
-    it is on it saves where it is off: `cost_us` per block of 256 samples and `memory_bytes`, on the host that answers.
+    `change_jnd` is what leaving the effect out would change, in just-noticeable differences of `parameter`. `cost_us`
+    per block of 256 samples and `memory_bytes` are what the effect costs on the answering host where it is on, and
+    saves where it is off.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -54,7 +55,8 @@ class Decided(BaseModel):
 
 
 class PlanDocument(BaseModel):
-    """Which effects a situation calls for. `cost_us` is the sum over what is on, `saved_us` over what is off."""
+    """The effects that a situation calls for. `cost_us` is the sum over effects that are on, `saved_us` over those that
+    are off."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -71,8 +73,8 @@ class PlanDocument(BaseModel):
 
 @dataclass(frozen=True)
 class PlanQuery:
-    """A situation in a scene. Without emitters there is one where a visitor finds it; the listener, too, is there
-    unless it is somewhere. A listener that `walks` also turns its head; emitters that `move` do so at walking pace."""
+    """A situation in a scene. Without emitters there is one at the scene's start, and so is a listener without a
+    position. A listener that `walks` also turns its head; emitters that `move` do so at walking pace."""
 
     listener: Vector3 | None = None
     yaw_deg: float = 0.0
@@ -83,7 +85,7 @@ class PlanQuery:
     effects: Mapping[str, bool] = field(default_factory=dict)
 
     def check(self, scene: AcousticField) -> Output:
-        """What is heard through. Raises RequestError for places and names that there are not."""
+        """Return the output. Raises RequestError for a position outside the scene and for an unknown name."""
         output = next((known for known in OUTPUTS if known == self.output), None)
         if output is None:
             raise RequestError("unknown_output", f"{self.output!r} is none of {', '.join(OUTPUTS)}", field="output")
@@ -97,7 +99,8 @@ class PlanQuery:
         return output
 
     def situation(self, scene: AcousticField) -> Situation:
-        """Asks the scene's field what it holds of each emitter. Raises RequestError, as `check`."""
+        """Compute the reverberation of each emitter with the scene's field, and return the situation. Raises
+        RequestError, as `check`."""
         output, start, bundle = self.check(scene), scene.bundle.manifest.start, scene.bundle
         yaw_deg = start.listener_yaw_deg if self.listener is None else self.yaw_deg
         listener = Pose.from_yaw(self.listener or start.listener, math.radians(yaw_deg))
@@ -114,7 +117,7 @@ class PlanQuery:
         )
 
     def plan(self, scene: AcousticField, costs: Costs | None = None) -> Plan:
-        """Raises RequestError. `costs` are measured here unless they are given."""
+        """Make the plan; `costs` are measured on this host if None. Raises RequestError, as `check`."""
         overrides = {**scene.bundle.manifest.effects, **read_overrides(self.effects)}
         situation = self.situation(scene)
         if costs is None:
@@ -123,7 +126,8 @@ class PlanQuery:
 
 
 def parse_effects(texts: Sequence[str]) -> dict[str, bool]:
-    """`NAME=on` or `NAME=off` of each. Raises RequestError `unknown_effect`, and `doubled_effect` for a name twice."""
+    """Parse texts `NAME=on` or `NAME=off`. Raises RequestError `unknown_effect`, or `doubled_effect` for a name
+    twice."""
     effects = {}
     for text in texts:
         name, _, state = text.partition("=")
@@ -136,7 +140,7 @@ def parse_effects(texts: Sequence[str]) -> dict[str, bool]:
 
 
 def rounded(plan: PlanDocument) -> str:
-    """As JSON, to the digits that mean something."""
+    """Return the plan as JSON, with numbers rounded to four significant digits."""
     document = plan.model_dump(mode="json")
 
     def short(value: object) -> object:

@@ -7,7 +7,7 @@ from server.planning.plan_query import Decided, PlanDocument
 
 
 def print_plan(plan: PlanDocument, console: Console | None = None) -> None:
-    """One row per effect and emitter; those of emitters that are decided alike are one."""
+    """Print one row per effect and emitter; emitters with the same decision share a row."""
     console = console or Console()
     emitters = list(dict.fromkeys(each.emitter for each in plan.decisions if each.emitter is not None))
     table = Table(title=f"Effects that {plan.scene} calls for", title_justify="left")
@@ -31,7 +31,7 @@ def print_plan(plan: PlanDocument, console: Console | None = None) -> None:
 
 
 def _alike(decisions: tuple[Decided, ...]) -> list[list[Decided]]:
-    """In the order of the decisions, those of several emitters together where they say the same."""
+    """Group the decisions of several emitters that agree, in the order of the decisions."""
     groups: dict[tuple[object, ...], list[Decided]] = {}
     for each in decisions:
         groups.setdefault((each.name, each.called_for, each.overridden, each.reason), []).append(each)

@@ -1,9 +1,9 @@
-"""When a session asks which effects its situation calls for, and what it was told last.
+"""The plan of a session's effects, and when the session asks for another.
 
-A plan is made off the audio thread: `take_request` says what for, and the plan comes back through `accept`.
-One is asked for as soon as anybody comes or goes, wishes change, or something starts to move, or to move faster than it
-did; while poses change, twice a second at most, once a second for many emitters, and less often where plans take more
-than their share of time. Clocks are seconds of sound.
+Plans are made off the audio thread: `take_request` returns what to plan, and `accept` takes the finished plan. A
+session asks at once when an emitter comes or goes, an override changes, or something starts to move or moves faster
+than before. While poses change it asks at most twice a second, once a second for many emitters, and less often where
+plans take more than their share of time. Clocks are in seconds of sound.
 """
 
 import dataclasses
@@ -23,17 +23,17 @@ from server.scene.effects import EffectName, Overrides
 
 PERIOD_S = 0.5
 _EMITTERS_PER_PERIOD, _MOST_PERIODS = 8, 2
-"""Plans of more take longer, and are made less often."""
+"""Plans of more than 8 emitters take longer and are made less often, at the least every second period."""
 _LONGEST_S = 2.0
-"""All are made well within the `HORIZON_S` that they look ahead."""
+"""The longest interval between plans while poses change, well within the `HORIZON_S` that each plan looks ahead."""
 _GRID_M = 0.25
 """Poses that differ by less call for no new plan."""
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """A plan to make; `corrections` are effects that were switched off and turned out to be heard, with the reason why
-    they are on."""
+    """A plan to make. `corrections` are effects that were off but turned out to be audible, each with the reason why it
+    is on."""
 
     situation: Situation
     previous: Plan | None
@@ -43,19 +43,19 @@ class PlanRequest:
 
     @property
     def is_first(self) -> bool:
-        """Whether an emitter is in none yet."""
+        """Whether the situation has an emitter that is in no plan yet."""
         return self.previous is None or not self.situation.emitters.keys() <= self.previous.by_emitter.keys()
 
     def plan(self) -> Plan:
-        """Milliseconds, more of them the more emitters: not for the audio thread."""
+        """Make the plan, in milliseconds that grow with the number of emitters: not for the audio thread."""
         overrides = {**dict.fromkeys(self.corrections, True), **self.overrides}
         plan = make_plan(self.situation, previous=self.previous, overrides=overrides, costs=self.costs)
         return _explained(plan, {name: why for name, why in self.corrections.items() if name not in self.overrides})
 
 
 class PlannedEffects:
-    """Of one session in `place`. `scene` are the wishes of who made the scene, which `own` ones, of who listens,
-    override. `costs` tells what effects cost here, or nothing as long as nobody knows."""
+    """The plans of one session in `place`. Overrides by the listener (`own`) take precedence over those by the scene's
+    author (`scene`). `costs` returns what effects cost on this host, or nothing while that is unknown."""
 
     def __init__(
         self,
@@ -88,13 +88,14 @@ class PlannedEffects:
 
     @property
     def shared(self) -> SharedEffects:
-        """Without a plan, whether there is a head is told from the output."""
+        """The shared effects; without a plan, the output decides whether there is a head."""
         if self.plan is None or not self.plan.shared:
             return SharedEffects(head=self.overrides.get(EffectName.HRTF, self.output == "headphones"))
         return shared_effects(self.plan)
 
     def wish(self, wishes: Mapping[EffectName, bool | None], output: Output | None) -> None:
-        """On, off, or, with None, as the plan or the scene has it."""
+        """Switch effects on or off by hand, or with None leave them to the plan or the scene; change the output if
+        given."""
         for name, is_on in wishes.items():
             if is_on is None:
                 self._own.pop(name, None)
@@ -104,7 +105,7 @@ class PlannedEffects:
         self._is_stale = True
 
     def correct(self, corrections: Mapping[EffectName, str]) -> None:
-        """Have effects be on from now on, for the reasons given."""
+        """Keep effects on from now on, for the reasons given."""
         self.corrections.update(corrections)
         self._is_stale = True
 
@@ -114,7 +115,7 @@ class PlannedEffects:
         self._is_stale |= turned != self._listener.turns(clock_s)
 
     def follow_emitter(self, name: str, pose: Pose, clock_s: float) -> None:
-        """One that comes is at rest until it moves."""
+        """Note the pose of an emitter; a new emitter is at rest until it moves."""
         motion = self._emitters.get(name)
         if motion is None:
             self._emitters[name] = Motion(pose, clock_s)
@@ -123,7 +124,7 @@ class PlannedEffects:
         self._follow(motion, pose, clock_s)
 
     def _follow(self, motion: Motion, pose: Pose, clock_s: float) -> None:
-        """What is faster than before leaves what a plan has looked at."""
+        """Note a pose. The plan becomes stale if the motion starts, ends or gets faster."""
         moved, speed_m_s = motion.moves(clock_s), motion.speed_m_s(clock_s)
         motion.follow(pose, clock_s)
         self._is_stale |= moved != motion.moves(clock_s) or motion.speed_m_s(clock_s) > speed_m_s
@@ -133,11 +134,11 @@ class PlannedEffects:
         self._is_stale = True
 
     def space(self, interval_s: float) -> None:
-        """Have at least so much time pass from one plan to the next while poses change, as far as plans last."""
+        """Set the least interval between plans while poses change, limited to how long a plan stays valid."""
         self._interval_s = min(interval_s, _LONGEST_S)
 
     def take_request(self, listener: Pose, emitters: Mapping[str, EmitterState], clock_s: float) -> PlanRequest | None:
-        """None where an earlier one is unanswered, or nothing has changed."""
+        """Return the plan to make, or None if an earlier request is unanswered or nothing has changed."""
         if self._in_flight or not emitters or not (self._is_stale or clock_s >= self._next_look_s):
             return None
         periods = min(max(1.0, len(emitters) / _EMITTERS_PER_PERIOD), _MOST_PERIODS)
@@ -156,7 +157,8 @@ class PlannedEffects:
         return PlanRequest(situation, self.plan, self.overrides, dict(self.corrections), costs)
 
     def accept(self, plan: Plan) -> bool:
-        """Put the plan asked for last into effect. Whether it switches anything, or is the first to say what costs."""
+        """Put the plan asked for last into effect. Return whether it switches anything, or is the first that includes
+        costs."""
         self._in_flight = False
         before, self.plan = self.plan, plan
         if before is None or _switched_on(before) != _switched_on(plan):
@@ -164,16 +166,17 @@ class PlannedEffects:
         return before.cost_us + before.saved_us == 0 < plan.cost_us + plan.saved_us
 
     def give_up(self) -> None:
-        """No plan came of the request: what is on stays on."""
+        """Note that the request brought no plan: the effects stay as they are."""
         self._in_flight = False
 
     def of_emitter(self, name: str, clock_s: float, *, lacking: Collection[EffectName]) -> EmitterEffects | None:
-        """Without those that the scene is `lacking`. None of an emitter that came after the plan was asked for."""
+        """Return an emitter's effects without those that the scene is `lacking`; None if the emitter is not in the plan
+        yet."""
         if self.plan is None or name not in self.plan.by_emitter:
             return None
         effects = emitter_effects(self.plan.on(name) - set(lacking))
         holds_still = self.overrides.get(EffectName.PROPAGATION_DELAY) is False
-        # It may have begun to move since the plan was asked for.
+        # The emitter may have begun to move since the plan was asked for.
         follows = effects.propagation_delay or (self._is_under_way(name, clock_s) and not holds_still)
         return dataclasses.replace(effects, propagation_delay=follows, holds_still=holds_still)
 
@@ -195,7 +198,7 @@ class PlannedEffects:
 
 
 def _coarse(situation: Situation) -> object:
-    """What a plan depends on, as far as it matters."""
+    """Return the inputs of a plan, rounded so that differences which do not matter compare equal."""
 
     def cell(pose: Pose) -> tuple[int, ...]:
         return tuple(round(coordinate / _GRID_M) for coordinate in pose.position)
@@ -213,7 +216,8 @@ def _switched_on(plan: Plan) -> frozenset[tuple[str | None, EffectName, bool, bo
 
 
 def _explained(plan: Plan, reasons: Mapping[EffectName, str]) -> Plan:
-    """With other reasons for some effects than that somebody wished for them."""
+    """The plan, with `reasons` for the effects named there: a correction forced them on, no user did, so they do not
+    count as overridden."""
 
     def explain(decisions: Mapping[EffectName, RenderingDecision]) -> dict[EffectName, RenderingDecision]:
         return {

@@ -1,8 +1,8 @@
 """Which effects a situation calls for.
 
-An effect is on from a change of one just-noticeable difference, and stays on down to 0.7 of one, so that nothing
-flutters about a threshold. Each alone may be inaudible and all that is left out together not: then the largest of
-them is on.
+An effect switches on at a change of one just-noticeable difference and stays on down to 0.7 of one, so that it does not
+flutter about the threshold. Effects that are inaudible one by one may be audible if all are left out; then the one with
+the largest change is on.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -22,7 +22,7 @@ THRESHOLD = Threshold(enter_jnd=1.0, leave_jnd=0.7)
 
 _OF_EMITTERS = [effect for effect in CATALOGUE.values() if not effect.is_shared]
 _BY_NEED = sorted(_OF_EMITTERS, key=lambda effect: effect.needs is not None)
-"""What others need is decided before them."""
+"""The effects in the order of their decisions: those that others need come first."""
 
 
 def make_plan(
@@ -32,8 +32,8 @@ def make_plan(
     overrides: Overrides | None = None,
     costs: Costs | None = None,
 ) -> Plan:
-    """The same for the same arguments. `previous` is the plan now in effect, whose decisions last a little longer than
-    they would be made anew."""
+    """Make a plan, which is the same for the same arguments. `previous` is the plan now in effect: its effects stay on
+    down to the lower threshold."""
     return _Planner(situation, previous, overrides or {}, costs or {}).plan()
 
 
@@ -44,7 +44,7 @@ class _Planner:
         self._overrides = overrides
         self._costs = costs
         self._without: dict[Off, list[Change]] = {}
-        """Changes of all emitters without several effects at once: most emitters are without the same."""
+        """Changes of all emitters by set of effects left out together; most emitters have the same set."""
 
     def plan(self) -> Plan:
         if not self._situation.emitters:
@@ -71,7 +71,7 @@ class _Planner:
     def _allow_for_sum(
         self, prediction: Prediction, emitter: str, number: int, decisions: dict[EffectName, RenderingDecision]
     ) -> None:
-        """Switch on what is inaudible alone while all that is off is audible together."""
+        """Switch on effects that are inaudible alone, as long as leaving out all that are off is audible."""
         while True:
             made = [(effect, decisions[effect.name]) for effect in ENERGY_EFFECTS]
             off = [(effect, one) for effect, one in made if not one.called_for and one.change_jnd > 0]
@@ -97,7 +97,8 @@ class _Planner:
         beside: Collection[Mapping[EffectName, RenderingDecision]] = (),
         together_with: Sequence[EnergyEffect] = (),
     ) -> RenderingDecision:
-        """`beside` are the decisions that there may be something to act on by, of one emitter or of all."""
+        """Decide about one effect. `beside` are decisions, of this emitter or of all, among which an effect that it
+        needs may be on."""
         wanted = self._overrides.get(effect.name)
         means_nothing = self._lacks(effect, beside)
         if means_nothing:
@@ -126,7 +127,7 @@ class _Planner:
 
     @staticmethod
     def _lacks(effect: Effect, beside: Collection[Mapping[EffectName, RenderingDecision]]) -> str:
-        """What an effect means nothing without, where it is not there."""
+        """Return why the effect is meaningless, since none of those it needs is on; else an empty string."""
         need = effect.needs
         if need is None or not beside or any(each[name].called_for for each in beside for name in need.any_of):
             return ""

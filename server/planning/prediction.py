@@ -1,9 +1,10 @@
-"""What is heard of each emitter, in energies: of the direct sound along the paths within reach, of the first
-reflections, and of what a field holds; and so what changes where an effect is left out.
+"""Energies of each emitter's sound at the listener, and how they change where an effect is left out: the direct sound
+along the paths within reach, the first reflections, and the field's responses.
 
-Energies add up, except where first reflections meet the direct sound, whose interference is computed. What an effect
-does to them is its own matter (`Factors`). A head is a sphere with outer ears. Axes as in `server.planning.reach`, and
-v variants, in each of which some effects are left out; energies are relative to the direct sound at one metre.
+Energies add up, except where first reflections meet the direct sound: there the interference is computed. Each effect
+defines its own factors on energies (`Factors`). The head is a sphere with outer ears. Axes are those of
+`server.planning.reach`, and v variants, each of which leaves out some effects. Energies are relative to the direct
+sound at one metre.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +32,8 @@ ALL_ON: Off = frozenset()
 
 _SILENCE = 1e-12
 _FACING_GAIN = 4.0
-"""6 dB; heads differ, and outer ears do more at 4 kHz (Shaw, J. Acoust. Soc. Am. 56, 1974)."""
+"""Gain of an ear that faces the sound, in power: 6 dB; heads differ, and outer ears do more at 4 kHz (Shaw, J. Acoust.
+Soc. Am. 56, 1974)."""
 _DIRECT_S = 0.0015
 _DECAY_POINTS = 48
 _THIRDS_HZ = 1000 * 2 ** (np.arange(-9, 11) / 3)
@@ -40,8 +42,8 @@ _PER_THIRD = 2 ** (np.linspace(-0.5, 0.5, 7) / 3)
 
 @dataclass(frozen=True)
 class Energies:
-    """Of the direct sound (v, n, band), the first reflections (v, e, band), the rest (v, e, band), and of that what
-    comes within 50 ms (v, e, band)."""
+    """Energies of the direct sound (v, n, band), the first reflections (v, e, band), the field's responses (v, e,
+    band), and the first 50 ms of those responses (v, e, band)."""
 
     direct: Floats
     mirrored: Floats
@@ -51,8 +53,8 @@ class Energies:
 
 @dataclass(frozen=True)
 class Mirrored:
-    """m paths by way of one surface, as everybody is now: whose, how long, at what gain (m, band) of surface and of
-    departure, and from where (m, 3)."""
+    """m paths by way of one surface, at the present poses: the index of the emitter, the length, the gains (m, band) of
+    the surface and of the emitter in the direction of departure, and the direction of arrival (m, 3)."""
 
     owner: npt.NDArray[np.int64]
     length_m: Floats
@@ -62,14 +64,14 @@ class Mirrored:
 
     @cached_property
     def departure(self) -> Floats:
-        """(m, band) what the direction a path leaves in does to its energy."""
+        """(m, band) factor of the emitter's directivity in the direction of departure."""
         return db_to_power(self.departure_db)
 
 
 @dataclass(frozen=True)
 class Way:
-    """The paths of the direct sound within reach, n of them, and what they do to energy. With `goes_through`, straight
-    through whatever stands in the way."""
+    """The n paths of the direct sound within reach, and their factors on energy. With `goes_through`, the paths go
+    straight through all obstacles."""
 
     place: SceneAcoustics
     paths: SoundPaths
@@ -78,22 +80,22 @@ class Way:
 
     @cached_property
     def spread(self) -> Floats:
-        """(n, 1) by their length."""
+        """(n, 1) factor of the distance."""
         return _spread(self.paths.length_m, self.place)
 
     @cached_property
     def air(self) -> Floats:
-        """(n, band)"""
+        """(n, band) factor of air absorption."""
         return _air(self.paths.length_m, self.place)
 
     @cached_property
     def departure(self) -> Floats:
-        """(n, band) by the direction they leave in."""
+        """(n, band) factor of the emitter's directivity in the direction of departure."""
         return db_to_power(self.departure_db)
 
     @cached_property
     def screen(self) -> Floats:
-        """(n, band) by the edges that they pass."""
+        """(n, band) factor of diffraction at the edges that they pass."""
         return db_to_power(self.paths.screen_db)
 
 
@@ -102,8 +104,8 @@ _Of = TypeVar("_Of")
 
 @dataclass(frozen=True)
 class Factors(Generic[_Of]):
-    """What an effect multiplies energies by where it is on, and where it is off; without a factor they stay as they
-    are."""
+    """The factors by which an effect multiplies energies where it is on and where it is off; None leaves energies
+    unchanged."""
 
     on: Callable[[_Of], Floats | float] | None = None
     off: Callable[[_Of], Floats | float] | None = None
@@ -113,7 +115,7 @@ UNTOUCHED: Factors[Any] = Factors()
 
 
 class EffectOnEnergies(Protocol):
-    """An effect, as far as predictions are concerned (`server.planning.effect.EnergyEffect`)."""
+    """The part of an effect that predictions use (`server.planning.effect.EnergyEffect`)."""
 
     @property
     def name(self) -> EffectName: ...
@@ -130,11 +132,12 @@ class EffectOnEnergies(Protocol):
 
 
 _Known = list[tuple[EffectName, Floats | float | None, Floats | float | None]]
-"""Factors of effects, on and off."""
+"""Names of effects, each with its factor where it is on and where it is off."""
 
 
 class Prediction:
-    """Of all emitters of a situation, one at least, and of these `effects` on energies."""
+    """Predicted energies, and changes without effects, for all emitters of a situation (at least one). `effects` are
+    those that change energies."""
 
     def __init__(self, situation: Situation, effects: Sequence[EffectOnEnergies]) -> None:
         self.situation = situation
@@ -162,7 +165,7 @@ class Prediction:
         self._heard = self._parameters(self.whole)
 
     def energies(self, variants: Sequence[Off]) -> Energies:
-        """What is heard without some effects, in each of v variants."""
+        """Return the energies in each of v variants, which are the sets of effects left out."""
         mirror = self.mirrored_energies(variants)
         direct = np.zeros((len(variants), len(self.reach.owner), len(OCTAVE_BANDS_HZ)))
         mirrored = np.zeros((len(variants), *self._held.shape))
@@ -177,7 +180,8 @@ class Prediction:
         return Energies(direct, mirrored, held, held * self._early)
 
     def mirrored_energies(self, variants: Sequence[Off]) -> Floats:
-        """(v, m, band) where there are any; air is in them whether or not the direct sound is without."""
+        """Return the energies (v, m, band) of the first reflections. They include air absorption even where it is off
+        for the direct sound."""
         energies = np.tile(self._mirrored_everywhere, (len(variants), 1, 1))
         for energy, off in zip(energies, variants, strict=True):
             _multiply(energy, self._on_mirrored, off)
@@ -185,7 +189,7 @@ class Prediction:
 
     @cached_property
     def _mirrored_everywhere(self) -> Floats:
-        """(m, band) where all radiate alike everywhere."""
+        """(m, band) energies of the first reflections if all emitters were omnidirectional."""
         paths, place = self.mirrored, self.place
         return db_to_power(paths.surface_db) * _spread(paths.length_m, place) * _air(paths.length_m, place)
 
@@ -199,24 +203,24 @@ class Prediction:
 
     @cached_property
     def _bent(self) -> _Known:
-        """Of the direct sound that goes round what stands in the way."""
+        """Factors on the direct sound that goes round obstacles."""
         way = Way(self.place, self.reach.paths, self.reach.departure_db, goes_through=False)
         return [_known(effect.name, effect.direct, way) for effect in self._effects]
 
     @cached_property
     def _straight(self) -> _Known:
-        """Of the direct sound that goes through it."""
+        """Factors on the direct sound that goes through obstacles."""
         way = Way(self.place, self.reach.straight, self.reach.straight_departure_db, goes_through=True)
         return [_known(effect.name, effect.direct, way) for effect in self._effects]
 
     def changes(self, variants: Sequence[Off]) -> dict[str, Floats]:
-        """(v, e) change of each parameter in each variant, in JND, the worst within reach."""
+        """Return the change (v, e) of each parameter in each variant, in JND, as the maximum within reach."""
         left = self.energies(variants)
         without = self._parameters(left)
         changes = {"spectrum": self.reach.most(self._spectral_change_db(left)) / JND_THRESHOLDS["spectrum"].amount}
         for name, heard in self._heard.items():
             if name == "edt":
-                # A decay that cannot be told, with or without, changes nothing: energies tell the rest.
+                # Where a decay cannot be measured, its change counts as 0; the other parameters show the difference.
                 told = (heard > 0) & (without[name] > 0)
                 ratio = np.divide(without[name], heard, out=np.ones_like(without[name]), where=told)
                 changes[name] = np.abs(ratio - 1) * 100 / JND_THRESHOLDS[name].amount
@@ -235,7 +239,7 @@ class Prediction:
         return {name: np.minimum(change, MOST_JND) for name, change in changes.items()}
 
     def _parameters(self, energies: Energies) -> dict[str, Floats]:
-        """Level (v, n) in dB, DRR and C50 (v, n) in JND, EDT (v, e) in seconds."""
+        """Return the level (v, n) in dB, DRR and C50 (v, n) in JND, and EDT (v, e) in seconds."""
         owner = self.reach.owner
         after = energies.mirrored + energies.held
         late = (energies.held - energies.early) @ self.shares
@@ -252,11 +256,11 @@ class Prediction:
         }
 
     def _spectral_change_db(self, left: Energies) -> Floats:
-        """(v, n) in the band where it is greatest, at an ear that hears the direct sound as it comes, or at one that
-        faces it and hears it louder than what comes from everywhere.
+        """Return the level change (v, n) in dB in the band where it is greatest, at an ear without gain for the direct
+        sound or at one that faces it and receives it louder than sound from everywhere.
 
-        What a field holds is noise: in a third of an octave it is more or less in phase with the rest by chance, and
-        the more so the fewer modes there are, of which a decay has as many as its bandwidth times its duration.
+        The field's response is noise. In a third-octave band, noise is partly in phase with the other sound by chance,
+        and more so the fewer modes it has. A decay has as many modes as its bandwidth times its duration.
         """
         owner, whole = self.reach.owner, self.whole
         within = bands_within(self.place.sample_rate)
@@ -280,7 +284,7 @@ class Prediction:
 
     @cached_property
     def _chance(self) -> Floats:
-        """(e, band) how much of noise is in phase with something, at most: two standard deviations."""
+        """(e, band) greatest correlation of noise with other sound by chance, as two standard deviations."""
         third_hz = np.asarray(OCTAVE_BANDS_HZ) * (2 ** (1 / 6) - 2 ** (-1 / 6))
         decays_s = np.array([np.zeros(len(third_hz)) if rest is None else rest.t60_s for rest in self.reverberation])
         return np.asarray(2 / np.sqrt(np.maximum(third_hz * decays_s / 6.9, 4)))
@@ -291,8 +295,8 @@ class Prediction:
 
     @cached_property
     def _phases(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.complex128]]:
-        """(frequency,) the bands of frequencies in thirds of octaves; (m, frequency) by how much mirrored paths are
-        later than the direct sound."""
+        """(frequency,) octave bands of frequencies in thirds of octaves, and (m, frequency) phase factors of the delay
+        of mirrored paths after the direct sound."""
         frequency = (_THIRDS_HZ[0.45 * self.place.sample_rate > _THIRDS_HZ, None] * _PER_THIRD).ravel()
         bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
         paths, direct_m = self.mirrored, self.reach.paths.length_m
@@ -300,8 +304,8 @@ class Prediction:
         return bands, np.exp(-2j * np.pi * later_s[:, None] * frequency)
 
     def _thirds_db(self, off: Off) -> Floats:
-        """(e, third) spectrum, as everybody is now: the direct sound and the first reflections with their phases, and
-        what the field holds."""
+        """Return the spectrum (e, third) in dB at the present poses: the sum of direct sound and first reflections with
+        their phases, and the energy of the field's response."""
         energies, (bands, turns) = self.energies([off]), self._phases
         count = len(self.emitters)
         wave = np.sqrt(energies.direct[0, :count])[:, bands].astype(np.complex128)
@@ -350,15 +354,15 @@ def _multiply(energy: Floats, factors: _Known, off: Off) -> None:
 
 @dataclass(frozen=True)
 class _Decays:
-    """Energy decay curves of all emitters as everybody is now, over the times in which a decay is read; (e, time) each,
-    `held` (e, band, time) and `mirrored` (m, time) for energies that are 1."""
+    """Energy decay curves of all emitters at the present poses, over the times in which a decay is measured: (e, time)
+    each, `held` (e, band, time) and `mirrored` (m, time) for energies of 1."""
 
     time_s: Floats
     held: Floats
     direct: Floats
     mirrored: Floats
     whose: Floats
-    """(e, m) 1 where a mirrored path is of an emitter."""
+    """(e, m) 1 where a mirrored path belongs to an emitter, else 0."""
 
     @classmethod
     def of(cls, prediction: "Prediction") -> "_Decays":
@@ -377,13 +381,14 @@ class _Decays:
         )
 
     def early_decay_s(self, prediction: "Prediction", energies: Energies) -> Floats:
-        """(v, e); 0 where the direct sound alone is the first 10 dB, or nothing decays."""
+        """Return the early decay time (v, e); 0 where the direct sound alone makes up the first 10 dB, or nothing
+        decays."""
         shares, paths = prediction.shares, prediction.mirrored
         count = len(self.time_s)
         curve = np.einsum("veb,ebt->vet", energies.held, self.held)
         curve += (energies.direct[:, :count] @ shares)[..., None] * self.direct
         if len(paths.owner):
-            # All paths of an emitter in the proportion they have together.
+            # In every variant, the paths of an emitter keep the proportions that they have with all effects on.
             energy = prediction.mirrored_energies([ALL_ON])[0] @ shares
             whole = self.whose @ energy
             steps = self.whose @ (energy[:, None] * self.mirrored) / np.maximum(whole, _SILENCE)[:, None]
@@ -399,7 +404,7 @@ class _Decays:
 
 
 def worst(changes: Mapping[str, Floats]) -> list[list[Change]]:
-    """Of all parameters, [variant][emitter]; `changes` are (v, e) of each."""
+    """Return the largest change over all parameters, as [variant][emitter]; `changes` are (v, e) for each parameter."""
     parameters, all_changes = list(changes), np.stack(list(changes.values()))
     most, which = all_changes.max(axis=0).tolist(), all_changes.argmax(axis=0).tolist()
     return [

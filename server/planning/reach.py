@@ -1,8 +1,8 @@
-"""The paths of the direct sound within reach: where each emitter is now, and where it and the listener can be before a
-plan is made anew.
+"""The paths of the direct sound within reach: at the present poses, and wherever emitters and listener can be before
+the next plan.
 
-Axes: n rows, each an emitter and a listener at some places of theirs; e emitters, the first e rows being as everybody
-is now; bands are OCTAVE_BANDS_HZ. Metres.
+Axes: n rows, each a position of one emitter and of the listener; e emitters, whose present positions are the first e
+rows; bands are OCTAVE_BANDS_HZ. Lengths are in metres.
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from server.planning.scene_acoustics import SceneAcoustics, Situation
 Floats = npt.NDArray[np.float64]
 
 HORIZON_S = 3.0
-"""So far a plan looks ahead."""
+"""How far ahead a plan looks."""
 
 _COURSES = 8
 _TURNS = np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
-"""Ahead of an emitter that turns, beside and behind it."""
+"""Directions ahead of an emitter that turns, beside it and behind it."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """`owner` (n,) is the index of a row's emitter. `paths` go round what stands in the way, `straight` ones through
-    it; `departure_db` (n, band) is the emitter's gain where the one leaves it, and `straight_departure_db` where the
-    other does."""
+    """The paths of all rows. `owner` (n,) is the index of a row's emitter. `paths` go round obstacles, `straight` ones
+    through them. `departure_db` (n, band) is the emitter's gain in the direction in which `paths` leave it, and
+    `straight_departure_db` the one for `straight`."""
 
     owner: npt.NDArray[np.int64]
     listener: Floats
@@ -41,7 +41,7 @@ class Reach:
 
     @classmethod
     def of(cls, situation: Situation) -> "Reach":
-        """Of one emitter or more."""
+        """Find the paths of a situation that has at least one emitter."""
         place, emitters = situation.place, list(situation.emitters.values())
         here = np.array([emitter.pose.position for emitter in emitters])
         listeners = _within_reach(np.array([situation.listener.pose.position]), [situation.listener.speed_m_s], place)
@@ -55,7 +55,7 @@ class Reach:
             [here],
         )
         for course, listener in enumerate(listeners[1:]):
-            # Each towards the others, and away from those that go the opposite way.
+            # Listener and moving emitters go opposite ways: over all courses they approach each other and part.
             at = np.concatenate([here, *([elsewhere[1 + (course + _COURSES // 2) % _COURSES]] if movers else [])])
             owner.append(np.concatenate([np.arange(len(emitters)), np.array(movers, np.int64)]))
             at_listener.append(np.repeat(listener, len(at), axis=0))
@@ -86,16 +86,18 @@ class Reach:
         return cls(rows, listener, emitter, paths, straight, departure_db, straight_departure_db)
 
     def most(self, values: Floats) -> Floats:
-        """(v, n) to (v, e): the greatest of each emitter's rows."""
+        """Reduce (v, n) to (v, e): the greatest value of each emitter's rows."""
         greatest = np.full((int(self.owner.max()) + 1, len(values)), -np.inf)
         np.maximum.at(greatest, self.owner, values.T)
         return greatest.T
 
 
 def _within_reach(points: Floats, speeds_m_s: list[float], place: SceneAcoustics) -> Floats:
-    """(1 + course, point, 3): where they are, and in every direction as far as they get, or as the place reaches.
+    """Return (1 + course, point, 3): the present points, and for each course how far they get within the bounds of the
+    place.
 
-    One that would end in a wall goes half as far, or stays. Of points at rest only the first.
+    A point that would end in a wall goes half as far, or stays. If all points are at rest, there are only the present
+    ones.
     """
     if not any(speeds_m_s):
         return points[np.newaxis]
@@ -111,7 +113,7 @@ def _within_reach(points: Floats, speeds_m_s: list[float], place: SceneAcoustics
 
 def _paths(finder: SoundPathFinder, listener: Floats, emitter: Floats) -> SoundPaths:
     found = SoundPaths.empty(len(listener))
-    # Rows of one listener stand together.
+    # Rows with the same position of the listener are adjacent.
     edges = np.flatnonzero(np.any(np.diff(listener, axis=0), axis=-1)) + 1
     for start, stop in zip([0, *edges], [*edges, len(listener)], strict=True):
         for whole, part in zip(
@@ -122,7 +124,7 @@ def _paths(finder: SoundPathFinder, listener: Floats, emitter: Floats) -> SoundP
 
 
 def _straight(listener: Floats, emitter: Floats) -> SoundPaths:
-    """Whatever stands in the way."""
+    """Return straight paths that ignore all obstacles."""
     straight_m, count = np.linalg.norm(listener - emitter, axis=-1), len(listener)
     towards = (emitter - listener) / np.maximum(straight_m, COINCIDENT_M)[:, None]
     silent = np.zeros((count, len(OCTAVE_BANDS_HZ)))

@@ -1,4 +1,4 @@
-"""Why an effect is on or off, in words."""
+"""Texts that say why an effect is on or off."""
 
 from collections.abc import Sequence
 
@@ -24,22 +24,23 @@ _PARAMETERS = {
 
 
 def nothing_in_the_way(place: SceneAcoustics) -> str:
-    """Empty where there may be something."""
+    """Return why nothing can block the direct sound; empty where something can."""
     if place.plan is None:
         return "no walls are known that could stand in the way"
     return "the room is convex: nothing can stand in the way" if place.paths is None else ""
 
 
 def one_loudspeaker(listener: Listener) -> str:
-    """Empty where two ears hear."""
+    """Return why a mono output has no head; empty for headphones."""
     return "one loudspeaker plays what one microphone would hear" if listener.output == "mono" else ""
 
 
 def reason(
     change: Change, *, is_predicted: bool, wanted: bool | None, absence: str = "", together_with: Sequence[str] = ()
 ) -> str:
-    """A sentence without its first capital and full stop; of an override, with what was predicted. `absence` says why
-    there is nothing to hear; `together_with` are the titles of what is left out too."""
+    """Return the reason of a decision as a sentence without its first capital and full stop; for an override it
+    includes the prediction. `absence` says why the effect has nothing to act on; `together_with` are titles of other
+    effects that are left out at the same time."""
     if together_with:
         said = f"without it and {' and '.join(together_with)}, {_amount(change)}"
     elif is_predicted:

@@ -1,7 +1,7 @@
-"""What a plan of effects is made for: a place, the emitters in it, and one listener.
+"""The input of a plan of effects: a place, its emitters, and one listener.
 
-Metres, metres per second; bands are OCTAVE_BANDS_HZ. Energies of responses are relative to that of the direct sound at
-one metre, which is 1 in every band.
+Lengths are in metres, speeds in metres per second; bands are OCTAVE_BANDS_HZ. Energies of responses are relative to
+that of the direct sound at one metre, which is 1 in every band.
 """
 
 from collections.abc import Mapping
@@ -29,12 +29,12 @@ WALKING_M_S = 1.4
 
 @dataclass(frozen=True, eq=False)
 class Reverberation:
-    """What a field's responses hold of one emitter: the sound after the direct sound and the reflections that are
-    computed from geometry, over both ears.
+    """The reverberation of one emitter in a field's responses, over both ears: all sound but the direct sound and the
+    reflections that are computed from geometry.
 
-    `energy` (band,), of which the share `early` comes within 50 ms; `t60_s` (band,); `late_iacc` is the interaural
-    cross-correlation of the late part. Between two ways the head may be turned the level at an ear differs by up to
-    `turn_db`.
+    `energy` (band,), of which the share `early` arrives within 50 ms; `t60_s` (band,); `late_iacc` is the interaural
+    cross-correlation of the late part. `turn_db` is the greatest difference in level at one ear between two
+    orientations of the head.
     """
 
     energy: Bands
@@ -46,10 +46,8 @@ class Reverberation:
 
 @dataclass(frozen=True)
 class Emitter(EmitterState):
-    """As plans see it: with all effects on, and how it may move; at `speed_m_s` at most, 0 at rest.
-
-    `reverberation` is of this emitter where it is; None where that is not known, and the place's own stands for it.
-    """
+    """An emitter as plans see it: all effects on, and how it may move (at most at `speed_m_s`, 0 at rest).
+    `reverberation` is what it excites at its position; if None (unknown), that of the place is used."""
 
     speed_m_s: float = 0.0
     turns: bool = False
@@ -70,14 +68,16 @@ class Listener:
 
 @dataclass(frozen=True, eq=False)
 class SceneAcoustics:
-    """What stays the same in a scene; two places are equal only if they are one. Safe to share between threads.
+    """The acoustics of a scene, which never change. Two places are equal only if they are the same object. Safe to
+    share between threads.
 
-    `minimum` and `maximum` bound where anybody can be. Nearer than `nearest_m`, sound gets no louder. `plan` is None in
-    the open, and where nobody measured the walls; `materials` are there where first reflections come from geometry;
-    `reverberation`, typical of the place, where it has a field; with `holds_direct_sound` that is all there is to hear.
-    Where it `transmits`, sound goes through walls whose mass is known, and is heard with the first reflections.
-    The late tails that emitters could share begin `tail_start_s` after emission; None where responses are too short to
-    share any. `reverberations` are of places all over it: as unlike as emitters of which nothing else is known.
+    `minimum` and `maximum` bound all positions. Nearer than `nearest_m`, sound gets no louder. `plan` is None in the
+    open, and where the walls are unknown; `materials` are set where first reflections come from geometry.
+    `reverberation` is typical of the place and set where it has a field; with `holds_direct_sound` the field's
+    responses contain all sound. If the scene `transmits`, sound also goes through walls whose mass is known, and is
+    rendered with the first reflections. The late tails that emitters could share begin `tail_start_s` after emission;
+    None where responses are too short to share any. `reverberations` are from positions all over the place: they differ
+    as much as those of emitters about which nothing else is known.
     """
 
     minimum: Vector3
@@ -96,14 +96,15 @@ class SceneAcoustics:
 
     @cached_property
     def paths(self) -> SoundPathFinder | None:
-        """None where nothing can stand in the way."""
+        """The path finder of the direct sound; None where nothing can block it."""
         if self.plan is None or not len(self.plan.bend_corners):
             return None
         return SoundPathFinder(self.plan, self.speed_of_sound)
 
     @cached_property
     def reflections(self) -> PathFinder | None:
-        """With them what goes straight through walls, where it does."""
+        """The path finder of first reflections and, where the scene transmits, of sound straight through walls; None
+        without materials."""
         if self.plan is None or self.materials is None:
             return None
         surfaces = self.materials.walls, self.materials.floor, self.materials.ceiling
@@ -115,14 +116,15 @@ class SceneAcoustics:
 
     @cached_property
     def band_shares(self) -> Bands:
-        """(band,) of the energy of an impulse: the first band reaches down to 0 Hz, the last up to all there is."""
+        """(band,) share of an impulse's energy in each band: the first band reaches down to 0 Hz, the last up to half
+        the sample rate."""
         edges = np.asarray(OCTAVE_BANDS_HZ[1:]) / np.sqrt(2)
         return np.asarray(np.diff(np.clip([0.0, *edges, np.inf], 0, self.sample_rate / 2)) / (self.sample_rate / 2))
 
 
 @dataclass(frozen=True)
 class Situation:
-    """`emitters` by id."""
+    """A place, its listener, and its `emitters` by id."""
 
     place: SceneAcoustics
     listener: Listener

@@ -1,8 +1,8 @@
-"""Where the sound that comes before all reflections travels in a scene: what a renderer's direct paths follow
-(`server.streaming.direct_path_tracker`), or a response holds of emitters that stand still. Beside it, where the scene
-wants them from geometry, the first reflections.
+"""The paths of the direct sound in a scene. Renderers follow them (`server.streaming.direct_path_tracker`), and
+responses include the direct sound of emitters at rest. Where a scene computes first reflections from geometry, they are
+here too.
 
-Metres; positions and directions in the world's axes.
+Lengths are in metres; positions and directions are in the world's axes.
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,11 +32,12 @@ Key = TypeVar("Key")
 
 _SILENT_DB = -100.0
 _IN_THE_OPEN = FloorPlan(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)), 1.0)
-"""A plan without a corner to go round: every path is straight."""
+"""A floor plan without a corner to bend round: every path is straight."""
 
 
 class FoundPaths(NamedTuple):
-    """Of n emitters: lengths (n,), directions of arrival (n, 3), gains (n, band) beside distance and air."""
+    """Paths from n emitters: lengths (n,), directions of arrival (n, 3), and gains (n, band) in dB without distance and
+    air."""
 
     length_m: _Floats
     arrival: _Floats
@@ -44,7 +45,7 @@ class FoundPaths(NamedTuple):
 
 
 class PathBatch(Generic[Key]):
-    """The ways from emitters whose paths are found alike, as long as those stay as and where they are."""
+    """Paths from emitters that share a path finder, valid as long as the emitters and their states stay the same."""
 
     def __init__(self, finder: SoundPathFinder, emitters: Sequence[tuple[Key, EmitterState]]) -> None:
         self.keys = [key for key, _ in emitters]
@@ -62,7 +63,7 @@ class PathBatch(Generic[Key]):
         ]
 
     def find(self, listener: Pose) -> FoundPaths:
-        """The paths to a listener, in the order of `keys`; good until the next are found."""
+        """Find the paths to a listener, in the order of `keys`. The arrays are reused by the next call."""
         paths = self._finder.find(np.array(listener.position), self._places, self._paths)
         more_db = [(rows, gain_of(paths)[rows]) for gain_of, rows in self._gains]
         gain_db = paths.screen_db
@@ -76,12 +77,12 @@ class PathBatch(Generic[Key]):
 
 
 class DirectSound:
-    """One scene's floor plan and air, heard through one head; `air_db_per_m` (7,) per octave band.
+    """The direct sound in one scene, through one head; `air_db_per_m` (7,) is per octave band.
 
-    `early_reflections` are what the impulse responses of the scene's fields leave out, None where they hold it. Fields
-    that hold the direct sound too leave nothing to a renderer: then there are no `filters` for it, and where those
-    fields have no ears either, `binauralization` gives them the listener's. `field_gain`, linear, takes the fields'
-    responses to unit pressure one metre from an emitter.
+    `early_reflections` are computed here if the responses of the scene's fields leave them out; otherwise None. If the
+    fields include the direct sound, a renderer has none to add and there are no `filters`; if those fields are also
+    mono, `binauralization` renders them for the listener's ears. `field_gain` is the linear factor from the fields'
+    responses to unit pressure at one metre from an emitter.
     """
 
     def __init__(
@@ -149,14 +150,14 @@ class DirectSound:
         )
 
     def early(self, channels: int) -> EarlyReflections | None:
-        """Those that two ears hear, or one without a head."""
+        """The first reflections for two ears, or for one channel without a head."""
         return self.early_reflections if channels == 2 else self.early_without_head
 
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
-        """Add the direct sound that `listener` hears of each emitter to its response (B, ear, sample), for emitters
-        whose direct sound stands still; sample 0 is emission.
+        """Add the direct sound of each emitter at `listener` to its response (B, ear, sample), for emitters whose
+        direct sound is baked into the response; sample 0 is emission.
 
-        A renderer plays these responses at the emitter's `reverberation_gain`, which this makes up for.
+        A renderer multiplies these responses by the emitter's `reverberation_gain`, which is divided out here.
         """
         if self._filters is None:
             return
@@ -174,12 +175,12 @@ class DirectSound:
 
     @property
     def is_heard_apart(self) -> bool:
-        """Whether there is a direct sound beside what the scene's fields hold."""
+        """Whether the direct sound is rendered apart from the fields' responses."""
         return self._filters is not None
 
     def ways_from(self, emitters: Iterable[tuple[Key, EmitterState]]) -> list["PathBatch[Key]"]:
-        """From emitters, each with what tells it from others. Those that walls may hide are looked for round corners;
-        for others nothing is looked for."""
+        """Return path batches for emitters, each given with a key. Paths of emitters with occlusion may bend round
+        corners; those of the others are straight."""
         hidden: list[tuple[Key, EmitterState]] = []
         open_: list[tuple[Key, EmitterState]] = []
         for each in emitters:
@@ -191,7 +192,7 @@ class DirectSound:
 
     @cached_property
     def _still_paths(self) -> tuple[tuple[StillPaths, StillPaths], tuple[StillPaths, StillPaths]]:
-        """For one ear and for two, without air and with it."""
+        """Renderers of resting paths for one ear and for two, each without air absorption and with it."""
         assert self._filters is not None
         airless = np.zeros_like(self._air_db_per_m)
         one, two = (

@@ -1,4 +1,4 @@
-"""What one ear without a head hears where a field knows two ears of one.
+"""Mono responses without a head, made from binaural ones.
 
 Axes: responses (B, channel, sample).
 """
@@ -13,17 +13,17 @@ from server.rendering.hrtf import kemar
 from server.responses.binaural import mean_over_directions
 
 _LEAST = 0.25
-"""Of what the head does to sound from all sides, no more than 12 dB are undone."""
+"""Lower limit of the head's mean gain in the equaliser: at most 12 dB are compensated."""
 
 
 def binaural_to_mono(responses: npt.NDArray[np.float32], sample_rate: int) -> npt.NDArray[np.float32]:
-    """(B, 1, sample) of responses (B, 2, sample) heard through the head that fields are simulated with.
+    """Return (B, 1, sample) for responses (B, 2, sample) through the head that fields are simulated with.
 
-    One ear is taken a quarter of a turn of phase after the other, so that energies add whether what they hear is alike,
-    of opposite sign, or has nothing to do with each other (the 90 degree shift of matrix surround). What the head does
-    to sound from all sides is undone. Nothing comes before it did at either ear.
+    One ear is shifted in phase by 90 degrees against the other (as in matrix surround), so that energies add whether
+    the ears' signals are equal, opposite or uncorrelated. The head's mean response over all directions is equalised.
+    Nothing arrives earlier than at either ear.
     """
-    from scipy.fft import rfft  # a third of a second; NumPy's gives other bits in single precision
+    from scipy.fft import rfft  # the import takes 0.3 s; NumPy's rfft gives other bits in single precision
 
     samples = responses.shape[-1]
     size = next_fast_length(2 * samples)
@@ -37,7 +37,7 @@ def binaural_to_mono(responses: npt.NDArray[np.float32], sample_rate: int) -> np
 
 @cache
 def _equaliser(sample_rate: int, size: int) -> npt.NDArray[np.complex64]:
-    """(bin,) the inverse of the minimum-phase mean over all directions."""
+    """Return the inverse (bin,) of the head's minimum-phase mean over all directions."""
     from scipy.fft import rfft
 
     mean = rfft(mean_over_directions(kemar(sample_rate)), size)

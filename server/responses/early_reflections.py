@@ -1,12 +1,12 @@
-"""A scene's first reflections as part of impulse responses: by way of one wall, the floor or the ceiling.
+"""A scene's first reflections as part of impulse responses: paths by way of one wall, the floor or the ceiling.
 
-They come a few milliseconds after the direct sound and interfere with it; their phase turns faster with the poses than
-a field can follow, and geometry knows it exactly. Scenes whose manifest says so leave them to this.
+They arrive a few milliseconds after the direct sound and interfere with it. Their phase changes with the poses faster
+than a field can follow, and geometry gives it exactly. Scenes whose manifest says so compute them here.
 
-A reflection appears and vanishes as somebody walks past the end of a wall. It does with the impulse response that it is
-part of, and those are crossfaded.
+A reflection appears or vanishes when the listener passes the end of a wall. It does so with the impulse response that
+contains it, and impulse responses are crossfaded.
 
-Axes: B poses; responses (B, ear, sample). Metres; positions and directions in the world's axes.
+Axes: B poses; responses (B, ear, sample). Lengths are in metres; positions and directions are in the world's axes.
 """
 
 import math
@@ -34,7 +34,7 @@ _Floats = npt.NDArray[np.float64]
 
 
 class EarlyReflections:
-    """One scene's surfaces and air, heard through one head; `air_db_per_m` (band,). Safe to share between threads."""
+    """First reflections in one scene, through one head; `air_db_per_m` (band,). Safe to share between threads."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class EarlyReflections:
         filters: HeadFilters | NoHead,
         transmission: bool = False,
     ) -> None:
-        """With `transmission` what goes straight through walls, as their mass lets it, is heard with them."""
+        """With `transmission`, sound that goes straight through walls, attenuated by their mass, is added as well."""
         surfaces = materials.walls, materials.floor, materials.ceiling
         gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
         self.filters = filters
@@ -54,17 +54,17 @@ class EarlyReflections:
         mass = materials.walls.surface_mass_kg_m2
         if transmission and mass is not None:
             self._finder = TransmittedPaths(self._finder, plan, transmission_loss_db(mass, OCTAVE_BANDS_HZ))
-        # Each of the two legs of a path is no longer than the room.
+        # Each of the two legs of a path is at most as long as the room's diagonal.
         (west, south), (east, north) = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
         longest_s = 2 * math.hypot(east - west, north - south, plan.height_m) / speed_of_sound
         self.end_samples = math.ceil((longest_s + filters.longest_delay_s) * filters.sample_rate) + filters.taps + TAPS
-        """From this sample of a response on, none of them is heard."""
+        """The sample of a response from which on it contains no reflection."""
         self._air_db_per_m = air_db_per_m
         self._paths = StillPaths(filters, speed_of_sound=speed_of_sound, air_db_per_m=air_db_per_m)
 
     @classmethod
     def of(cls, bundle: Bundle, filters: HeadFilters | NoHead) -> "EarlyReflections | None":
-        """None where the bundle's fields hold the first reflections themselves."""
+        """Return the first reflections of a bundle's scene; None if the responses of its fields include them."""
         manifest = bundle.manifest
         geometry = manifest.geometry
         if manifest.image_order == 0 or geometry is None:
@@ -79,10 +79,11 @@ class EarlyReflections:
         )
 
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
-        """Add what `listener` hears of each emitter to its response (B, ear, sample); sample 0 is emission.
+        """Add the first reflections of each emitter at `listener` to its response (B, ear, sample); sample 0 is
+        emission.
 
-        A renderer plays these responses at the emitter's `reverberation_gain`, as is right for sound from all sides;
-        these paths have a gain of their own instead.
+        A renderer multiplies these responses by the emitter's `reverberation_gain`, which is right for diffuse sound.
+        Here it is divided out, and each path has the gain of its own direction.
         """
         found = self._finder.find(listener.position, [emitter.pose.position for emitter in emitters])
         gains_db = found.gain_db
@@ -99,8 +100,9 @@ class EarlyReflections:
             )
 
     def band_power(self, listeners: _Floats, emitter: npt.ArrayLike) -> _Floats:
-        """(B, band) squared pressure that they bring to `listeners` (B, 3) from one emitter (3,), all round."""
-        # A path is the same both ways, and here are many listeners to one emitter.
+        """Return the squared pressure (B, band) of the reflections at `listeners` (B, 3) from one omnidirectional
+        emitter (3,)."""
+        # A path is the same in both directions, and here many listeners share one emitter.
         found = self._finder.find(emitter, listeners)
         levels_db = found.gain_db - found.length_m[:, None] * self._air_db_per_m
         power = np.zeros((len(listeners), levels_db.shape[-1]))

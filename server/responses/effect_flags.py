@@ -1,4 +1,4 @@
-"""Which parts of a listener's sound are made: what a plan of effects switches."""
+"""The parts of a listener's sound that are rendered, which a plan of effects switches."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ import numpy.typing as npt
 from server.acoustics.sound_path import SoundPaths
 
 PathGain = Callable[[SoundPaths], npt.NDArray[np.float64]]
-"""How much louder the direct sound of n paths is in each octave band, (n, band) in decibels: beside what distance, air,
-edges and directivity do; 0 where it stays as it is."""
+"""Returns the gain (n, band) in decibels of the direct sound along n paths, besides distance, air, edges and
+directivity; 0 leaves it unchanged."""
 
 
 @dataclass(frozen=True)
 class EmitterEffects:
-    """Of one emitter. `early` are the first reflections from geometry, `late` is what the field holds; `path_gains`
-    change the direct sound besides."""
+    """The parts of one emitter's sound that are rendered. `early` stands for the first reflections from geometry,
+    `late` for the field's responses; `path_gains` change the direct sound in addition."""
 
     direct_path: bool = True
     propagation_delay: bool = True
@@ -28,7 +28,7 @@ class EmitterEffects:
     early: bool = True
     late: bool = True
     holds_still: bool = False
-    """Whether the delay is to stand still even while something moves."""
+    """Whether the delay stays fixed even while something moves."""
     path_gains: tuple[PathGain, ...] = ()
 
     @property
@@ -37,23 +37,23 @@ class EmitterEffects:
 
     @property
     def bakes_direct(self) -> bool:
-        """Whether the direct sound stands still and is part of the impulse response."""
+        """Whether the direct sound has a fixed delay and is part of the impulse response."""
         return self.direct_path and not self.propagation_delay and self.has_response
 
     @property
     def path(self) -> tuple[object, ...]:
-        """What the path of the direct sound, and its gains, depend on."""
+        """The flags on which the path of the direct sound and its gains depend."""
         return self.occlusion, self.diffraction, self.directivity, self.path_gains
 
 
 ALL_ON = EmitterEffects()
-"""All that the renderer does of its own, without path gains."""
+"""All parts of the renderer on, without path gains."""
 
 
 @dataclass(frozen=True)
 class SharedEffects:
-    """Of all that a listener hears: through a `head` or with one ear without; every emitter with a tail of its own;
-    responses anew when the head turns."""
+    """The shared parts of a listener's sound: with a `head` or in mono; with a late tail for each emitter (`own_tails`)
+    or one for all; with new responses when the head turns (`head_rotation`) or not."""
 
     head: bool = True
     own_tails: bool = True

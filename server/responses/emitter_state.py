@@ -1,4 +1,4 @@
-"""Where an emitter is, how it radiates, and which of its effects are heard, at one moment."""
+"""The state of an emitter at one moment: its pose, its directivity, and its effects."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from server.responses.effect_flags import ALL_ON, EmitterEffects
 
 @dataclass(frozen=True)
 class EmitterState:
-    """What code gets that renders an emitter, asks for its response or plans its effects."""
+    """The state from which an emitter is rendered, its responses are computed and its effects are planned."""
 
     pose: Pose
     pattern: Directivity = OMNIDIRECTIONAL
-    """How it radiates, whether or not that is heard."""
+    """The emitter's directivity, whether or not that effect is on."""
     effects: EmitterEffects = ALL_ON
     gain_db: float = 0.0
 
@@ -23,5 +23,5 @@ class EmitterState:
 
     @property
     def directivity(self) -> Directivity:
-        """How it is heard to radiate."""
+        """The directivity that is rendered: omnidirectional if the effect is off."""
         return self.pattern if self.effects.directivity else OMNIDIRECTIONAL

@@ -1,7 +1,7 @@
-"""A scene's whole impulse responses: the direct path from geometry, with it the first reflections where the field
-leaves them out, and what follows from the field; or all of it from the field, where that holds the direct sound.
+"""A scene's full impulse responses: the direct path and, where the field leaves them out, the first reflections from
+geometry, then the field's response; or the field's response alone, where that includes the direct sound.
 
-Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians.
+Axes: B poses; responses (B, channel, sample), two ears or one microphone. Lengths are in metres, angles in radians.
 """
 
 from functools import cached_property
@@ -27,8 +27,7 @@ _N_FFT = 512
 
 
 class FullResponse:
-    """A field heard through one head, direct sound included; thread-safe, as the field is. Emitters radiate alike in
-    all directions."""
+    """Full responses of a field through one head, for omnidirectional emitters. Thread-safe, as the field is."""
 
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
         manifest = field.bundle.manifest
@@ -41,7 +40,7 @@ class FullResponse:
 
     @classmethod
     def through_kemar(cls, field: AcousticField) -> "FullResponse":
-        """Heard by the head that everything is heard by where no other was asked for."""
+        """Return full responses through KEMAR, the default head."""
         return cls(field, kemar(field.sample_rate))
 
     @property
@@ -55,7 +54,8 @@ class FullResponse:
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
     ) -> npt.NDArray[np.float32]:
-        """(B, channel, ir_samples); sample 0 is the moment of emission, unit pressure at one metre."""
+        """Return responses (B, channel, ir_samples); sample 0 is the moment of emission, and 1 is unit pressure at one
+        metre."""
         listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
         responses = self.field.impulse_responses(listeners, emitters, yaws)
         if self.bundle.manifest.direct_sound == "field":
@@ -71,11 +71,11 @@ class FullResponse:
         return responses
 
     def path_power(self, listeners: npt.NDArray[np.float64], emitter: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """(B,) energy per ear of what `impulse_responses` adds to those of the field, averaged over all orientations of
-        the head."""
+        """Return the energy per ear (B,) that `impulse_responses` adds to the field's responses, averaged over all
+        orientations of the head."""
         if self.bundle.manifest.direct_sound == "field":
             return np.zeros(len(listeners))
-        # A path is the same both ways, and here are many listeners to one emitter.
+        # A path is the same in both directions, and here many listeners share one emitter.
         paths = self._paths.find(emitter, listeners)
         spread = np.maximum(paths.length_m, NEAR_LIMIT_M)[:, None] ** 2
         bands = db_to_power(paths.screen_db - paths.length_m[:, None] * self._air_db_per_m) / spread
@@ -89,11 +89,11 @@ class FullResponse:
 
 
 def diffuse_energy(filters: HeadFilters) -> npt.NDArray[np.float64]:
-    """(band,) energy per ear of a unit impulse from everywhere, by octave band."""
+    """Return the energy per ear (band,) of a unit impulse from all directions, by octave band."""
     spectra = np.abs(np.exp(np.fft.rfft(filters.cepstra, _N_FFT))) ** 2
     everywhere = np.einsum("d,def->f", solid_angles(filters.directions), spectra) / 2
     frequency = np.maximum(np.fft.rfftfreq(_N_FFT, 1 / filters.sample_rate), 1.0)
     band = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
-    # Bins between DC and Nyquist stand for two.
+    # Bins between DC and Nyquist also stand for negative frequencies.
     weight = np.r_[1, np.full(len(frequency) - 2, 2), 1] / _N_FFT
     return np.asarray(np.bincount(band, everywhere * weight, len(OCTAVE_BANDS_HZ)), dtype=np.float64)

@@ -1,8 +1,9 @@
-"""Single impulse responses (IRs), direct sound included: one way to compute and write them, for the command line and
-for HTTP alike.
+"""Single impulse responses (IRs) with the direct sound, computed and written in the same way for the command line and
+for HTTP.
 
-Metres; angles in degrees, since these are human edges. Samples are (channel, sample) float32, channel 0 the left ear;
-of a scene that one microphone heard there is one channel, and the head's yaw changes nothing.
+Lengths are in metres. Angles are in degrees, since people write and read them. Samples are (channel, sample) float32,
+with the left ear as channel 0. A scene measured with one microphone has one channel, and the head's yaw changes
+nothing.
 """
 
 import io
@@ -29,11 +30,11 @@ MEDIA_TYPES: dict[IrFormat, str] = {"wav": "audio/wav", "npy": "application/octe
 
 
 POSITION_PATTERN = rf"^ *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *$"
-"""What `parse_position` takes, as a regular expression of JSON Schema."""
+"""The texts that `parse_position` accepts, as a regular expression of JSON Schema."""
 
 
 def parse_position(text: str, field: str) -> Vector3:
-    """Three decimal numbers between commas, metres. Raises RequestError malformed_pose naming `field`."""
+    """Parse three decimal numbers between commas, in metres. Raises RequestError malformed_pose naming `field`."""
     parts = text.split(",", 3)
     if len(parts) != 3:
         raise RequestError("malformed_pose", f"{field}: {text!r} is not three numbers x,y,z", field=field)
@@ -45,7 +46,7 @@ def parse_position(text: str, field: str) -> Vector3:
 
 
 def parse_format(name: str) -> IrFormat:
-    """Raises RequestError unknown_format."""
+    """Return the format of this name. Raises RequestError unknown_format."""
     for known in IR_FORMATS:
         if name == known:
             return known
@@ -54,24 +55,26 @@ def parse_format(name: str) -> IrFormat:
 
 @dataclass(frozen=True)
 class IrQuery:
-    """Which IR; `yaw_deg` is the head's, counter-clockwise, 0 looks along +x."""
+    """The poses of an IR; `yaw_deg` is that of the head, counter-clockwise, where 0 looks along +x."""
 
     listener: Vector3
     emitter: Vector3
     yaw_deg: float = 0.0
 
     def require_inside(self, field: AcousticField) -> None:
-        """Raises RequestError position_out_of_bounds."""
+        """Check both positions. Raises RequestError position_out_of_bounds."""
         field.bundle.require_inside(self.listener, "listener")
         field.bundle.require_inside(self.emitter, "emitter")
 
     def etag(self, field: AcousticField, name: str) -> str:
-        """Strong entity tag of this IR in format `name`: changes with the bundle, the query and what computes it."""
+        """Return the strong entity tag of this IR in format `name`. It changes with the bundle, the query and the
+        software that computes the IR."""
         return entity_tag(field, "impulse-response", asdict(self), name)
 
 
 def entity_tag(field: AcousticField, kind: str, parameters: dict[str, object], name: str) -> str:
-    """Tag of whatever is computed from a field's bundle, its level and `parameters`, written in format `name`."""
+    """Return the entity tag of a result computed from a field's bundle, its level and `parameters`, in format
+    `name`."""
     return computed_tag(field.bundle.digest, field.level.name, kind, parameters, name)
 
 
@@ -88,8 +91,8 @@ class ImpulseResponse:
 
     @classmethod
     def compute(cls, field: AcousticField, query: IrQuery) -> "ImpulseResponse":
-        """Milliseconds of work: keep it off the event loop. The same samples for the same query, whatever was asked
-        before: a warm phase starts from the frozen one. Raises RequestError position_out_of_bounds."""
+        """Compute the IR, in milliseconds: keep it off the event loop. The samples depend on the query alone and not on
+        earlier ones, since a warm phase starts from the frozen one. Raises RequestError position_out_of_bounds."""
         query.require_inside(field)
         whole = FullResponse.through_kemar(field)
         samples = whole.impulse_responses([query.listener], [query.emitter], [math.radians(query.yaw_deg)])[0]
@@ -97,7 +100,7 @@ class ImpulseResponse:
         return cls(field.bundle.id, field.level.name, query, field.sample_rate, channels, samples)
 
     def encode(self, name: IrFormat) -> bytes:
-        """The same samples in any format, and the same bytes for the same IR."""
+        """Write the IR in a format. The samples are the same in all formats, and the same IR gives the same bytes."""
         buffer = io.BytesIO()
         match name:
             case "wav":
@@ -109,8 +112,8 @@ class ImpulseResponse:
         return buffer.getvalue()
 
     def _wav(self) -> bytes:
-        """As `scipy.io.wavfile.write` has it, whose import takes a third of a second; libsndfile stamps the time of day
-        into WAV files of floats (PEAK chunk)."""
+        """Write a WAV file byte for byte as `scipy.io.wavfile.write` does, whose import takes a third of a second.
+        libsndfile would put the time of day into WAV files of floats (PEAK chunk)."""
         channels, frames = self.samples.shape
         samples = self.samples.T.astype("<f4").tobytes()
         frame_bytes = 4 * channels

@@ -1,7 +1,8 @@
-"""Impulse responses (IRs) ready to be convolved, kept where a quality level reuses them.
+"""A cache of impulse responses (IRs), prepared for convolution, at quality levels that reuse them.
 
-What a response is made of says which poses share it, so that none is asked for that is already heard. Where first
-reflections are the pose's own, the rest is kept, and the stages of partitions that they do not reach are used again.
+The identity of a response tells which poses share it, so that a response that is already playing is not requested
+again. Where first reflections differ between poses, the rest of the response is cached, with the partitions that the
+reflections do not reach.
 """
 
 from collections.abc import Hashable, Sequence
@@ -29,8 +30,8 @@ class _Late(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """What is equal where poses have the same response, whole, and which listeners are sure to have that one too as
-    long as nothing else changes."""
+    """The `identity` of a response, which is equal for all poses with the same full response, and the listener poses
+    `around` it that are sure to have it as long as nothing else changes."""
 
     identity: Hashable
     around: Neighbourhood
@@ -39,7 +40,7 @@ class Shared(NamedTuple):
 def shared_response(
     field: AcousticField, early: EarlyReflections | None, listener: Pose, emitter: EmitterState
 ) -> Shared | None:
-    """At a field's level; None where each pose has a response of its own."""
+    """Return the shared response of a pose at a field's level; None where each pose has a response of its own."""
     if not field.kind.shares_whole_responses(has_reflections=early is not None):
         return None
     snapped, around = field.find(listener.position, emitter.pose.position, listener.yaw)
@@ -61,8 +62,8 @@ def prepared_irs(
     listener: Pose,
     emitters: Sequence[EmitterState],
 ) -> tuple[PartitionedIr, ...]:
-    """One per emitter, at a level that reuses responses: taken from `cache` as far as they are there. Raises ValueError
-    where the field is not finite."""
+    """Return a prepared IR per emitter at a level that reuses responses, taken from `cache` where possible. Raises
+    ValueError if the field's output is not finite."""
     if early is None or field.kind.shares_reflections:
         return tuple(_whole(field, cache, early, renderer, listener, emitter) for emitter in emitters)
     return tuple(_with_first_reflections(field, cache, early, renderer, listener, emitter) for emitter in emitters)

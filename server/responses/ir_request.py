@@ -1,4 +1,4 @@
-"""Impulse responses (IRs) that a session asks for, and how they are computed."""
+"""Requests of a session for impulse responses (IRs), and their computation."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ from server.responses.node_reflections import add_first_reflections
 
 @dataclass(frozen=True)
 class AskedIr:
-    """The response of one emitter as it was; `serial` tells it from others of the same id, and `identity` its response
-    from others where poses share responses."""
+    """A requested response for one emitter, in the `state` that it had then. `serial` tells the emitter from others
+    with the same id, and `identity` the response from others where poses share responses."""
 
     serial: int
     state: EmitterState
@@ -30,30 +30,31 @@ class AskedIr:
 
 @dataclass(frozen=True)
 class IrRequest:
-    """IRs of a quality level wanted for the poses as they were when `pose_id` was the newest, for two ears of a head or
-    for one without."""
+    """A request for IRs of one quality level, for the poses at the time when `pose_id` was the newest, with two
+    channels through a head or one without."""
 
     pose_id: int
     level: str
     listener: Pose
     asked: tuple[AskedIr, ...]
-    """Of those emitters whose IR is out of date."""
+    """The responses of emitters whose IR is out of date."""
     direct_sound: DirectSound
-    """What the field's IRs leave out, as this session's head hears it."""
+    """The direct sound and first reflections that the field's IRs leave out, through this session's head."""
     channels: int = 2
     is_first: bool = False
-    """Whether an emitter has none yet, and waits to be heard."""
+    """Whether an emitter in the request waits for its first IR to become audible."""
 
 
 @dataclass(frozen=True)
 class IrResponse:
     request: IrRequest
     irs: tuple[PartitionedIr, ...]
-    """One for each that was asked for."""
+    """One prepared IR for each that was requested."""
 
 
 def compute_irs(levels: FieldsByLevel, request: IrRequest, renderer: Renderer) -> IrResponse:
-    """Answer a request: milliseconds of work, for a worker thread. Raises ValueError where the field is not finite."""
+    """Answer a request: milliseconds of work, for a worker thread. Raises ValueError if the field's output is not
+    finite."""
     field, direct = levels[request.level], request.direct_sound
     renderer.prepare_hearing(request.channels)
     emitters = [asked.state for asked in request.asked]
@@ -76,8 +77,8 @@ def composed_irs(
     *,
     remember: bool = False,
 ) -> npt.NDArray[np.float32]:
-    """(B, channel, sample) the responses of emitters, of the parts that their effects call for: the field is asked for
-    none but those whose late part is. `remember` is as in `AcousticField.impulse_responses`."""
+    """Return responses (B, channel, sample) with the parts that the emitters' effects call for. The field computes only
+    those of emitters with `late` on. `remember` is as in `AcousticField.impulse_responses`."""
     count = len(emitters)
     held = _held(field, direct, listener, emitters, remember=remember)
     if direct.binauralization is not None:
@@ -103,7 +104,8 @@ def composed_irs(
 def _held(
     field: AcousticField, direct: DirectSound, listener: Pose, emitters: Sequence[EmitterState], *, remember: bool
 ) -> npt.NDArray[np.float32]:
-    """(B, channel, sample) of the field, an array of its own; zeros for those whose late part is off."""
+    """Return the field's responses (B, channel, sample) in an array of their own; zeros for emitters with `late`
+    off."""
     late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
     channels = 2 if direct.binauralization is None else 1
     if not late:
@@ -121,9 +123,9 @@ def _held(
 
 
 def _without_end(ir: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """(channel, sample) up to the last sample that is not zero, one at least."""
+    """Return the response (channel, sample) up to its last sample that is not zero; at least one sample."""
     if ir[:, -1].any():
-        return ir  # nearly always, and at once
+        return ir  # the usual case, found without a search
     heard = ir != 0
     ends = [ir.shape[1] - int(np.argmax(channel[::-1])) for channel in heard if channel.any()]
     return ir[:, : max(ends, default=1)]

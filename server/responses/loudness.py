@@ -1,9 +1,9 @@
-"""How loud an emitter is everywhere in a scene: a map of listener positions, for people to look at.
+"""The level of an emitter all over a scene: a map over listener positions, for people to look at.
 
-Level is that of both ears together, averaged over head orientations, in dB relative to the emitter's free field at one
-metre. It is of white sound, of all frequencies up to half of the scene's rate. Heads are levelled so that white sound
-up to 12 kHz from everywhere keeps its energy: in the open such a level is 1/r. A scene at 48 kHz is 2.7 dB beneath
-that, since a unit impulse has half of its energy above 12 kHz there, of which KEMAR's ears get 11 dB less.
+The level is that of both ears together, averaged over orientations of the head, in dB relative to the emitter's free
+field at one metre. The signal is white noise up to half the scene's sample rate. Heads are normalised so that white
+noise up to 12 kHz from all directions keeps its energy: in the open such a level is 1/r. In a scene at 48 kHz it is 2.7
+dB lower, since half the energy of a unit impulse lies above 12 kHz there, where KEMAR's ears receive 11 dB less.
 """
 
 import io
@@ -20,15 +20,15 @@ from server.responses.full_response import FullResponse
 from server.runtime.pace import Checkpoint, no_checkpoint
 from server.scene.bundle import Bundle
 
-# Ears of two opposite heads face four ways.
+# Levels are averaged over two opposite orientations of the head, with two ears each.
 _YAWS = 2
 MAX_POINTS = 2_000
-"""Of a map; a point costs milliseconds."""
+"""Limit of the points of a map; each takes milliseconds."""
 FINEST_M = 0.1
 _USUAL_M = 0.25
 _POINTS_ACROSS = 8
 _CHUNK = 4
-"""Cells between two checkpoints: some 15 ms of work."""
+"""Cells between two checkpoints: about 15 ms of work."""
 _PIXELS_PER_METRE = 80
 _RANGE_DB = 30.0
 # Perceptually even, dark to bright, legible under dark and light drawings (a subset of the CAM02-UCS path of
@@ -41,8 +41,8 @@ _COLOURS = np.array(
 
 @dataclass(frozen=True)
 class LoudnessMap:
-    """`levels_db` (row, column), NaN outside the room; row 0 is the southernmost. `origin` is the centre of cell (0,
-    0), metres."""
+    """Levels `levels_db` (row, column), NaN outside the room; row 0 is the southernmost. `origin` is the centre of cell
+    (0, 0) in metres."""
 
     levels_db: npt.NDArray[np.float64]
     origin: tuple[float, float]
@@ -61,12 +61,13 @@ class LoudnessMap:
         }
 
     def to_png(self) -> bytes:
-        """North up, transparent outside the room; the brightest colour is the loudest, 30 dB above the darkest."""
-        from PIL import Image  # these two take a tenth of a second
+        """Return a PNG with north at the top, transparent outside the room; the brightest colour is the loudest level,
+        30 dB above the darkest."""
+        from PIL import Image  # the two imports take 0.1 s
         from scipy.ndimage import distance_transform_edt
 
         outside = np.isnan(self.levels_db)
-        # Cells outside take the level of the nearest inside, or they would bleed into the room in the enlarged picture.
+        # Cells outside take the level of the nearest cell inside; else the enlargement would blend them into the room.
         nearest = distance_transform_edt(outside, return_distances=False, return_indices=True)
         levels = self.levels_db[tuple(nearest)].astype(np.float32)
         scale = self.spacing_m * _PIXELS_PER_METRE
@@ -84,8 +85,8 @@ class LoudnessMap:
 
 
 def usual_spacing_m(bundle: Bundle) -> float:
-    """Between map points where none was asked for: 0.25 m; less in a small scene, so that at least eight points lie
-    across it, and more in a large one, so that MAX_POINTS suffice. Whole centimetres."""
+    """Return the default spacing of map points, in whole centimetres: 0.25 m; less in a small scene, so that at least
+    eight points lie across it, and more in a large one, so that MAX_POINTS suffice."""
     low, high = np.asarray(bundle.manifest.bounds.minimum[:2]), np.asarray(bundle.manifest.bounds.maximum[:2])
     fitting = max(FINEST_M, min(_USUAL_M, float((high - low).min()) / _POINTS_ACROSS))
     affordable = math.sqrt(bundle.floor_plan.area_m2 / MAX_POINTS)
@@ -100,8 +101,8 @@ def loudness_map(
     spacing_m: float = 0.25,
     checkpoint: Checkpoint = no_checkpoint,
 ) -> LoudnessMap:
-    """Asks the field for every cell in the floor plan, on a grid centred in the bounds; some milliseconds each. Every
-    few cells it is at a `checkpoint`, and raises what that does."""
+    """Compute the level at every cell inside the floor plan, on a grid centred in the bounds, at some milliseconds
+    each. Calls `checkpoint` every few cells, and passes on what it raises."""
     bundle = field.bundle
     low, high = np.asarray(bundle.manifest.bounds.minimum[:2]), np.asarray(bundle.manifest.bounds.maximum[:2])
     columns, rows = np.maximum(1, np.floor((high - low) / spacing_m + 1e-6).astype(int))
@@ -125,8 +126,8 @@ def loudness_map(
 def _reflected_power(
     field: AcousticField, listeners: npt.NDArray[np.float64], emitter: Vector3
 ) -> npt.NDArray[np.float64]:
-    """(listener,) energy per channel, averaged over channels and head orientations, straight from what the field
-    says."""
+    """Return the energy per channel (listener,), averaged over channels and orientations of the head, of the responses
+    that the field predicts; they are not decoded where that can be avoided."""
     yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
     positions, heads = np.repeat(listeners, _YAWS, axis=0), np.tile(yaws, len(listeners))
     power = field.energy(positions, np.broadcast_to(emitter, positions.shape), heads).mean(axis=-1)

@@ -1,6 +1,6 @@
-"""First reflections at quality levels that reuse responses together with them.
+"""First reflections at quality levels that reuse responses together with their reflections.
 
-Metres; responses (B, channel, sample).
+Lengths are in metres; responses are (B, channel, sample).
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,8 @@ def add_first_reflections(
     listener: Pose,
     emitters: Sequence[EmitterState],
 ) -> None:
-    """As `EarlyReflections.add`, at a field's level: those of the poses, or those kept with the node's response."""
+    """Add first reflections as `EarlyReflections.add` does, at a field's level: those of the poses, or those of the
+    lattice node whose response is reused."""
     if not field.kind.shares_reflections:
         early.add(responses, listener, emitters)
         return

@@ -1,5 +1,4 @@
-"""How emitters radiate where they are placed: what a direction of the world is to one that is turned, and how loud a
-room gets."""
+"""How oriented emitters radiate: their gain in a direction of the world, and the level at which they excite a room."""
 
 import math
 
@@ -13,17 +12,18 @@ from server.responses.emitter_state import EmitterState
 
 
 def departure_gain_db(emitter: EmitterState, departure: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:
-    """(band,) gain of what leaves an emitter in a direction (3,) of the world; 0 for one that radiates all round."""
+    """Return the gain (band,) in dB of sound that leaves an emitter in a direction (3,) of the world; 0 for an
+    omnidirectional one."""
     if emitter.directivity == OMNIDIRECTIONAL:
         return 0.0
     return emitter.directivity.gain_db(seen_from(emitter.pose.orientation, departure.tolist()))
 
 
 def seen_from(orientation: Quaternion, direction: Vector3) -> Vector3:
-    """A direction of the world in the frame of something turned by `orientation`."""
+    """Return a direction of the world in the frame of an object turned by `orientation`."""
     qx, qy, qz, qw = orientation
     x, y, z = direction
-    # v - w t + q x t with t = 2 q x v, in scalars: NumPy would take ten times as long for three numbers.
+    # v - w t + q x t with t = 2 q x v, in scalars: NumPy takes ten times as long for three numbers.
     tx, ty, tz = 2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)
     return (
         x - qw * tx + qy * tz - qz * ty,
@@ -33,6 +33,6 @@ def seen_from(orientation: Quaternion, direction: Vector3) -> Vector3:
 
 
 def reverberation_gain(directivity: Directivity) -> float:
-    """Amplitude at which an emitter fills a room, beside one that is all round as loud as this is ahead: the power mean
-    over all directions and octave bands."""
+    """Return the amplitude at which an emitter excites a room, relative to an omnidirectional one as loud as this one
+    ahead: the root of the power averaged over all directions and octave bands."""
     return math.sqrt(np.mean(db_to_power(directivity.diffuse_gain_db)))

@@ -1,7 +1,8 @@
-"""Has a renderer make what a session's effects call for, and nothing else.
+"""Makes a renderer produce the sound that a session's effects call for, and nothing else.
 
-Direct sound that stands still is *baked*: it is part of the impulse response (IR), and the renderer does no more for it
-than keep the delay line. The IR without it is kept, so that it follows with the next block when something moves.
+Direct sound with a fixed delay is *baked*: it is part of the impulse response (IR), and the renderer only keeps its
+delay line running. The IR without direct sound is stored, so that the direct sound can follow poses from the next block
+on when something moves.
 """
 
 import dataclasses
@@ -20,8 +21,8 @@ from server.streaming.emitters import StreamedEmitter
 
 
 class ActiveEffects:
-    """Of one session. `has_early` and `has_late` say what a scene has beside direct sound. Without `planned` effects
-    all are on."""
+    """The effects now active in one session. `has_early` and `has_late` say which sound the scene has besides the
+    direct sound. Without `planned` effects all are on."""
 
     def __init__(
         self, renderer: Renderer, planned: PlannedEffects | None, *, sample_rate: int, has_early: bool, has_late: bool
@@ -35,27 +36,26 @@ class ActiveEffects:
 
     @property
     def clock_s(self) -> float:
-        """Seconds of sound so far."""
+        """Seconds of sound rendered so far."""
         return self._renderer.sample_clock / self._sample_rate
 
     @property
     def wants_other_ears(self) -> bool:
-        """Whether another number of ears is called for than everything is heard with."""
+        """Whether the effects call for another number of channels than the renderer has."""
         return self.shared.channels != self._renderer.channels
 
     @property
     def awaits_ears(self) -> bool:
-        """Whether other ears are called for, and there is room to switch."""
+        """Whether the effects call for another number of channels, and the renderer has room to switch."""
         return self.wants_other_ears and self._renderer.can_hear_with(self.shared.channels)
 
     @property
     def channels(self) -> int:
-        """Of the IRs to ask for."""
+        """The number of channels of the IRs to request."""
         return self.shared.channels if self.awaits_ears else self._renderer.channels
 
     def enforce(self, emitters: Mapping[str, StreamedEmitter]) -> list[str]:
-        """Put the plan into effect. Emitters that are decided about by it for the first time and have no IR to wait
-        for."""
+        """Put the plan into effect. Return the emitters that it includes for the first time and that need no IR."""
         assert self.planned is not None
         ears = self.shared.channels
         self.shared = self.planned.shared
@@ -73,7 +73,7 @@ class ActiveEffects:
         return begin
 
     def whole(self) -> tuple[EmitterEffects, bool]:
-        """What would be on if all were but what was switched off by hand, and whether that has a head."""
+        """Return the flags with every effect on but those switched off by hand, and whether there is a head then."""
         assert self.planned is not None
         off = {name for name, is_on in self.planned.overrides.items() if not is_on}
         told = {effect.name for effect in ENERGY_EFFECTS} - off - self._lacking
@@ -81,21 +81,22 @@ class ActiveEffects:
         return whole, self.planned.output == "headphones" and EffectName.HRTF not in off
 
     def share_tail(self, is_shared: bool, emitters: Mapping[str, StreamedEmitter]) -> None:
-        """Have emitters share a late tail where a quality level does, or none would be told from its own."""
+        """Make emitters share one late tail, if the quality level does or the plan finds no audible difference."""
         several = sum(emitter.effects.late for emitter in emitters.values()) > 1
         self._renderer.share_tail(is_shared or (several and not self.shared.own_tails))
 
     def accept_ir(
         self, name: str, emitter: StreamedEmitter, ir: PartitionedIr, asked: EmitterEffects, token: int
     ) -> bool:
-        """Hand the renderer an IR that was asked for with some effects. False where others are in force by now."""
+        """Give the renderer an IR that was requested with certain effects. Return False if other effects are active by
+        now."""
         if not emitter.effects.has_response or (asked.early, asked.late) != (
             emitter.effects.early,
             emitter.effects.late,
         ):
             return False
         if asked.bakes_direct:
-            if asked != emitter.effects:  # it holds the direct sound as it was to be heard
+            if asked != emitter.effects:  # its direct sound has the effects of an earlier state
                 emitter.is_outdated = True
                 return False
             if emitter.is_outdated and not emitter.effects.holds_still:
@@ -110,7 +111,7 @@ class ActiveEffects:
         return True
 
     def unbake(self, name: str, emitter: StreamedEmitter) -> None:
-        """Have the direct sound follow poses again, with the next block."""
+        """Make the direct sound follow poses again, from the next block on."""
         heard = emitter.heard
         if not heard.bakes_direct or emitter.effects.holds_still:
             return
@@ -135,7 +136,7 @@ class ActiveEffects:
             emitter.heard.bakes_direct, emitter.heard.without_direct = False, None
         elif emitter.heard.bakes_direct and (not effects.bakes_direct or before != effects):
             self.unbake(name, emitter)
-            if emitter.heard.bakes_direct:  # in a response that nothing stands for
+            if emitter.heard.bakes_direct:  # there is no IR without direct sound to fall back on
                 emitter.discard_response()
         self._set_direct(name, emitter, bakes_direct=emitter.heard.bakes_direct)
 
@@ -151,7 +152,8 @@ class ActiveEffects:
 
 
 def as_asked(emitter: StreamedEmitter) -> EmitterState:
-    """The state to ask for an IR of. Before the direct sound is baked, there has to be an IR of the pose without it."""
+    """Return the state to request an IR for. The direct sound is baked only once there is an IR of the pose without
+    it."""
     effects = emitter.effects
     if not effects.bakes_direct or emitter.wants_baking or effects.holds_still:
         return emitter.state

@@ -1,28 +1,30 @@
 """The threads that render every stream, one per core.
 
 A hop through an executor costs a millisecond per block; a thread that stays awake for its streams costs none. A stream
-stays with the thread that was least busy when it came. Impulse responses (IRs) are computed by a pool of workers and
-picked up at the next block: an audio thread waits for no field and no network.
+stays on the thread that was least busy when it opened. Impulse responses (IRs) are computed by a pool of workers and
+picked up at the next block: an audio thread never waits for a field or for the network.
 
 **When blocks fall due.** Every block of a stream is due at a whole number of block durations from the stream's origin.
-Were all origins arbitrary, a thread would wake for every block of every stream, and each time the interpreter's lock,
-the renderer's call and the way to the event loop would cost about what rendering does; were all the same, the first
-stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly apart, gives a
-new stream the one with the fewest others, and renders what is due at an instant in one call without the lock, or, where
-it fell behind, as much of it as a tick has time for.
+With arbitrary origins, a thread would wake for every block of every stream, and each time the interpreter's lock, the
+call of the renderer and the way to the event loop would cost about as much as rendering does. With equal origins, the
+first stream rendered would wait for the last. So a thread offers `PHASES` instants per block duration, evenly spaced,
+and gives a new stream the instant with the fewest others. It renders all blocks due at an instant in one call without
+the lock or, if it fell behind, as many of them as a tick has time for.
 
-**Under load**, two blocks of a stream are rendered at once, or four, or eight: those after the first cost less
-rendering, for much of what they read is in the caches, and hardly any of what waking, messages and the way to the event
-loop cost. They are ready before they are due, so poses are heard up to so many blocks later. The streams of an instant
-take turns with it, so that every instant has as much to do.
+**Under load**, two, four or eight blocks of a stream are rendered at once. The blocks after the first cost less
+rendering, since much of their data is in the caches, and hardly any of the cost of waking, messages and the way to the
+event loop. They are ready before they are due, so poses take effect up to that many blocks later. The streams of an
+instant render their groups of blocks at different times, so that every instant has equal work.
 
-**What a stream gets.** Four times a second a thread measures what it and its streams went through, and does what the
-load policy decides (`server.streaming.load_policy`): how many blocks at once, which quality, how often responses.
+**What a stream gets.** Four times a second a thread measures its load and that of its streams, and carries out the
+decision of the load policy (`server.streaming.load_policy`): how many blocks at once, which quality, how often
+responses.
 
-Messages that may call for an IR wake the thread at once, which asks for the IR and renders nothing early. Streams take
-turns with that (`server.streaming.request_queue`).
+A message that may call for an IR wakes the thread at once. The thread then requests the IR, but renders nothing early.
+Streams take turns with requests (`server.streaming.request_queue`).
 
-Who may touch what: a `Stream` belongs to its audio thread, but for `Stream.offer`; `AudioEngine` to the event loop.
+Thread safety: a `Stream` belongs to its audio thread, except for `Stream.offer`; an `AudioEngine` belongs to the event
+loop.
 """
 
 import logging
@@ -48,20 +50,22 @@ from server.streaming.request_queue import RequestQueue
 from server.streaming.stream import Outgoing, Stream, StreamFailed
 
 PHASES = 2
-"""Four streams of 16 emitters cost their two threads 9 % less than at four, and poses are heard 0.4 ms later."""
+"""Instants per block duration. With two, four streams of 16 emitters cost their two threads 9 % less than with four,
+and poses take effect 0.4 ms later."""
 _APART = 5
-"""Places from one that is taken to the next: a number without a divisor in common with how many there are."""
+"""Step from one place taken to the next: a number that has no divisor in common with the number of places."""
 _EARLY_S = 0.0002
-"""Blocks due within that are rendered now: sooner than one could sleep and wake again."""
+"""Blocks due within this time are rendered now: sleeping and waking again would take longer."""
 _MOST_AT_A_TICK = 1.5
-"""What is rendered at a tick takes about so many blocks' time, of the shortest, or is of one stream."""
+"""Rendering in one tick takes at most about this many durations of the shortest block, unless it is for a single
+stream."""
 _GIVE_WAY_S = 0.001
-"""How long an audio thread that would sleep less waits for the event loop at the most, about twice as long as the loop
-takes. Where both have but one core, and the thread hardly sleeps, the loop got nothing of it for up to 0.1 s: blocks
-were ready in time and sent too late."""
+"""How long an audio thread with no time to sleep waits for the event loop at most, about twice as long as the loop
+takes. When both shared one core and the thread hardly slept, the loop got no time for up to 0.1 s: blocks were ready in
+time and sent too late."""
 _SWITCH_S = 0.0005
-"""How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, one that is busy
-half of the time holds audio up for longer than blocks last."""
+"""How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, a thread that is
+busy half of the time delays audio by more than a block."""
 _STOP_S = 1.0
 _FAILED = "a stream failed and is closed"
 _logger = logging.getLogger(__name__)
@@ -73,13 +77,13 @@ Post = Callable[[Callable[[], None]], object]
 class AudioEngine:
     """Renders streams until stopped.
 
-    `workers` computes IRs; each stream has at most one request with it. `thresholds` are those of the load policy.
-    `is_real_time` asks the system to schedule audio threads before all others. Its threads are watched
+    `workers` compute IRs; each stream has at most one request with them. `thresholds` are those of the load policy.
+    `is_real_time` asks the system to schedule audio threads before all others. The threads are watched
     (`server.runtime.thread_watch`).
     """
 
     patience_s = 1.0
-    """How long a tick may take; it takes milliseconds."""
+    """How long a tick may take before its thread counts as stuck; it usually takes milliseconds."""
 
     def __init__(
         self,
@@ -106,7 +110,8 @@ class AudioEngine:
             thread.start()
 
     def stop(self) -> None:
-        """Return once the threads have ended, which takes one tick; of one that is stuck, without that."""
+        """Stop the threads and wait until they have ended, which takes one tick; give up on a stuck one after a
+        second."""
         for thread in self.threads:
             thread.stop()
         until_s = time.monotonic() + _STOP_S
@@ -116,16 +121,16 @@ class AudioEngine:
 
     @property
     def streams(self) -> tuple[Stream, ...]:
-        """Those open, in the order they came."""
+        """The open streams, in the order in which they were opened."""
         return tuple(self._thread_of)
 
     @property
     def steps(self) -> Counter[LevelReason]:
-        """How often streams were moved to other quality, by reason."""
+        """How often the quality of a stream was changed, by reason."""
         return sum((thread.steps for thread in self.threads), Counter())
 
     def open(self, stream: Stream) -> None:
-        """Start a stream now, on the thread that is least busy."""
+        """Start a stream now, on the least busy thread."""
         loads = dict.fromkeys(self.threads, 0.0)
         for other, thread in self._thread_of.items():
             loads[thread] += max(self._thresholds.presumed_load, other.load)
@@ -135,15 +140,15 @@ class AudioEngine:
         thread.open(stream)
 
     def close(self, stream: Stream) -> None:
-        """Stop rendering a stream; what it made before may still be delivered. Closing twice does no harm."""
+        """Stop rendering a stream; blocks made before may still be delivered. Closing twice does no harm."""
         thread = self._thread_of.pop(stream, None)
         if thread is not None:
             self._share_workers()
             thread.close(stream)
 
     def replace(self, dead: Watched) -> None:
-        """Start a thread in the place of one that died. Its streams go on there, unless it died at work on them: nobody
-        knows their state then, and they have failed."""
+        """Start a thread to replace one that died. Its streams continue on the new one, unless it died while it worked
+        on them: then their state is unknown, and they have failed."""
         number, thread = next((number, each) for number, each in enumerate(self.threads) if each is dead)
         successor = self.threads[number] = thread.successor()
         for stream in self._streams_of(thread):
@@ -156,7 +161,7 @@ class AudioEngine:
         successor.start()
 
     def give_up(self, stuck: Watched) -> None:
-        """Tell the streams of a thread that is stuck that they have failed."""
+        """Tell the streams of a stuck thread that they have failed."""
         for stream in self._streams_of(stuck):
             stream.deliver([StreamFailed()])
 
@@ -164,7 +169,7 @@ class AudioEngine:
         return [stream for stream, its_thread in self._thread_of.items() if its_thread is thread]
 
     def _share_workers(self) -> None:
-        """Have threads with streams keep as many of them busy as each other."""
+        """Give all threads with streams equal shares of the workers."""
         sharing = set(self._thread_of.values())
         for thread in sharing:
             thread.turns.requests = requests_at_once(
@@ -173,7 +178,7 @@ class AudioEngine:
 
 
 class AudioThread:
-    """Ticks its streams; `tick` is all that happens on it."""
+    """A thread that renders its streams by calling `tick` over and over."""
 
     def __init__(
         self,
@@ -188,24 +193,24 @@ class AudioThread:
         self._post = post
         self._workers = workers
         self.turns = RequestQueue(1)
-        """Of its streams, to ask for IRs."""
+        """The turns of its streams to request IRs."""
         self._number = number
         self._is_real_time = is_real_time
         self._thresholds = thresholds
         self._time_s = time_s
-        # All reasons from the start: a reader on another thread must not find it growing.
+        # It has all reasons from the start: a reader on another thread must not see it grow.
         self.steps: Counter[LevelReason] = Counter(dict.fromkeys(get_args(LevelReason), 0))
-        """Times that streams were moved to other quality."""
+        """How often the quality of a stream was changed, by reason."""
         self._load = ThreadState()
         self._busy_s = 0.0
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
-        """With the place of each: its phase, and with which block it begins to be rendered several at once."""
+        """The streams, each with its place: its phase, and the block at which its groups of blocks begin."""
         self._arrivals: deque[tuple[Stream, bool]] = deque()
         self._origin_s: float | None = None
         self._wake = threading.Event()
         self._has_arrived = threading.Event()
-        """What was handed to the event loop."""
+        """Set once the event loop has handled everything it was given."""
         self._has_arrived.set()
         self._is_stopping = False
         self._ticks = 0
@@ -214,7 +219,7 @@ class AudioThread:
 
     @property
     def blocks_at_once(self) -> int:
-        """How many blocks of a stream it renders together."""
+        """How many blocks of a stream are rendered together."""
         return self._load.ahead.blocks
 
     @property
@@ -223,19 +228,19 @@ class AudioThread:
 
     @property
     def is_dead(self) -> bool:
-        """Whether it has ended by itself."""
+        """Whether the thread has ended without being stopped."""
         return self._thread.ident is not None and not (self._thread.is_alive() or self._is_stopping)
 
     @property
     def work_number(self) -> int | None:
-        """Which tick it is at; None between two. Of a thread that died, where it died."""
+        """The number of the tick in progress, None between two; for a dead thread, the tick in which it died."""
         return self._ticks if self._is_ticking else None
 
     def start(self) -> None:
         self._thread.start()
 
     def successor(self) -> "AudioThread":
-        """One without streams, that counts on."""
+        """Return a new thread without streams that continues the counts of this one."""
         thread = AudioThread(
             self._post,
             self._workers,
@@ -266,9 +271,9 @@ class AudioThread:
         self._wake.set()
 
     def tick(self) -> float | None:
-        """Heed what waits, render what is due, and hand over what was made.
+        """Process waiting messages and results, render the blocks that are due, and pass on the output.
 
-        Seconds until the next is due, None where no stream is to be rendered.
+        Return the seconds until the next block is due; None if there is no stream to render.
         """
         now_s = self._time_s()
         self._admit(now_s)
@@ -285,7 +290,7 @@ class AudioThread:
                 if blocks is not None:
                     began_s = self._time_s()
                     stream.session.begin_block()
-                    # Of what it has just heard, something may have to be looked after block by block.
+                    # After the messages just processed, the stream may have to be rendered block by block.
                     due.append(_Due(stream, min(blocks, self._blocks_of(stream)), self._time_s() - began_s))
             except Exception:
                 _logger.exception(_FAILED)
@@ -302,8 +307,9 @@ class AudioThread:
         return None if next_s == math.inf else next_s - self._time_s()
 
     def _due(self, now_s: float) -> dict[Stream, int]:
-        """Whose blocks to render now, and how many: of all that are due those that are late soonest, as many as a tick
-        has time for. A thread that fell behind has the first of them sent before it goes on."""
+        """Return the streams to render now, with the number of blocks of each: of all that are due, those with the
+        earliest deadlines, as many as a tick has time for. If the thread fell behind, the first of them are sent before
+        it goes on."""
         soon_s = now_s + _EARLY_S
         due = sorted((stream for stream in self._streams if stream.due_s <= soon_s), key=attrgetter("deadline_s"))
         if due and self.blocks_at_once == self._thresholds.blocks_at_once[-1]:
@@ -319,13 +325,13 @@ class AudioThread:
         return blocks_of
 
     def _may_come_along(self, stream: Stream, now_s: float) -> bool:
-        """With the most blocks at once, those of the next instant are rendered together with this one's: half as many
-        ticks, and hardly earlier than they are anyway."""
+        """Return whether a stream of the next instant is rendered together with those of this one, at the highest
+        number of blocks at once: this halves the ticks, and such blocks are early anyway."""
         early_s = stream.block_s / PHASES + _EARLY_S
         return stream.due_s <= now_s + early_s and stream.session.renderer.runs_by_itself
 
     def _blocks_of(self, stream: Stream) -> int:
-        """How many blocks of a stream that is due are rendered now."""
+        """Return how many blocks of a stream that is due to render now."""
         count = self.blocks_at_once
         if count == 1 or not stream.session.renderer.runs_by_itself:
             return 1
@@ -339,7 +345,7 @@ class AudioThread:
         renderers = [each.stream.session.renderer for each in due for _ in range(each.blocks)]
         try:
             blocks = iter(render_all(renderers))
-        except Exception:  # whose block it was shows when each is rendered alone
+        except Exception:  # rendering each alone shows which one fails
             _logger.exception("%d blocks rendered together failed", len(renderers))
             for each in due:
                 if len(renderers) == 1:
@@ -358,7 +364,7 @@ class AudioThread:
                 self._fail(stream, made)
 
     def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
-        """Measure what the thread and its streams went through, and do what the load policy decides."""
+        """Measure the load of the thread and its streams, and carry out the decision of the load policy."""
         busy, self._busy_s = self._busy_s / (now_s - self._looked_s), 0.0
         self._looked_s = now_s
         state = LoadState(self._load, {stream: stream.ladder for stream in self._streams})
@@ -375,7 +381,7 @@ class AudioThread:
             stream.company = len(self._streams)
 
     def _fail(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> None:
-        """The boundary between streams: one that breaks leaves the others sounding."""
+        """Drop a stream that failed; the others keep playing."""
         del self._streams[stream]
         made.setdefault(stream, []).append(StreamFailed())
 
@@ -393,21 +399,22 @@ class AudioThread:
                 stream.leave()
 
     def _freest_place(self, block_s: float) -> int:
-        """Where the fewest streams are of those with blocks as long: of its phase, and of those that would be rendered
-        with it, two at once or more. Of equal ones, one that lies apart from those taken before: where one instant has
-        more to do, the next is to have less, or neither the event loop nor IRs get anything for long."""
+        """Return the place with the fewest streams of the same block duration: in its phase, and among those that would
+        be rendered with it, two blocks at once or more. Among equal places, take one apart from those taken before: an
+        instant with more work should be followed by one with less, or the event loop and IRs get no time for long."""
         taken = [place for stream, place in self._streams.items() if stream.block_s == block_s]
         *periods, cycle = [PHASES * count for count in self._thresholds.blocks_at_once]
 
         def company(place: int) -> list[int]:
             alike = [sum((other - place) % period == 0 for other in taken) for period in periods]
-            # With the most at once, all phases of a block are rendered together.
+            # With the most blocks at once, all phases of a block are rendered together.
             return [*alike, sum(other // PHASES == place // PHASES for other in taken), taken.count(place)]
 
         return min((number * _APART % cycle for number in range(cycle)), key=company)
 
     def _origin_of(self, phase: int, block_s: float, now_s: float) -> float:
-        """The next instant of `phase` that lies a block ahead at least, so that the first has time to be rendered."""
+        """Return the next instant of `phase` that is at least one block ahead, so that there is time to render the
+        first block."""
         if self._origin_s is None:
             self._origin_s = now_s
         first_s = self._origin_s + phase / PHASES * block_s
@@ -424,11 +431,11 @@ class AudioThread:
             self._rest(wait_s)
 
     def _rest(self, wait_s: float | None) -> None:
-        """Sleep until the next stream is due. Where there is no time for that, let the event loop have the core as long
-        as it takes to send what was made: before that, nobody hears it."""
+        """Sleep until the next stream is due. If there is no time to sleep, let the event loop have the core for as
+        long as it takes to send the blocks: until then they are of no use."""
         if wait_s is not None and wait_s < _GIVE_WAY_S and not (self._is_stopping or self._has_arrived.is_set()):
             began_s = self._time_s()
-            # Of several at once, all but the first are early.
+            # With several blocks at once, all but the first are early.
             self._has_arrived.wait(_GIVE_WAY_S if wait_s <= 0 or self.blocks_at_once > 1 else wait_s)
             if wait_s < 0:
                 self._busy_s += self._time_s() - began_s
@@ -438,7 +445,7 @@ class AudioThread:
         self._wake.clear()
 
     def _deliver(self, made: dict[Stream, list[Outgoing]]) -> None:
-        """On the event loop."""
+        """Deliver the output of a tick; runs on the event loop."""
         try:
             for stream, outgoing in made.items():
                 stream.deliver(outgoing)
@@ -447,7 +454,7 @@ class AudioThread:
 
 
 class _Due(NamedTuple):
-    """So many blocks of a stream, which have cost `cost_s` so far."""
+    """A stream with the number of its `blocks` to render, which have cost `cost_s` so far."""
 
     stream: Stream
     blocks: int

@@ -1,4 +1,5 @@
-"""What a response of each quality level takes on this host: from a pose to what is ready to be convolved."""
+"""How long a response of each quality level takes on this host, from a pose to the response prepared for
+convolution."""
 
 import statistics
 import time
@@ -20,13 +21,13 @@ from server.responses.ir_request import AskedIr, IrRequest, compute_irs
 POSES = 5
 _BLOCK_SIZE = 256
 _MOST_MS = 50.0
-"""Of a level that has taken so long no more is asked."""
+"""A level that has taken this long in total is measured no further."""
 
 
 class Listener:
-    """Somebody who hears one emitter, all of its sound, at the level of `field`, as a stream serves them.
+    """A listener to one emitter with all effects on, at the level of `field`, served as a stream is.
 
-    `node_cache` holds what was kept from before; `time_s` is the clock.
+    `node_cache` has the responses kept from before; `time_s` is the clock.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Listener:
         return self._node_cache.bytes
 
     def time_ms(self, listener: Pose) -> float:
-        """Milliseconds that a pose takes: next to nothing where its response is heard already."""
+        """Return the milliseconds that a pose takes: next to nothing if its response is already playing."""
         started_s = self._time_s()
         if self._heard is None or not self._heard.around.holds(listener):
             shared = shared_response(self._field, self._direct_sound.early_reflections, listener, self._emitter)
@@ -66,17 +67,17 @@ class Listener:
         return 1000 * (self._time_s() - started_s)
 
     def forget(self) -> None:
-        """Have nothing kept, and hear nothing."""
+        """Clear the cache and the response that is playing."""
         self._node_cache.clear()
         self._heard = None
 
 
 def calibrate(levels: FieldsByLevel, filters: HeadFilters, poses: int = POSES) -> dict[str, float]:
-    """Milliseconds of this thread that a response nobody asked for before takes here and now, by level: the median of
-    `poses`, or of fewer for a level that is slow.
+    """Return the milliseconds that a new response takes on this host now, by level: the median of `poses`, or of fewer
+    for a slow level.
 
-    Time of this thread, so that what else runs meanwhile counts little; levels take turns, so that it slows all of
-    them. What `levels` keep is forgotten.
+    Times are CPU time of this thread, so that other load has little influence; levels take turns, so that it affects
+    all of them alike. The caches of `levels` are cleared.
     """
     start = levels.bundle.manifest.start
     places = [(float(x), float(y), float(z)) for x, y, z in np.linspace(start.listener, start.emitter, poses)]
@@ -87,7 +88,7 @@ def calibrate(levels: FieldsByLevel, filters: HeadFilters, poses: int = POSES) -
     times_ms: dict[str, list[float]] = {name: [] for name in levels}
     for number in range(-1, poses):
         for name, listener in listeners.items():
-            # The first time warms up, compiling what has to be, and says nothing of the others.
+            # The first time is a warm-up that may compile code, so it is left out.
             if sum(times_ms[name][1:]) <= _MOST_MS:
                 listener.forget()
                 times_ms[name].append(listener.time_ms(Pose.from_yaw(places[number], float(number))))

@@ -1,7 +1,7 @@
-"""Keeps a renderer's direct paths where listener and emitters are.
+"""Keeps a renderer's direct paths up to date with the poses of listener and emitters.
 
-A listener who moves has every path found anew, many times a second, while what there is to know of the emitters stays
-the same: it is kept from one time to the next.
+While the listener moves, all paths are found anew many times a second. The data about the emitters stay the same
+meanwhile, so they are kept from one time to the next.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,21 +13,21 @@ from server.streaming.emitters import StreamedEmitter
 
 
 class DirectPathTracker:
-    """That of `renderer`, at `emitters` by id, all of which it has. Whoever moves one of them, or changes how its path
-    is heard, says so by its `is_displaced`."""
+    """The direct paths of `renderer` for `emitters` by id, all of which the renderer has. Code that moves an emitter,
+    or changes effects on its path, sets its `is_displaced`."""
 
     def __init__(self, direct_sound: DirectSound, renderer: Renderer, emitters: Mapping[str, StreamedEmitter]) -> None:
         self._direct_sound = direct_sound
         self._renderer = renderer
         self._emitters = emitters
         self._place: Vector3 | None = None
-        """Of the listener, when paths were found last."""
+        """The listener's position when paths were found last."""
         self._ways: list[PathBatch[str]] = []
         self._known = 0
-        """From how many emitters those are."""
+        """The number of emitters in `_ways`."""
 
     def follow(self, listener: Pose) -> None:
-        """Have the next block's direct sound come from where emitters are to where the listener is."""
+        """Set the direct paths of the next block from the present positions of emitters and listener."""
         if not self._direct_sound.is_heard_apart:
             return
         emitters = self._emitters

@@ -1,4 +1,5 @@
-"""What a session knows of one emitter: its state, what it plays, what is heard of it, and what is out of date."""
+"""A session's data of one emitter: its state, its source, the response that is playing, and which of them are out of
+date."""
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
@@ -22,14 +23,14 @@ _LIVE_QUEUE_S = 0.5
 
 
 class Stage(Enum):
-    """How far an emitter has come since it was added. Every one goes through all stages, in this order."""
+    """The stages of an emitter after it was added. Every emitter goes through all of them in this order."""
 
     UNDECIDED = auto()
-    """No plan has said yet which of its effects are heard."""
+    """No plan has decided about its effects yet."""
     DECIDED = auto()
-    """It waits for its first impulse response, if its effects call for one."""
+    """Its effects are decided; it waits for its first impulse response, if they call for one."""
     ANNOUNCED = auto()
-    """The client was told that it sounds."""
+    """The client has been informed that it is audible."""
 
 
 @dataclass
@@ -37,19 +38,19 @@ class HeardResponse:
     """The newest impulse response (IR) of an emitter that the renderer has."""
 
     token: int | None = None
-    """Pose id; None before the first."""
+    """The id of its pose; None before the first."""
     identity: Hashable | None = None
-    """Which one it is, where poses share responses; None where it is not known to be that of a pose."""
+    """The identity of the response where poses share responses; None if it is not known to belong to a pose."""
     without_direct: PartitionedIr | None = None
-    """The newest that leaves the direct sound to the renderer."""
+    """The newest IR that leaves the direct sound to the renderer."""
     bakes_direct: bool = False
-    """Whether the direct sound is part of it."""
+    """Whether the IR includes the direct sound."""
     validity: "Validity | None" = None
 
 
 @dataclass(frozen=True)
 class Validity:
-    """An IR is sure to be that of a listener too who is in `around`, as long as the `circumstances` are the same."""
+    """Where an IR stays valid: every listener in `around` has the same one while the `circumstances` stay the same."""
 
     circumstances: Hashable
     around: Neighbourhood
@@ -60,8 +61,9 @@ class Validity:
 
 @dataclass
 class StreamedEmitter:
-    """`state` is what the client and the plan say; `heard` is what the renderer was given last. Code that changes the
-    state notes here what of that is out of date. `serial` tells it from others that had the same id before."""
+    """One emitter of a stream. `state` follows the client and the plan; `heard` is what the renderer has. Code that
+    changes the state marks here which parts of `heard` are out of date. `serial` distinguishes it from others that had
+    the same id before."""
 
     serial: int
     state: EmitterState
@@ -69,9 +71,10 @@ class StreamedEmitter:
     stage: Stage = Stage.DECIDED
     heard: HeardResponse = field(default_factory=HeardResponse)
     is_outdated: bool = True
-    """Whether the IR may be of another state: one is to be asked for, unless the one that is heard is that one."""
+    """Whether the IR may belong to an earlier state. If so, a new one is requested, unless the one that is playing
+    turns out to be the same."""
     is_displaced: bool = True
-    """Whether the renderer has the direct path of another state."""
+    """Whether the renderer has the direct path of an earlier state."""
 
     @classmethod
     def added_by(
@@ -86,12 +89,12 @@ class StreamedEmitter:
 
     @property
     def is_decided(self) -> bool:
-        """Whether a plan has said which effects are heard, or there is none."""
+        """Whether a plan has decided about its effects, or there are no plans."""
         return self.stage is not Stage.UNDECIDED
 
     @property
     def wants_baking(self) -> bool:
-        """Whether the direct sound is to become part of an IR that is otherwise up to date."""
+        """Whether the direct sound is to be baked into an IR that is otherwise up to date."""
         has_other = self.heard.without_direct is not None and not self.heard.bakes_direct
         return self.effects.bakes_direct and has_other and not self.is_outdated
 
@@ -100,12 +103,12 @@ class StreamedEmitter:
             self.stage = Stage.DECIDED
 
     def announce(self) -> bool:
-        """Whether the client is still to be told that it sounds."""
+        """Note that the client is informed. Return whether that still has to be done."""
         is_news, self.stage = self.stage is not Stage.ANNOUNCED, Stage.ANNOUNCED
         return is_news
 
     def move(self, message: MoveEmitter) -> None:
-        # Turning on the spot leaves what a field says as it is.
+        # A field's response does not depend on an emitter's orientation.
         self.is_outdated |= message.position != self.state.position
         self.is_displaced = True
         pose = message.pose if message.has_front else Pose(message.position, self.state.pose.orientation)
@@ -118,13 +121,13 @@ class StreamedEmitter:
         self.state = replace(self.state, effects=effects)
 
     def discard_response(self) -> None:
-        """The IR is no longer right, wherever the emitter is."""
+        """Mark the IR as wrong for every position of the emitter."""
         self.is_outdated, self.heard.identity = True, None
 
 
 @dataclass
 class LiveInput:
-    """The live source of emitter `id`, and which of its blocks came last."""
+    """The live source of emitter `id`, and the sequence number of its newest block."""
 
     id: str
     source: LiveSource
@@ -138,7 +141,7 @@ class LiveInput:
         return cls(identifier, LiveSource(capacity=capacity, lead=lead))
 
     def push(self, block: DryBlock) -> None:
-        """Raises RequestError stale_block."""
+        """Queue a block. Raises RequestError stale_block for one that is not newer than those before."""
         if block.sequence <= self.newest_sequence:
             problem = f"block {block.sequence} of emitter {self.id!r} is not newer than {self.newest_sequence}"
             raise RequestError("stale_block", problem, field="sequence")
@@ -157,7 +160,7 @@ class LiveInput:
         )
 
     def complaint(self) -> RequestError | None:
-        """What was wrong with the samples that came since it was asked last."""
+        """Return the error about invalid samples since the last call, or None."""
         gated = self.source.samples_gated - self._gated_told
         self._gated_told += gated
         if not gated:

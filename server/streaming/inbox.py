@@ -1,6 +1,6 @@
-"""What waits for an audio thread to take it into a stream: a client's messages, and what workers have computed.
+"""Queues of items for an audio thread: a client's messages, and results from workers.
 
-The event loop and the workers put something in, and the audio thread takes it out. There is no lock to wait for.
+The event loop and the workers put items in, and the audio thread takes them out, all without locks.
 """
 
 from collections import deque
@@ -24,24 +24,24 @@ class ComputedResponse:
     response: IrResponse
     duration_s: float
     cpu_s: float
-    """What the thread that computed it spent."""
+    """CPU time of the thread that computed the response."""
 
 
 class Inbox:
-    """Of one stream. In place of an outcome there is the exception that came instead."""
+    """The queues of one stream. An exception in place of a result means that the work failed."""
 
     def __init__(self) -> None:
         self.responses: deque[tuple[IrRequest, ComputedResponse | BaseException]] = deque()
         self.plans: deque[tuple[Plan, float] | BaseException] = deque()
-        """With the CPU time that each took."""
+        """Plans, each with the CPU time that it took."""
         self.regrets: deque[Regret | BaseException] = deque()
         self.brings_emitter = False
-        """Whether a message that waits does."""
+        """Whether a waiting message adds an emitter."""
         self._messages: deque[tuple[float, ClientMessage]] = deque()
 
     def put_message(self, message: ClientMessage, now_s: float) -> bool:
-        """False, and the message refused, where too many wait already. A listener's pose takes the place of an older
-        one that came directly before it."""
+        """Queue a message; return False, and refuse it, if too many are waiting. A listener's pose replaces an older
+        one directly before it."""
         if not self._replace_pose(message, now_s):
             if len(self._messages) >= MAX_WAITING_MESSAGES:
                 return False
@@ -56,7 +56,7 @@ class Inbox:
             _, last = self._messages[-1]
             if not (isinstance(last, ListenerPose) and last.pose_id < message.pose_id):
                 return False
-            # Only here anything is appended: if the audio thread has taken it meanwhile, nothing is left at all.
+            # Only this method appends: if the audio thread has taken the last message meanwhile, the queue is empty.
             self._messages[-1] = now_s, message
         except IndexError:
             return False
@@ -68,24 +68,24 @@ class Inbox:
 
     @property
     def has_answers(self) -> bool:
-        """Whether a response or a plan has come, which waits for no block."""
+        """Whether a response or a plan has arrived, which is processed before the next block."""
         return bool(self.responses or self.plans)
 
     def take_messages(self) -> Iterator[tuple[float, ClientMessage]]:
-        """Those that wait now, each with the time at which it came."""
+        """Take the messages that wait now, each with its time of arrival."""
         for _ in range(len(self._messages)):
             yield self._messages.popleft()
 
 
 class PendingWork:
-    """What workers were given by one stream and have not done yet."""
+    """Work of one stream that workers have not finished yet."""
 
     def __init__(self) -> None:
-        # What is done is taken out: a future holds whom it calls back, which is the stream.
+        # Finished futures are removed, since a future refers to its callback and so to the stream.
         self._futures: set[Future[Any]] = set()
 
     def keep_outcome(self, future: "Future[T]", keep: "Callable[[T | BaseException], None]") -> None:
-        """Have `keep` called with what comes of it: on the worker's thread, or at once where it is done."""
+        """Call `keep` with the result or the exception: on the worker's thread, or at once if it is done."""
         self._futures.add(future)
         future.add_done_callback(partial(self._settle, keep))
 

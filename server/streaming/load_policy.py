@@ -1,21 +1,21 @@
-"""What an audio thread and its streams do without when there is more to do than there is time: `decide`, a pure
-function of one measurement. Nothing here waits, looks at a clock or keeps anything.
+"""What an audio thread and its streams give up when there is more work than time: `decide`, a pure function of one
+measurement. Nothing here waits, reads a clock or stores anything.
 
-A thread measures four times a second what it and its streams went through. What was decided before, as far as it
-matters, is a `LoadState`, which `decide` takes and gives back anew. In this order something is given up:
+A thread measures its load and that of its streams four times a second. A `LoadState` carries what matters of earlier
+decisions; `decide` takes one and returns the next. These things are given up, in this order:
 
-1. *Blocks at once*: a thread renders more blocks of a stream at once, which takes less of a core for each; poses are
-   heard up to so many blocks later.
-2. *Responses*: below the top of its ladder a stream gets impulse responses (IRs) from an equal part of a share of a
-   core, the smaller the busier the thread is.
+1. *Blocks at once*: a thread renders more blocks of a stream at once, which takes less of a core for each; poses
+   take effect up to that many blocks later.
+2. *Responses*: below the top of its ladder, a stream's impulse responses (IRs) get an equal part of a share of a
+   core, which shrinks as the thread gets busier.
 3. *Quality*: a stream steps down its ladder (`server.streaming.quality_steps`).
 
-Late blocks, or a thread with no time left, concern all its streams alike: those that stand best step down first, and
-those that stand worst are the first to step back up, one at a time. IRs that are long in coming concern the stream that
-waits for them. A stream that stepped down waits until the step shows before it steps again. One that steps up, and has
-to step down soon after, waits twice as long the next time: near a limit, a stream stays below it.
+Late blocks, or a thread without spare time, concern all its streams alike: those on the highest steps step down first,
+and those on the lowest are the first to step back up, one at a time. Slow IRs concern the stream that waits for them.
+After a step down, a stream waits until the step shows before it steps again. A stream that steps up, and has to step
+down soon after, waits twice as long the next time: near a limit, a stream stays below it.
 
-Seconds are of one monotonic clock. The thresholds, with their reasons, are in `server.streaming.load_thresholds`.
+Times are seconds of one monotonic clock. The thresholds, with their reasons, are in `server.streaming.load_thresholds`.
 """
 
 import math
@@ -28,17 +28,17 @@ from server.streaming.load_thresholds import Thresholds
 from server.streaming.quality_steps import QualityStep
 
 Key = TypeVar("Key", bound=Hashable)
-"""Tells the streams of a thread apart."""
+"""A key that identifies a stream of a thread."""
 
 
 @dataclass(frozen=True)
 class LoadSample:
-    """What a stream went through in the period just over.
+    """The load of a stream in the last period.
 
-    `lateness` is how long after it was due a block was ready, at worst, as a share of what the client has in hand: 1 is
-    late. `ir_wait_s` is the longest time from asking for IRs to having them, so far where it still waits; None where it
-    asked for none. `request_s` and `plan_s` are seconds of CPU time that a request for IRs and a plan of effects have
-    taken of late.
+    `lateness` is the longest time from a block's due time until it was ready, as a share of what the client has in
+    hand: 1 is late. `ir_wait_s` is the longest time from requesting IRs to having them, so far if the stream still
+    waits; None if it requested none. `request_s` and `plan_s` are smoothed CPU times of a request for IRs and of a plan
+    of effects.
     """
 
     lateness: float = 0.0
@@ -49,7 +49,7 @@ class LoadSample:
 
 @dataclass(frozen=True)
 class Measurement(Generic[Key]):
-    """What an audio thread went through in the period that ended `now_s`: for the share `busy` of it, it rendered."""
+    """The load of an audio thread in the period that ended at `now_s`; it rendered for the share `busy` of it."""
 
     now_s: float
     busy: float
@@ -57,16 +57,16 @@ class Measurement(Generic[Key]):
 
     @property
     def lateness(self) -> float:
-        """The worst of all streams."""
+        """The worst lateness of all streams."""
         return max((sample.lateness for sample in self.streams.values()), default=0.0)
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """A stream's steps, best first, on which of them it stands, and how it has come there.
+    """A stream's quality steps, best first, with its present step and how it came there.
 
-    `caution` multiplies how long all has to be well before it steps up. `rose_s` is when it stepped up last, as long as
-    that may turn out to have been too early.
+    `caution` multiplies the time for which load must be low before the stream steps up. `rose_s` is the time of its
+    last step up, while that may still prove to have been too early.
     """
 
     steps: tuple[QualityStep, ...]
@@ -83,12 +83,12 @@ class Ladder:
 
     @property
     def above(self) -> QualityStep:
-        """The next better step, or this one at the top."""
+        """The next better step, or the present one at the top."""
         return self.steps[max(0, self.at - 1)]
 
     @property
     def is_eased(self) -> bool:
-        """Whether it stands below its top."""
+        """Whether the stream is below its top step."""
         return self.at > 0
 
     @property
@@ -98,11 +98,11 @@ class Ladder:
 
 @dataclass(frozen=True)
 class RenderAhead:
-    """How many blocks of a stream a thread renders at once, and its mean busy share over the last of so many `periods`
-    since that changed.
+    """How many blocks of a stream a thread renders at once, and its mean busy share over the last of the `periods`
+    since that number changed.
 
-    `caution` multiplies how long the `long_mean` reaches back that calls for fewer blocks. `periods_since_fewer` counts
-    from when they became fewer, as long as that may turn out to have been too early.
+    `caution` multiplies the length of the `long_mean` that calls for fewer blocks. `periods_since_fewer` counts from
+    the last decrease, while that may still prove to have been too early.
     """
 
     blocks: int = 1
@@ -115,18 +115,18 @@ class RenderAhead:
 
 @dataclass(frozen=True)
 class ThreadState:
-    """What a decision depends on beside the newest measurement, of a thread."""
+    """The part of a decision's input that belongs to a thread, besides the newest measurement."""
 
     ahead: RenderAhead = RenderAhead()
     overloaded_periods: int = 0
     well_since_s: float | None = None
     moved_s: float = -math.inf
-    """When it had its streams step down last."""
+    """When the thread last made streams step down."""
 
 
 @dataclass(frozen=True)
 class LoadState(Generic[Key]):
-    """The same, of a thread and its streams."""
+    """The state of a thread and the ladders of its streams."""
 
     thread: ThreadState
     ladders: Mapping[Key, Ladder]
@@ -134,9 +134,9 @@ class LoadState(Generic[Key]):
 
 @dataclass(frozen=True)
 class Decision(Generic[Key]):
-    """What follows: how many blocks of a stream are rendered at once, which streams have moved by one step and why, and
-    the least seconds from one request for IRs, and from one plan of effects, to the next. `ir_share` is what IRs may
-    take of a core."""
+    """The decision: how many blocks of a stream to render at once, which streams move by one step and why, and for each
+    stream the least seconds between requests for IRs and between plans of effects. `ir_share` is the share of a core
+    that IRs may take."""
 
     blocks_at_once: int
     ir_share: float
@@ -148,9 +148,8 @@ class Decision(Generic[Key]):
 def decide(
     thresholds: Thresholds, state: LoadState[Key], measurement: Measurement[Key]
 ) -> tuple[LoadState[Key], Decision[Key]]:
-    """The state that follows, and what the thread and its streams are to do. `state` has a ladder for each stream that
-    was measured."""
-    # A thread that could make time before this measurement gets the chance to first.
+    """Return the next state and the decision. `state` has a ladder for each stream in the measurement."""
+    # A thread that could save time by more blocks at once before this measurement does that first.
     can_make_time = state.thread.ahead.blocks < thresholds.blocks_at_once[-1]
     thread = _judge_thread(thresholds, state.thread, measurement, can_make_time=can_make_time)
     ladders = {
@@ -174,7 +173,8 @@ def decide(
 
 
 def render_ahead(thresholds: Thresholds, ahead: RenderAhead, *, busy: float, lateness: float) -> RenderAhead:
-    """After a period in which a thread rendered for the share `busy`, and a block was late by `lateness` at worst."""
+    """Return the blocks at once after a period in which a thread rendered for the share `busy`, with the worst lateness
+    `lateness`."""
     ahead = _average(thresholds, ahead, busy)
     numbers = thresholds.blocks_at_once
     at = numbers.index(ahead.blocks)
@@ -183,21 +183,22 @@ def render_ahead(thresholds: Thresholds, ahead: RenderAhead, *, busy: float, lat
     falls_behind = busy > thresholds.behind_busy and lateness > thresholds.behind_lateness
     is_full = at + 1 < len(numbers) and has_mean and ahead.mean_busy > thresholds.more_blocks_above[at]
     if is_full or (at + 1 < len(numbers) and falls_behind):
-        has_relapsed = is_full and ahead.periods_since_fewer is not None  # a moment's load says nothing of the number
+        # A short peak of load does not show that fewer blocks were too few.
+        has_relapsed = is_full and ahead.periods_since_fewer is not None
         caution = min(thresholds.most_caution, 2 * ahead.caution) if has_relapsed else ahead.caution
         return RenderAhead(numbers[at + 1], caution=caution)
     if at == 0:
         return ahead
     left = 1 - thresholds.saved_by_doubling
     would_do = has_long_mean and ahead.long_mean / left < thresholds.more_blocks_above[at - 1]
-    # Where even a quarter of the blocks would do, half of them surely do.
+    # Where even a quarter of the blocks would suffice, half of them certainly do.
     if would_do or (has_mean and ahead.mean_busy / left**2 < thresholds.more_blocks_above[at - 1]):
         return RenderAhead(numbers[at - 1], caution=ahead.caution, periods_since_fewer=0)
     return ahead
 
 
 def _average(thresholds: Thresholds, ahead: RenderAhead, busy: float) -> RenderAhead:
-    """With one more period in its means, and less caution where fewer blocks have done for long enough."""
+    """Return the means with one more period, and with less caution if fewer blocks have sufficed for long enough."""
     periods, since, caution = ahead.periods + 1, ahead.periods_since_fewer, ahead.caution
     if since is not None:
         since += 1
@@ -215,26 +216,27 @@ def _average(thresholds: Thresholds, ahead: RenderAhead, busy: float) -> RenderA
 
 
 def ir_share(thresholds: Thresholds, *, busy: float) -> float:
-    """Of a core, for IRs of the streams of an audio thread that renders for a share `busy` of the time."""
+    """Return the share of a core for IRs of the streams of an audio thread that renders for a share `busy` of the
+    time."""
     most = thresholds.ir_share
     return min(most, max(thresholds.shared_core - busy, thresholds.least_ir_share * most))
 
 
 def ir_interval_s(ladder: Ladder, *, request_s: float, streams: int, share: float) -> float:
-    """Least time from one request for IRs to the next. `request_s` of CPU time is what one takes; below the top of its
-    ladder, a stream may take an equal part of a `share` of a core, with `streams` that do."""
+    """Return the least time between requests for IRs. `request_s` is the CPU time of one. Below the top of its ladder,
+    a stream may take an equal part of a `share` of a core, which `streams` such streams divide."""
     rate_hz = ladder.step.ir_rate_hz
     paced_s = 0.0 if rate_hz is None else 1 / rate_hz
     return max(paced_s, request_s * streams / share) if ladder.is_eased else paced_s
 
 
 def requests_at_once(thresholds: Thresholds, *, workers: int, threads: int) -> int:
-    """How many requests for IRs a thread may have unanswered, of so many threads with streams that share workers."""
+    """Return how many unanswered requests for IRs a thread may have, if `threads` with streams share the workers."""
     return thresholds.requests_ahead + math.ceil(workers / threads)
 
 
 def patience_s(thresholds: Thresholds, step: QualityStep) -> float:
-    """How long IRs may take from being asked for to being there."""
+    """Return how long IRs may take from their request to their arrival."""
     if step.ir_rate_hz is None:
         return thresholds.patience_s
     return max(thresholds.patience_s, thresholds.patience_intervals / step.ir_rate_hz)
@@ -243,8 +245,8 @@ def patience_s(thresholds: Thresholds, step: QualityStep) -> float:
 def _judge_thread(
     thresholds: Thresholds, thread: ThreadState, measurement: Measurement[Key], *, can_make_time: bool
 ) -> ThreadState:
-    """With what the measurement says of the thread. One that `can_make_time` otherwise is not overloaded as long as no
-    block is nearly late."""
+    """Return the thread's state after the measurement. A thread that `can_make_time` by other means is not overloaded
+    as long as no block is nearly late."""
     busy, lateness = measurement.busy, measurement.lateness
     is_overloaded = (busy > thresholds.full_busy and not can_make_time) or lateness > thresholds.tight
     is_well = busy <= thresholds.free_busy and lateness <= thresholds.easy
@@ -257,7 +259,7 @@ def _judge_thread(
 
 
 def _judge_stream(thresholds: Thresholds, ladder: Ladder, sample: LoadSample, now_s: float) -> Ladder:
-    """With what the measurement says of how one stream waits for IRs."""
+    """Return a stream's ladder after the measurement of how long it waits for IRs."""
     wait_s = sample.ir_wait_s or 0.0
     is_overloaded = wait_s > patience_s(thresholds, ladder.step)
     expected_s = wait_s * ladder.above.cost_ms / ladder.step.cost_ms
@@ -281,8 +283,8 @@ def _since(since_s: float | None, now_s: float, *, is_so: bool) -> float | None:
 def _move(
     thresholds: Thresholds, thread: ThreadState, ladders: dict[Key, Ladder], measurement: Measurement[Key]
 ) -> tuple[ThreadState, dict[Key, Ladder], dict[Key, LevelReason]]:
-    """One step at a time: down those that wait too long for IRs, and, where the thread has too much to do, those that
-    stand best; or else up one."""
+    """Move streams by one step: down those that wait too long for IRs and, if the thread has too much work, those on
+    the highest steps; or else one of them up."""
     now_s = measurement.now_s
     moved: dict[Key, LevelReason] = {}
 
@@ -309,7 +311,7 @@ def _move(
 
 
 def _best_off(ladders: Mapping[Key, Ladder]) -> Sequence[Key]:
-    """Those that stand highest of all that can still step down."""
+    """Return the streams on the highest steps among those that can still step down."""
     able = [key for key, ladder in ladders.items() if not ladder.is_lowest]
     highest = min((ladders[key].at for key in able), default=0)
     return [key for key in able if ladders[key].at == highest]

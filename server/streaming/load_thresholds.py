@@ -18,7 +18,7 @@ class Thresholds:
 
     ir_rates_hz: tuple[float, ...] = (12.0, 5.0)
     """Responses per second and emitter on the steps below the top: reverberation that follows a walk 12 times a second
-    is hardly told from one that follows every pose, 5 times is heard as a lag."""
+    is hardly distinguishable from one that follows every pose; at 5 times a lag is audible."""
     least_ir_rate_hz: float = 2.0
     """Responses per second and emitter on the lowest step: a walk is still followed."""
 
@@ -62,17 +62,18 @@ class Thresholds:
     """Mean busy share above which a thread renders twice as many blocks at once, for each number but the last. The last
     lies below `full_busy`: poses are heard later before quality falls."""
     behind_busy: float = 0.95
-    """Busy share of one period that is no time for a mean, where `behind_lateness` is passed as well."""
+    """Busy share of a single period at which a thread renders more blocks at once without waiting for a mean, if
+    `behind_lateness` is exceeded as well."""
     behind_lateness: float = 0.25
-    """Lateness that goes with it: the thread falls behind."""
+    """Lateness above which, together with `behind_busy`, a thread falls behind."""
     saved_by_doubling: float = 1 / 7
-    """Share of a thread's time that twice as many blocks at once save, at the most. A thread that would do with half as
-    many if it were so renders half as many."""
+    """Largest share of a thread's time that doubling the blocks at once saves. A thread renders half as many blocks at
+    once if it would manage even without that saving."""
     mean_periods: int = 3
     """Periods after a change until a mean of busy shares says something."""
     newest_weight: float = 0.25
-    """Weight of a period in that mean, which so reaches back about a second: a moment in which something else has the
-    core is what clients have blocks in hand for."""
+    """Weight of a period in that mean, which so covers about a second: for a short load by another program, clients
+    have blocks in hand."""
 
     ir_share: float = 0.25
     """Share of a core that responses of a thread's streams may take below the top of their ladders; `NAFIR_IR_SHARE`
@@ -83,8 +84,8 @@ class Thresholds:
     least_ir_share: float = 1 / 3
     """Share of `ir_share` that responses get however busy a thread is: reverberation keeps following."""
     requests_ahead: int = 1
-    """Requests for responses beside those being computed, so that no worker waits for the next. More would be of poses
-    long gone when their turn comes."""
+    """Requests for responses in addition to those being computed, so that no worker waits for the next. With more,
+    poses would be outdated when their turn comes."""
     plan_share: float = 0.03
     """Share of a core that plans of effects may take for all streams of a thread, as far as plans last."""
     presumed_load: float = 0.02

@@ -1,7 +1,7 @@
-"""When a block is due, and how many may be on their way.
+"""When a block is due, and how many blocks may be on their way.
 
-Seconds of one monotonic clock. Block k of a stream plays from `origin_s + k * block_s`; the server renders it `lead`
-blocks earlier. Everything is measured from the origin, so the error of one sleep never adds to the next.
+Times are seconds of one monotonic clock. Block k of a stream plays from `origin_s + k * block_s`; the server renders it
+`lead` blocks earlier. All times are counted from the origin, so the error of one sleep never adds to the next.
 """
 
 import math
@@ -22,25 +22,25 @@ class StreamClock:
         return self._origin_s + (block - self._lead) * self._block_s
 
     def deadline_s(self, block: int) -> float:
-        """When a player that keeps `lead` blocks in hand needs block `block`: later is late."""
+        """Return when a player with `lead` blocks in hand needs block `block`; a block after that is late."""
         return self._origin_s + block * self._block_s
 
     def ahead_s(self, block: int, now_s: float) -> float:
-        """How far ahead of real time a stream is whose next block is `block`; negative when it is behind."""
+        """Return how far ahead of real time a stream is if its next block is `block`; negative if it is behind."""
         return self.deadline_s(block) - now_s
 
     def slip(self, block: int, now_s: float) -> None:
-        """Move the origin by whole blocks so that `block` is due next: after a stall, sound resumes instead of arriving
-        in a burst, and other streams' blocks still fall due between this one's."""
+        """Move the origin by whole blocks so that `block` is due next. After a stall, sound then resumes instead of
+        arriving in a burst, and other streams' blocks still fall due between this one's."""
         # guard: a stall moves a clock by whole blocks
         self._origin_s += math.ceil((now_s - self.due_s(block)) / self._block_s) * self._block_s
 
 
 class SendWindow:
-    """At most `size` blocks sent and not yet acknowledged.
+    """A limit of `size` blocks that are sent and not yet acknowledged.
 
-    Awaiting a socket tells nothing about what the client has: seconds of audio fit in the buffers between.
-    Acknowledgements do.
+    Awaiting a socket does not show what the client has: seconds of audio fit in the buffers between. Acknowledgements
+    do.
     """
 
     def __init__(self, size: int) -> None:
@@ -57,13 +57,13 @@ class SendWindow:
         return self.unacknowledged >= self.size
 
     def take_sequences(self, blocks: int) -> range:
-        """The sequence numbers of so many blocks, or of the first of them for which the window has room."""
+        """Return the sequence numbers of the next `blocks`, or of as many of them as the window has room for."""
         first = self.sent
         self.sent += max(0, min(blocks, self.size - self.unacknowledged))
         return range(first, self.sent)
 
     def acknowledge(self, sequence: int) -> None:
-        """Blocks up to and including `sequence` arrived. Raises RequestError for one that was never sent."""
+        """Note that blocks up to and including `sequence` arrived. Raises RequestError for one that was never sent."""
         # guard: what was not sent cannot have arrived
         if sequence >= self.sent:
             raise RequestError("unknown_sequence", f"block {sequence} has not been sent yet", field="sequence")

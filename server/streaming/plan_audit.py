@@ -1,9 +1,10 @@
-"""Whether a plan of effects is right: a moment of one emitter, heard as planned and with everything on, compared.
+"""Checks a plan of effects: compares one emitter at one moment, rendered by the plan, with the same rendered with
+everything on.
 
-Whole responses are compared where everybody is at that moment, in just-noticeable differences (JND). What only motion
-tells (a delay that follows, responses that turn with the head) they do not show; what a client switched by hand is no
-regret. A plan that is found out is corrected: of the effects that are off, the one that makes up for most is on from
-then on.
+Full responses at the present poses are compared, in just-noticeable differences (JND). They do not show effects that
+only motion shows (a delay that follows, responses that turn with the head). Effects that a client switched by hand do
+not count. If a check finds an audible difference, it corrects the plan: of the effects that are off, the one that
+reduces the difference most is on from then on.
 """
 
 import dataclasses
@@ -26,22 +27,24 @@ from server.scene.effects import EffectName
 
 FIRST_S = 2.0
 PERIOD_S = 10.0
-"""Of sound from one check to the next, or more where checks take more than their share of time."""
+"""Seconds of sound between checks, or more where checks take more than their share of time."""
 SHARE = 0.01
-"""Of a core that the checks of one stream may take."""
+"""Share of a core that the checks of one stream may take."""
 SHARE_OF_ALL = 0.02
-"""Of a core that those of all streams of an audio thread may take."""
+"""Share of a core that the checks of all streams of an audio thread may take."""
 LIMIT_JND = 1.0
 
 
 def interval_s(cost_s: float, *, streams: int) -> float:
-    """Of sound until the check after one that took `cost_s` of CPU time, with so many streams that share a core."""
+    """Return the seconds of sound until the next check, after one that took `cost_s` of CPU time, with `streams` that
+    share a core."""
     return max(PERIOD_S, cost_s / min(SHARE, SHARE_OF_ALL / streams))
 
 
 @dataclass(frozen=True)
 class Regret:
-    """By audible parameter, in JND; `corrections` say why effects are to be on that were not. `cost_s` of CPU time."""
+    """The result of a check: differences in JND by audible parameter. `corrections` are effects to switch on, with the
+    reasons. `cost_s` is CPU time."""
 
     by_parameter: Mapping[str, float]
     corrections: Mapping[EffectName, str]
@@ -54,8 +57,8 @@ class Regret:
 
 @dataclass(frozen=True)
 class PlanAudit:
-    """Of one emitter as it was. `whole` are the effects that would be on if all were but those switched off by hand;
-    `channels` is what it is heard with, and `whole_channels` what it would be then."""
+    """A check of one emitter in a past state. `whole` has all effects on but those switched off by hand; `channels` is
+    the number that is rendered, and `whole_channels` the number with `whole`."""
 
     level: str
     listener: Pose
@@ -67,12 +70,12 @@ class PlanAudit:
 
     @property
     def finds_anything(self) -> bool:
-        """Whether anything is off that could be heard at one moment."""
+        """Whether an effect is off whose absence could be heard at a single moment."""
         still = dataclasses.replace(self.emitter.effects, propagation_delay=True, holds_still=False)
         return still != self.whole or self.channels != self.whole_channels
 
     def run(self, field: AcousticField) -> Regret:
-        """Tens of milliseconds, for a worker thread."""
+        """Make the comparison, which takes tens of milliseconds, on a worker thread."""
         began_s = time.thread_time()
         reference = self._heard(field, self.whole, self.whole_channels)
         planned = self._compare(field, reference, self.emitter.effects, self.channels)
@@ -105,7 +108,7 @@ class PlanAudit:
         return audible_difference(reference, heard, field.sample_rate, onset_s=onset_s)
 
     def _heard(self, field: AcousticField, effects: EmitterEffects, channels: int) -> npt.NDArray[np.float32]:
-        """(2, sample) the whole response; one ear's twice."""
+        """Return the full response (2, sample); a mono one is repeated."""
         emitter = dataclasses.replace(self.emitter, effects=dataclasses.replace(effects, propagation_delay=True))
         responses = composed_irs(field, self.direct_sound, self.listener, [emitter], channels)
         if effects.direct_path:
@@ -115,7 +118,7 @@ class PlanAudit:
 
 @dataclass
 class RegretRecord:
-    """What checks found."""
+    """The results of all checks so far."""
 
     checks: int = 0
     failures: int = 0

@@ -1,7 +1,7 @@
-"""The qualities that a stream can be given under load: its steps, best first.
+"""The quality steps that a stream can have under load, best first.
 
-A step is a quality level and how many impulse responses (IRs) per second it gets. From the top there are first fewer
-IRs, then cheaper levels, then levels whose emitters share a tail. Costs are milliseconds per IR.
+A step is a quality level and a rate of impulse responses (IRs) per second. From the top there are first fewer IRs, then
+cheaper levels, then levels whose emitters share a tail. Costs are milliseconds per IR.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,8 @@ from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 
 @dataclass(frozen=True)
 class QualityStep:
-    """IRs of `level`, `cost_ms` each: at most `ir_rate_hz` a second for each emitter, or one with every pose."""
+    """IRs of `level`, which cost `cost_ms` each: at most `ir_rate_hz` per second for each emitter; if None, one per
+    pose."""
 
     level: str
     ir_rate_hz: float | None
@@ -26,21 +27,22 @@ class QualityStep:
 
     @classmethod
     def full(cls, level: QualityLevel, cost_ms: float) -> Self:
-        """All that a level has."""
+        """Return the step of a level at the full rate."""
         return cls(level.name, level.ir_rate_hz, level.shared_tail, cost_ms)
 
 
 @dataclass(frozen=True)
 class Offer:
-    """The levels of a scene, cheapest first, and what an IR of each costs on this host."""
+    """The levels of a scene, cheapest first, and the cost of an IR of each on this host."""
 
     levels: tuple[QualityLevel, ...]
     ms_here: Mapping[str, float]
     thresholds: Thresholds = THRESHOLDS
 
     def steps(self, choice: str, *, block_s: float) -> tuple[QualityStep, ...]:
-        """Best first, for a client that chose a level, or `AUTO`: then all levels whose IR takes no longer than a block
-        lasts, or, where none is so cheap, the cheapest. Raises RequestError unknown_level."""
+        """Return the steps, best first, for a client that chose a level or `AUTO`. For `AUTO` these are of all levels
+        whose IR takes no longer than a block lasts or, if there is none, of the cheapest. Raises RequestError
+        unknown_level."""
         least_hz = self.thresholds.least_ir_rate_hz
         if choice != AUTO:
             level = next((level for level in self.levels if level.name == choice), None)
@@ -49,10 +51,10 @@ class Offer:
                 raise RequestError("unknown_level", f"{choice!r} is none of {AUTO}, {known}", field="level")
             return (*self._slower(level), self._step(level, least_hz))
         fitting = [level for level in self.levels if self.ms_here[level.name] <= 1000 * block_s] or self.levels[:1]
-        # The most expensive is the best, but what shares a tail comes last.
+        # The most expensive level is the best, but levels that share a tail come last.
         best_first = reversed(fitting)
         best, *cheaper = sorted(best_first, key=lambda level: kind_of(level).shares_tail)
-        # What reuses responses has fewer to compute, however often it is asked.
+        # A level that reuses responses has fewer of them to compute, however often they are requested.
         often_hz, *_, seldom_hz = self.thresholds.ir_rates_hz
         down = [self._step(level, often_hz if kind_of(level).reuses_responses else seldom_hz) for level in cheaper]
         return (*self._slower(best), *down, self._step((best, *cheaper)[-1], least_hz))

@@ -1,9 +1,9 @@
-"""Has a renderer make what follows a session's direct sound: the impulse responses (IRs) of its newest poses, at the
-quality that was asked for last.
+"""Requests the impulse responses (IRs) for a session's newest poses at the quality chosen last, and gives them to the
+renderer.
 
-IRs are computed off the audio thread: `take_request` says which, one request at a time and always for the newest poses,
-and they come back through `accept`, or through `give_up` where none could be. A step that takes another level's
-IRs is heard from when they are there. Clocks are samples.
+IRs are computed off the audio thread: `take_request` returns the ones to compute, one request at a time and always for
+the newest poses. They come back through `accept`, or through `give_up` if the computation failed. A quality step with
+another level takes effect when its IRs have arrived. Clocks are in samples.
 """
 
 from collections.abc import Hashable, Iterable, Mapping
@@ -24,29 +24,29 @@ from server.streaming.quality_steps import QualityStep
 
 
 class Scope(Enum):
-    """Which IRs may be asked for."""
+    """Which IRs may be requested."""
 
     ALL = auto()
-    """Those of all emitters whose IR is out of date."""
+    """The IRs of all emitters whose IR is out of date."""
     FIRST = auto()
-    """First ones alone, of emitters that are not heard yet."""
+    """Only the first IRs of emitters that are not audible yet."""
 
 
 class _Demand(Enum):
-    """What is known of the IRs to ask for next."""
+    """Whether there are IRs to request next."""
 
     UNKNOWN = auto()
-    """Something has changed: it is to be looked at."""
+    """Something has changed, so the emitters have to be checked."""
     LATER = auto()
-    """There are some, which wait for their time."""
+    """There are some, but it is too soon to request them."""
     NONE = auto()
     """There are none until something changes."""
 
 
 @dataclass
 class _InFlight:
-    """The request that is unanswered. It `is_partial` where other IRs than those it asks for are out of date too, and
-    `is_overtaken` where something has changed since that may call for another."""
+    """The unanswered request. It `is_partial` if it leaves out other IRs that are out of date, and `is_overtaken` if a
+    change since then may call for another request."""
 
     request: IrRequest
     is_partial: bool
@@ -54,7 +54,7 @@ class _InFlight:
 
 
 class ResponseScheduler:
-    """Of one session, whose `emitters` are who sounds at each moment. `quality` is what is heard of `levels` first."""
+    """The scheduler of one session with its audible `emitters`. `quality` is the first quality, one of `levels`."""
 
     def __init__(
         self,
@@ -67,10 +67,10 @@ class ResponseScheduler:
         quality: QualityStep,
     ) -> None:
         self.heard = quality
-        """The quality that is heard."""
+        """The quality that is playing."""
         self.newest_pose_id = 0
         self.applied_pose_id = 0
-        """Of the poses whose IRs are heard."""
+        """The id of the poses whose IRs are playing."""
         self._renderer = renderer
         self._effects = effects
         self._emitters = emitters
@@ -88,17 +88,16 @@ class ResponseScheduler:
 
     @property
     def are_awaited(self) -> bool:
-        """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
+        """Whether a request is unanswered, or it is too soon for the next. Any thread may call this."""
         return self._in_flight is not None or self._renderer.sample_clock < self._next_request_clock
 
     @property
     def are_wanted(self) -> bool:
-        """Whether there was something to ask for when it was looked last, and it is time to."""
+        """Whether the last check found IRs to request, and it is time to request them."""
         return self._demand is _Demand.LATER and not self.are_awaited
 
     def set_quality(self, quality: QualityStep, reason: LevelReason) -> list[ServerMessage]:
-        """Have IRs come from another step: from now on, or, where it takes another level's, from when they are
-        there."""
+        """Change to another quality step: from now on, or for another level when its IRs have arrived."""
         if quality.level != self._wanted.level:
             for emitter in self._emitters.values():
                 emitter.is_outdated = True
@@ -108,13 +107,12 @@ class ResponseScheduler:
         return self.change_quality() if quality.level == self.heard.level else self.change_quality_unheard()
 
     def change_quality_unheard(self) -> list[ServerMessage]:
-        """Stand on the step that was asked for last where no emitter has, or is to have, an IR that tells levels
-        apart."""
+        """Change to the step chosen last if no emitter has, or will have, an IR that differs between levels."""
         has_irs = any(not emitter.is_decided or emitter.effects.has_response for emitter in self._emitters.values())
         return [] if has_irs else self.change_quality()
 
     def change_quality(self) -> list[ServerMessage]:
-        """Stand on the step that was asked for last, with the block that follows."""
+        """Change to the step chosen last, from the next block on."""
         if self._wanted == self.heard:
             return []
         self.heard = self._wanted
@@ -130,11 +128,11 @@ class ResponseScheduler:
         ]
 
     def space(self, interval_s: float) -> None:
-        """Have so much time pass from one request to the next, unless an emitter waits for its first."""
+        """Set the least time between requests; an emitter that waits for its first IR is not affected."""
         self._interval_s = interval_s
 
     def advance(self, pose_id: int) -> None:
-        """Something takes a pose. Raises RequestError where a newer one was taken before."""
+        """Note a new pose of the listener or of an emitter. Raises RequestError if a newer one came before."""
         # guard: an old pose is refused
         if pose_id <= self.newest_pose_id:
             raise RequestError("stale_pose", f"pose {pose_id} is not newer than {self.newest_pose_id}", field="pose_id")
@@ -142,14 +140,14 @@ class ResponseScheduler:
         if self._demand is _Demand.LATER and not self._levels[self._wanted.level].kind.reuses_responses:
             self._note_change()
         else:
-            self._look_again()  # what is heard may be the pose's response again
+            self._look_again()  # the response that is playing may fit this pose again
 
     def retry(self) -> None:
-        """Look again at what to ask for: somebody has come, or is decided about."""
+        """Check for IRs to request, after an emitter was added or a plan decided about one."""
         self._look_again()
 
     def _look_again(self) -> None:
-        """Something has changed that may call for an IR."""
+        """Note a change that may call for an IR."""
         self._demand = _Demand.UNKNOWN
         self._note_change()
 
@@ -158,15 +156,15 @@ class ResponseScheduler:
             self._in_flight.is_overtaken = True
 
     def enforce_plan(self) -> list[ServerMessage]:
-        """Put the plan of effects into effect, with the block that follows."""
+        """Put the plan of effects into effect, from the next block on."""
         events = self._announce(self._effects.enforce(self._emitters))
         self._effects.share_tail(self.heard.shared_tail, self._emitters)
         self._look_again()
         return events + self.change_quality_unheard()
 
     def take_request(self, listener: Pose, scope: Scope = Scope.ALL) -> IrRequest | None:
-        """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
-        none is in `scope`. Where it is not time for others, first ones are asked for alone."""
+        """Return the IRs to compute now; None while a request is unanswered, if every IR is up to date, or if none is
+        in `scope`. If it is too soon for others, only first IRs are requested."""
         if self._in_flight is not None or self._demand is _Demand.NONE:
             return None
         if self._renderer.sample_clock < self._next_request_clock:
@@ -176,14 +174,14 @@ class ResponseScheduler:
         outdated = [emitter for emitter in self._emitters.values() if self._needs_ir(emitter, listener)]
         if not outdated and not self._effects.awaits_ears:
             self._accepted_pose_id = self.newest_pose_id
-            # Room for other ears comes by itself; whatever else calls for an IR is told.
+            # The renderer does not report room for other channels; every other cause for an IR is reported.
             self._demand = _Demand.UNKNOWN if self._effects.wants_other_ears else _Demand.NONE
             return None
         first = [emitter for emitter in outdated if emitter.heard.token is None]
         if scope is Scope.FIRST and not first:
             self._demand = _Demand.LATER
             return None
-        # IRs of another level, or for other ears, replace all at once.
+        # IRs of another level, or with other channels, replace all at once.
         replaces_all = self._wanted.level != self.heard.level or self._effects.awaits_ears
         is_partial = scope is Scope.FIRST and not replaces_all and len(first) < len(outdated)
         if not is_partial:
@@ -212,12 +210,12 @@ class ResponseScheduler:
         )
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
-        """Put the answer of the last request into effect, with the block that follows."""
+        """Put the answer to the last request into effect, from the next block on."""
         is_partial = self._in_flight is not None and self._in_flight.is_partial
         self._in_flight = None
         self._look_again()
         if response.request.level not in {self._wanted.level, self.heard.level}:
-            return []  # of a level that is no longer wanted; IRs of the one that is are out of date, all of them
+            return []  # its level is no longer wanted, and all IRs of the wanted level are still to be requested
         pose_id = response.request.pose_id
         arrived = {each.serial: (ir, each) for each, ir in zip(response.request.asked, response.irs, strict=True)}
         events: list[ServerMessage] = []
@@ -237,11 +235,11 @@ class ResponseScheduler:
         return events
 
     def give_up(self, request: IrRequest) -> list[ServerMessage]:
-        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes, or
-        at once where one has since."""
+        """Note that a request failed: playing IRs stay in use until a pose or an emitter changes, or until the next
+        request if one has changed since."""
         failing, self._in_flight = self._in_flight, None
         if failing is not None and not failing.is_overtaken:
-            # Others than the first ones that it was for are still to be asked for, in their turn.
+            # The IRs that a partial request left out are still to be requested, in their turn.
             self._demand = _Demand.LATER if failing.is_partial else _Demand.NONE
         failed = {asked.serial for asked in request.asked}
         for emitter in self._emitters.values():
@@ -251,13 +249,13 @@ class ResponseScheduler:
         ]
 
     def follow_renderer(self) -> None:
-        """See, after each block, whether the IRs accepted last are heard."""
+        """Check, after each block, whether the IRs accepted last are playing."""
         if self.applied_pose_id != self._accepted_pose_id and self._has_applied_all():
             self.applied_pose_id = self._accepted_pose_id
 
     def _needs_ir(self, emitter: StreamedEmitter, listener: Pose) -> bool:
-        """Whether its IR is of another pose, which where poses share responses need not make it another; or is to hold
-        the direct sound, too."""
+        """Return whether an emitter needs an IR: its IR belongs to another pose that does not share the response, or is
+        to include the direct sound."""
         if not (emitter.is_decided and emitter.effects.has_response):
             return False
         if emitter.is_outdated and emitter.heard.identity is not None:
@@ -265,8 +263,8 @@ class ResponseScheduler:
         return emitter.is_outdated or emitter.wants_baking
 
     def _still_hears(self, emitter: StreamedEmitter, listener: Pose) -> bool:
-        """Whether what is heard of an emitter is its response at the pose, too: at once where that has hardly changed
-        since it was found to be."""
+        """Return whether the IR that is playing for an emitter is also its response at this pose. This is fast while
+        the listener stays near the pose for which it was last confirmed."""
         heard = emitter.heard
         circumstances = heard.identity, self._wanted.level, emitter.state, self._effects.channels
         if heard.validity is not None and heard.validity.holds(circumstances, listener):
@@ -291,7 +289,7 @@ class ResponseScheduler:
         return Shared((shared.identity, emitter.effects, self._effects.channels), shared.around)
 
     def _announce(self, identifiers: Iterable[str]) -> list[ServerMessage]:
-        """That emitters sound from the next block on, of those of whom it has not been said."""
+        """Return messages that these emitters are audible from the next block on, for those not announced before."""
         clock = self._renderer.sample_clock
         news = [identifier for identifier in identifiers if self._emitters[identifier].announce()]
         return [EmitterAdded(id=identifier, sample_clock=clock) for identifier in news]

@@ -1,13 +1,13 @@
 """One listener's stream as a state machine without input, output or waiting.
 
-Messages go in, messages and audio blocks come out. The direct paths of each block follow the newest poses. What follows
-the direct sound comes later: `take_request` hands out what impulse responses (IRs) to compute, and the answer comes
-back through `accept` between two blocks. Sound never waits for it.
+Messages go in; messages and audio blocks come out. The direct paths of each block follow the newest poses. Reflections
+and reverberation follow later: `take_request` returns the impulse responses (IRs) to compute, and the answer comes back
+through `accept` between two blocks. Rendering never waits for it.
 
-Blocks are rendered in three steps, so that many sessions' can be rendered in one call: `begin_block`, rendering
+Blocks are rendered in three steps, so that one call can render those of many sessions: `begin_block`, rendering
 `renderer`, `finish_blocks`.
 
-A `Session` belongs to the thread that renders it. Positions are metres, clocks are samples.
+A `Session` belongs to the thread that renders it. Positions are in metres, clocks in samples.
 """
 
 import math
@@ -61,7 +61,7 @@ def _start_pose(bundle: Bundle) -> Pose:
 
 
 def _require_served(hello: Hello, sample_rate: int) -> None:
-    """Raises RequestError for another protocol or sample rate than a session has."""
+    """Check the hello. Raises RequestError for an unknown protocol or another sample rate than the scene's."""
     if hello.protocol != PROTOCOL:
         problem = f"this server speaks protocol {PROTOCOL}, not {hello.protocol}"
         raise RequestError("unsupported_protocol", problem, field="protocol")
@@ -71,12 +71,11 @@ def _require_served(hello: Hello, sample_rate: int) -> None:
 
 
 class Session:
-    """Everything one client has: poses, emitters, a renderer and the window of unacknowledged blocks.
+    """The state of one client's stream: poses, emitters, a renderer and the window of unacknowledged blocks.
 
-    `levels` are the scene's, and `quality` is what to hear of them first.
-    `filters` are the head it hears through. `load_clip` gives audio at the scene's rate, and is quick: it is
-    called on the rendering thread.
-    Raises RequestError for a hello that cannot be served.
+    `levels` are the scene's, and `quality` is the first one to render. `filters` are those of the listener's head.
+    `load_clip` returns audio at the scene's rate; it has to be fast, since it is called on the rendering thread. Raises
+    RequestError for a hello that cannot be served.
     """
 
     def __init__(
@@ -137,40 +136,39 @@ class Session:
             quality=quality,
         )
         self._next_serial = 0
-        self._followed_pose_id = 0  # by the direct paths
+        self._followed_pose_id = 0  # the pose of the direct paths
         self._checked = 0
 
     @property
     def sample_clock(self) -> int:
-        """Samples rendered so far: the clock of the next block's first frame."""
+        """The number of samples rendered so far, which is the clock of the next block's first frame."""
         return self.renderer.sample_clock
 
     @property
     def quality(self) -> QualityStep:
-        """The quality that is heard."""
+        """The quality that is playing."""
         return self._responses.heard
 
     @property
     def awaits_irs(self) -> bool:
-        """Whether a request is unanswered, or it is too soon for the next; may be asked from any thread."""
+        """Whether a request is unanswered, or it is too soon for the next. Any thread may call this."""
         return self._responses.are_awaited
 
     def set_quality(self, quality: QualityStep, reason: LevelReason) -> list[ServerMessage]:
-        """Have what follows the direct sound come from another step: from now on, or, where it takes another level's
-        IRs, from when they are there."""
+        """Change to another quality step: from now on, or for another level when its IRs have arrived."""
         return self._responses.set_quality(quality, reason)
 
     def set_ir_interval(self, interval_s: float) -> None:
-        """Have so much time pass from one request for IRs to the next, unless an emitter waits for its first."""
+        """Set the least time between requests for IRs; an emitter that waits for its first IR is not affected."""
         self._responses.space(interval_s)
 
     def space_plans(self, interval_s: float) -> None:
-        """Have so much time pass from one plan of effects to the next, unless something calls for one at once."""
+        """Set the least time between plans of effects; changes that need a plan at once are not affected."""
         if self._effects.planned is not None:
             self._effects.planned.space(interval_s)
 
     def receive(self, message: ClientMessage) -> list[ServerMessage]:
-        """Take in one message; what is wrong with it comes back as an `Error`, and nothing has changed then."""
+        """Process one message; if it is invalid, return an `Error` and change nothing."""
         try:
             match message:
                 case ListenerPose():
@@ -198,24 +196,24 @@ class Session:
 
     @property
     def wants_irs(self) -> bool:
-        """Whether there was something to ask for when `take_request` looked last, and it is time to."""
+        """Whether the last `take_request` found IRs to request, and it is time to request them."""
         return self._responses.are_wanted
 
     def take_request(self, scope: Scope = Scope.ALL) -> IrRequest | None:
-        """The IRs to compute now. None while an earlier request is unanswered, when every IR is up to date, or where
-        none is in `scope`."""
+        """Return the IRs to compute now; None while a request is unanswered, if every IR is up to date, or if none is
+        in `scope`."""
         return self._responses.take_request(self._listener, scope)
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
-        """Put the answer of the last request into effect, with the block that follows."""
+        """Put the answer to the last request into effect, from the next block on."""
         return self._responses.accept(response)
 
     def give_up(self, request: IrRequest) -> list[ServerMessage]:
-        """Nothing answers the request: what sounds goes on with the IRs it has, until a pose or an emitter changes."""
+        """Note that a request failed: playing IRs stay in use until a pose or an emitter changes."""
         return self._responses.give_up(request)
 
     def take_plan_request(self) -> PlanRequest | None:
-        """The plan of effects to make now. None while an earlier one is unanswered, or where nothing has changed."""
+        """Return the plan of effects to make now; None while a request is unanswered or if nothing has changed."""
         planned = self._effects.planned
         if planned is None:
             return None
@@ -223,7 +221,7 @@ class Session:
         return planned.take_request(self._listener, states, self._effects.clock_s)
 
     def adopt(self, plan: Plan) -> list[ServerMessage]:
-        """Put the plan asked for last into effect, with the block that follows."""
+        """Put the plan requested last into effect, from the next block on."""
         planned = self._effects.planned
         assert planned is not None
         is_other = planned.accept(plan)
@@ -231,7 +229,7 @@ class Session:
         return [*events, PlanChanged.of(plan, self.sample_clock)] if is_other else events
 
     def take_check(self) -> PlanAudit | None:
-        """A check of the plan in effect, of one emitter after the other; None where everything is on."""
+        """Return a check of the active plan, for each emitter in turn; None if everything is on."""
         planned = self._effects.planned
         if planned is None or planned.plan is None:
             return None
@@ -253,12 +251,12 @@ class Session:
         return check if check.finds_anything else None
 
     def learn(self, regret: Regret) -> None:
-        """Correct the plan by what a check found."""
+        """Correct the plan by the result of a check."""
         if regret.corrections and self._effects.planned is not None:
             self._effects.planned.correct(regret.corrections)
 
     def keep_effects(self) -> list[ServerMessage]:
-        """No plan came of the one asked for last: what is on stays on; of who has just come, everything."""
+        """Note that the request for a plan failed: effects stay as they are, and new emitters have all of them on."""
         planned = self._effects.planned
         assert planned is not None
         planned.give_up()
@@ -268,16 +266,16 @@ class Session:
         return [Error(code="plan_failure", message="no plan of effects could be made")]
 
     def begin_block(self) -> None:
-        """Have the direct paths of the next block follow the newest poses."""
+        """Set the direct paths of the next block from the newest poses."""
         self._aim.follow(self._listener)
         self.renderer.set_orientation(self._listener.orientation)
         self._followed_pose_id = self._responses.newest_pose_id
 
     def finish_blocks(self, sample_clock: int, rendered: Sequence[Rendered]) -> list[AudioBlock]:
-        """The blocks just rendered at once, the first of which began at `sample_clock`; fewer where the window is full,
-        so that the last are not to be sent.
+        """Return the blocks just rendered together, the first of which began at `sample_clock`; only the first of them
+        if the window is full.
 
-        A block that is not sent was rendered all the same: clips and reverberation keep their place on the clock.
+        A block that is not sent was rendered all the same: clips and reverberation stay in step with the clock.
         """
         self._responses.follow_renderer()
         sequences = self.window.take_sequences(len(rendered))
@@ -296,7 +294,7 @@ class Session:
         return blocks
 
     def render_block(self) -> AudioBlock | None:
-        """All three steps for this session alone."""
+        """Run all three steps for this session alone."""
         self.begin_block()
         sample_clock = self.sample_clock
         return next(iter(self.finish_blocks(sample_clock, render_all([self.renderer]))), None)
@@ -305,7 +303,7 @@ class Session:
         return tuple(emitter.live.status for emitter in self._emitters.values() if emitter.live)
 
     def complaints(self) -> list[ServerMessage]:
-        """What was wrong with live samples since this was asked last."""
+        """Return errors about live samples since the last call."""
         refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
         return [Error.from_refusal(refusal) for refusal in refusals if refusal]
 
@@ -339,7 +337,7 @@ class Session:
         self._responses.advance(message.pose_id)
         before = emitter.state.pose.orientation
         emitter.move(message)
-        # A field knows no orientation of emitters, but a mirrored path leaves in a direction of its own.
+        # A field's response does not depend on an emitter's orientation, but the gain of a mirrored path does.
         is_mirrored = self._direct_sound.early_reflections is not None and emitter.state.directivity != OMNIDIRECTIONAL
         emitter.is_outdated |= is_mirrored and emitter.state.pose.orientation != before
         self._effects.unbake(message.id, emitter)

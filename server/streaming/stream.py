@@ -1,7 +1,7 @@
-"""A session in time: when its blocks are due, what waits to go in, and how long things take.
+"""A session in time: when its blocks are due, what waits in its inbox, and how long its work takes.
 
-A stream whose window stays full is *paused*: nothing is rendered, its sample clock stands, and both go on where they
-were with the first acknowledgement that makes room.
+A stream whose window stays full is *paused*: nothing is rendered, and its sample clock stands still. Both continue from
+there with the first acknowledgement that makes room.
 
 A `Stream` and its session belong to the audio thread that renders them; only `offer` may be called from any thread.
 """
@@ -34,8 +34,8 @@ from server.streaming.session import Session
 from server.streaming.stream_times import ResponseWait, StreamTimes
 
 PAUSE_AFTER_S = 1.0
-"""How long a window may be full before nothing is rendered for it: a network that falters for less costs no sound but
-that which there was no room for."""
+"""How long a window may be full before rendering stops. If the network stalls for less, only the blocks without room in
+the window are lost."""
 _MAX_BEHIND_S = 0.5
 _LOAD_SMOOTHING = 0.02
 _COST_SMOOTHING = 0.2
@@ -44,7 +44,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class TimedBlock:
-    """A block on its way out; after `deadline_s` of the audio engine's clock it is late."""
+    """A block to be sent; after `deadline_s` of the audio engine's clock it is late."""
 
     block: AudioBlock
     deadline_s: float
@@ -52,7 +52,7 @@ class TimedBlock:
 
 @dataclass(frozen=True)
 class StreamFailed:
-    """Rendering raised: nothing more will come from this stream."""
+    """A message that rendering failed: no more output comes from this stream."""
 
 
 Outgoing = ServerMessage | TimedBlock | StreamFailed
@@ -60,25 +60,25 @@ Outgoing = ServerMessage | TimedBlock | StreamFailed
 
 @dataclass
 class CpuCosts:
-    """Seconds of CPU time that work for a stream has taken of late."""
+    """Smoothed CPU times, in seconds, of work for a stream."""
 
     request_s: float = 0.0
-    """A request for impulse responses."""
+    """CPU time of a request for impulse responses."""
     plan_s: float = 0.0
-    """A plan of effects."""
+    """CPU time of a plan of effects."""
 
 
 @dataclass
 class Pause:
-    """A stream is paused from when its window has been full for a while until there is room in it."""
+    """Whether a stream is paused, and since when its window has been full."""
 
     full_since_s: float | None = None
     is_paused: bool = False
 
 
 class Stream:
-    """`ladder`, of the levels on `offer`, is where the session stands. `deliver` is called on the event loop with what
-    the stream made, in order."""
+    """A session with its clock, inbox and load. `ladder` is its position among the levels on `offer`. `deliver` is
+    called on the event loop with the stream's output, in order."""
 
     def __init__(
         self,
@@ -96,16 +96,16 @@ class Stream:
         self.block_s = block_s
         self.deliver = deliver
         self.blocks_late = 0
-        """Counted by the sender of the blocks, since only it knows when they left."""
+        """Late blocks, counted by the sender, since only it knows when they left."""
         self.times = StreamTimes()
         self.regrets = RegretRecord()
         self.load = 0.0
-        """Share of a core that its blocks have taken of late."""
+        """Smoothed share of a core that its blocks take."""
         self.next_block = 0
         self.due_s = math.inf
-        """When that should be rendered; never before the stream has started."""
+        """When the next block should be rendered; infinite before the start and in a pause."""
         self.wants_turn = False
-        """Whether impulse responses are to be asked for as soon as it is its turn."""
+        """Whether the stream waits for its turn to request impulse responses."""
         self.asked_last_s = -math.inf
         self._has_asked = False
         self._wait = ResponseWait()
@@ -121,10 +121,10 @@ class Stream:
         self._time_s: Callable[[], float] = time.monotonic
         self._turns = RequestQueue(1)
         self.company = 1
-        """Streams of the audio thread, with this one."""
+        """The number of streams on the audio thread, including this one."""
         self._worst_lateness_s = 0.0
         self._next_check_s: float | None = FIRST_S
-        """None while one is under way."""
+        """Seconds of sound at which the next check of a plan is due; None during a check."""
         self._next_status_s = 1.0
 
     @property
@@ -133,39 +133,42 @@ class Stream:
 
     @property
     def awaits_irs_since_s(self) -> float | None:
-        """When impulse responses were called for that have not come."""
+        """Since when the stream waits for impulse responses; None if it does not."""
         return self._wait.since_s
 
     @property
     def stalled_s(self) -> float:
-        """For how long no block could be sent, since too many are unacknowledged; may be asked from any thread."""
+        """How long no block could be sent because too many are unacknowledged. Any thread may call this."""
         since_s = self._pause.full_since_s
         return 0.0 if since_s is None else self._time_s() - since_s
 
     @property
     def deadline_s(self) -> float:
-        """When its next block is late."""
+        """The time after which the next block is late."""
         return self.clock.deadline_s(self.next_block)
 
     def attach(self, *, wake: Callable[[], None], time_s: Callable[[], float], turns: RequestQueue) -> None:
-        """`wake` has the audio thread look at what waits; `time_s` is its clock; `turns` are those of its streams."""
+        """Attach the stream to an audio thread: `wake` makes it process the inbox, `time_s` is its clock, `turns` are
+        those of its streams."""
         self._wake, self._time_s, self._turns = wake, time_s, turns
 
     def offer(self, message: ClientMessage) -> bool:
-        """Leave a message for the audio thread; False, and the message refused, where too many wait already.
+        """Queue a message for the audio thread; return False, and refuse it, if too many are waiting.
 
-        What may call for an impulse response that can be asked for is looked at now, anything else with the next block.
+        A message that calls for an impulse response, if one can be requested now, wakes the thread; all others wait for
+        the next block.
         """
         if not self._inbox.put_message(message, self._time_s()):
             return False
-        # While one is computed, no other is asked for until its answer comes, and that wakes too.
+        # While a request is unanswered there is no other, and the answer wakes the thread too.
         asks = isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once
-        if asks or self._pause.is_paused:  # which no block would wake
+        if asks or self._pause.is_paused:  # a paused stream has no blocks that would wake the thread
             self._wake()
         return True
 
     def start(self, origin_s: float) -> None:
-        """The next block, number 0 unless another thread has rendered some before, plays at `origin_s`."""
+        """Start the clock: the next block, which is number 0 unless another thread has rendered some, plays at
+        `origin_s`."""
         first_s = origin_s - self.next_block * self.block_s
         self._clock = StreamClock(origin_s=first_s, block_s=self.block_s, lead=self._lead)
         self.due_s = self._clock.due_s(self.next_block)
@@ -177,22 +180,23 @@ class Stream:
 
     @property
     def has_news(self) -> bool:
-        """Whether something waits that cannot wait for the next block: for an IR to be asked for, or for an answer."""
+        """Whether an item in the inbox cannot wait for the next block: an answer, or a message that lets an IR be
+        requested."""
         is_urgent = self._pause.is_paused or self._asks_at_once
         return self._inbox.has_answers or (self._inbox.has_messages and is_urgent)
 
     @property
     def _asks_at_once(self) -> bool:
-        """Whether it need not wait for its turn, be it since an emitter comes that is not heard yet."""
+        """Whether the stream may request IRs at once: turns are left, or a new emitter needs its first IR."""
         return not self.session.awaits_irs and (self._inbox.brings_emitter or self._turns.are_left)
 
     @property
     def is_unanswered(self) -> bool:
-        """Whether impulse responses have been asked for, and no answer has come."""
+        """Whether a request for impulse responses is unanswered."""
         return self._has_asked and not self._inbox.responses
 
     def drain_inbox(self, workers: Workers) -> list[Outgoing]:
-        """Heed what waits and ask for impulse responses, or, where it is not its turn, `wants_turn` from then on."""
+        """Process the inbox and request impulse responses; if it is not the stream's turn, set `wants_turn`."""
         outgoing: list[Outgoing] = []
         inbox = self._inbox
         inbox.brings_emitter = False
@@ -215,14 +219,15 @@ class Stream:
 
     def _call_for_work(self, workers: Workers) -> None:
         self._check_plan(workers)
-        # Who has not been heard yet waits for it; all others only for something better.
+        # New emitters wait for a plan to become audible, so it is urgent; for others it only improves the effects.
         if (wanted := self.session.take_plan_request()) is not None:
             plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
             self._pending.keep_outcome(plan, self._keep_plan)
         self._ask(workers)
 
     def _ask(self, workers: Workers) -> None:
-        """For the impulse responses of the newest poses, if it is its turn, or for the first of an emitter."""
+        """Request the impulse responses for the newest poses if it is the stream's turn, or else the first ones of
+        emitters."""
         request = self.session.take_request(Scope.ALL if self._turns.may_ask(self) else Scope.FIRST)
         self.wants_turn = self.session.wants_irs
         if request is not None:
@@ -235,28 +240,29 @@ class Stream:
         self._wait.note(self._has_asked or self.wants_turn, self._time_s())
 
     def leave(self) -> None:
-        """Have nothing computed any more that this stream has asked for."""
+        """Cancel all work requested by this stream."""
         self._pending.cancel()
 
     def sample_load(self, now_s: float) -> LoadSample:
-        """What it went through since this was asked last."""
+        """Return the load of this stream since the last call."""
         lateness, self._worst_lateness_s = self._worst_lateness_s / (self._lead * self.block_s), 0.0
         return LoadSample(lateness, self._wait.take_longest_s(now_s), self._costs.request_s, self._costs.plan_s)
 
     def follow_ladder(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
-        """Have the session hear the step on which the ladder, which has been moved, now stands."""
-        self._wait.restart(now_s)  # what was asked for before does not tell how a new step does
+        """Set the session to the present step of the ladder, which has been moved."""
+        self._wait.restart(now_s)  # earlier requests do not show how the new step performs
         return [*self.session.set_quality(self.ladder.step, reason)]
 
     def set_intervals(self, ir_s: float, plan_s: float) -> None:
-        """Have so much time pass from one request for IRs to the next, and from one plan of effects to the next."""
+        """Set the least time between requests for IRs, and between plans of effects."""
         self.session.space_plans(plan_s)
         self.session.set_ir_interval(ir_s)
 
     def finish_blocks(
         self, sample_clock: int, rendered: Sequence[Rendered], *, cost_s: float, now_s: float
     ) -> list[Outgoing]:
-        """Pass on the blocks just rendered at once, which took `cost_s` together and are ready `now_s`."""
+        """Return the blocks just rendered together, which took `cost_s` and are ready at `now_s`, with messages that
+        are due."""
         clock, count = self.clock, len(rendered)
         blocks = self.session.finish_blocks(sample_clock, rendered)
         outgoing: list[Outgoing] = [
@@ -268,8 +274,8 @@ class Stream:
         each_s = cost_s / count
         self.load += (1 - (1 - _LOAD_SMOOTHING) ** count) * (each_s / self.block_s - self.load)
         self.times.render.add(each_s, count)
-        if self.next_block >= self._lead:  # the first were due before the stream was
-            lateness_s = max(0.0, now_s - self.due_s)  # what is early is not late
+        if self.next_block >= self._lead:  # the first blocks were due before the stream started
+            lateness_s = max(0.0, now_s - self.due_s)  # an early block has no lateness
             self._worst_lateness_s = max(self._worst_lateness_s, lateness_s)
             after_due = min(count, 1 + int(lateness_s / self.block_s))
             for ahead in range(after_due):
@@ -296,7 +302,7 @@ class Stream:
             self._wait.note(False, now_s)
 
     def _resume(self) -> None:
-        """There is room again: the block that is next is due now, and not when it would have been."""
+        """End a pause, since there is room again: the next block is due now instead of at its old time."""
         was_paused, self._pause = self._pause.is_paused, Pause()
         if was_paused:
             self.clock.slip(self.next_block, self._time_s())
@@ -325,7 +331,7 @@ class Stream:
             self._pending.keep_outcome(regret, self._keep_regret)
 
     def _keep_regret(self, regret: Regret | BaseException) -> None:
-        self._inbox.regrets.append(regret)  # looked at with the next block
+        self._inbox.regrets.append(regret)  # processed with the next block
 
     def _take_regret(self, regret: Regret | BaseException) -> None:
         clock_s = self.next_block * self.block_s
@@ -386,7 +392,7 @@ def _smoothed(cost_s: float, newest_s: float) -> float:
 
 
 def _plan_timed(request: PlanRequest) -> tuple[Plan, float]:
-    """With the CPU time it took."""
+    """Make a plan and return it with its CPU time."""
     started_s = time.thread_time()
     return request.plan(), time.thread_time() - started_s
 

@@ -1,4 +1,4 @@
-"""How long things take in a stream, and how long it waits for them. Seconds."""
+"""Durations in a stream, of its work and of its waits, in seconds."""
 
 from collections import deque
 
@@ -6,11 +6,11 @@ from server.core.durations import DurationHistogram
 
 
 class PoseTimes:
-    """How long poses take from their arrival to the first block that has them, or a newer one."""
+    """Durations from a pose's arrival to the first block that uses it or a newer one."""
 
     def __init__(self) -> None:
         self.durations = DurationHistogram()
-        # Where a field fails, poses wait in vain; the oldest are forgotten.
+        # If a field fails, poses never take effect; the oldest are dropped.
         self._waiting: deque[tuple[int, float]] = deque(maxlen=1024)
 
     def arrive(self, pose_id: int, now_s: float) -> None:
@@ -22,19 +22,19 @@ class PoseTimes:
 
 
 class StreamTimes:
-    """Since the stream began."""
+    """All durations since the stream began."""
 
     def __init__(self) -> None:
         self.render = DurationHistogram()
-        """Of a block."""
+        """Time to render a block."""
         self.lateness = DurationHistogram()
-        """After a block was due, until it was ready."""
+        """Time from a block's due time until it was ready."""
         self.response = DurationHistogram()
-        """Of a request for impulse responses, on its worker."""
+        """Time of a request for impulse responses on its worker."""
         self.pose = PoseTimes()
-        """Until the direct sound follows."""
+        """Time until the direct sound follows a pose."""
         self.reverberation = PoseTimes()
-        """Until what comes after it does."""
+        """Time until reflections and reverberation follow a pose."""
 
     def arrive(self, pose_id: int, now_s: float) -> None:
         self.pose.arrive(pose_id, now_s)
@@ -42,35 +42,34 @@ class StreamTimes:
 
 
 class ResponseWait:
-    """How long impulse responses are in coming: from when they are called for, be it that they wait for their turn, to
-    their answer."""
+    """Waiting times for impulse responses, from when they are needed to their answer; waiting for a turn counts."""
 
     def __init__(self) -> None:
         self.since_s: float | None = None
-        """None where none are called for."""
+        """Since when impulse responses are needed; None if none are."""
         self._longest_s: float | None = None
 
     def note(self, is_waiting: bool, now_s: float) -> None:
-        """Whether some are called for now."""
+        """Note whether impulse responses are needed now."""
         if not is_waiting:
             self.since_s = None
         elif self.since_s is None:
             self.since_s = now_s
 
     def end(self, now_s: float) -> None:
-        """The answer is there."""
+        """Note that the answer has arrived."""
         if self.since_s is not None:
             self._longest_s = max(self._longest_s or 0.0, now_s - self.since_s)
             self.since_s = None
 
     def restart(self, now_s: float) -> None:
-        """Forget how long it has been so far."""
+        """Restart the present wait from now."""
         self._longest_s = None
         if self.since_s is not None:
             self.since_s = now_s
 
     def take_longest_s(self, now_s: float) -> float | None:
-        """Since this was asked last, of answers and of what still waits; None where nothing was called for."""
+        """Return the longest wait since the last call, finished or not; None if no impulse responses were needed."""
         waits_s = [] if self.since_s is None else [now_s - self.since_s]
         if self._longest_s is not None:
             waits_s.append(self._longest_s)

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from training.data.importers.conditioning import Conditioning
     from training.data.responses import Measurement
 
-importing = StrictTyper(
-    no_args_is_help=True, help="Import responses in the layout of SoundSpaces, MeshRIR, RAF or SOFA."
-)
+importing = StrictTyper(no_args_is_help=True, help="Import responses; each command reads one published layout.")
 
 _T = TypeVar("_T")
 _MOST_LATENCY_SAMPLES = 1_000_000

@@ -1,4 +1,4 @@
-"""An error of energies to train on: clarity, decay times and levels are made of energies.
+"""A loss on energies, from which clarity, decay times and levels follow.
 
 Errors of single bins that have the same sign do not average out in a sum, and listeners hear sums. So the loss also
 compares energies of runs of frames, and the energy still to come after each frame, by octave and over all octaves.
@@ -68,6 +68,7 @@ class EnergyError(nn.Module):
 
 
 def _octaves(frequencies_hz: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """(octave, frequency) 1 where the centre of this octave band is the nearest on a logarithmic scale, else 0."""
+    """Return a matrix (octave, frequency) with 1 where the centre of this octave band is the nearest on a logarithmic
+    scale, else 0."""
     distance = np.abs(np.log2(np.maximum(frequencies_hz, 1.0)) - np.log2(OCTAVE_BANDS_HZ)[:, None])
     return np.asarray(np.argmin(distance, axis=0) == np.arange(len(OCTAVE_BANDS_HZ))[:, None], dtype=np.float64)

@@ -82,7 +82,7 @@ class FactorisedLearner:
 
     @torch.no_grad()
     def initialise(self, rows: Rows, seed: int) -> None:
-        """Sets the normalisation, and a basis that begins with the principal components of the training
+        """Set the normalisation, and a basis that begins with the principal components of the training
         spectrograms."""
         field = self.field
         sample = np.sort(np.random.default_rng([seed, 4]).choice(rows, min(_SAMPLE_ROWS, len(rows)), replace=False))
@@ -102,7 +102,7 @@ class FactorisedLearner:
         return one_cycle(fraction)
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
-        """Rows of distillation targets follow those of the responses."""
+        """Return the rows of an epoch in random order; rows of distillation targets follow those of the responses."""
         if self._distilled is None:
             return rng.permutation(rows)
         measured = len(self.targets.yaw)
@@ -144,8 +144,8 @@ class FactorisedLearner:
         return losses
 
     def _distill(self, run: Path) -> DistillationTargets:
-        """Raises RunError if the folder holds no finished run on these data, and RecipeError if it is a run of another
-        kind."""
+        """Return the distillation targets of a finished `naf` run. Raises RunError if the folder holds no finished run
+        on these data, and RecipeError if it is a run of another kind."""
         configuration = Configuration.read(run)
         if configuration.kind != "naf" or configuration.name in {"naf-time-domain", "naf-whole"}:
             problem = "only a naf that predicts spectrograms of late reverberation can teach"
@@ -157,7 +157,7 @@ class FactorisedLearner:
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> None:
-        """Corrects predicted levels by their mean deficit over the training set."""
+        """Correct predicted levels by their mean deficit over the training set."""
         if not self.recipe.level_correction:
             return
         field, levels = self.field, self.field.heads.levels
@@ -176,5 +176,5 @@ class FactorisedLearner:
 
 
 def _rows_of(source: Targets | DistillationTargets, rows: Rows) -> tuple[npt.NDArray[np.floating], ...]:
-    """Listener, emitter, yaw and flat target."""
+    """Return listener, emitter, yaw and flat target of these rows."""
     return source.listener[rows], source.emitter[rows], source.yaw[rows], source.flat[rows]

@@ -22,7 +22,7 @@ class Learner(Protocol):
     def field(self) -> nn.Module: ...
 
     def prepare(self, progress: Progress) -> None:
-        """Computes targets, or loads them. Results that take long are stored beside the responses."""
+        """Compute targets, or load them. Results that take long are stored beside the responses."""
         ...
 
     @property
@@ -31,34 +31,34 @@ class Learner(Protocol):
         ...
 
     def initialise(self, rows: Rows, seed: int) -> None:
-        """Is called once before the first step: sets the normalisation and initial parameters."""
+        """Set the normalisation and initial parameters; called once before the first step."""
         ...
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Groups of parameters with their weight decay."""
+        """Return groups of parameters with their weight decay."""
         ...
 
     def momentum_and_rate(self, fraction: float) -> tuple[float, float]:
-        """Adam's first beta, and the share of the learning rate, when a `fraction` of the training is done."""
+        """Return Adam's first beta, and the share of the learning rate, when a `fraction` of the training is done."""
         ...
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
-        """The rows that one epoch visits, in order."""
+        """Return the rows that one epoch visits, in order."""
         ...
 
     def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """Inputs of the field, and targets, for these rows. Without a generator the result is repeatable, for
+        """Return inputs of the field, and targets, for these rows. Without a generator the result is repeatable, for
         validation."""
         ...
 
     def validation(self, rows: Rows) -> Rows:
-        """The validation rows that are used."""
+        """Return the validation rows that are used."""
         ...
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
-        """Weighted terms of the loss: means over the batch, float32."""
+        """Return weighted terms of the loss: means over the batch, float32."""
         ...
 
     def finish(self, rows: Rows) -> None:
-        """Is called once after the last step, with the parameters that are kept."""
+        """Complete the field; called once after the last step, with the parameters that are kept."""
         ...

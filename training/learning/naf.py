@@ -43,7 +43,7 @@ class NafLearner:
         self._trainable = np.flatnonzero(~responses.held_out)
 
     def prepare(self, progress: Progress) -> None:
-        """Does nothing: there are no stored targets."""
+        """Do nothing: there are no stored targets."""
 
     @property
     def prepared_s(self) -> float:
@@ -51,7 +51,7 @@ class NafLearner:
 
     @torch.no_grad()
     def initialise(self, rows: Rows, seed: int) -> None:
-        """Sets mean and spread (three standard deviations) of every point over responses and ears, and the mean
+        """Set mean and spread (three standard deviations) of every point over responses and ears, and the mean
         interaural coherence."""
         field = self.field
         sample = np.random.default_rng([seed, 4]).permutation(rows)[:_STATISTICS_ROWS]
@@ -85,7 +85,7 @@ class NafLearner:
             field.coherence.copy_(torch.from_numpy(np.stack([coherence.real, coherence.imag])))
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Only the features of the grids have weight decay."""
+        """Return groups of parameters; only the features of the grids have weight decay."""
         grids = [grid.features for grid in self.field.grids]
         others = [part for part in self.field.parameters() if not any(part is held for held in grids)]
         groups: list[dict[str, Any]] = [{"params": others, "weight_decay": 0.0}]
@@ -95,7 +95,7 @@ class NafLearner:
         return decay_to_a_tenth(fraction)
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
-        """Every pair once, at a random orientation."""
+        """Return every pair once, each at a random orientation."""
         shuffled = rng.permutation(rows)
         _, first = np.unique(self.responses.pair[self._trainable[shuffled]], return_index=True)
         return shuffled[np.sort(first)]
@@ -134,14 +134,14 @@ class NafLearner:
         return {"magnitude": squared[..., 0].mean(), "phase": self.recipe.phase_weight * squared[..., 1].mean()}
 
     def finish(self, rows: Rows) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
     def _aligned(self, row: int) -> npt.NDArray[np.float64]:
-        """(ear, sample)"""
+        """Return the response of a row (ear, sample), shifted so that its sound arrives at the beginning."""
         return align(self.responses.read([row])[0], delay_samples(self.responses, row))
 
     def _values(self, aligned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(ear, *axes, outputs)"""
+        """Return the values that the network learns, for an aligned response: (ear, *axes, outputs)."""
         if self.field.shape.domain == "time":
             return aligned[..., None]
         return np.stack(self.codec.encode(aligned), axis=-1)

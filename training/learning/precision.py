@@ -10,8 +10,8 @@ import torch
 _GAIN = 1.15
 _ROUNDS = 3
 _WORTHWHILE_S = 0.02
-"""In shorter steps bfloat16 saves little, and on a busy machine chance could decide. The same seed should give the same
-result."""
+"""Shortest step for which bfloat16 is considered. In shorter ones it saves little, and on a busy machine chance could
+decide, while the same seed should give the same result."""
 
 
 def autocast(device: torch.device, *, bfloat16: bool) -> AbstractContextManager[None]:

@@ -65,6 +65,6 @@ class Processes:
         return total / self.count
 
     def wait(self) -> None:
-        """Waits until all processes have come here."""
+        """Wait until all processes have come here."""
         if self.count > 1:
             dist.barrier()

@@ -23,11 +23,11 @@ _FIELD_NAMES = {"lessons": "distilled_poses"}
 
 
 class RunError(NafirError):
-    """A run folder holds another configuration, or no trained field."""
+    """The error for a run folder that has another configuration, or no trained field."""
 
 
 class RecipeError(NafirError):
-    """The training options do not fit the data."""
+    """The error for training options that do not fit the data."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Configuration:
 
     @classmethod
     def read(cls, run: Path) -> "Configuration":
-        """Raises RunError if the folder holds no run."""
+        """Read the configuration of a run. Raises RunError if the folder holds no run."""
         values = read_json(run, "run.json")
         try:
             naf = values.pop("kind") == "naf"
@@ -175,7 +175,7 @@ def dataset_folder(run: Path) -> Path:
 
 
 def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> None:
-    """Makes the folder a run of this configuration on these data, if it is not one already.
+    """Make the folder a run of this configuration on these data, if it is not one already.
 
     Raises RunError if the folder holds a run of another configuration or on other data.
     """
@@ -190,7 +190,7 @@ def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> No
 
 
 def require_same_data(responses: ResponseSet, run: Path) -> None:
-    """Raises RunError if the run was trained on other data."""
+    """Check that the run was trained on these data. Raises RunError if not."""
     recorded = read_json(run, "dataset.json")
     identity = _identity(responses)
     if {name: recorded.get(name) for name in identity} != identity:
@@ -207,7 +207,7 @@ def read_json(run: Path, name: str) -> dict[str, Any]:
 
 
 def save_checkpoint(run: Path, state: dict[str, Any]) -> None:
-    """Writes the checkpoint so that an interruption leaves the previous one whole."""
+    """Write the checkpoint so that an interruption leaves the previous one whole."""
     # guard: checkpoints are written whole
     partial = run / "checkpoint.partial"
     torch.save(state, partial)
@@ -215,7 +215,7 @@ def save_checkpoint(run: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
-    """Raises RunError if there is no checkpoint."""
+    """Load the checkpoint of a run. Raises RunError if there is none."""
     try:
         return dict(torch.load(run / CHECKPOINT, map_location=device, weights_only=True))
     except OSError as exc:
@@ -223,7 +223,7 @@ def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
 
 
 def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> None:
-    """Loads the parameters of a finished run into the field. Raises RunError if the run is unfinished, or of another
+    """Load the parameters of a finished run into the field. Raises RunError if the run is unfinished, or of another
     network."""
     state = load_checkpoint(run, torch.device("cpu"))
     # guard: an unfinished run is no field
@@ -250,7 +250,7 @@ def minutes_of(run: Path) -> float:
 
 
 def keep_log(run: Path, rounds: int) -> None:
-    """Cuts the log to the `rounds` that the checkpoint has; later rounds will be written again."""
+    """Cut the log to the `rounds` that the checkpoint has; later rounds will be written again."""
     path = run / LOG
     if not rounds:
         path.unlink(missing_ok=True)
@@ -271,7 +271,7 @@ def append_log(run: Path, row: dict[str, float]) -> None:
 
 
 def _write_whole(path: Path, document: dict[str, Any]) -> None:
-    """Writes the file so that an interruption leaves the previous one whole."""
+    """Write the file so that an interruption leaves the previous one whole."""
     # guard: what a run is, is written whole
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(document, indent=2) + "\n")

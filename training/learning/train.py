@@ -51,11 +51,11 @@ Normalised targets have errors of about one at first."""
 
 
 class DivergedError(NafirError):
-    """A loss or gradient that is not finite, or far above its first value."""
+    """The error for a loss or gradient that is not finite, or far above its first value."""
 
 
 def train(responses: ResponseSet, run: Path, configuration: Configuration, progress: Progress) -> None:
-    """Trains to the end, and resumes an interrupted run. Under `torchrun`, all processes train together.
+    """Train to the end, or resume an interrupted run. Under `torchrun`, all processes train together.
 
     Raises RunError if the folder holds a run of another configuration or on other data, RecipeError if the
     configuration does not fit the data, and DivergedError if the loss becomes implausible; the last checkpoint stays.
@@ -188,14 +188,14 @@ class _Loop:
         return patience is not None and self._state.stale >= patience
 
     def _measure(self) -> float:
-        """How far training is, in rounds."""
+        """The number of rounds done, with fractions."""
         if self._configuration.minutes is None:
             return self._state.step / self._steps_per_epoch
         return self._fraction() * _ROUNDS
 
     def _next_round(self) -> int:
-        """The measure at which the current round ends. It is later than now, however long the last validation took, so
-        that every round trains."""
+        """The number of rounds at which the current round ends. It is later than now, however long the last validation
+        took, so that every round trains."""
         return min(math.floor(self._measure()) + 1, self._total())
 
     def _total(self) -> int:
@@ -205,8 +205,8 @@ class _Loop:
     def _step(
         self, parallel: torch.nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...], *, save: bool
     ) -> None:
-        """One training step. With `save`, the parameters before the step are saved, after their loss has shown that
-        they are good."""
+        """Make one training step. With `save`, the parameters before the step are saved, after their loss has shown
+        that they are good."""
         state, configuration = self._state, self._configuration
         beta, share = self._learner.momentum_and_rate(self._fraction())
         for group in self._optimiser.param_groups:

@@ -15,14 +15,14 @@ THRESHOLD = Threshold(enter_jnd=0.25, leave_jnd=0.25)
 
 
 def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
-    """Make the planner for the probes of a dataset with this seed. Raises SceneFileError for a scene that is too large
-    to simulate, or whose duration is too short for its longest path."""
+    """Return the planner for the probes of a dataset with this seed. Raises SceneFileError if the scene is too large to
+    be simulated, or too large for its responses."""
     SimulationSize(scene).require_reasonable()
     return SimulationPlanner(Predictions(scene, scene.probe_positions(seed)))
 
 
 class SimulationPlanner:
-    """Plans the simulation of one scene. The predictions depend only on the scene, not on the overrides."""
+    """A planner for one scene. Its predictions do not depend on overrides, so plans share them."""
 
     def __init__(self, predictions: Predictions) -> None:
         self._predictions = predictions
@@ -35,14 +35,13 @@ class SimulationPlanner:
 
     @property
     def everything(self) -> SimulationPlan:
-        """A plan that leaves out nothing that the scene file allows."""
+        """The plan with every effect on that the scene file allows."""
         has_mass = self._predictions.scene.geometry.materials.walls.surface_mass_kg_m2 is not None
         never = {SimulatedEffect.DIRECTIVITY: False, SimulatedEffect.TRANSMISSION: has_mass}
         return self.plan({**dict.fromkeys(SimulatedEffect, True), **never})
 
     def plan(self, overrides: Overrides) -> SimulationPlan:
-        """Decide each effect by its prediction or override. Raises SceneFileError for an override that is impossible in
-        the scene."""
+        """Make a plan. Raises SceneFileError for an override that the scene cannot follow."""
         predicted = self._predictions
         self._refuse_what_cannot_be(overrides)
         order, images = self._images(overrides)
@@ -83,8 +82,8 @@ class SimulationPlanner:
         )
 
     def _images(self, overrides: Overrides) -> tuple[int, Prediction]:
-        """The highest order of reflections that is called for, and the change if all orders beyond the geometric ones
-        were left out."""
+        """Return the highest reflection order that is called for, and the change without all orders beyond those
+        computed from geometry."""
         called_for = [order for order, each in self._by_order.items() if THRESHOLD.is_reached(each.change_jnd)]
         order = max(called_for, default=GEOMETRIC_ORDER)
         if SimulatedEffect.EARLY_REFLECTIONS in overrides:

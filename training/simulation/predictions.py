@@ -1,7 +1,7 @@
-"""Predictions of the change if an effect is left out of a simulation, in just-noticeable differences, with a reason in
-words. They follow from geometry, statistical acoustics and a trial with few rays, before anything else is simulated.
+"""Predictions of what leaving an effect out of a simulation would change, made before it from geometry, statistical
+acoustics and a trial with few rays: in just-noticeable differences, with a reason in words.
 
-Axes: (pair, band); metres. Power is squared pressure relative to that of the direct sound at one metre.
+Axes: (pair, band); lengths are in metres. Power is squared pressure relative to the direct sound at one metre.
 """
 
 import math
@@ -32,17 +32,17 @@ from training.simulation.trial import Trial
 _Floats = npt.NDArray[np.float64]
 
 _EARLY_S = 0.050
-# Rays may widen the spread of clarity over draws of the noise by a tenth.
+# A limited number of rays may increase the standard deviation of clarity between draws of the noise by a tenth.
 _RAY_VARIANCE = 1.1**2 - 1
-# For chords that parallel lines cut from a sphere: the mean of the square divided by the square of the mean.
+# For chords of a sphere along parallel lines: the mean of the square over the square of the mean.
 _CHORDS = 9 / 8
 _LEVEL_DB = JND_THRESHOLDS["level"].amount
 _EMITTERS_TRIED = 16
-# The allowed standard error of a shared tail's reverberation time, relative: one just-noticeable difference.
+# Allowed standard error of a shared tail's reverberation time, relative: one just-noticeable difference.
 _TAIL_ERROR = JND_THRESHOLDS["t60"].amount / 100
-# The most rays of a shared tail, as a multiple of the rays of an emitter.
+# Limit of the rays of a shared tail, as a multiple of the rays of one emitter.
 _MOST_TAIL_RAYS = 16
-# The most tests: of sequences of walls, each for a receiver; and of paths around corners, each for a wall.
+# Limits of tests: of sequences of walls for each receiver, and of paths round corners for each wall.
 _MOST_IMAGE_TESTS, _MOST_PATH_TESTS = 30_000_000, 20_000_000
 
 
@@ -55,7 +55,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Predictions:
-    """The predictions for one scene and its probes (probe, xyz)."""
+    """Predictions for one scene and its probes (probe, xyz)."""
 
     scene: SceneFile
     probes: _Floats
@@ -70,20 +70,19 @@ class Predictions:
 
     @cached_property
     def longest_onset_s(self) -> float:
-        """The longest time that the first sound takes from one probe to another."""
+        """The longest propagation time of direct sound between two probes."""
         return float(self._paths.length_m.max() / SPEED_OF_SOUND)
 
     @cached_property
     def longest_way_s(self) -> float:
-        """The longest time that the first sound takes from one probe to another, or between the start positions of a
-        visit."""
+        """The longest propagation time of direct sound between two probes or between the scene's start positions."""
         start = self.scene.start
         start_m = self.floor_plan.path_length_m(np.array(start.emitter), np.array(start.listener))
         return max(self.longest_onset_s, float(start_m) / SPEED_OF_SOUND)
 
     @property
     def is_one_room(self) -> bool:
-        """Whether every place can be seen from every other place."""
+        """Whether every place is in sight of every other."""
         return len(self.floor_plan.bend_corners) == 0
 
     @cached_property
@@ -95,8 +94,8 @@ class Predictions:
         return _told(self.trial.without_late(), reason)
 
     def early_reflections(self, order: int) -> Prediction:
-        """Predict the change if specular paths of this many reflections were replaced by noise of the same energy,
-        whose levels in octave bands vary. The result is for the pair with the largest change."""
+        """Predict the change without mirrored paths of this order, for the pair of probes with the largest change:
+        noise of the same energy would replace them, and its octave levels vary."""
         settings = self.scene.simulation
         everything = SimulationPlan.everything(settings.image_order, settings.rays)
         shares = []
@@ -111,8 +110,7 @@ class Predictions:
             beside = distance[:, None] ** -2 + self.room.reflected_power(1)
             power = np.array([(amplitudes**2).sum(axis=0) for _, amplitudes in tracer.images(emitter)])
             shares.append(power / beside)
-        # All of these paths arrive within about one mean free path; noise of this length varies by 1 / sqrt(B T) in a
-        # band.
+        # These paths arrive within about one mean free path; noise of that length varies by 1 / sqrt(B T) in a band.
         lasting_s = self.room.mean_free_path_m / SPEED_OF_SOUND
         spread = 1 / np.sqrt(np.maximum(1.0, np.asarray(OCTAVE_BANDS_HZ) / np.sqrt(2) * lasting_s))
         changes_db = power_to_db(1 + np.concatenate(shares) * spread)
@@ -130,7 +128,7 @@ class Predictions:
         return _told(self.trial.without_scattering(), reason)
 
     def air_absorption(self, *, has_rays: bool, scatters: bool) -> Prediction:
-        """Predict the change without absorption by the air, for the sound that the plan includes; a trial compares all
+        """Predict the change without air absorption, for the other effects as planned; a trial compares all
         parameters."""
         reason = "without the air's share reverberation lasts longer, by a trial"
         if not has_rays:
@@ -157,7 +155,7 @@ class Predictions:
 
     @property
     def tail_start_s(self) -> float:
-        """The time after emission from which the tail can be shared, for every receiver."""
+        """The time after emission at which the shared tail begins, for every receiver."""
         return self.room.mixing_time_s + self.longest_onset_s
 
     @property
@@ -166,8 +164,8 @@ class Predictions:
 
     @property
     def reverberation_s(self) -> tuple[float, float]:
-        """The longest reverberation time (60 dB) over octave bands, in seconds, and the centre frequency of its band in
-        Hz; inf if it cannot be measured in a trial."""
+        """The longest reverberation time (60 dB) over octave bands, and the centre frequency of that band in Hz; inf if
+        the trial does not show the end of the decay."""
         audible = bands_within(self.scene.simulation.sample_rate)
         times_s = np.nan_to_num(self.trial.reverberation_time_s[:audible], nan=np.inf)
         longest = int(np.argmax(times_s))
@@ -175,7 +173,7 @@ class Predictions:
 
     @property
     def needed_s(self) -> float:
-        """The length of a response that contains a decay of 60 dB for every receiver."""
+        """The duration of a response that contains 60 dB of decay for every receiver."""
         return self.longest_way_s + self.reverberation_s[0]
 
     def notes(self, *, has_rays: bool) -> tuple[str, ...]:
@@ -228,10 +226,10 @@ class Predictions:
         return Prediction(change_jnd, "level", reason)
 
     def rays(self) -> int:
-        """The least number of rays per emitter that adds little to the spread of clarity, on average over receivers; at
-        most the number in the scene file.
+        """Return the number of rays per emitter that keeps their part in the spread of clarity small, on average over
+        receivers; at most the number in the scene file.
 
-        A ray that fills the room crosses a sphere of radius r pi r**2 / V times per metre, on average.
+        If rays fill the room evenly, one crosses a sphere of radius r pi r**2 / V times per metre.
         """
         most = self.scene.simulation.rays
         if not self.is_one_room:
@@ -243,11 +241,11 @@ class Predictions:
         return min(most, int(np.ceil(rays / 100)) * 100)
 
     def tail_rays(self) -> int:
-        """The number of rays of a shared tail: the number of one emitter, or more if its reverberation time would
-        otherwise be too inaccurate.
+        """Return the number of rays of a shared tail: that of one emitter, or more if the reverberation time needs
+        them.
 
-        The tail is part of every response. So its random error is the same for all pairs, and averaging over pairs does
-        not reduce it.
+        The tail is part of every response. So its random error is the same for all pairs, and does not average out over
+        them.
         """
         rays = self.scene.simulation.rays
         needed = self.trial.tail_rays(self.tail_start_s, _TAIL_ERROR)
@@ -255,8 +253,8 @@ class Predictions:
 
     @cached_property
     def _ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """(pair,) the probes at both ends of each pair: every pair of probes once or, if there are many walls and
-        probes, only the pairs of a few probes with all others."""
+        """(pair,) indices of the probes at both ends: each couple once or, where walls and probes are many, the couples
+        of some probes."""
         count = len(self.probes)
         tried = int(_MOST_PATH_TESTS / (count * len(self.floor_plan.corners)))
         if tried >= count:
@@ -268,13 +266,13 @@ class Predictions:
 
     @property
     def _pairs(self) -> tuple[_Floats, _Floats]:
-        """(pair, xyz) the positions of both ends."""
+        """(pair, xyz) positions of both ends."""
         first, second = self._ends
         return self.probes[first], self.probes[second]
 
     @cached_property
     def _paths(self) -> SoundPaths:
-        """The shortest paths (pair,), in the order of `_pairs`."""
+        """(pair,) paths of the direct sound in the order of `_pairs`."""
         finder, (first, second) = SoundPathFinder(self.floor_plan, SPEED_OF_SOUND), self._ends
         found = [finder.find(self.probes[at], self.probes[second[first == at]]) for at in np.unique(first)]
         return SoundPaths(
@@ -283,18 +281,19 @@ class Predictions:
 
     @property
     def _direct_power(self) -> _Floats:
-        """(pair, 1) power of the first sound, around corners if necessary, without the loss at the corners."""
+        """(pair, 1) power of the direct sound along its path, round corners if necessary, without the loss at
+        corners."""
         return np.asarray(self._paths.length_m[:, None] ** -2)
 
     @property
     def _straight_power(self) -> _Floats:
-        """(pair, 1) power along the straight line, through any walls, without their loss."""
+        """(pair, 1) power of the direct sound along a straight line, through all obstacles."""
         return np.asarray((self._paths.length_m - self._paths.excess_m)[:, None] ** -2)
 
     @property
     def _passage_m2(self) -> float:
-        """The mean area of the openings; if the scene names none, the area of the narrowest passage at a reflex
-        corner."""
+        """The mean area of the openings; without any, the area of the narrowest gap beside a convex corner of the
+        walls."""
         geometry = self.scene.geometry
         widths = [np.subtract(opening.start, opening.end) for opening in geometry.openings]
         if widths:
@@ -303,9 +302,9 @@ class Predictions:
 
     @cached_property
     def _reverberant_power(self) -> _Floats:
-        """(pair, band) reverberant power. For pairs that do not see each other, it is that of a room coupled by the
-        passage (Cremer & Mueller, Principles and Applications of Room Acoustics, vol. 1, 1982, sec. II.1): multiplied
-        by the share S / (S + A)."""
+        """(pair, band) power of the reverberation. For pairs not in sight it is that of a coupled room, reduced by the
+        share S / (S + A) of the passage (Cremer & Mueller, Principles and Applications of Room Acoustics, vol. 1, 1982,
+        sec. II.1)."""
         power = np.tile(self.room.reflected_power(1), (len(self._paths.length_m), 1))
         if not self.is_one_room:
             passage, area = self._passage_m2, self.room.surface_m2 * self.room.absorption / 2
@@ -318,12 +317,12 @@ def _told(change: Change, reason: str) -> Prediction:
 
 
 def _level_change_jnd(more: _Floats, other: _Floats) -> float:
-    """The greatest change of level, in JND, when one power is added to another."""
+    """Return the largest change in level from adding one power to another, in JND."""
     return float(np.max(power_to_db(1 + more / other))) / _LEVEL_DB
 
 
 def _narrowest_m(plan: FloorPlan) -> float:
-    """The shortest distance from a reflex corner to a wall that does not end at this corner."""
+    """Return the narrowest gap from a corner that sound bends round to a wall that does not end there."""
     start, end = plan.walls[:, 0], plan.walls[:, 1]
     along = end - start
     narrowest = np.inf

@@ -45,7 +45,9 @@ class ComputedResponses(ResponseSource):
         return Snapped(Node(listener, emitter, yaw), 0)
 
     def find(self, listener: Vector3, emitter: Vector3, yaw: float) -> tuple[Snapped, Neighbourhood]:
-        no_other = Neighbourhood(listener, 0.0, emitter, 0.0, 0.0, yaw, 0.0)
+        no_other = Neighbourhood(
+            listener=listener, radius_m=0.0, emitter=emitter, nearest_m=0.0, farthest_m=0.0, yaw=yaw, arc_rad=0.0
+        )
         return self.snap(listener, emitter, yaw), no_other
 
     def response(self, snapped: Snapped) -> Float32:

@@ -1,4 +1,4 @@
-"""Air absorption: air takes the treble of what comes from far away (ISO 9613-1)."""
+"""Air absorption: air attenuates the treble of distant sound (ISO 9613-1)."""
 
 from server.planning.cost import MOVING, Variant
 from server.planning.effect import EnergyEffect

@@ -27,5 +27,5 @@ EFFECT = EnergyEffect(
     is_coherent=True,
     may_act=lambda situation: situation.place.paths is not None,
     absence=lambda situation, _: nothing_in_the_way(situation.place),
-    # The path that occlusion finds tells what its edges take, too: it costs nothing beside that.
+    # The path search of occlusion also returns the loss at edges, so diffraction costs nothing more.
 )

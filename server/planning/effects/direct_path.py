@@ -1,4 +1,4 @@
-"""The direct sound: what comes first, straight or round corners."""
+"""Direct path: the sound that arrives first, straight or round corners."""
 
 from server.planning.cost import STILL, Variant
 from server.planning.effect import ENERGIES, EnergyEffect

@@ -1,4 +1,4 @@
-"""Head rotation: responses are of the way the head is turned."""
+"""Head rotation: impulse responses follow the orientation of the head."""
 
 import numpy as np
 
@@ -12,11 +12,12 @@ from server.planning.scene_acoustics import Emitter, Situation
 from server.scene.effects import EffectName
 
 _EAR_GAIN = 3.0
-"""Of the energy from one side, by how much that of some third of an octave changes at an ear that turns to it: 6 dB."""
+"""Energy that an ear gains by turning to one side, in some third-octave band, as a multiple of the energy from there:
+3, since it grows by up to 6 dB, to 4 times."""
 
 
 def _change(prediction: Prediction) -> Change:
-    """Responses of one orientation while the head turns."""
+    """Return the change if responses keep one orientation while the head turns."""
     listener = prediction.listener
     if not listener.turns or listener.output == "mono":
         return UNCHANGED
@@ -28,7 +29,7 @@ def _change(prediction: Prediction) -> Change:
     change_db = 0.0
     for number, rest in enumerate(prediction.reverberation):
         mine = prediction.mirrored.owner == number
-        # What comes from one side more than from the other, of which a head takes or adds some bands when it turns.
+        # The excess of energy from one side, in some bands of which a head that turns adds or removes energy.
         sided = _EAR_GAIN * np.linalg.norm(mirrored[mine] @ prediction.mirrored.arrival[mine, :2])
         held = float(energies.held[0, number] @ shares)
         turned = sided + (0.0 if rest is None else held * (10 ** (rest.turn_db / 10) - 1))
@@ -43,7 +44,8 @@ def _absence(situation: Situation, _: Emitter | None) -> str:
 
 
 def _responses(measured: Measured) -> Cost:
-    """Responses of where one walks are of where one looks: it costs where the head turns alone."""
+    """Return the cost of responses while only the head turns. A listener who walks needs new responses in any case, and
+    they follow the head too."""
     each_us, first_us = measured.response_us
     return Cost(turning_us=each_us, turning_first_us=first_us)
 

@@ -1,4 +1,4 @@
-"""The head: each ear hears through it."""
+"""HRTF: each ear hears sound filtered by the head."""
 
 from server.acoustics.geometry import axes_of
 from server.planning.between_ears import LATERAL_ILD_DB, delay_s
@@ -11,18 +11,18 @@ from server.responses.effect_flags import SharedEffects
 from server.scene.effects import EffectName
 
 _LEAST_COLOURING_DB = 3.0
-"""No direction is heard without some third of an octave being off by more, whatever head hears it."""
+"""Every head, for every direction, changes the level of some third-octave band by more than this."""
 
 
 def _change(prediction: Prediction) -> Change:
-    """Both ears hear the same."""
+    """Return the change if both ears hear the same."""
     listener = prediction.listener
     if listener.output == "mono":
         return UNCHANGED
     energies, shares = prediction.whole, prediction.shares
     after = (energies.mirrored[0] + energies.held[0]) @ shares
     direct = energies.direct[0, : len(after)] @ shares
-    # What a field holds begins with the direct sound.
+    # Where the field's responses hold the direct sound, they begin with it.
     is_first_heard = (direct > after / 10) | prediction.place.holds_direct_sound
     changes = [
         in_jnd("iacc", (1 - rest.late_iacc) * float(part))

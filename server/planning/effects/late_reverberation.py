@@ -1,4 +1,4 @@
-"""Late reverberation: what the field holds."""
+"""Late reverberation: the part of the response that the field computes."""
 
 from server.planning.cost import STILL, Cost, Measured, Variant
 from server.planning.effect import ENERGIES, EnergyEffect

@@ -1,4 +1,4 @@
-"""Occlusion: walls stand in the way of the direct sound, which goes round them."""
+"""Occlusion: walls block the direct sound, which goes round them."""
 
 from collections.abc import Callable
 

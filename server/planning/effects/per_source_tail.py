@@ -1,4 +1,4 @@
-"""Own late tails: each emitter's is its own, or all share one."""
+"""Own late tails: each emitter has a late tail of its own, or all share one."""
 
 import itertools
 
@@ -14,7 +14,7 @@ from server.scene.effects import EffectName
 
 
 def _change(prediction: Prediction) -> Change:
-    """All share the tail of one."""
+    """Return the change if all emitters share the tail of one."""
     start_s, shares = prediction.place.tail_start_s, prediction.shares
     emitters = prediction.emitters
     if start_s is None or len(emitters) < 2:
@@ -27,7 +27,7 @@ def _change(prediction: Prediction) -> Change:
     changes = [UNCHANGED]
     for own, shared in itertools.permutations(known, 2):
         own_s, shared_s = (float(rest.t60_s @ shares) for rest in (own, shared))
-        # T60 is the slope from -5 to -35 dB; the tail is some of it, or none.
+        # T60 is the slope from -5 to -35 dB, of which the late tail makes up a part or nothing.
         first_s, last_s = own_s * 5 / 60, own_s * 35 / 60
         tail = float(np.clip((last_s - start_s) / (last_s - first_s), 0, 1)) if own_s > 0 else 0.0
         changes.append(in_jnd("t60", 100 * (shared_s / own_s - 1) * tail if own_s > 0 else 0.0))

@@ -1,4 +1,4 @@
-"""Propagation delay: the direct sound is late by the length of its path, hence Doppler."""
+"""Propagation delay: the direct sound arrives late by the length of its path, which gives the Doppler effect."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from server.scene.effects import EffectName
 
 
 def _change(prediction: Prediction, number: int) -> Change:
-    """A delay that stands still while the emitter or the listener moves or turns."""
+    """Return the change if the delay stays fixed while the emitter or the listener moves or turns."""
     listener, emitter, place = prediction.listener, prediction.emitters[number], prediction.place
     if place.holds_direct_sound:
         return UNCHANGED
@@ -33,7 +33,7 @@ def _absence(situation: Situation, emitter: Emitter | None) -> str:
 
 
 def _while_turning(measured: Measured) -> Cost:
-    """The same as while anything moves."""
+    """Return the cost while only the head turns, which is the same as in motion."""
     each_us, first_us = measured.between(MOVING, STILL)
     return Cost(turning_us=each_us, turning_first_us=first_us)
 
