@@ -122,6 +122,27 @@ def convolver(
 
 
 @app.command()
+def start(
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds, of which the median counts.")] = 5,
+    is_first: Annotated[
+        bool, typer.Option("--first", help="Also start a server that has everything to compile: some minutes.")
+    ] = False,
+    as_json: AsJson = False,
+) -> Outcome:
+    """How long new processes take: `nafir --help`, `nafir ir`, and `nafir serve` until it is ready."""
+    from server.bench.startup import measure_starts
+
+    measured = measure_starts(rounds, is_first=is_first)
+    judgements = [Judgement(**row) for row in measured["summary"]]
+    if as_json:
+        print_json(measured)
+    else:
+        print_measures("Host", measured["host"])
+        print_judgements("Goals", judgements)
+    return Outcome.judged("start", judgements)
+
+
+@app.command()
 def stream(
     emitters: Annotated[
         list[int] | None, typer.Option(min=1, max=16, help="Of each session; repeatable. [default: 1, 4, 16]")

@@ -19,8 +19,8 @@ Indices = npt.NDArray[np.int64]
 
 RISE_S = 0.0003
 MOST_GIVEN = 15.0
-"""Upper limit of the energy added to a sample, as a multiple of its square. Otherwise a response that begins late,
-after the removed energy, would consist of that energy only."""
+"""The gate adds the energy that it removed to later samples: to each at most this multiple of its own square. Without a
+limit, a response that begins late would be almost only removed energy."""
 
 
 class Gate:

@@ -85,8 +85,8 @@ def _play(mixer) -> None:
 
 @compiled
 def _scale(mixer) -> None:
-    """Scale the rows by gain and send: the send goes to the convolver's input, the gain is applied in place. Rows that
-    play nothing are silent already."""
+    """Apply each source's gain to its row in place, then write the row times the send to the input of the convolver.
+    Rows that play nothing are silent already."""
     slots, size = mixer.slots, mixer.block_size
     plays = carray(pointer(mixer.plays), (slots,), np.int64)
     gain = carray(pointer(mixer.gain), (2, slots), np.float32)

@@ -1,10 +1,11 @@
 """A scene's first reflections as part of impulse responses: paths by way of one wall, the floor or the ceiling.
 
 They arrive a few milliseconds after the direct sound and interfere with it. Their phase changes with the poses faster
-than a field can follow, and geometry gives it exactly. Scenes whose manifest says so compute them here.
+than a field can follow, and geometry gives it exactly. They are computed here for scenes whose manifest leaves them out
+of the field (`image_order` 1).
 
-A reflection appears or vanishes when the listener passes the end of a wall. It does so with the impulse response that
-contains it, and impulse responses are crossfaded.
+A reflection appears or vanishes when the listener passes the end of a wall. That makes no click: it is part of an
+impulse response, and impulse responses are crossfaded.
 
 Axes: B poses; responses (B, ear, sample). Lengths are in metres; positions and directions are in the world's axes.
 """

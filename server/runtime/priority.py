@@ -22,7 +22,8 @@ _NICENESS = 5
 _PROMPT_NICENESS = -10
 _PROMPT_SLICE_NS = 100_000
 """The shortest time slice that Linux has. A thread with a shorter slice than the running thread need not wait until
-that thread's slice ends. The usual slice is 3 ms, and takes 30 ms on a core that audio fills to nine tenths."""
+that thread's slice ends. The usual slice is 3 ms of processor time, which lasts 30 ms where audio threads take nine
+tenths of the core."""
 _ORDINARY, _RESET_ON_FORK = 0, 1
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 

@@ -136,7 +136,8 @@ def _summed(energy: _Floats) -> _Floats:
 
 
 class ShapedNearest:
-    """Estimates responses by reshaping the nearest one. `stretches` is the number of stretches of time."""
+    """Estimates a response from the nearest one by changing its arrival and its energies. `stretches` counts the
+    intervals of time (between EDGES_S) whose energies are changed separately."""
 
     def __init__(self, pairs: TrainingPairs, delays_s: npt.NDArray[np.floating], sample_rate: float) -> None:
         self.pairs, self.delays_s, self.sample_rate = pairs, delays_s, sample_rate

@@ -179,7 +179,8 @@ class SampledPairs:
         )
 
     def scores_of(self, estimate: Callable[[Entry], _Responses], numbers: npt.NDArray[np.int64]) -> "Scores":
-        """Audible errors of some entries, without the spectral loss: it takes a third of the time of `errors_of`."""
+        """Audible errors of the entries with these `numbers`. This takes a third of the time of `errors_of`, since it
+        leaves out the spectral loss."""
         entries = [self.entries[number] for number in numbers]
         audible = [in_jnd(self._differences(entry, estimate(entry)), entry.parameters) for entry in entries]
         return Scores(

@@ -90,10 +90,10 @@ class PairSimulation:
     def own(
         self, emitter: int, listeners: npt.NDArray[np.integer], take: int
     ) -> Iterator[tuple[int, _Singles, OwnResponse]]:
-        """Yield each listener with its own energy and response: all of both, or the part before the shared tail.
+        """Yield each listener with its energy and its response; with a shared tail, only the part before it.
 
-        The TAKES are independent. Until a shared tail sets in, the noise depends on pair and take but not on the plan.
-        So responses of two plans differ there only by the plans' effects.
+        The takes (`dataset.TAKES`) are independent. Before the tail, the noise depends on pair and take only, so the
+        responses of two plans differ only by the plans' effects.
         """
         place, receivers = self.probes[emitter], self.probes[listeners]
         images = self._tracer(receivers).images(place)
