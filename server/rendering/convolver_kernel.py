@@ -63,7 +63,7 @@ def process_convolver(address: int) -> None:
     """Convolve the block at `input` and write the mix to `output`; `address` is the address of a CONVOLVER record."""
     convolver = carray(pointer(address), (1,), CONVOLVER)[0]
     stages = carray(pointer(convolver.stage), (convolver.stages,), STAGE)
-    _take_in(convolver)
+    _write_input(convolver)
     _head(convolver, stages[0])
     for number in range(1, convolver.stages):
         _tick(convolver, stages[number])
@@ -98,7 +98,7 @@ def process_block(address: int, blocks: npt.NDArray[np.float32], output: npt.NDA
 
 
 @compiled
-def _take_in(convolver) -> None:
+def _write_input(convolver) -> None:
     """Write the block of every source that is not silent into its history."""
     size = convolver.block_size
     place = (convolver.blocks % convolver.history_blocks) * size

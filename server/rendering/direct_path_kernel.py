@@ -89,7 +89,7 @@ def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatAr
         slot = state.slots[index]
         if index + 1 < blocks.shape[0]:
             _fetch(state, index + 1, position, size)
-        if slot.present and _take_in(slot, state.line[index], position, state.ring, state.quiet, blocks[index]):
+        if slot.present and _write_input(slot, state.line[index], position, state.ring, state.quiet, blocks[index]):
             _render_slot(state, slot, index, size)
     state.position[0] = (position + size) % state.ring
     for kind in range(_PLAIN):
@@ -140,7 +140,7 @@ def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
 
 
 @compiled_in_place
-def _take_in(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, block: FloatArray) -> bool:
+def _write_input(slot: Any, line: FloatArray, position: int, ring: int, quiet: int, block: FloatArray) -> bool:
     """Write a block to the slot's delay line. Returns False if the slot has rung out: the line is silent then and need
     not be written."""
     size = block.size

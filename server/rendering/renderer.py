@@ -200,7 +200,7 @@ class Renderer:
             if not emitter.has_ir and emitter.mixer is not self._mixer:
                 self._hand_over(emitter, self._mixer)
 
-    def can_hear_with(self, channels: int) -> bool:
+    def can_set_channels(self, channels: int) -> bool:
         """Whether there is room for all emitters to be heard with this number of channels: earlier sound in that mixer
         has rung out."""
         return channels == self._mixer.channels or self._mixers.is_free(channels)

@@ -47,7 +47,7 @@ class ActiveEffects:
     @property
     def awaits_ears(self) -> bool:
         """Whether the effects call for another number of channels, and the renderer has room to switch."""
-        return self.wants_other_ears and self._renderer.can_hear_with(self.shared.channels)
+        return self.wants_other_ears and self._renderer.can_set_channels(self.shared.channels)
 
     @property
     def channels(self) -> int:

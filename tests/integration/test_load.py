@@ -76,9 +76,9 @@ class Listener:
         end_s = time.monotonic() + PATIENCE_S
         while not is_enough(self):
             assert time.monotonic() < end_s, f"only {self.changes}"
-            self._take_in(self.socket.recv(timeout=10))
+            self._receive(self.socket.recv(timeout=10))
 
-    def _take_in(self, message):
+    def _receive(self, message):
         if isinstance(message, bytes):
             block = AudioBlock.parse(message, "f32")
             self.blocks += 1

@@ -188,11 +188,11 @@ def test_a_head_is_put_on_and_taken_off_by_a_fade_of_what_goes_in(engine, first,
     renderer = engine(has_head=first == 2)
     add(renderer, clip, irs[first])
     heard = [run(renderer, 12)]
-    assert renderer.can_hear_with(second)
+    assert renderer.can_set_channels(second)
     renderer.set_channels(second)
     if has_ir:
         renderer.set_ir("a", irs[second])
-    assert not renderer.can_hear_with(first)
+    assert not renderer.can_set_channels(first)
     heard.append(run(renderer, 48))
     fade = np.ones(60 * SIZE)
     fade[12 * SIZE : 13 * SIZE] = raised_cosine(SIZE)[::-1]
@@ -244,7 +244,7 @@ def toggles(renderer):
     shorter = renderer.prepare(room(13)[:, :500])
 
     def ears(channels):
-        if renderer.can_hear_with(channels):
+        if renderer.can_set_channels(channels):
             renderer.set_channels(channels)
             renderer.set_ir("a", irs[channels])
 
