@@ -25,7 +25,9 @@ MEASURE ?=
 FUZZ_SECONDS ?= 60
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# Bytecode is compiled afterwards, on all cores; pip would use one. Some packages ship templates that do not compile.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+BYTECODE := $(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -163,6 +165,7 @@ $(BIN)/python:
 $(VENV)/installed-server: pyproject.toml | $(BIN)/python
 	@echo "Installing the server into $(VENV), once ..."
 	$(PIP) --editable .
+	@$(BYTECODE)
 	@touch $@
 
 # torch first and alone, so that no other requirement chooses a different build of it.
@@ -170,10 +173,12 @@ $(VENV)/installed-training: pyproject.toml | $(BIN)/python
 	@echo "Installing the training side into $(VENV), once ..."
 	$(PIP) torch==2.13.0
 	$(PIP) --editable '.[training]'
+	@$(BYTECODE)
 	@touch $(VENV)/installed-server $@
 
 $(VENV)/installed-dev: pyproject.toml | $(BIN)/python
 	@echo "Installing what tests need into $(VENV), once ..."
 	$(PIP) torch==2.13.0
 	$(PIP) --editable '.[dev]'
+	@$(BYTECODE)
 	@touch $(VENV)/installed-server $(VENV)/installed-training $@

@@ -17,7 +17,7 @@ from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_c
 from server.api.connection import StreamHost
 from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
-from server.api.first_start import ResponseCompiler, tell_while_compiling
+from server.api.first_start import CompilingProcess, tell_while_compiling
 from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
 from server.api.problems import install_problems
@@ -82,7 +82,7 @@ def create_app(
                 waiting=settings.max_waiting_requests,
                 is_urgent=lambda: workers.are_busy,
             ) as responses,
-            ResponseCompiler() as compiler,
+            CompilingProcess() as compiler,
         ):
             audio = AudioEngine(
                 asyncio.get_running_loop().call_soon_threadsafe,
@@ -136,7 +136,7 @@ def create_app(
     return app
 
 
-async def _become_ready(host: StreamHost, compiler: ResponseCompiler) -> None:
+async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:
     progress = asyncio.create_task(tell_while_compiling())
     try:
         await run_in_own_thread(partial(_warm_up, host, compiler), "nafir-warm-up")
@@ -170,7 +170,7 @@ def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:
             return
 
 
-def _warm_up(host: StreamHost, compiler: ResponseCompiler) -> None:
+def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
     """Decode clips, compute responses and render once, so that the first stream does not have to wait for it. Also
     measure how long this host takes for a response of each level."""
     compiler.begin(next(iter(host.scenes.values())).bundle, cores=usable_cores())

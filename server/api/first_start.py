@@ -1,35 +1,39 @@
-"""The first start compiles for minutes of processor time: on two cores at once, with messages about its progress.
+"""The first start compiles for minutes of processor time. It does so on two cores at once, and tells how far it is.
 
-Numba compiles one function at a time in each process. So a second process, a plain `nafir ir`, compiles the code that
-computes responses while this one compiles the code that renders blocks; each reads from disk what the other has
-compiled.
+Numba compiles one function at a time in each process. So a second process shares the work: first it compiles what
+computes responses, then what renders blocks, largest blocks first, while the server begins with the smallest. Each
+process reads from disk what the other has compiled.
 """
 
 import asyncio
 import subprocess
 import sys
-import tempfile
 import threading
 import time
+from pathlib import Path
 from types import TracebackType
+from typing import get_args
 
+from server.field.fields_by_level import FieldsByLevel
 from server.kernels.compiled import functions_compiled, is_kept
+from server.protocol.client_messages import BlockSize
 from server.rendering.output_kernel import mix_listeners
+from server.rendering.warm_up import warm_up
+from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import Bundle
 
 _TOLD_EVERY_S = 5.0
 
 
-class ResponseCompiler:
-    """Compiles the code that computes responses, in a process of its own that ends with the context at the latest."""
+class CompilingProcess:
+    """Compiles from the other end, in a process of its own that ends with the context at the latest."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._has_ended = False
-        self._folder = tempfile.TemporaryDirectory(prefix="nafir-")
 
-    def __enter__(self) -> "ResponseCompiler":
+    def __enter__(self) -> "CompilingProcess":
         return self
 
     def __exit__(
@@ -40,23 +44,16 @@ class ResponseCompiler:
             if self._process is not None:
                 self._process.kill()
                 self._process.wait()
-        self._folder.cleanup()
 
     def begin(self, bundle: Bundle, *, cores: int) -> None:
         """Start compiling. Do nothing on one core, for a scene without a field, or if an earlier start has compiled
         everything."""
         if cores < 2 or not bundle.manifest.fields or is_kept(mix_listeners):
             return
-        start = bundle.manifest.start
-        places = [
-            f"--{name}=" + ",".join(f"{at:f}" for at in place)
-            for name, place in (("listener", start.listener), ("emitter", start.emitter))
-        ]
-        output = f"{self._folder.name}/response.npy"
         with self._lock:
             if not self._has_ended:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "server", "ir", str(bundle.folder), *places, f"--output={output}"],
+                    [sys.executable, "-m", "server.api.first_start", str(bundle.folder)],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
@@ -80,3 +77,15 @@ async def tell_while_compiling() -> None:
             passed_s = time.monotonic() - started_s
             sys.stderr.write(f"Compiling for this processor, once: {count} functions in {passed_s:.0f} s ...\n")
             sys.stderr.flush()
+
+
+def _compile(folder: Path) -> None:
+    """Compute a response of a bundle, and render with blocks of each size, so that the code for both is on disk."""
+    field = FieldsByLevel.load(Bundle.load(folder)).default
+    start = field.bundle.manifest.start
+    ImpulseResponse.compute(field, IrQuery(start.listener, start.emitter))
+    warm_up(reversed(get_args(BlockSize)))
+
+
+if __name__ == "__main__":
+    _compile(Path(sys.argv[1]))

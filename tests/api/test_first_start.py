@@ -7,7 +7,8 @@ import sys
 import pytest
 
 from server.api import first_start
-from server.api.first_start import ResponseCompiler, tell_while_compiling
+from server.api.first_start import CompilingProcess, tell_while_compiling
+from server.responses.impulse_response import ImpulseResponse
 
 
 @pytest.fixture
@@ -25,26 +26,34 @@ def begun(monkeypatch):
 
 
 def test_another_process_computes_a_response_and_ends_with_the_context(field, begun):
-    with ResponseCompiler() as compiler:
+    with CompilingProcess() as compiler:
         compiler.begin(field.bundle, cores=2)
         ((arguments, process),) = begun
         assert process.poll() is None
-    assert arguments[1:5] == ["-m", "server", "ir", str(field.bundle.folder)]
+    assert arguments[1:] == ["-m", "server.api.first_start", str(field.bundle.folder)]
     assert process.returncode != 0
     compiler.wait()
+
+
+def test_the_other_process_begins_with_a_response_and_the_largest_blocks(field, monkeypatch):
+    done, compute = [], ImpulseResponse.compute
+    monkeypatch.setattr(ImpulseResponse, "compute", lambda *asked: done.append("response") or compute(*asked))
+    monkeypatch.setattr(first_start, "warm_up", done.extend)
+    first_start._compile(field.bundle.folder)
+    assert done == ["response", 1024, 512, 256, 128]
 
 
 @pytest.mark.parametrize(("cores", "is_kept"), [(1, False), (2, True)])
 def test_on_one_core_or_with_all_compiled_none_is_begun(field, begun, monkeypatch, cores, is_kept):
     monkeypatch.setattr(first_start, "is_kept", lambda _: is_kept)
-    with ResponseCompiler() as compiler:
+    with CompilingProcess() as compiler:
         compiler.begin(field.bundle, cores=cores)
         compiler.wait()
     assert not begun
 
 
 def test_after_the_end_none_is_begun(field, begun):
-    with ResponseCompiler() as compiler:
+    with CompilingProcess() as compiler:
         pass
     compiler.begin(field.bundle, cores=2)
     assert not begun
