@@ -1,8 +1,7 @@
 """The first start compiles for minutes of processor time. It does so on two cores at once, and tells how far it is.
 
-Numba compiles one function at a time in each process. So a second process shares the work: first it compiles what
-computes responses, then what renders blocks, largest blocks first, while the server begins with the smallest. Each
-process reads from disk what the other has compiled.
+Numba compiles one function at a time in each process. So a second process compiles the code that computes responses,
+while the server compiles the code that renders blocks. Each reads from disk what the other has compiled.
 """
 
 import asyncio
@@ -12,13 +11,10 @@ import threading
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import get_args
 
 from server.field.fields_by_level import FieldsByLevel
 from server.kernels.compiled import functions_compiled, is_kept
-from server.protocol.client_messages import BlockSize
 from server.rendering.output_kernel import mix_listeners
-from server.rendering.warm_up import warm_up
 from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import Bundle
 
@@ -26,7 +22,7 @@ _TOLD_EVERY_S = 5.0
 
 
 class CompilingProcess:
-    """Compiles from the other end, in a process of its own that ends with the context at the latest."""
+    """Compiles the code that computes responses, in a process of its own that ends with the context at the latest."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -80,11 +76,10 @@ async def tell_while_compiling() -> None:
 
 
 def _compile(folder: Path) -> None:
-    """Compute a response of a bundle, and render with blocks of each size, so that the code for both is on disk."""
+    """Compute one response of a bundle, so that the code for it is on disk."""
     field = FieldsByLevel.load(Bundle.load(folder)).default
     start = field.bundle.manifest.start
     ImpulseResponse.compute(field, IrQuery(start.listener, start.emitter))
-    warm_up(reversed(get_args(BlockSize)))
 
 
 if __name__ == "__main__":

@@ -18,14 +18,17 @@ from server.assets.hrtfs import HrtfLibrary
 from server.field.fields_by_level import FieldsByLevel
 
 HERE = Path(__file__).parent
+_LEFT_CLOSING = "ignore:unclosed transport <_SelectorSocketTransport closing:ResourceWarning"
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Servers and browsers here are measured while they run: every test is `timed`."""
+    """Servers and browsers here are measured while they run: every test is `timed`. A loop that ends while a connection
+    is being closed leaves its transport to the collector, which is no fault."""
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.timed)
+            item.add_marker(pytest.mark.filterwarnings(_LEFT_CLOSING))
 
 
 @contextmanager
