@@ -1,7 +1,9 @@
 """`scene.json`, the manifest of a scene bundle.
 
-Since format 2 the fields of a bundle hold the reflected field only, and the server computes the direct sound from
-geometry. With `image_order` 1 the server also computes the early reflections, and the fields hold only the late
+A field predicts what arrives at the ears of one head, or what arrives from each direction, from which the server
+computes what any head hears. Only bundles with a field of directions have format 3; all others have format 2.
+
+The fields of a bundle hold the reflected field only, and the server computes the direct sound from geometry. With `image_order` 1 the server also computes the early reflections, and the fields hold only the late
 reverberation. Measured responses cannot be separated like that: with `direct_sound` "field" the fields hold everything,
 for one microphone or two ears. If the walls of such a place are unknown, there is no `geometry`, and the place is the
 box of `bounds`.
@@ -12,13 +14,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
 
 from server.acoustics.air import absorption_db_per_m
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
+from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.scene.effects import EffectName
 from server.scene.geometry import Finite, Geometry, Point, Strict
 from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
@@ -26,7 +29,9 @@ from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ,
 ARRAYS_FILE = "arrays.npz"
 NO_FIELD = "none"
 """Name of the field in the only level of a scene without fields."""
-FORMAT_VERSION: Literal[2] = 2
+EARS_FORMAT: Literal[2] = 2
+DIRECTIONS_FORMAT: Literal[3] = 3
+"""The format of a bundle with a field that predicts directions."""
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -119,12 +124,31 @@ class CodecParameters(Strict):
 
 class FieldFile(Strict):
     """One trained network: its ONNX file, the rank of its output basis if it has one, and its `codec` if that differs
-    from the bundle's."""
+    from the bundle's.
+
+    ears: the field predicts spectrograms at the ears of one head, or its response. directions: it predicts the power
+    that arrives per octave band, and from where, in spherical harmonics up to `order`.
+    """
 
     file: FileName
     architecture: str
     rank: Annotated[int, Field(ge=1)] | None = None
     codec: CodecParameters | None = None
+    predicts: Literal["ears", "directions"] = "ears"
+    order: Annotated[int, Field(ge=0, le=HIGHEST_ORDER)] | None = None
+
+    @model_validator(mode="after")
+    def _has_an_order_if_it_has_directions(self) -> "FieldFile":
+        if (self.predicts == "directions") != (self.order is not None):
+            raise ValueError("order: a field that predicts directions has one, any other has none")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_what_format_2_lacks(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+        document: dict[str, object] = write(self)
+        if self.predicts == "ears":
+            del document["predicts"], document["order"]
+        return document
 
 
 class Phase(Strict):
@@ -252,7 +276,8 @@ class AcceptedLaw(Strict):
 class Manifest(Strict):
     """The content of `scene.json`."""
 
-    format_version: Literal[2] = FORMAT_VERSION
+    format_version: Literal[2, 3] = EARS_FORMAT
+    """3 if a field predicts directions, else 2."""
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
     """Identifier by which clients ask for the scene."""
     name: str
@@ -310,6 +335,12 @@ class Manifest(Strict):
                 raise ValueError(f"fields.{name}.file: {field.file} is not listed in files")
             if field.codec is not None and field.codec.sample_rate != self.codec.sample_rate:
                 raise ValueError(f"fields.{name}.codec.sample_rate: must be the scene's, {self.codec.sample_rate}")
+        has_directions = any(field.predicts == "directions" for field in self.fields.values())
+        expected = DIRECTIONS_FORMAT if has_directions else EARS_FORMAT
+        if self.format_version != expected:
+            raise ValueError(f"format_version: is {self.format_version}, but fields like these make it {expected}")
+        if has_directions and (len(self.channels) == 1 or self.direct_sound == "field"):
+            raise ValueError("fields: directions are those of late reverberation; the direct sound is from geometry")
         if not self.fields:
             return self._has_no_field()
         for level in self.levels:

@@ -1,0 +1,43 @@
+"""What a manifest says of a field that predicts directions."""
+
+import pytest
+from pydantic import ValidationError
+
+from server.scene.manifest import FieldFile, Manifest
+from tests.conftest import MANIFEST
+
+DIRECTIONAL = FieldFile(file="arithmetic.onnx", architecture="arithmetic", predicts="directions", order=2)
+
+
+def with_field(field: FieldFile, **changes: object) -> dict[str, object]:
+    document = MANIFEST.model_dump(mode="json")
+    return document | {"fields": {"arithmetic": field.model_dump(mode="json")}} | changes
+
+
+def test_a_bundle_with_directions_has_format_3():
+    manifest = Manifest.model_validate(with_field(DIRECTIONAL, format_version=3))
+    assert manifest.fields["arithmetic"].order == 2
+    with pytest.raises(ValidationError, match="format_version: is 2, but fields like these make it 3"):
+        Manifest.model_validate(with_field(DIRECTIONAL))
+
+
+@pytest.mark.parametrize("choice", [{"predicts": "directions"}, {"predicts": "ears", "order": 1}, {"order": 0}])
+def test_directions_have_an_order_and_ears_none(choice):
+    with pytest.raises(ValidationError, match="order: a field that predicts directions has one"):
+        FieldFile.model_validate({"file": "a.onnx", "architecture": "a"} | choice)
+
+
+@pytest.mark.parametrize("order", [-1, 4])
+def test_an_order_that_is_none_is_refused(order):
+    with pytest.raises(ValidationError, match="order"):
+        FieldFile(file="a.onnx", architecture="a", predicts="directions", order=order)
+
+
+@pytest.mark.parametrize("changes", [{"channels": ["mono"], "direct_sound": "field"}, {"direct_sound": "field"}])
+def test_directions_are_of_late_reverberation(changes):
+    with pytest.raises(ValidationError, match="directions are those of late reverberation"):
+        Manifest.model_validate(with_field(DIRECTIONAL, format_version=3, **changes))
+
+
+def test_a_bundle_of_ears_is_written_as_version_2_knows_it():
+    assert set(MANIFEST.model_dump(mode="json")["fields"]["arithmetic"]) == {"file", "architecture", "rank", "codec"}
