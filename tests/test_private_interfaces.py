@@ -37,6 +37,7 @@ MODULES = {
     "numba.core": "server/kernels/",
     "numba.core.codegen": "server/kernels/dispatchers.py",
     "numba.core.compiler": "server/kernels/dispatchers.py",
+    "numba.core.compiler_lock": "server/kernels/dispatchers.py",
     "numba.core.registry": "server/kernels/dispatchers.py",
     "numba.core.imputils": "server/kernels/by_reference.py",
     "numba.core.typing.templates": "server/kernels/by_reference.py",

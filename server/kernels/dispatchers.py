@@ -7,11 +7,14 @@ calls. That takes half of the processor time. Results stay the same to the bit: 
 unless it is told that it may.
 """
 
-from collections.abc import Callable
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
 
@@ -50,6 +53,19 @@ class _CalledFunction(CPUDispatcher):  # type: ignore[misc]
         self._on_compiled()
 
 
+@contextlib.contextmanager
+def _no_collections() -> Iterator[None]:
+    """Pause the garbage collector, which would look again and again at all that a compilation makes: a fifth of it."""
+    with global_compiler_lock:
+        is_on = gc.isenabled()
+        gc.disable()
+        try:
+            yield
+        finally:
+            if is_on:
+                gc.enable()
+
+
 class CompiledFunction(CPUDispatcher):  # type: ignore[misc]
     """A function as Python calls it, compiled on its first call for each combination of types.
 
@@ -61,6 +77,10 @@ class CompiledFunction(CPUDispatcher):  # type: ignore[misc]
     ) -> None:
         super().__init__(py_func, targetoptions={**targetoptions, "no_cfunc_wrapper": True})
         self._called = _CalledFunction(py_func, targetoptions, on_compiled)
+
+    def compile(self, sig: Any) -> Any:
+        with _no_collections():
+            return super().compile(sig)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Numba asks for this, and then for `get_overload`, where compiled code calls the function."""

@@ -1,5 +1,6 @@
 """Of compiled functions only what Python calls becomes machine code, and results do not depend on who calls."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import pytest
 from numba.core.errors import NumbaError
 
 from server.kernels.compiled import compiled, compiled_in_place
+from server.kernels.dispatchers import CompiledFunction
 
 
 @compiled_in_place
@@ -71,6 +73,34 @@ def test_what_a_called_function_may_not_do_is_said_when_it_is_compiled():
 
     with pytest.raises(NumbaError, match="no_such_attribute"):
         outer(1.0)
+
+
+def test_the_garbage_collector_rests_while_code_is_compiled_and_then_goes_on():
+    def fails(x):
+        return x.no_such_attribute
+
+    def calls(x):
+        return square_root(x)
+
+    seen = []
+    function = CompiledFunction(fails, {"nopython": True}, lambda: None)
+    caller = CompiledFunction(calls, {"nopython": True}, lambda: None)
+    square_root._called._on_compiled, told = lambda: seen.append(gc.isenabled()), square_root._called._on_compiled
+    try:
+        assert caller(np.float32(4)) == 2
+    finally:
+        square_root._called._on_compiled = told
+    assert seen == [False]
+    assert gc.isenabled()
+    with pytest.raises(NumbaError):
+        function(1.0)
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        caller(1)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
 
 
 MODULE = """
