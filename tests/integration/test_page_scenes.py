@@ -9,7 +9,6 @@ from tests import visitor
 from tests.visitor import level_db, listen, start
 
 browser = visitor.browser
-server = visitor.server
 pytestmark = visitor.needs_browser
 
 SCENES = [folder.name for folder in bundled_scenes()]
