@@ -34,25 +34,25 @@ def compile_kernels() -> None:
 
 
 def _compile_rendering() -> None:
-    from server.protocol.client_messages import BlockSize
-    from server.rendering.warm_up import warm_up
-
-    warm_up(get_args(BlockSize))
-
-
-def _compile_responses() -> None:
-    """Also what simulates them."""
+    """And what simulates them."""
     from rich.progress import Progress
 
-    from server.field.fields_by_level import FieldsByLevel
-    from server.responses.impulse_response import ImpulseResponse, IrQuery
-    from server.scene.bundle import Bundle, find_bundle
+    from server.protocol.client_messages import BlockSize
+    from server.rendering.warm_up import warm_up
     from training.simulation.run import simulate
 
+    warm_up(get_args(BlockSize))
     with tempfile.TemporaryDirectory() as folder:
         simulate(
             ROOT / "tests/data/tiny.toml", Path(folder) / "data", seed=5, workers=1, progress=Progress(disable=True)
         )
+
+
+def _compile_responses() -> None:
+    from server.field.fields_by_level import FieldsByLevel
+    from server.responses.impulse_response import ImpulseResponse, IrQuery
+    from server.scene.bundle import Bundle, find_bundle
+
     field = FieldsByLevel.load(Bundle.load(find_bundle("apartment"))).default
     start = field.bundle.manifest.start
     ImpulseResponse.compute(field, IrQuery(start.listener, start.emitter))

@@ -155,6 +155,7 @@ def test_a_second_source_is_heard_too(page):
     assert np.all(level_db(listen(page)) > -70)
 
 
+@pytest.mark.untimed
 def test_an_error_of_the_server_is_shown_and_the_stream_goes_on(browser, server):
     context = browser.new_context()
     context.route(
