@@ -1,6 +1,6 @@
 """Compiles what most tests call, so that workers of one run do not all compile the same: `compile_kernels`.
 
-Run as a script, this is one of two processes that do so: with `rendering` or `responses`.
+Run as a script, with the name of a part, this is one of the processes that do so.
 """
 
 import os
@@ -22,11 +22,11 @@ def compile_kernels() -> None:
     if is_kept(mix_listeners):
         return
     began_s = time.monotonic()
-    sys.stderr.write("Compiling kernels in two processes, once: a minute or two ...\n")
+    sys.stderr.write("Compiling kernels, once: a minute or two ...\n")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     processes = [
         subprocess.Popen([sys.executable, __file__, part], cwd=ROOT, env=environment, stdin=subprocess.DEVNULL)
-        for part in ("responses", "rendering")
+        for part in _PARTS
     ]
     for process in processes:
         process.wait()  # what a process that failed has left out, tests compile and tell of
@@ -34,14 +34,17 @@ def compile_kernels() -> None:
 
 
 def _compile_rendering() -> None:
-    """And what simulates them."""
-    from rich.progress import Progress
-
     from server.protocol.client_messages import BlockSize
     from server.rendering.warm_up import warm_up
-    from training.simulation.run import simulate
 
     warm_up(get_args(BlockSize))
+
+
+def _compile_simulation() -> None:
+    from rich.progress import Progress
+
+    from training.simulation.run import simulate
+
     with tempfile.TemporaryDirectory() as folder:
         simulate(
             ROOT / "tests/data/tiny.toml", Path(folder) / "data", seed=5, workers=1, progress=Progress(disable=True)
@@ -58,6 +61,8 @@ def _compile_responses() -> None:
     ImpulseResponse.compute(field, IrQuery(start.listener, start.emitter))
 
 
+_PARTS = {"simulation": _compile_simulation, "rendering": _compile_rendering, "responses": _compile_responses}
+
 if __name__ == "__main__":
     sys.path[0] = str(ROOT)
-    {"rendering": _compile_rendering, "responses": _compile_responses}[sys.argv[1]]()
+    _PARTS[sys.argv[1]]()
