@@ -22,6 +22,7 @@ from server.acoustics.spherical_harmonics import harmonic_count
 from server.field.directions_kernel import ears_of_directions
 from server.field.graph import INPUTS, FieldGraph, Spectrograms
 from server.field.runtime import InferenceSession
+from server.kernels.simd import LANES
 from server.rendering.ear_products import EarProducts
 from server.rendering.hrtf import HeadFilters, kemar
 from server.scene.bundle import Bundle
@@ -103,7 +104,9 @@ class DirectionalGraph(FieldGraph):
         orientations = orientations_of(heads)
         rows, all_columns = len(orientations), arrivals.log_magnitude.shape[-1]
         levels, coherence = np.empty((2, rows, 2, codec.bins, all_columns), np.float32)
-        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), all_columns), np.float32)
+        written = all_columns if columns is None else columns
+        whole = -(-written // LANES) * LANES
+        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
         band, share = self._between_bands
         for row, orientation in enumerate(orientations):
             ears_of_directions(
@@ -114,7 +117,7 @@ class DirectionalGraph(FieldGraph):
                 share,
                 codec.log_floor,
                 LEAST_POWER,
-                columns or all_columns,
+                written,
                 work,
                 levels[row],
                 coherence[row],
@@ -154,7 +157,8 @@ class DirectionalGraph(FieldGraph):
         key, last = orientation.tobytes(), self._turned
         if last is None or last.orientation != key:
             of_bins = self._products.turned(orientation)
-            last = self._turned = _Turned(key, of_bins, np.tensordot(self._mean_over_band, of_bins, 1))
+            of_bands = self._mean_over_band @ of_bins.reshape(len(of_bins), -1)
+            last = self._turned = _Turned(key, of_bins, of_bands.reshape(-1, *of_bins.shape[1:]))
         return last
 
     @cached_property
