@@ -383,6 +383,8 @@ class Manifest(Strict):
     def _has_no_field(self) -> "Manifest":
         if len(self.levels) > 1 or self.levels[0].field != NO_FIELD or self.levels[0].reuse is not None:
             raise ValueError(f"levels: a scene without fields has one level, of field {NO_FIELD!r}")
+        if self.levels[0].tail != "stft":
+            raise ValueError(f"levels.{self.levels[0].name}.tail: bands are for fields of directions")
         if self.direct_sound == "field":
             raise ValueError("direct_sound: there is no field that could hold it")
         return self
