@@ -126,7 +126,9 @@ class AcousticField:
         heard = self._heard.get(filters)
         if heard is None:
             graph = self.graph.through(filters)
-            heard = self if graph is self.graph else self._with(graph)
+            if graph is self.graph:
+                return self
+            heard = self._with(graph)
             self._heard.put(filters, heard, 1)
         return heard
 
