@@ -8,7 +8,7 @@ Axes: B poses, 7 octave bands, columns of frames, harmonics k (ACN, SN3D; `serve
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -88,23 +88,31 @@ class DirectionalGraph(FieldGraph):
     def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
         """What arrives at listeners (B, 3) from emitters (B, 3), whatever their heads."""
         listeners = np.asarray(listeners, dtype=np.float32)
-        said = self.run(listeners, emitters, np.zeros(len(listeners)))
-        if self.order == 0:
-            rows, *axes = said[0].shape
-            said.append(np.zeros((rows, 0, *axes), np.float32))
-        return Arrivals(*said)
+        return self._arrivals_of(self.run(listeners, emitters, np.zeros(len(listeners))))
+
+    def _arrivals_of(self, said: Sequence[Float32]) -> Arrivals:
+        if self.order > 0:
+            return Arrivals(*said)
+        rows, *axes = said[0].shape
+        return Arrivals(said[0], np.zeros((rows, 0, *axes), np.float32))
+
+    def predictions_of(self, said: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:
+        return self.at_ears(self._arrivals_of(said), heads)
 
     def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         return self.at_ears(self.arrivals(listeners, emitters), heads)
 
     def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike, *, columns: int | None = None) -> Spectrograms:
         """The spectrograms at the ears of heads, as orientations (B, 4) or yaws (B,) of level heads. With `columns`,
-        only that many are computed, and the others are left as they come."""
+        only that many are computed, and the others are zeros."""
         codec = self.parameters.codec
         orientations = orientations_of(heads)
         rows, all_columns = len(orientations), arrivals.log_magnitude.shape[-1]
         levels, coherence = np.empty((2, rows, 2, codec.bins, all_columns), np.float32)
         written = all_columns if columns is None else columns
+        # What is left out must be numbers: decoders multiply it by zero.
+        levels[..., written:] = 0
+        coherence[..., written:] = 0
         whole = -(-written // LANES) * LANES
         work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
         band, share = self._between_bands
@@ -137,7 +145,11 @@ class DirectionalGraph(FieldGraph):
     @cached_property
     def _mean_over_band(self) -> Float32:
         codec = self.parameters.codec
-        weights = band_weights(np.linspace(0, codec.sample_rate / 2, codec.bins))
+        frequency = np.linspace(0, codec.sample_rate / 2, codec.bins)
+        weights = band_weights(frequency)
+        # At low rates or with short windows, a band may have no bin of its own: it takes the nearest one.
+        empty = np.flatnonzero(weights.sum(axis=1) == 0)
+        weights[empty, np.abs(frequency - np.array(OCTAVE_BANDS_HZ)[empty, None]).argmin(axis=1)] = 1
         return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
 
     @cached_property

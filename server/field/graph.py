@@ -9,7 +9,7 @@ several frames (`CodecParameters.frame_cells`) in place of frames: late sound is
 take most of the time.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -133,11 +133,15 @@ class FieldGraph:
 
     def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Predictions as the graph gives them, per frame or per cell. Only for a graph that gives spectrograms."""
-        said = self.run(listeners, emitters, heads)
-        if self.channels == 1:
-            rows, _, *axes = said[0].shape
-            said.append(np.zeros((rows, 2, *axes), np.float32))
-        return Spectrograms(*said)
+        return self.predictions_of(self.run(listeners, emitters, heads), heads)
+
+    def predictions_of(self, said: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:  # noqa: ARG002
+        """Predictions from outputs of `run` for these heads."""
+        if self.channels == 2:
+            return Spectrograms(*said)
+        log_magnitude, frequency, certainty = said
+        rows, _, *axes = log_magnitude.shape
+        return Spectrograms(log_magnitude, frequency, certainty, np.zeros((rows, 2, *axes), np.float32))
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Float32:
         """(B, channel, samples), aligned. Only for a graph that gives responses."""

@@ -68,5 +68,6 @@ class Predictions:
             magnitude = np.abs(codec.transform(outputs[0])).astype(np.float32)
         else:
             axis = self.graph.parameters.frame_axis
-            magnitude = codec.magnitude(outputs[0] if axis is None else outputs[0] @ axis.spread())
+            levels = self.graph.predictions_of(outputs, poses[:, YAW]).log_magnitude
+            magnitude = codec.magnitude(levels if axis is None else levels @ axis.spread())
         return self.windows.energies(magnitude)
