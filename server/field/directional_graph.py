@@ -53,6 +53,7 @@ class DirectionalGraph(FieldGraph):
     Raises BundleError for a graph that does not fit the manifest.
     """
 
+    predicts_directions: ClassVar[bool] = True
     _inputs: ClassVar[dict[str, list[int]]] = DIRECTIONAL_INPUTS
 
     def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
@@ -94,7 +95,7 @@ class DirectionalGraph(FieldGraph):
         rows, columns = len(orientations), arrivals.log_magnitude.shape[-1]
         levels, coherence = np.empty((2, rows, 2, codec.bins, columns), np.float32)
         work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), columns), np.float32)
-        band, share = self._between_bands
+        band, share = self.between_bands
         for row, orientation in enumerate(orientations):
             ears_of_directions(
                 arrivals.log_magnitude[row],
@@ -135,7 +136,7 @@ class DirectionalGraph(FieldGraph):
         return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.order)
 
     @cached_property
-    def _between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
+    def between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
         """For each bin, the octave band below it and its share of the way to the next, over the logarithm of frequency;
         the outermost bands reach to the ends."""
         codec = self.parameters.codec
