@@ -82,10 +82,12 @@ def serve(
     from server.api import serving
     from server.api.app import create_app
     from server.api.catalogue import load_hrtfs, load_scenes
-    from server.api.settings import Settings
+    from server.api.first_start import CompilingProcess
+    from server.api.settings import Settings, usable_cores
     from server.runtime.drain import Drain
     from server.runtime.memory import give_back_large_arrays
     from server.runtime.open_files import allow_connections
+    from server.scene.bundle import Bundle, bundled_scenes
 
     give_back_large_arrays()
     given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf}
@@ -102,12 +104,14 @@ def serve(
     with contextlib.ExitStack() as opened:
         # Before the slow part, so that a port that cannot be bound is reported at once.
         listeners = [opened.enter_context(listener) for listener in serving.bind(settings.host, settings.port)]
+        compiler = opened.enter_context(CompilingProcess())
+        compiler.begin(map(Bundle.load, bundled_scenes()), cores=usable_cores())
         scenes = load_scenes(settings.bundles)
         if not scenes:
             raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
         hrtfs = load_hrtfs(settings.hrtfs, scenes)
         drain = Drain(settings.drain_s)
-        application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain)
+        application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain, compiler=compiler)
         url = serving.url(listeners[0], settings.host)
         announcement = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
         serving.serve(
