@@ -76,6 +76,8 @@ class AcousticField:
         self.bundle = bundle
         self.level = level
         self.graph = graph
+        if level.order is not None and isinstance(graph, DirectionalGraph):
+            self.graph = graph = graph.of_order(level.order)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
         is_whole = bundle.manifest.direct_sound == "field"
         # Measured sound may arrive earlier than geometry predicts: the gate opens with the first coded sample.
