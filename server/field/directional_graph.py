@@ -70,6 +70,9 @@ class DirectionalGraph(FieldGraph):
         order = bundle.manifest.fields[name].order
         assert order is not None  # by the manifest
         self.order = order
+        """The order of the predicted harmonics."""
+        self.heard_order = order
+        """The order up to which they are heard."""
         self._turned: _Turned | None = None
         super().__init__(bundle, name, session)
 
@@ -80,10 +83,20 @@ class DirectionalGraph(FieldGraph):
     def through(self, filters: HeadFilters) -> "DirectionalGraph":
         if filters is self._filters:
             return self
+        other = self._copy()
+        other._filters = filters
+        return other
+
+    def of_order(self, order: int) -> "DirectionalGraph":
+        """The same field with harmonics up to a lower order only."""
+        other = self._copy()
+        other.heard_order = min(order, self.order)
+        return other
+
+    def _copy(self) -> "DirectionalGraph":
         other = copy.copy(self)
         other._turned = None
         vars(other).pop("_products", None)
-        other._filters = filters
         return other
 
     def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
@@ -94,6 +107,11 @@ class DirectionalGraph(FieldGraph):
             rows, *axes = said[0].shape
             said.append(np.zeros((rows, 0, *axes), np.float32))
         return Arrivals(*said)
+
+    def heard_arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
+        """What arrives, with directions up to the heard order."""
+        arrivals = self.arrivals(listeners, emitters)
+        return Arrivals(arrivals.log_magnitude, arrivals.directions[:, : harmonic_count(self.heard_order) - 1])
 
     def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         return self.at_ears(self.arrivals(listeners, emitters), heads)
@@ -107,12 +125,13 @@ class DirectionalGraph(FieldGraph):
         levels, coherence = np.empty((2, rows, 2, codec.bins, all_columns), np.float32)
         written = all_columns if columns is None else columns
         whole = -(-written // LANES) * LANES
-        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
+        harmonics = harmonic_count(self.heard_order)
+        work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
         band, share = self.between_bands
         for row, orientation in enumerate(orientations):
             ears_of_directions(
                 arrivals.log_magnitude[row],
-                arrivals.directions[row],
+                arrivals.directions[row, : harmonics - 1],
                 self._turned_to(orientation).of_bins,
                 band,
                 share,
@@ -164,7 +183,7 @@ class DirectionalGraph(FieldGraph):
 
     @cached_property
     def _products(self) -> EarProducts:
-        return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.order)
+        return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.heard_order)
 
     @cached_property
     def between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:

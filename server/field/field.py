@@ -77,6 +77,8 @@ class AcousticField:
         self.bundle = bundle
         self.level = level
         self.graph = graph
+        if level.order is not None and isinstance(graph, DirectionalGraph):
+            self.graph = graph = graph.of_order(level.order)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
         is_whole = bundle.manifest.direct_sound == "field"
         # Measured sound may arrive earlier than geometry predicts: the gate opens with the first coded sample.
@@ -213,7 +215,7 @@ class AcousticField:
         assert isinstance(self.graph, DirectionalGraph)
         aligned = self._aligned(listeners, emitters)
         decoder = AmbisonicDecoder(self.graph.parameters, ir_samples=self.ir_samples, frames=self.level.frames)
-        arrivals = self.graph.arrivals(listeners, emitters)
+        arrivals = self.graph.heard_arrivals(listeners, emitters)
         responses = self._finite(
             decoder.decode(arrivals, self.graph.between_bands, aligned, order), listeners, emitters
         )

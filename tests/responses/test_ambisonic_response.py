@@ -155,6 +155,14 @@ def test_a_field_of_any_order_gives_channels_of_any(tmp_path, order):
     assert np.isfinite(response).all()
 
 
+def test_a_level_of_a_lower_order_tells_less_of_directions(from_the_north):
+    blurred = AcousticField(
+        from_the_north.bundle, QualityLevel(name="blurred", field="directional", order=0), from_the_north.graph
+    )
+    w, y, _, _ = blurred.ambisonics([LISTENER], [EMITTER], 1)[0].astype(float)
+    assert abs(y @ w) < 0.2 * np.sum(w**2)
+
+
 def test_a_level_with_fewer_frames_ends_earlier(tmp_path):
     manifest = directional_manifest(2)
     short = QualityLevel(name="short", field="directional", frames=6)
