@@ -63,6 +63,7 @@ class DirectionalGraph(FieldGraph):
     Raises BundleError for a graph that does not fit the manifest.
     """
 
+    predicts_directions: ClassVar[bool] = True
     _inputs: ClassVar[dict[str, list[int]]] = DIRECTIONAL_INPUTS
 
     def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
@@ -71,7 +72,7 @@ class DirectionalGraph(FieldGraph):
         self.order = order
         """The order of the predicted harmonics."""
         self.heard_order = order
-        """The order up to which ears hear them."""
+        """The order up to which they are heard."""
         self._turned: _Turned | None = None
         super().__init__(bundle, name, session)
 
@@ -107,6 +108,11 @@ class DirectionalGraph(FieldGraph):
             said.append(np.zeros((rows, 0, *axes), np.float32))
         return Arrivals(*said)
 
+    def heard_arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
+        """What arrives, with directions up to the heard order."""
+        arrivals = self.arrivals(listeners, emitters)
+        return Arrivals(arrivals.log_magnitude, arrivals.directions[:, : harmonic_count(self.heard_order) - 1])
+
     def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         return self.at_ears(self.arrivals(listeners, emitters), heads)
 
@@ -121,7 +127,7 @@ class DirectionalGraph(FieldGraph):
         whole = -(-written // LANES) * LANES
         harmonics = harmonic_count(self.heard_order)
         work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
-        band, share = self._between_bands
+        band, share = self.between_bands
         for row, orientation in enumerate(orientations):
             ears_of_directions(
                 arrivals.log_magnitude[row],
@@ -180,7 +186,7 @@ class DirectionalGraph(FieldGraph):
         return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.heard_order)
 
     @cached_property
-    def _between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
+    def between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
         """For each bin, the octave band below it and its share of the way to the next, over the logarithm of frequency;
         the outermost bands reach to the ends."""
         codec = self.parameters.codec
