@@ -79,6 +79,28 @@ def axes_of(orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDAr
     ).reshape(3, 3)
 
 
+def yaws_of(heads: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(B,) headings of the look directions, of heads that are given as orientations (B, 4); yaws (B,) of level heads
+    are returned as they are."""
+    given = np.asarray(heads, dtype=np.float64)
+    if given.ndim == 1:
+        return given
+    return np.array([_heading(*orientation) for orientation in given.tolist()], dtype=np.float64)
+
+
+def orientations_of(heads: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(B, 4) orientations of level heads that are given as yaws (B,); orientations (B, 4) are returned as they are."""
+    given = np.asarray(heads, dtype=np.float64)
+    if given.ndim != 1:
+        return given
+    level = np.zeros_like(given)
+    return np.stack([level, level, np.sin(given / 2), np.cos(given / 2)], axis=-1)
+
+
+def _heading(x: float, y: float, z: float, w: float) -> float:
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
 @dataclass(frozen=True)
 class Pose:
     """A position in metres and an orientation.
@@ -114,8 +136,7 @@ class Pose:
     @property
     def yaw(self) -> float:
         """The heading of the look direction in the horizontal plane, radians in [-pi, pi]."""
-        x, y, z, w = self.orientation
-        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return _heading(*self.orientation)
 
 
 @dataclass(frozen=True)

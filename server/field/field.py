@@ -4,16 +4,18 @@ Reflected sound is everything after the direct sound, which `server.responses.fu
 bundle's `image_order` is 1, the first reflections are computed from geometry too. For measured scenes, whose
 `direct_sound` is the field's, responses are complete.
 
-Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
+Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds. Heads are
+orientations (B, 4) as quaternions x, y, z, w, or yaws (B,) of level heads; a field of ears knows yaws only.
 """
 
+import copy
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.fast_length import next_fast_length
-from server.acoustics.geometry import Vector3
+from server.acoustics.geometry import Vector3, yaws_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
@@ -23,6 +25,7 @@ from server.field.any_size_decoder import add_from, resized
 from server.field.decoder import Decoder
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
+from server.field.graphs import graph_of
 from server.field.kinds.catalogue import kind_of
 from server.field.kinds.every_pose import ComputedResponses
 from server.field.kinds.level_kind import LevelKind
@@ -30,6 +33,7 @@ from server.field.lattice import Neighbourhood, Snapped
 from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.field.phase_cache import PhaseCache
 from server.field.response_source import ResponseSource
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from server.scene.manifest import Phase, QualityLevel
 
@@ -37,6 +41,8 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 _CHUNK = 32
+_HEADS = 16
+"""Number of heads for which a field of directions keeps what it has prepared."""
 _NEVER = 2.0**31
 """Samples: larger than any index of a response."""
 _EAR_AHEAD_S = 0.00026
@@ -109,7 +115,30 @@ class AcousticField:
         if not manifest.fields:
             return Silence(bundle, chosen)
         session = open_graph(bundle, manifest.fields[chosen.field].file, threads=threads)
-        return cls(bundle, chosen, FieldGraph(bundle, chosen.field, session))
+        return cls(bundle, chosen, graph_of(bundle, chosen.field, session))
+
+    def through(self, filters: HeadFilters) -> "AcousticField":
+        """The same field heard through this head; the field itself if it predicts the ears of one head."""
+        heard = self._heard.get(filters)
+        if heard is None:
+            graph = self.graph.through(filters)
+            heard = self if graph is self.graph else self._with(graph)
+            self._heard.put(filters, heard, 1)
+        return heard
+
+    def _with(self, graph: FieldGraph) -> "AcousticField":
+        """A copy whose graph gives the spectrograms of another head."""
+        other = copy.copy(self)
+        vars(other).pop("_heard", None)
+        other.graph = graph
+        if other._cache is not None:
+            other._cache = PhaseCache()
+        other.source = other.kind.open(self.bundle, self._paths, other._compute_all, BoundedCache(NODE_CACHE_BYTES))
+        return other
+
+    @cached_property
+    def _heard(self) -> BoundedCache[HeadFilters, "AcousticField"]:
+        return BoundedCache(_HEADS)
 
     @cached_property
     def kind(self) -> LevelKind:
@@ -129,7 +158,7 @@ class AcousticField:
         return self.bundle.manifest.codec.samples
 
     def impulse_responses(
-        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike, *, remember: bool = False
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike, *, remember: bool = False
     ) -> Float32:
         """Responses (B, channel, ir_samples) without the parts that geometry adds. Sample 0 is emission; the source has
         unit pressure at one metre.
@@ -140,11 +169,11 @@ class AcousticField:
 
         Raises ValueError for poses that are not finite, and FieldError if a response would not be finite.
         """
-        listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        listeners, emitters, heads = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
         # guard: poses that are not finite reach no field
-        if not all(np.isfinite(part).all() for part in (listeners, emitters, yaws)):
-            raise ValueError("listeners, emitters and yaws must be finite")
-        return self.source.responses(listeners, emitters, yaws, remember=remember)
+        if not all(np.isfinite(part).all() for part in (listeners, emitters, heads)):
+            raise ValueError("listeners, emitters and heads must be finite")
+        return self.source.responses(listeners, emitters, heads, remember=remember)
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
         """The node that represents a pair of poses at this level: the poses themselves, unless the level reuses
@@ -156,33 +185,33 @@ class AcousticField:
         reuses responses."""
         return self.source.find(listener, emitter, yaw)
 
-    def _compute_all(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
+    def _compute_all(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool = False) -> Float32:
         cache = self._cache if remember else None
-        if 0 < len(yaws) <= _CHUNK:
-            return self._compute(listeners, emitters, yaws, cache)
-        responses = np.empty((len(yaws), self.channels, self.ir_samples), dtype=np.float32)
-        for start in range(0, len(yaws), _CHUNK):
+        if 0 < len(heads) <= _CHUNK:
+            return self._compute(listeners, emitters, heads, cache)
+        responses = np.empty((len(heads), self.channels, self.ir_samples), dtype=np.float32)
+        for start in range(0, len(heads), _CHUNK):
             part = slice(start, start + _CHUNK)
-            responses[part] = self._compute(listeners[part], emitters[part], yaws[part], cache)
+            responses[part] = self._compute(listeners[part], emitters[part], heads[part], cache)
         return responses
 
-    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Spectrograms that the network predicts, before they are decoded to responses. Only for a field that gives
-        spectrograms. Positions (B, 3), yaws (B,)."""
-        return self.graph.spectrograms(listeners, emitters, yaws)
+        spectrograms. Positions (B, 3)."""
+        return self.graph.spectrograms(listeners, emitters, heads)
 
-    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:
+    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Floats:
         """(B, channel) sum of the squared samples of each predicted response, from the spectrograms if there are any,
         without decoding."""
-        poses = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
-        listeners, emitters, yaws = self.source.computed_for(*poses)
+        poses = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
+        listeners, emitters, heads = self.source.computed_for(*poses)
         if self.graph.gives_responses:
-            aligned = self.graph.impulse_responses(listeners, emitters, yaws)
+            aligned = self.graph.impulse_responses(listeners, emitters, heads)
             return np.asarray(np.sum(aligned.astype(np.float64) ** 2, axis=-1))
         codec = self.graph.parameters.codec
         # Bins between DC and Nyquist count twice, for negative frequencies.
         weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
-        magnitude = codec.magnitude(self.graph.spectrograms(listeners, emitters, yaws).log_magnitude)
+        magnitude = codec.magnitude(self.graph.spectrograms(listeners, emitters, heads).log_magnitude)
         return np.asarray(np.einsum("bcft,f->bc", magnitude[..., : self.level.frames] ** 2, weight))
 
     def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
@@ -191,17 +220,17 @@ class AcousticField:
         length_m = [self._paths.find(*pair).length_m for pair in pairs]
         return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
 
-    def _compute(self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None) -> Float32:
+    def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, cache: PhaseCache | None) -> Float32:
         parameters = self.graph.parameters
         aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
         # guard: a way without end is no index of a sample
         if not (aligned < _NEVER).all():
             raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
         if self._decoder is None:
-            coded = self.graph.impulse_responses(listeners, emitters, yaws)
+            coded = self.graph.impulse_responses(listeners, emitters, heads)
             responses = self._finite(self._placed(coded, aligned), listeners, emitters)
         else:
-            responses = self._decoded(self._decoder, listeners, emitters, yaws, aligned, cache)
+            responses = self._decoded(self._decoder, listeners, emitters, heads, aligned, cache)
         onsets, echoes = np.floor(aligned).astype(np.int64) + self._lead, None
         if self._first_echo is not None:
             echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
@@ -214,21 +243,21 @@ class AcousticField:
         decoder: Decoder,
         listeners: Floats,
         emitters: Floats,
-        yaws: Floats,
+        heads: Floats,
         aligned: Floats,
         cache: PhaseCache | None,
     ) -> Float32:
         """Decoded responses (B, channel, ir_samples), including the energy that windows smear to before the onset."""
-        predicted = self.graph.predictions(listeners, emitters, yaws)
+        predicted = self.graph.predictions(listeners, emitters, heads)
         if self.channels == 1:
             # Decoders expect two ears; a single microphone is stored as the left one.
             predicted = predicted.twice()
         if cache is None:
             responses = self._finite(decoder.decode(predicted, aligned), listeners, emitters)
             return np.ascontiguousarray(responses[:, : self.channels])
-        responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
+        responses = np.empty((len(heads), 2, self.ir_samples), dtype=np.float32)
         # One after the other, because each may start from the one before it.
-        for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
+        for row, pose in enumerate(zip(listeners, emitters, yaws_of(heads), strict=True)):
             rows = slice(row, row + 1)
             responses[rows] = decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
             self._finite(responses[rows], listeners[rows], emitters[rows])  # check before later poses start from it
@@ -280,15 +309,18 @@ class Silence(AcousticField):
         self.source = ComputedResponses(self.impulse_responses)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
 
+    def through(self, filters: HeadFilters) -> "Silence":  # noqa: ARG002  all heads hear the same
+        return self
+
     def impulse_responses(
         self,
         listeners: npt.ArrayLike,  # noqa: ARG002  the same everywhere
         emitters: npt.ArrayLike,  # noqa: ARG002
-        yaws: npt.ArrayLike,
+        heads: npt.ArrayLike,
         *,
         remember: bool = False,  # noqa: ARG002
     ) -> Float32:
-        return np.zeros((np.size(yaws), self.channels, self.ir_samples), dtype=np.float32)
+        return np.zeros((len(np.asarray(heads)), self.channels, self.ir_samples), dtype=np.float32)
 
-    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:  # noqa: ARG002
-        return np.zeros((np.size(yaws), self.channels))
+    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Floats:  # noqa: ARG002
+        return np.zeros((len(np.asarray(heads)), self.channels))

@@ -203,7 +203,7 @@ class DoubleFullResponse(FullResponse):
     """`FullResponse` computed in float64."""
 
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
-        super().__init__(field if isinstance(field, Silence) else _DoubleField(field), filters)
+        super().__init__(field if isinstance(field, Silence) else _DoubleField(field.through(filters)), filters)
         paths = DoubleStillPaths(
             filters, speed_of_sound=field.bundle.manifest.speed_of_sound, air_db_per_m=self._air_db_per_m
         )

@@ -3,10 +3,11 @@
 A field predicts what arrives at the ears of one head, or what arrives from each direction, from which the server
 computes what any head hears. Only bundles with a field of directions have format 3; all others have format 2.
 
-The fields of a bundle hold the reflected field only, and the server computes the direct sound from geometry. With `image_order` 1 the server also computes the early reflections, and the fields hold only the late
-reverberation. Measured responses cannot be separated like that: with `direct_sound` "field" the fields hold everything,
-for one microphone or two ears. If the walls of such a place are unknown, there is no `geometry`, and the place is the
-box of `bounds`.
+The fields of a bundle hold the reflected field only, and the server computes the direct sound from geometry. With
+`image_order` 1 the server also computes the early reflections, and the fields hold only the late reverberation.
+Responses that were measured cannot be separated like that: with `direct_sound` "field" the fields hold everything, for
+one microphone or two ears. If the walls of such a place are unknown, there is no `geometry`, and the place is the box
+of `bounds`.
 """
 
 from collections.abc import Mapping
@@ -335,6 +336,8 @@ class Manifest(Strict):
                 raise ValueError(f"fields.{name}.file: {field.file} is not listed in files")
             if field.codec is not None and field.codec.sample_rate != self.codec.sample_rate:
                 raise ValueError(f"fields.{name}.codec.sample_rate: must be the scene's, {self.codec.sample_rate}")
+            if field.predicts == "directions" and (field.codec or self.codec).known_frames:
+                raise ValueError(f"fields.{name}.codec.known_frames: must be 0, directions have no phase")
         has_directions = any(field.predicts == "directions" for field in self.fields.values())
         expected = DIRECTIONS_FORMAT if has_directions else EARS_FORMAT
         if self.format_version != expected:
@@ -346,7 +349,13 @@ class Manifest(Strict):
         for level in self.levels:
             if level.field not in self.fields:
                 raise ValueError(f"levels.{level.name}.field: there is no field {level.field}")
-            codec = (self.fields[level.field].codec or self.codec).codec
+            field = self.fields[level.field]
+            if field.predicts == "directions" and (level.reuse is not None or level.phase.kind == "integrated"):
+                raise ValueError(
+                    f"levels.{level.name}: a field of directions is heard anew at every pose and predicts no phase; "
+                    "leave out reuse, and take another phase than integrated"
+                )
+            codec = (field.codec or self.codec).codec
             if level.frames is not None and level.frames > codec.frames:
                 raise ValueError(f"levels.{level.name}.frames: the field has {codec.frames}")
         if len({level.name for level in self.levels}) < len(self.levels):

@@ -11,6 +11,7 @@ DIRECTIONAL = FieldFile(file="arithmetic.onnx", architecture="arithmetic", predi
 
 def with_field(field: FieldFile, **changes: object) -> dict[str, object]:
     document = MANIFEST.model_dump(mode="json")
+    document["codec"]["known_frames"] = 0
     return document | {"fields": {"arithmetic": field.model_dump(mode="json")}} | changes
 
 
@@ -41,3 +42,23 @@ def test_directions_are_of_late_reverberation(changes):
 
 def test_a_bundle_of_ears_is_written_as_version_2_knows_it():
     assert set(MANIFEST.model_dump(mode="json")["fields"]["arithmetic"]) == {"file", "architecture", "rank", "codec"}
+
+
+def test_directions_have_no_known_phase():
+    document = with_field(DIRECTIONAL, format_version=3)
+    document["codec"]["known_frames"] = 4
+    with pytest.raises(ValidationError, match="known_frames: must be 0, directions have no phase"):
+        Manifest.model_validate(document)
+
+
+@pytest.mark.parametrize(
+    "level",
+    [
+        {"reuse": {"spacing_m": 1.0, "turn_deg": 120.0}},
+        {"phase": {"kind": "integrated"}},
+    ],
+)
+def test_directions_are_heard_anew_and_have_no_phase_to_integrate(level):
+    levels = [{"name": "standard", "field": "arithmetic"} | level]
+    with pytest.raises(ValidationError, match=r"levels\.standard: a field of directions is heard anew"):
+        Manifest.model_validate(with_field(DIRECTIONAL, format_version=3, levels=levels))

@@ -1,0 +1,146 @@
+"""The network of a field that predicts directions, and what the ears of any head hear of it.
+
+The network says how much power arrives in each octave band and column of frames, and from where, in spherical harmonics
+in world axes. It knows no head. A head's filters and its orientation make the spectrograms of two ears of it, in the
+same form as a network that predicts ears.
+
+Axes: B poses, 7 octave bands, columns of frames, harmonics k (ACN, SN3D; `server.acoustics.spherical_harmonics`).
+"""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.geometry import orientations_of
+from server.acoustics.spherical_harmonics import harmonic_count
+from server.field.directions_kernel import ears_of_directions
+from server.field.graph import INPUTS, FieldGraph, Spectrograms
+from server.field.runtime import InferenceSession
+from server.rendering.ear_products import EarProducts
+from server.rendering.hrtf import HeadFilters, kemar
+from server.scene.bundle import Bundle
+
+Float32 = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+LOG_MAGNITUDE = "log_magnitude"
+DIRECTIONS = "directions"
+DIRECTIONAL_INPUTS = {name: shape for name, shape in INPUTS.items() if name != "yaw"}
+"""The inputs of a graph that predicts directions, with their shapes after the batch axis."""
+LEAST_POWER = 0.02
+"""An ear's power is at least this much of what it would be if the sound came from all directions. Harmonics of low
+order cannot say that a direction is silent: their sum may fall below zero there."""
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """Predictions of the network: `log_magnitude` (B, band, column) of what an ideal omnidirectional microphone hears,
+    and `directions` (B, k - 1, band, column), the harmonics of its power from the second on, relative to the first."""
+
+    log_magnitude: Float32
+    directions: Float32
+
+
+class DirectionalGraph(FieldGraph):
+    """The graph of a field that predicts directions, heard through one head: KEMAR, or that of `through`.
+
+    Raises BundleError for a graph that does not fit the manifest.
+    """
+
+    _inputs: ClassVar[dict[str, list[int]]] = DIRECTIONAL_INPUTS
+
+    def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
+        order = bundle.manifest.fields[name].order
+        assert order is not None  # by the manifest
+        self.order = order
+        self._turned: tuple[bytes, Float32] | None = None
+        super().__init__(bundle, name, session)
+
+    @cached_property
+    def _filters(self) -> HeadFilters:
+        return kemar(self.parameters.sample_rate)
+
+    def through(self, filters: HeadFilters) -> "DirectionalGraph":
+        if filters is self._filters:
+            return self
+        other = copy.copy(self)
+        other._turned = None
+        vars(other).pop("_products", None)
+        other._filters = filters
+        return other
+
+    def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
+        """What arrives at listeners (B, 3) from emitters (B, 3), whatever their heads."""
+        listeners = np.asarray(listeners, dtype=np.float32)
+        said = self.run(listeners, emitters, np.zeros(len(listeners)))
+        if self.order == 0:
+            rows, *axes = said[0].shape
+            said.append(np.zeros((rows, 0, *axes), np.float32))
+        return Arrivals(*said)
+
+    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
+        return self.at_ears(self.arrivals(listeners, emitters), heads)
+
+    def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike) -> Spectrograms:
+        """The spectrograms at the ears of heads, as orientations (B, 4) or yaws (B,) of level heads."""
+        codec = self.parameters.codec
+        orientations = orientations_of(heads)
+        rows, columns = len(orientations), arrivals.log_magnitude.shape[-1]
+        levels, coherence = np.empty((2, rows, 2, codec.bins, columns), np.float32)
+        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), columns), np.float32)
+        band, share = self._between_bands
+        for row, orientation in enumerate(orientations):
+            ears_of_directions(
+                arrivals.log_magnitude[row],
+                arrivals.directions[row],
+                self._products_of(orientation),
+                band,
+                share,
+                codec.log_floor,
+                LEAST_POWER,
+                work,
+                levels[row],
+                coherence[row],
+            )
+        no_phase = np.zeros((rows, 2, codec.bins, self.parameters.known_frames), np.float32)
+        return Spectrograms(levels, no_phase, no_phase, coherence)
+
+    @cached_property
+    def _shapes(self) -> Mapping[str, tuple[int, ...]]:
+        every = (len(OCTAVE_BANDS_HZ), self.parameters.columns)
+        more = harmonic_count(self.order) - 1
+        shapes = {LOG_MAGNITUDE: (1, *every)}
+        return shapes if more == 0 else {**shapes, DIRECTIONS: (1, more, *every)}
+
+    @property
+    def _expected_outputs(self) -> str:
+        return f"float {', '.join(self._shapes)}"
+
+    def _products_of(self, orientation: Floats) -> Float32:
+        """The products of the turned head. Those of the last orientation are kept, since all emitters of a listener
+        have the same."""
+        key, last = orientation.tobytes(), self._turned
+        if last is None or last[0] != key:
+            last = self._turned = key, self._products.turned(orientation)
+        return last[1]
+
+    @cached_property
+    def _products(self) -> EarProducts:
+        return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.order)
+
+    @cached_property
+    def _between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
+        """For each bin, the octave band below it and its share of the way to the next, over the logarithm of frequency;
+        the outermost bands reach to the ends."""
+        codec = self.parameters.codec
+        frequency = np.linspace(0, codec.sample_rate / 2, codec.bins)
+        octave = np.log2(np.maximum(frequency, 1.0) / OCTAVE_BANDS_HZ[0])
+        position = np.clip(octave, 0, len(OCTAVE_BANDS_HZ) - 1)
+        band = np.minimum(position.astype(np.int64), len(OCTAVE_BANDS_HZ) - 2)
+        return band, (position - band).astype(np.float32)
