@@ -18,6 +18,7 @@ from torch import nn
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.core.errors import NafirError
+from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
 from server.field.graph import INPUTS, OUTPUTS, RESPONSE
 from server.field.runtime import open_session
 from server.health.check import Effort, Health, check, check_fields
@@ -40,7 +41,6 @@ from training.learning.naf import NafLearner
 from training.learning.runs import Configuration
 from training.learning.train import load_learner
 from training.models.basis_field import BasisField
-from training.models.directional import OUTPUTS as DIRECTION_OUTPUTS
 from training.models.directional import ExportedDirections
 from training.models.encoders import GEOMETRY
 from training.models.factorised import ExportedField
@@ -63,8 +63,8 @@ _TRUNCATION_POSES = 3000
 # Rounding of weights is the only difference. Phases of uncertain bins may change, so frequency is compared where phase
 # is certain. Tolerances are for the largest difference in float32 (float16 weights), and the root mean square in int8.
 _TOLERANCES: dict[Precision, dict[str, float]] = {
-    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, DIRECTION_OUTPUTS[1]: 0.02, RESPONSE: 1e-3},
-    "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, DIRECTION_OUTPUTS[1]: 0.05, RESPONSE: 0.05},
+    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, DIRECTIONS: 0.02, RESPONSE: 1e-3},
+    "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, DIRECTIONS: 0.05, RESPONSE: 0.05},
 }
 _PHASE_TOLERANCE: dict[Precision, float] = {"float32": 0.05, "int8": 0.2}
 TABLED_TOLERANCE = 1e-4
@@ -109,12 +109,12 @@ def export(
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision. The first field is the
     default. Factorised and directional fields are also written at each lower one of `ranks`, with the least loss. With
-    `exact_tables`, a `naf` is also written with less arithmetic for the same numbers. In place of a run, the folder of measured
-    responses stands for the field that needs no training, `ShapedNearest`, in one precision.
+    `exact_tables`, a `naf` is also written with less arithmetic for the same numbers. In place of a run, the folder of
+    measured responses stands for the field that needs no training, `ShapedNearest`, in one precision.
 
     Fields of a simulated scene leave direct sound and first reflections to the server. Fields of measured responses
-    include them, and so does `naf-whole`. If the first field of a simulated scene is factorised or directional, the best of several
-    draws of frozen noise is chosen (`training.bundling.noise`); otherwise the noise is the first draw.
+    include them, and so does `naf-whole`. If the first field of a simulated scene is factorised or directional, the
+    best of several draws of frozen noise is chosen (`training.bundling.noise`); otherwise the noise is the first draw.
 
     The name of a factorised or directional field includes its width if that differs from the first one's.
 
@@ -268,9 +268,7 @@ def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
 def _require_used(fields: Sequence[Learner | ImportedDataset], variants: _Variants) -> None:
     """Raises ExportError for options that apply to none of the fields."""
     if variants.ranks and not any(isinstance(field, BasisLearner) for field in fields):
-        raise ExportError(
-            "ranks: none of the runs is a factorised or directional field, and other fields have none; leave it out"
-        )
+        raise ExportError("ranks: none of the runs is a field with a basis, and other fields have none; leave it out")
     if variants.exact_tables and not any(isinstance(field, NafLearner) for field in fields):
         raise ExportError("exact-tables: none of the runs is a naf, and other fields have none; leave it out")
     if list(variants.precisions) != ["float32"] and all(isinstance(field, ImportedDataset) for field in fields):
@@ -298,7 +296,7 @@ def _form_of(learner: BasisLearner) -> _Form:
         return _Form(ExportedField, 3, _outputs(learner), learner.cells.known_frames, None)
     if isinstance(learner, DirectionalLearner):
         order = learner.recipe.order
-        return _Form(ExportedDirections, 2, DIRECTION_OUTPUTS[: 1 + (order > 0)], 0, order)
+        return _Form(ExportedDirections, 2, (LOG_MAGNITUDE, DIRECTIONS)[: 1 + (order > 0)], 0, order)
     raise TypeError(f"{type(learner)} has no graph")
 
 

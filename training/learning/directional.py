@@ -5,6 +5,7 @@ import torch
 from rich.progress import Progress
 from torch import Tensor
 
+from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
 from training.data.responses import ResponseSet, SimulatedResponses
 from training.learning.basis import TARGETS, BasisLearner
 from training.learning.energies import BandEnergyError
@@ -19,8 +20,8 @@ from training.models.stored_targets import load_directional_targets
 from training.models.targets import codec_of
 
 # In nepers, and in shares of the power: about what no field can predict from the places alone.
-_SPREADS = {"log_magnitude": 0.35, "directions": 1.0}
-_HEAD_WEIGHTS = {"log_magnitude": 1.0, "directions": 1.0}
+_SPREADS = {LOG_MAGNITUDE: 0.35, DIRECTIONS: 0.5}
+_HEAD_WEIGHTS = {LOG_MAGNITUDE: 1.0, DIRECTIONS: 1.0}
 
 
 class DirectionalLearner(BasisLearner):

@@ -14,13 +14,11 @@ from torch import Tensor, nn
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.spherical_harmonics import harmonic_count
+from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
 from training.models.basis_field import BasisField, ExportedBasis, tile
 from training.models.cells import Cells
 from training.models.encoders import FieldShape, PathEncoder
 from training.models.site import Reach
-
-OUTPUTS = ("log_magnitude", "directions")
-"""The outputs of a graph; the second is absent for order 0."""
 
 
 class DirectionHeads(nn.Module):
@@ -36,11 +34,11 @@ class DirectionHeads(nn.Module):
         """Raises ValueError for an order that spherical harmonics are not defined for here."""
         super().__init__()
         columns = cells.all_frames
-        self.shapes: dict[str, tuple[int, ...]] = {"log_magnitude": (len(OCTAVE_BANDS_HZ), columns.cells)}
+        self.shapes: dict[str, tuple[int, ...]] = {LOG_MAGNITUDE: (len(OCTAVE_BANDS_HZ), columns.cells)}
         if harmonic_count(order) > 1:
-            self.shapes["directions"] = (harmonic_count(order) - 1, len(OCTAVE_BANDS_HZ), columns.cells)
+            self.shapes[DIRECTIONS] = (harmonic_count(order) - 1, len(OCTAVE_BANDS_HZ), columns.cells)
         self.sizes, self.slices = tile(self.shapes)
-        self.levels = self.slices["log_magnitude"]
+        self.levels = self.slices[LOG_MAGNITUDE]
         self.size = sum(self.sizes)
         areas = torch.tensor(columns.widths, dtype=torch.float32).repeat(len(OCTAVE_BANDS_HZ))
         self.register_buffer("areas", areas, persistent=False)
