@@ -8,15 +8,15 @@ Axes: B poses, 7 octave bands, columns of frames, harmonics k (ACN, SN3D; `serve
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
 from server.acoustics.geometry import orientations_of
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.field.directions_kernel import ears_of_directions
@@ -47,6 +47,15 @@ class Arrivals:
     directions: Float32
 
 
+class _Turned(NamedTuple):
+    """A turned head's products: `of_bins` (bin, product, k), and averaged over each octave band, `of_bands` (band,
+    product, k)."""
+
+    orientation: bytes
+    of_bins: Float32
+    of_bands: Float32
+
+
 class DirectionalGraph(FieldGraph):
     """The graph of a field that predicts directions, heard through one head: KEMAR, or that of `through`.
 
@@ -59,7 +68,7 @@ class DirectionalGraph(FieldGraph):
         order = bundle.manifest.fields[name].order
         assert order is not None  # by the manifest
         self.order = order
-        self._turned: tuple[bytes, Float32] | None = None
+        self._turned: _Turned | None = None
         super().__init__(bundle, name, session)
 
     @cached_property
@@ -78,38 +87,58 @@ class DirectionalGraph(FieldGraph):
     def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
         """What arrives at listeners (B, 3) from emitters (B, 3), whatever their heads."""
         listeners = np.asarray(listeners, dtype=np.float32)
-        said = self.run(listeners, emitters, np.zeros(len(listeners)))
+        return self._arrivals_of(self.run(listeners, emitters, np.zeros(len(listeners))))
+
+    def _arrivals_of(self, outputs: Sequence[Float32]) -> Arrivals:
+        said = list(outputs)
         if self.order == 0:
             rows, *axes = said[0].shape
             said.append(np.zeros((rows, 0, *axes), np.float32))
         return Arrivals(*said)
 
-    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
-        return self.at_ears(self.arrivals(listeners, emitters), heads)
+    def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:
+        return self.at_ears(self._arrivals_of(outputs), heads)
 
-    def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike) -> Spectrograms:
-        """The spectrograms at the ears of heads, as orientations (B, 4) or yaws (B,) of level heads."""
+    def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike, *, columns: int | None = None) -> Spectrograms:
+        """The spectrograms at the ears of heads, as orientations (B, 4) or yaws (B,) of level heads. With `columns`,
+        only that many are computed, and the others are left as they come."""
         codec = self.parameters.codec
         orientations = orientations_of(heads)
-        rows, columns = len(orientations), arrivals.log_magnitude.shape[-1]
-        levels, coherence = np.empty((2, rows, 2, codec.bins, columns), np.float32)
-        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), columns), np.float32)
+        rows, all_columns = len(orientations), arrivals.log_magnitude.shape[-1]
+        levels, coherence = np.empty((2, rows, 2, codec.bins, all_columns), np.float32)
+        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), all_columns), np.float32)
         band, share = self._between_bands
         for row, orientation in enumerate(orientations):
             ears_of_directions(
                 arrivals.log_magnitude[row],
                 arrivals.directions[row],
-                self._products_of(orientation),
+                self._turned_to(orientation).of_bins,
                 band,
                 share,
                 codec.log_floor,
                 LEAST_POWER,
+                columns or all_columns,
                 work,
                 levels[row],
                 coherence[row],
             )
         no_phase = np.zeros((rows, 2, codec.bins, self.parameters.known_frames), np.float32)
         return Spectrograms(levels, no_phase, no_phase, coherence)
+
+    def band_products(self, orientation: Floats) -> Float32:
+        """(band, product, k) the products of the turned head, averaged over each octave band."""
+        return self._turned_to(orientation).of_bands
+
+    @property
+    def diffuse_products(self) -> Floats:
+        """(bin, product) what the head's ears hear of unit power that arrives from all directions alike."""
+        return self._products.matrix[..., 0]
+
+    @cached_property
+    def _mean_over_band(self) -> Float32:
+        codec = self.parameters.codec
+        weights = band_weights(np.linspace(0, codec.sample_rate / 2, codec.bins))
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
 
     @cached_property
     def _shapes(self) -> Mapping[str, tuple[int, ...]]:
@@ -122,13 +151,14 @@ class DirectionalGraph(FieldGraph):
     def _expected_outputs(self) -> str:
         return f"float {', '.join(self._shapes)}"
 
-    def _products_of(self, orientation: Floats) -> Float32:
+    def _turned_to(self, orientation: Floats) -> "_Turned":
         """The products of the turned head. Those of the last orientation are kept, since all emitters of a listener
         have the same."""
         key, last = orientation.tobytes(), self._turned
-        if last is None or last[0] != key:
-            last = self._turned = key, self._products.turned(orientation)
-        return last[1]
+        if last is None or last.orientation != key:
+            of_bins = self._products.turned(orientation)
+            last = self._turned = _Turned(key, of_bins, np.tensordot(self._mean_over_band, of_bins, 1))
+        return last
 
     @cached_property
     def _products(self) -> EarProducts:

@@ -20,6 +20,7 @@ def ears_of_directions(
     share: Float32,
     log_floor: float,
     least: float,
+    columns: int,
     work: Float32,
     levels: Float32,
     coherence: Float32,
@@ -29,10 +30,10 @@ def ears_of_directions(
 
     `log_magnitude` (band, column) and `directions` (k - 1, band, column) are a field's predictions, `products` (bin,
     product, k) those of the turned head. A bin lies between `band` (bin,) and the next, at this `share` (bin,) of the
-    way. Where directions cancel, an ear's power is `least` times that of the same sound from all directions. `work` is
-    (k + 1, band, column).
+    way. Where directions cancel, an ear's power is `least` times that of the same sound from all directions. Only the
+    first `columns` are written. `work` is (k + 1, band, column).
     """
-    bands, columns = log_magnitude.shape
+    bands = log_magnitude.shape[0]
     harmonics = products.shape[2]
     zero, one = np.float32(0.0), np.float32(1.0)
     floor = np.float32(log_floor)

@@ -22,7 +22,9 @@ from server.acoustics.sound_path import SoundPathFinder
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError, FieldError
 from server.field.any_size_decoder import add_from, resized
+from server.field.band_tail import BandTail
 from server.field.decoder import Decoder
+from server.field.directional_graph import DirectionalGraph
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.graphs import graph_of
@@ -87,18 +89,20 @@ class AcousticField:
             gives_back=self._first_echo is not None,
         )
         self._decoder: Decoder | None = None
+        self._tail: BandTail | None = None
         if graph.gives_responses:
             if level.frames is not None or level.phase != Phase():
                 raise BundleError(
                     graph.path, RESPONSE, f"needs no decoding: take phase and frames from levels.{level.name}"
                 )
         else:
+            self._tail = self._open_tail()
             self._decoder = Decoder(
                 graph.parameters,
                 noise or frozen_noise(bundle, graph),
                 ir_samples=self.ir_samples,
                 phase=level.phase,
-                frames=level.frames,
+                frames=level.frames if self._tail is None else self._tail.early_frames,
             )
         self._cache = PhaseCache() if level.phase.warm else None
         node_cache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
@@ -131,10 +135,16 @@ class AcousticField:
         other = copy.copy(self)
         vars(other).pop("_heard", None)
         other.graph = graph
+        other._tail = other._open_tail()
         if other._cache is not None:
             other._cache = PhaseCache()
         other.source = other.kind.open(self.bundle, self._paths, other._compute_all, BoundedCache(NODE_CACHE_BYTES))
         return other
+
+    def _open_tail(self) -> BandTail | None:
+        if self.level.tail == "stft" or not isinstance(self.graph, DirectionalGraph):
+            return None
+        return BandTail(self.graph, self.bundle.frozen_noise)
 
     @cached_property
     def _heard(self) -> BoundedCache[HeadFilters, "AcousticField"]:
@@ -248,6 +258,9 @@ class AcousticField:
         cache: PhaseCache | None,
     ) -> Float32:
         """Decoded responses (B, channel, ir_samples), including the energy that windows smear to before the onset."""
+        if self._tail is not None:
+            responses = self._tail.responses(decoder, listeners, emitters, heads, aligned)
+            return self._finite(responses, listeners, emitters)
         predicted = self.graph.predictions(listeners, emitters, heads)
         if self.channels == 1:
             # Decoders expect two ears; a single microphone is stored as the left one.

@@ -230,7 +230,9 @@ class QualityLevel(Strict):
 
     With `frames` only that many frames of a response are computed, and the rest is silent. An emitter gets at most
     `ir_rate_hz` responses per second or, without that, one for every pose. With `shared_tail` all emitters of a
-    listener share one late reverberation. With `reuse` poses near each other share responses.
+    listener share one late reverberation. With `reuse` poses near each other share responses. `tail` is how the end of
+    a response is made: as its beginning, by an inverse transform of spectrograms (stft), or from frozen noises in
+    octave bands, whose gains follow the prediction (bands; for fields of directions).
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
@@ -240,8 +242,16 @@ class QualityLevel(Strict):
     reuse: Reuse | None = None
     ir_rate_hz: Positive | None = None
     shared_tail: bool = False
+    tail: Literal["stft", "bands"] = "stft"
     accuracy: Accuracy | None = None
     cost: Cost | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_what_format_2_lacks(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+        document: dict[str, object] = write(self)
+        if self.tail == "stft":
+            del document["tail"]
+        return document
 
 
 class FrontierPoint(Strict):
@@ -354,6 +364,12 @@ class Manifest(Strict):
                 raise ValueError(
                     f"levels.{level.name}: a field of directions is heard anew at every pose and predicts no phase; "
                     "leave out reuse, and take another phase than integrated"
+                )
+            if level.tail == "bands" and (
+                field.predicts == "ears" or level.frames is not None or level.phase.kind != "frozen"
+            ):
+                raise ValueError(
+                    f"levels.{level.name}.tail: bands are for fields of directions, with frozen phase and all frames"
                 )
             codec = (field.codec or self.codec).codec
             if level.frames is not None and level.frames > codec.frames:

@@ -20,12 +20,12 @@ import numpy.typing as npt
 from scipy.fft import irfft, rfft
 from scipy.sparse import coo_array
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
 from server.rendering.hrtf import HeadFilters
 from server.scene.manifest import Air
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import HISTOGRAM_BIN_S
-from training.simulation.head_spectra import HeadSpectra, band_weights
+from training.simulation.head_spectra import HeadSpectra
 from training.simulation.tracing import Arrivals, free_field_amplitude
 
 _Floats = npt.NDArray[np.float64]

@@ -19,7 +19,9 @@ SILENT = Progress(disable=True)
 @pytest.fixture(scope="module")
 def directional_run(dataset, configuration, tmp_path_factory):
     folder = tmp_path_factory.mktemp("directional") / "run"
-    train(SimulatedResponses(dataset), folder, Configuration.directional(configuration.shape, epochs=60, batch=8), SILENT)
+    train(
+        SimulatedResponses(dataset), folder, Configuration.directional(configuration.shape, epochs=60, batch=8), SILENT
+    )
     return folder
 
 
@@ -91,7 +93,9 @@ def test_it_shares_a_bundle_with_a_field_of_ears(dataset, run, directional_run, 
 def test_order_zero_has_one_output(dataset, configuration, tmp_path):
     recipe = DirectionalRecipe(order=0)
     responses = SimulatedResponses(dataset)
-    train(responses, tmp_path / "run", Configuration.directional(configuration.shape, recipe, epochs=60, batch=8), SILENT)
+    train(
+        responses, tmp_path / "run", Configuration.directional(configuration.shape, recipe, epochs=60, batch=8), SILENT
+    )
     bundle = export(responses, [tmp_path / "run"], tmp_path / "bundle")
     session = open_session(bundle.models["directional.onnx"])
     assert [each.name for each in session.get_outputs()] == ["log_magnitude"]
