@@ -1,6 +1,9 @@
 """The directional field and its loss."""
 
+from collections.abc import Sequence, Set
+
 import numpy as np
+import numpy.typing as npt
 import torch
 from rich.progress import Progress
 from torch import Tensor
@@ -10,6 +13,7 @@ from training.data.responses import ResponseSet, SimulatedResponses
 from training.learning.basis import TARGETS, BasisLearner
 from training.learning.energies import BandEnergyError
 from training.learning.learner import Losses, Rows
+from training.learning.pairs import split
 from training.learning.runs import Configuration, DirectionalRecipe, RecipeError
 from training.models.cells import Cells
 from training.models.directional import DirectionalField
@@ -47,13 +51,18 @@ class DirectionalLearner(BasisLearner):
             raise RecipeError(str(exc)) from exc
         super().__init__(field, _SPREADS, _HEAD_WEIGHTS, InterpolatedBands(self.cells))
         self._energy_error = BandEnergyError(self.cells)
+        trainable = np.flatnonzero(~responses.held_out)
         # Rows count responses, targets count pairs.
-        pairs = responses.pair[~responses.held_out]
-        _, self._pair = np.unique(pairs, return_inverse=True)
+        _, first, self._pair = np.unique(responses.pair[trainable], return_index=True, return_inverse=True)
+        used, _ = split(responses, share=configuration.share, seed=configuration.seed)
+        ends = [responses.ends(row) for row in trainable[first]]
+        self._partner = _exchanged(ends, set(self._pair[used].tolist())) if recipe.reciprocal else np.arange(len(ends))
 
     def prepare(self, progress: Progress) -> None:
         folder = self.responses.file.parent / TARGETS
         self._targets = load_directional_targets(self.responses, self.cells, folder, progress)
+        power = np.exp(2 * self._targets.flat[:, self.field.heads.levels].astype(np.float32))
+        self._levels = 0.5 * np.log((power + power[self._partner]) / 2)
 
     def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
         """Return one row of each pair in random order."""
@@ -80,8 +89,17 @@ class DirectionalLearner(BasisLearner):
 
     def _flat(self, rows: Rows) -> Tensor:
         """(row, heads.size) targets of the recipe's order, which are the beginning of those that are stored."""
-        return torch.from_numpy(self.targets.flat[self._pair[rows], : self.field.heads.size]).float()
+        pairs, levels, size = self._pair[rows], self.field.heads.levels, self.field.heads.size
+        shares = self.targets.flat[pairs, levels.stop : size].astype(np.float32)
+        return torch.from_numpy(np.concatenate([self._levels[pairs], shares], axis=1))
 
     def _one_of_each_pair(self, rows: Rows) -> Rows:
         _, first = np.unique(self._pair[rows], return_index=True)
         return rows[np.sort(first)]
+
+
+def _exchanged(ends: Sequence[tuple[int, int]], used: Set[int]) -> npt.NDArray[np.int64]:
+    """(pair,) the number of the pair with exchanged ends, where both are used, else that of the pair itself."""
+    numbers = {pair: number for number, pair in enumerate(ends) if number in used}
+    partners = [numbers.get((listener, emitter), number) for number, (emitter, listener) in enumerate(ends)]
+    return np.array([partner if number in used else number for number, partner in enumerate(partners)])

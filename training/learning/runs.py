@@ -56,12 +56,14 @@ class FactorisedRecipe:
 class DirectionalRecipe:
     """How a directional field is trained. `order`: highest order of its spherical harmonics, 0 to 3. `fine_frames`:
     number of frames that are predicted one by one, before cells. `energy_weight`: weight of the error of energies
-    (`training.learning.energies`). `noise_m`: standard deviation of noise that is added to positions."""
+    (`training.learning.energies`). `noise_m`: standard deviation of noise that is added to positions. `reciprocal`:
+    learn the mean power of a pair and of the pair with exchanged ends, which differ only by the randomness of rays."""
 
     order: int = 2
     fine_frames: int = 24
     energy_weight: float = 3.0
-    noise_m: float = 0.0
+    noise_m: float = 0.1
+    reciprocal: bool = True
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Configuration:
         cls, shape: FieldShape | None = None, recipe: DirectionalRecipe | None = None, **changes: Any
     ) -> "Configuration":
         """An epoch visits each pair once and not at every yaw, so there are more of them."""
-        settings = {"epochs": 60, "batch": 64, **changes}
+        settings = {"epochs": 100, "batch": 32, **changes}
         return cls(shape=shape or FieldShape(), recipe=recipe or DirectionalRecipe(), **settings)
 
     @property

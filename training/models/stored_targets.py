@@ -6,8 +6,8 @@ HDF5 lets one process at a time write the file. The rows lie in one piece, and a
 import hashlib
 import json
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -39,12 +39,7 @@ class Targets:
     seconds: float
 
 
-class _Kind(Protocol):
-    """A way to compute targets. `choice` says of what, and names the file."""
-
-    @property
-    def choice(self) -> dict[str, Any]: ...
-
+class _Computation(Protocol):
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
         """(row, n) flat targets of some responses of one pair."""
         ...
@@ -61,8 +56,12 @@ def load_targets(
     Raises DatasetError if the dataset has no energies, if another process is computing the same, or if the file is
     damaged.
     """
-    kind = _Expected(_simulated(responses), cells) if expected else _Drawn(responses, cells)
-    return _load(responses, np.flatnonzero(~responses.held_out), kind, folder, progress)
+    choice = {"format": _FORMAT, "cells": asdict(cells), "expected": expected}
+
+    def computation() -> _Computation:
+        return _Expected(_simulated(responses), cells) if expected else _Drawn(responses, cells)
+
+    return _load(responses, np.flatnonzero(~responses.held_out), choice, computation, folder, progress)
 
 
 def load_directional_targets(responses: ResponseSet, cells: Cells, folder: Path, progress: Progress) -> Targets:
@@ -70,13 +69,20 @@ def load_directional_targets(responses: ResponseSet, cells: Cells, folder: Path,
     pairs. They are stored and raise errors like those at the ears."""
     rows = np.flatnonzero(~responses.held_out)
     first = rows[np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))]
-    return _load(responses, first, _Directional(_simulated(responses), cells), folder, progress)
+    choice = {"format": _FORMAT, "cells": asdict(cells), "predicts": "directions"}
+    return _load(responses, first, choice, lambda: _Directional(_simulated(responses), cells), folder, progress)
 
 
 def _load(
-    responses: ResponseSet, rows: npt.NDArray[np.int64], kind: _Kind, folder: Path, progress: Progress
+    responses: ResponseSet,
+    rows: npt.NDArray[np.int64],
+    choice: dict[str, Any],
+    computation: Callable[[], _Computation],
+    folder: Path,
+    progress: Progress,
 ) -> Targets:
-    path = folder / f"targets-{hashlib.sha256(json.dumps(kind.choice).encode()).hexdigest()[:12]}.h5"
+    """Targets of these rows; `choice` names their file."""
+    path = folder / f"targets-{hashlib.sha256(json.dumps(choice).encode()).hexdigest()[:12]}.h5"
     key = json.dumps({"written": responses.file.stat().st_mtime_ns, "rows": len(rows)})
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -84,7 +90,7 @@ def _load(
             if file.attrs.get("key") != key:
                 file.clear()
                 file.attrs.update(key=key, pairs=0, seconds=0.0)
-            _complete(file, responses.pair[rows], rows, kind, progress)
+            _complete(file, responses.pair[rows], rows, computation, progress)
             offset, shape = file["flat"].id.get_offset(), file["flat"].shape
             seconds = float(file.attrs["seconds"])
     except BlockingIOError as exc:
@@ -98,7 +104,11 @@ def _load(
 
 
 def _complete(
-    file: h5py.File, pairs: npt.NDArray[np.int64], rows: npt.NDArray[np.int64], kind: _Kind, progress: Progress
+    file: h5py.File,
+    pairs: npt.NDArray[np.int64],
+    rows: npt.NDArray[np.int64],
+    computation: Callable[[], _Computation],
+    progress: Progress,
 ) -> None:
     """Computes the pairs that the file does not have yet. Its attribute `pairs` counts those it has; `pairs` (row,) are
     those of the rows."""
@@ -106,11 +116,12 @@ def _complete(
     done = int(file.attrs["pairs"])
     if done == len(starts):
         return
+    targets = computation()
     task = progress.add_task("targets", total=len(starts), completed=done)
     flushed_s = time.monotonic()
     for number in range(done, len(starts)):
         stop = starts[number + 1] if number + 1 < len(starts) else len(rows)
-        of_pair = kind.of_rows(rows[starts[number] : stop])
+        of_pair = targets.of_rows(rows[starts[number] : stop])
         if "flat" not in file:
             file.create_dataset("flat", (len(rows), of_pair.shape[-1]), np.float16)
         file["flat"][starts[number] : stop] = of_pair
@@ -129,24 +140,19 @@ def _simulated(responses: ResponseSet) -> SimulatedResponses:
     return responses
 
 
+@dataclass(frozen=True)
 class _Drawn:
-    def __init__(self, responses: ResponseSet, cells: Cells) -> None:
-        self._responses, self._cells = responses, cells
-        self.choice = {"format": _FORMAT, "cells": asdict(cells), "expected": False}
+    responses: ResponseSet
+    cells: Cells
 
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
-        responses = self._responses
-        return flat_targets(align(responses.read(rows), delay_samples(responses, rows[0])), self._cells)
+        responses = self.responses
+        return flat_targets(align(responses.read(rows), delay_samples(responses, rows[0])), self.cells)
 
 
 class _Expected:
     def __init__(self, responses: SimulatedResponses, cells: Cells) -> None:
-        self._responses, self._cells = responses, cells
-        self.choice = {"format": _FORMAT, "cells": asdict(cells), "expected": True}
-
-    @cached_property
-    def _targets(self) -> ExpectedTargets:
-        return ExpectedTargets(self._responses.dataset, self._cells)
+        self._responses, self._targets = responses, ExpectedTargets(responses.dataset, cells)
 
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
         emitter, listener = self._responses.ends(rows[0])
@@ -155,12 +161,7 @@ class _Expected:
 
 class _Directional:
     def __init__(self, responses: SimulatedResponses, cells: Cells) -> None:
-        self._responses, self._cells = responses, cells
-        self.choice = {"format": _FORMAT, "cells": asdict(cells), "predicts": "directions"}
-
-    @cached_property
-    def _targets(self) -> DirectionalTargets:
-        return DirectionalTargets(self._responses.dataset, self._cells)
+        self._responses, self._targets = responses, DirectionalTargets(responses.dataset, cells)
 
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
         return self._targets.of_pair(*self._responses.ends(rows[0]))[None]

@@ -19,9 +19,8 @@ SILENT = Progress(disable=True)
 @pytest.fixture(scope="module")
 def directional_run(dataset, configuration, tmp_path_factory):
     folder = tmp_path_factory.mktemp("directional") / "run"
-    train(
-        SimulatedResponses(dataset), folder, Configuration.directional(configuration.shape, epochs=60, batch=8), SILENT
-    )
+    settings = Configuration.directional(configuration.shape, epochs=60, batch=8)
+    train(SimulatedResponses(dataset), folder, settings, SILENT)
     return folder
 
 
@@ -93,9 +92,8 @@ def test_it_shares_a_bundle_with_a_field_of_ears(dataset, run, directional_run, 
 def test_order_zero_has_one_output(dataset, configuration, tmp_path):
     recipe = DirectionalRecipe(order=0)
     responses = SimulatedResponses(dataset)
-    train(
-        responses, tmp_path / "run", Configuration.directional(configuration.shape, recipe, epochs=60, batch=8), SILENT
-    )
+    settings = Configuration.directional(configuration.shape, recipe, epochs=60, batch=8)
+    train(responses, tmp_path / "run", settings, SILENT)
     bundle = export(responses, [tmp_path / "run"], tmp_path / "bundle")
     session = open_session(bundle.models["directional.onnx"])
     assert [each.name for each in session.get_outputs()] == ["log_magnitude"]

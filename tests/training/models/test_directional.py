@@ -57,10 +57,12 @@ def test_shares_are_none_above_one_and_levels_none_below_silence():
 
 
 def test_no_feature_is_that_of_a_head():
-    """All features change with the places, but those of geometry that this plan has none of."""
-    features = made().encoder(*places(300)).detach()
-    flat = features.std(dim=0) < 1e-6
-    assert not flat.any()
+    """Every feature changes with the places, in both rooms of the plan."""
+    rng = np.random.default_rng(2)
+    ends = [torch.from_numpy(rng.uniform((0.1, 0.1, 1), (5.9, 1.9, 2), (300, 3)).astype(np.float32)) for _ in range(2)]
+    ends[0][:150, :2] = ends[0][:150, [1, 0]]
+    features = made().encoder(*ends).detach()
+    assert (features.std(dim=0) > 1e-6).all()
 
 
 def test_sight_is_found_among_the_features():
