@@ -8,7 +8,7 @@ Axes: B poses, 7 octave bands, columns of frames, harmonics k (ACN, SN3D; `serve
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -102,7 +102,10 @@ class DirectionalGraph(FieldGraph):
     def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
         """What arrives at listeners (B, 3) from emitters (B, 3), whatever their heads."""
         listeners = np.asarray(listeners, dtype=np.float32)
-        said = self.run(listeners, emitters, np.zeros(len(listeners)))
+        return self._arrivals_of(self.run(listeners, emitters, np.zeros(len(listeners))))
+
+    def _arrivals_of(self, outputs: Sequence[Float32]) -> Arrivals:
+        said = list(outputs)
         if self.order == 0:
             rows, *axes = said[0].shape
             said.append(np.zeros((rows, 0, *axes), np.float32))
@@ -113,8 +116,8 @@ class DirectionalGraph(FieldGraph):
         arrivals = self.arrivals(listeners, emitters)
         return Arrivals(arrivals.log_magnitude, arrivals.directions[:, : harmonic_count(self.heard_order) - 1])
 
-    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
-        return self.at_ears(self.arrivals(listeners, emitters), heads)
+    def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:
+        return self.at_ears(self._arrivals_of(outputs), heads)
 
     def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike, *, columns: int | None = None) -> Spectrograms:
         """The spectrograms at the ears of heads, as orientations (B, 4) or yaws (B,) of level heads. With `columns`,

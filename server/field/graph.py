@@ -9,7 +9,7 @@ several frames (`CodecParameters.frame_cells`) in place of frames: late sound is
 take most of the time.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -134,7 +134,11 @@ class FieldGraph:
 
     def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Predictions as the graph gives them, per frame or per cell. Only for a graph that gives spectrograms."""
-        said = self.run(listeners, emitters, heads)
+        return self.spectrograms_of(self.run(listeners, emitters, heads), heads)
+
+    def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:  # noqa: ARG002  for fields of any head
+        """Predictions from the outputs of `run` for these heads."""
+        said = list(outputs)
         if self.channels == 1:
             rows, _, *axes = said[0].shape
             said.append(np.zeros((rows, 2, *axes), np.float32))

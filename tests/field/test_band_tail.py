@@ -26,7 +26,8 @@ class _Predicted(DirectionalGraph):
     """A graph whose predictions a test chooses, with the codec and noise of the apartment."""
 
     def __init__(self, log_magnitude, relative) -> None:
-        self.name, self.channels, self.gives_responses, self.order = "predicted", 2, False, 2
+        self.name, self.channels, self.gives_responses = "predicted", 2, False
+        self.order = self.heard_order = 2
         self.parameters = PARAMETERS
         self._turned = None
         self.said = log_magnitude, relative
