@@ -63,12 +63,16 @@ class DirectionalGraph(FieldGraph):
     Raises BundleError for a graph that does not fit the manifest.
     """
 
+    predicts_directions: ClassVar[bool] = True
     _inputs: ClassVar[dict[str, list[int]]] = DIRECTIONAL_INPUTS
 
     def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
         order = bundle.manifest.fields[name].order
         assert order is not None  # by the manifest
         self.order = order
+        """The order of the predicted harmonics."""
+        self.heard_order = order
+        """The order up to which they are heard."""
         self._turned: _Turned | None = None
         super().__init__(bundle, name, session)
 
@@ -79,10 +83,20 @@ class DirectionalGraph(FieldGraph):
     def through(self, filters: HeadFilters) -> "DirectionalGraph":
         if filters is self._filters:
             return self
+        other = self._copy()
+        other._filters = filters
+        return other
+
+    def of_order(self, order: int) -> "DirectionalGraph":
+        """The same field with harmonics up to a lower order only."""
+        other = self._copy()
+        other.heard_order = min(order, self.order)
+        return other
+
+    def _copy(self) -> "DirectionalGraph":
         other = copy.copy(self)
         other._turned = None
         vars(other).pop("_products", None)
-        other._filters = filters
         return other
 
     def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
@@ -90,17 +104,20 @@ class DirectionalGraph(FieldGraph):
         listeners = np.asarray(listeners, dtype=np.float32)
         return self._arrivals_of(self.run(listeners, emitters, np.zeros(len(listeners))))
 
-    def _arrivals_of(self, said: Sequence[Float32]) -> Arrivals:
-        if self.order > 0:
-            return Arrivals(*said)
-        rows, *axes = said[0].shape
-        return Arrivals(said[0], np.zeros((rows, 0, *axes), np.float32))
+    def _arrivals_of(self, outputs: Sequence[Float32]) -> Arrivals:
+        said = list(outputs)
+        if self.order == 0:
+            rows, *axes = said[0].shape
+            said.append(np.zeros((rows, 0, *axes), np.float32))
+        return Arrivals(*said)
 
-    def predictions_of(self, said: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:
-        return self.at_ears(self._arrivals_of(said), heads)
+    def heard_arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
+        """What arrives, with directions up to the heard order."""
+        arrivals = self.arrivals(listeners, emitters)
+        return Arrivals(arrivals.log_magnitude, arrivals.directions[:, : harmonic_count(self.heard_order) - 1])
 
-    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
-        return self.at_ears(self.arrivals(listeners, emitters), heads)
+    def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:
+        return self.at_ears(self._arrivals_of(outputs), heads)
 
     def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike, *, columns: int | None = None) -> Spectrograms:
         """The spectrograms at the ears of heads, as orientations (B, 4) or yaws (B,) of level heads. With `columns`,
@@ -114,12 +131,13 @@ class DirectionalGraph(FieldGraph):
         levels[..., written:] = 0
         coherence[..., written:] = 0
         whole = -(-written // LANES) * LANES
-        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
-        band, share = self._between_bands
+        harmonics = harmonic_count(self.heard_order)
+        work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
+        band, share = self.between_bands
         for row, orientation in enumerate(orientations):
             ears_of_directions(
                 arrivals.log_magnitude[row],
-                arrivals.directions[row],
+                arrivals.directions[row, : harmonics - 1],
                 self._turned_to(orientation).of_bins,
                 band,
                 share,
@@ -175,10 +193,10 @@ class DirectionalGraph(FieldGraph):
 
     @cached_property
     def _products(self) -> EarProducts:
-        return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.order)
+        return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.heard_order)
 
     @cached_property
-    def _between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
+    def between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
         """For each bin, the octave band below it and its share of the way to the next, over the logarithm of frequency;
         the outermost bands reach to the ends."""
         codec = self.parameters.codec

@@ -94,6 +94,7 @@ class FieldGraph:
     Raises BundleError for a graph that does not fit the manifest.
     """
 
+    predicts_directions: ClassVar[bool] = False
     _inputs: ClassVar[dict[str, list[int]]] = INPUTS
 
     def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
@@ -133,15 +134,15 @@ class FieldGraph:
 
     def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Predictions as the graph gives them, per frame or per cell. Only for a graph that gives spectrograms."""
-        return self.predictions_of(self.run(listeners, emitters, heads), heads)
+        return self.spectrograms_of(self.run(listeners, emitters, heads), heads)
 
-    def predictions_of(self, said: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:  # noqa: ARG002
-        """Predictions from outputs of `run` for these heads."""
-        if self.channels == 2:
-            return Spectrograms(*said)
-        log_magnitude, frequency, certainty = said
-        rows, _, *axes = log_magnitude.shape
-        return Spectrograms(log_magnitude, frequency, certainty, np.zeros((rows, 2, *axes), np.float32))
+    def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:  # noqa: ARG002  for fields of any head
+        """Predictions from the outputs of `run` for these heads."""
+        said = list(outputs)
+        if self.channels == 1:
+            rows, _, *axes = said[0].shape
+            said.append(np.zeros((rows, 2, *axes), np.float32))
+        return Spectrograms(*said)
 
     def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Float32:
         """(B, channel, samples), aligned. Only for a graph that gives responses."""

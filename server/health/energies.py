@@ -67,7 +67,6 @@ class Predictions:
         if self.graph.gives_responses:
             magnitude = np.abs(codec.transform(outputs[0])).astype(np.float32)
         else:
-            axis = self.graph.parameters.frame_axis
-            levels = self.graph.predictions_of(outputs, poses[:, YAW]).log_magnitude
-            magnitude = codec.magnitude(levels if axis is None else levels @ axis.spread())
+            predicted = self.graph.spectrograms_of(outputs, poses[:, YAW])
+            magnitude = codec.magnitude(predicted.spread(self.graph.parameters.frame_axis).log_magnitude)
         return self.windows.energies(magnitude)

@@ -212,3 +212,15 @@ def test_bands_without_bins_of_their_own_are_heard(diffuse, rate, n_fft):
     found = graph.band_products(np.array(LEVEL))
     assert np.isfinite(found).all()
     assert (found[:, :2, 0] > 0).all()
+
+
+@pytest.mark.parametrize("tail", ["stft", "bands"])
+def test_a_level_may_hear_a_lower_order(tmp_path, tail):
+    """As if the field had predicted no more."""
+    high, low = (write_directional(tmp_path / str(order), order, (0.0, 1.0, 0.0), tail) for order in (3, 1))
+    level = high.manifest.levels[0].model_copy(update={"order": 1})
+    limited = AcousticField(high, level, AcousticField.load(high).graph)
+    for head in (LEVEL, Quaternion(0.3, 0.2, 0.1, 0.9)):
+        found = limited.impulse_responses([LISTENER], [EMITTER], [head])
+        assert_array_equal(found, AcousticField.load(low).impulse_responses([LISTENER], [EMITTER], [head]))
+        assert not np.array_equal(found, AcousticField.load(high).impulse_responses([LISTENER], [EMITTER], [head]))

@@ -71,3 +71,20 @@ def test_a_scene_without_fields_has_no_tail_of_bands():
     document["levels"][0]["tail"] = "bands"
     with pytest.raises(ValidationError, match=r"levels\.geometry\.tail: bands are for fields of directions"):
         Manifest.model_validate(document)
+
+
+@pytest.mark.parametrize(
+    ("field", "order", "told"),
+    [(DIRECTIONAL, 3, "order 2"), (FieldFile(file="arithmetic.onnx", architecture="a"), 1, "no directions")],
+)
+def test_a_level_uses_no_more_harmonics_than_there_are(field, order, told):
+    version = 3 if field is DIRECTIONAL else 2
+    levels = [{"name": "standard", "field": "arithmetic", "order": order}]
+    with pytest.raises(ValidationError, match=rf"levels.standard.order: is {order}, but field arithmetic has {told}"):
+        Manifest.model_validate(with_field(field, format_version=version, levels=levels))
+
+
+def test_bands_are_for_directions_alone():
+    levels = [{"name": "standard", "field": "arithmetic", "tail": "bands"}]
+    with pytest.raises(ValidationError, match="bands are for fields of directions"):
+        Manifest.model_validate(MANIFEST.model_dump(mode="json") | {"levels": levels})

@@ -100,31 +100,56 @@ class BinauralSynthesis:
         """(bin, product, yaw, cell) expected products per sample of the ears' spectra, for the diffuse part of
         `render`. They are summed over `times_s` (time,) with `weights` (time, cell); times outside the response add
         nothing. `products` is the result of `arrival_products`."""
-        step_s = self._n_fft // 2 / self._sample_rate
-        frames = -(-self.samples // (self._n_fft // 2)) + 1
-        per_sample = power_at(np.asarray(np.arange(frames) * step_s, np.float64), energy) / np.float32(
-            self._sample_rate
-        )
         frequencies_hz = np.linspace(0, self._sample_rate / 2, products.shape[0])
-        power = np.einsum("dbt,bn->ndt", per_sample, band_weights(frequencies_hz).astype(np.float32), optimize=True)
+        power = np.einsum(
+            "dbt,bn->ndt",
+            self._window_powers(energy),
+            band_weights(frequencies_hz).astype(np.float32),
+            optimize=True,
+        )
+        over_cells = self._sum_over_time(power, onset_s, times_s, weights)
+        # einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
+        return np.einsum("bpyd,bdc->bpyc", products, over_cells)
+
+    def late_power(self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles) -> _Singles:
+        """(direction, band, cell) expected power per sample that arrives from each direction, without a head; otherwise
+        as in `late_covariance`."""
+        return self._sum_over_time(self._window_powers(energy), onset_s, times_s, weights)
+
+    def _window_powers(self, energy: _Singles) -> _Singles:
+        """(direction, band, window) power per sample in the middle of each window of the noise."""
+        times_s = np.asarray(np.arange(self._windows) * self._window_step_s, np.float64)
+        return power_at(times_s, energy) / np.float32(self._sample_rate)
+
+    def _sum_over_time(self, power: _Singles, onset_s: float, times_s: _Floats, weights: _Singles) -> _Singles:
+        """(..., cell) the `power` (..., window) of the noise at `times_s` (time,), summed with `weights`
+        (time, cell)."""
         # Overlapping windows shape the same noise. Their amplitudes add up, so neighbouring windows also contribute a
         # product.
-        position = np.clip(times_s / step_s, 0, frames - 1)
-        before = np.minimum(position.astype(int), frames - 2)
+        windows = self._windows
+        position = np.clip(times_s / self._window_step_s, 0, windows - 1)
+        before = np.minimum(position.astype(int), windows - 2)
         share = np.sin(np.pi / 2 * (position - before)) ** 2
         rise = np.sin(np.pi / 2 * np.clip((times_s - onset_s) / _DIFFUSE_RISE_S, 0, 1)) ** 4
         rise[times_s >= self.samples / self._sample_rate] = 0
         at = np.arange(len(times_s))
         own = coo_array(
             (np.concatenate([rise * (1 - share) ** 2, rise * share**2]), (np.tile(at, 2), [*before, *(before + 1)])),
-            shape=(len(times_s), frames),
+            shape=(len(times_s), windows),
         )
-        shared = coo_array((2 * rise * share * (1 - share), (at, before)), shape=(len(times_s), frames - 1))
+        shared = coo_array((2 * rise * share * (1 - share), (at, before)), shape=(len(times_s), windows - 1))
         own_weights, shared_weights = ((part.T @ weights).astype(np.float32) for part in (own, shared))
         neighbours = np.sqrt(power[..., :-1] * power[..., 1:])
-        over_cells = np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
-        # einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
-        return np.einsum("bpyd,bdc->bpyc", products, over_cells)
+        return np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
+
+    @property
+    def _windows(self) -> int:
+        """The number of windows that shape the diffuse part. The first begins one step before sample 0."""
+        return -(-self.samples // (self._n_fft // 2)) + 1
+
+    @property
+    def _window_step_s(self) -> float:
+        return self._n_fft // 2 / self._sample_rate
 
     def arrival_products(self, bins: int) -> _Singles:
         """(bin, product, yaw, direction) products of the ears' spectra for a wave from each direction, at frequencies
@@ -202,7 +227,7 @@ class BinauralSynthesis:
     def late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
         """(yaw, ear, sample) diffuse sound of `energy` (direction, band, bin), which begins at `onset_s`."""
         step = self._n_fft // 2
-        frames = -(-self.samples // step) + 1  # the first begins one step before sample 0
+        frames = self._windows
         # Drawn frame by frame, so that a longer response begins with the same noise.
         noise = _unit_noise((frames + 1, len(energy), step), rng)
         sections = np.concatenate([noise[:-1], noise[1:]], axis=-1)
