@@ -59,6 +59,11 @@ class BandTail:
         self._missing = _missing(codec.window * codec.dual_window, codec.hop)
         self._noises, self._diffuse = _band_noises(graph, frozen_noise)
 
+    @property
+    def nbytes(self) -> int:
+        """The size of the noises, which is nearly all that a tail holds."""
+        return self._noises.nbytes
+
     def responses(
         self, decoder: Decoder, listeners: Floats, emitters: Floats, heads: npt.ArrayLike, aligned: Floats
     ) -> Float32:

@@ -121,12 +121,15 @@ class DirectionalGraph(FieldGraph):
 
     def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike, *, columns: int | None = None) -> Spectrograms:
         """The spectrograms at the ears of heads, as orientations (B, 4) or yaws (B,) of level heads. With `columns`,
-        only that many are computed, and the others are left as they come."""
+        only that many are computed, and the others are zeros."""
         codec = self.parameters.codec
         orientations = orientations_of(heads)
         rows, all_columns = len(orientations), arrivals.log_magnitude.shape[-1]
         levels, coherence = np.empty((2, rows, 2, codec.bins, all_columns), np.float32)
         written = all_columns if columns is None else columns
+        # What is left out must be numbers: decoders multiply it by zero.
+        levels[..., written:] = 0
+        coherence[..., written:] = 0
         whole = -(-written // LANES) * LANES
         harmonics = harmonic_count(self.heard_order)
         work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
@@ -160,7 +163,11 @@ class DirectionalGraph(FieldGraph):
     @cached_property
     def _mean_over_band(self) -> Float32:
         codec = self.parameters.codec
-        weights = band_weights(np.linspace(0, codec.sample_rate / 2, codec.bins))
+        frequency = np.linspace(0, codec.sample_rate / 2, codec.bins)
+        weights = band_weights(frequency)
+        # At low rates or with short windows, a band may have no bin of its own: it takes the nearest one.
+        empty = np.flatnonzero(weights.sum(axis=1) == 0)
+        weights[empty, np.abs(frequency - np.array(OCTAVE_BANDS_HZ)[empty, None]).argmin(axis=1)] = 1
         return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
 
     @cached_property

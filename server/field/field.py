@@ -44,8 +44,10 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 _CHUNK = 32
-_HEADS = 16
-"""Number of heads for which a field of directions keeps what it has prepared."""
+_HEADS_BYTES = 64 * 1024 * 1024
+"""Size of what a field of directions keeps prepared for heads. The longest tail that a scene may have fits in."""
+_HEAD_BYTES = 256 * 1024
+"""What a head takes besides its tail, roughly."""
 _NEVER = 2.0**31
 """Samples: larger than any index of a response."""
 _EAR_AHEAD_S = 0.00026
@@ -129,8 +131,11 @@ class AcousticField:
         heard = self._heard.get(filters)
         if heard is None:
             graph = self.graph.through(filters)
-            heard = self if graph is self.graph else self._with(graph)
-            self._heard.put(filters, heard, 1)
+            if graph is self.graph:
+                return self
+            heard = self._with(graph)
+            tail_bytes = 0 if heard._tail is None else heard._tail.nbytes
+            self._heard.put(filters, heard, _HEAD_BYTES + tail_bytes)
         return heard
 
     def _with(self, graph: FieldGraph) -> "AcousticField":
@@ -151,7 +156,7 @@ class AcousticField:
 
     @cached_property
     def _heard(self) -> BoundedCache[HeadFilters, "AcousticField"]:
-        return BoundedCache(_HEADS)
+        return BoundedCache(_HEADS_BYTES)
 
     @cached_property
     def kind(self) -> LevelKind:

@@ -148,7 +148,8 @@ class FieldFile(Strict):
     def _without_what_format_2_lacks(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
         document: dict[str, object] = write(self)
         if self.predicts == "ears":
-            del document["predicts"], document["order"]
+            document.pop("predicts", None)
+            document.pop("order", None)
         return document
 
 
@@ -252,9 +253,9 @@ class QualityLevel(Strict):
     def _without_what_format_2_lacks(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
         document: dict[str, object] = write(self)
         if self.tail == "stft":
-            del document["tail"]
+            document.pop("tail", None)
         if self.order is None:
-            del document["order"]
+            document.pop("order", None)
         return document
 
 
@@ -390,6 +391,10 @@ class Manifest(Strict):
     def _has_no_field(self) -> "Manifest":
         if len(self.levels) > 1 or self.levels[0].field != NO_FIELD or self.levels[0].reuse is not None:
             raise ValueError(f"levels: a scene without fields has one level, of field {NO_FIELD!r}")
+        if self.levels[0].tail != "stft":
+            raise ValueError(f"levels.{self.levels[0].name}.tail: bands are for fields of directions")
+        if self.levels[0].order is not None:
+            raise ValueError(f"levels.{self.levels[0].name}.order: a scene without fields has no directions")
         if self.direct_sound == "field":
             raise ValueError("direct_sound: there is no field that could hold it")
         return self

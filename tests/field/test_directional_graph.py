@@ -1,5 +1,6 @@
 """Fields that predict directions: what ears hear of them, whatever the head and however it is turned."""
 
+import copy
 import math
 
 import numpy as np
@@ -15,6 +16,7 @@ from server.core.errors import BundleError
 from server.field.directional_graph import LEAST_POWER, Arrivals, DirectionalGraph
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
+from server.health.check import Effort, check
 from server.rendering.ear_products import EarProducts
 from server.rendering.hrtf import HeadFilters, kemar
 from server.responses.full_response import FullResponse
@@ -182,6 +184,34 @@ def test_a_graph_of_ears_is_refused_as_one_of_directions(tmp_path, bundle):
     wrong = write_bundle(tmp_path / "flat", directional_manifest(2), files)
     with pytest.raises(BundleError, match=r"inputs: are .*yaw"):
         AcousticField.load(wrong)
+
+
+@pytest.mark.parametrize("tail", ["stft", "bands"])
+@pytest.mark.parametrize("order", [0, 2])
+def test_a_directional_scene_obeys_the_laws_of_computing(tail, order, tmp_path):
+    bundle = write_directional(tmp_path / "flat", order, (0.0, 1.0, 0.0), tail)
+    health = check(bundle, Effort(scattered=16, climbing=2, halved=2, responses=3))
+    faults = [finding for finding in health.findings if not finding.law.can_be_accepted]
+    assert {"double", "batch", "repeatable"} <= {finding.law.name for finding in faults}
+    assert all(finding.holds for finding in faults), faults
+
+
+def test_columns_that_are_left_out_are_zeros(diffuse):
+    graph = diffuse.graph
+    found = graph.at_ears(graph.arrivals([LISTENER], [EMITTER]), [LEVEL], columns=3)
+    assert found.log_magnitude[..., :3].all()
+    assert not found.log_magnitude[..., 3:].any()
+    assert not found.interaural[..., 3:].any()
+
+
+@pytest.mark.parametrize(("rate", "n_fft"), [(8000, 256), (24_000, 64), (96_000, 64)])
+def test_bands_without_bins_of_their_own_are_heard(diffuse, rate, n_fft):
+    graph = diffuse.graph.through(copy.copy(kemar(24_000)))
+    vars(graph).pop("_mean_over_band", None)
+    graph.parameters = graph.parameters.model_copy(update={"sample_rate": rate, "n_fft": n_fft, "hop": n_fft // 4})
+    found = graph.band_products(np.array(LEVEL))
+    assert np.isfinite(found).all()
+    assert (found[:, :2, 0] > 0).all()
 
 
 @pytest.mark.parametrize("tail", ["stft", "bands"])

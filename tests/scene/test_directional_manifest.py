@@ -64,6 +64,18 @@ def test_directions_are_heard_anew_and_have_no_phase_to_integrate(level):
         Manifest.model_validate(with_field(DIRECTIONAL, format_version=3, levels=levels))
 
 
+def test_a_scene_without_fields_has_neither_bands_nor_directions():
+    document = MANIFEST.model_dump(mode="json")
+    document |= {"fields": {}, "levels": [{"name": "geometry", "field": "none"}]}
+    Manifest.model_validate(document)
+    document["levels"][0]["tail"] = "bands"
+    with pytest.raises(ValidationError, match=r"levels\.geometry\.tail: bands are for fields of directions"):
+        Manifest.model_validate(document)
+    document["levels"] = [{"name": "geometry", "field": "none", "order": 1}]
+    with pytest.raises(ValidationError, match=r"levels\.geometry\.order: a scene without fields has no directions"):
+        Manifest.model_validate(document)
+
+
 @pytest.mark.parametrize(
     ("field", "order", "told"),
     [(DIRECTIONAL, 3, "order 2"), (FieldFile(file="arithmetic.onnx", architecture="a"), 1, "no directions")],

@@ -89,7 +89,11 @@ class HeldOut:
         """
         if self.simulated is None:
             raise EvaluationError(f"{self.name}: a measurement knows one head; another is for simulated data only")
-        heads = tilted(self.yaws, math.radians(tilt_deg)) if tilt_deg else self.yaws
+        heads = self.yaws
+        if tilt_deg:
+            heads = tilted(heads, math.radians(tilt_deg))
+            # In turn among those that are evaluated: every fourth of all would be tilted alike.
+            heads[self.yaw_indices] = tilted(self.yaws[self.yaw_indices], math.radians(tilt_deg))
         rate = self.sample_rate
         filters = kemar(rate) if hrtf is None else HeadFilters.from_hrtf(Hrtf.read(hrtf, rate))
         first, second = (ReheardReferences(self.simulated, filters, heads, take) for take in TAKES)

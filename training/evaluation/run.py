@@ -62,9 +62,9 @@ def evaluate_bundles(
         stored = None
         if keep is not None:
             depends_on = [[bundle.digest for bundle in bundles], [signature(folder) for folder in (*runs, data)]]
-            stored = StoredErrors(
-                keep, [depends_on, [column.name for column in measured], pairs, yaws, draws, seed, held_out.name]
-            )
+            head = None if hrtf is None else [str(hrtf), hrtf.stat().st_size, hrtf.stat().st_mtime_ns]
+            names = [column.name for column in measured]
+            stored = StoredErrors(keep, [depends_on, names, pairs, yaws, draws, seed, tilt_deg, head])
         evaluation = evaluate(
             held_out,
             measured,

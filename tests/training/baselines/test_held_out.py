@@ -256,3 +256,10 @@ def test_measured_responses_are_not_heard_through_another_head(tmp_path):
     TestMeasured().write(tmp_path)
     with open_held_out(tmp_path) as opened, pytest.raises(EvaluationError, match="a measurement knows one head"):
         opened.reheard(None, tilt_deg=30.0)
+
+
+def test_evaluated_heads_are_tilted_in_turn_however_many_there_are(dataset):
+    with open_held_out(dataset.folder) as everything:
+        held_out = everything.sample(pairs=1, yaws=2, seed=0).reheard(None, tilt_deg=30.0)
+        expected = tilted(everything.yaws[held_out.yaw_indices], np.radians(30.0))
+        np.testing.assert_array_equal(held_out.yaws[held_out.yaw_indices], expected)
