@@ -62,6 +62,22 @@ class Quaternion(_Components):
             raise ValueError("yaw must be a finite number")
         return cls(0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
+    @classmethod
+    def from_angles(cls, yaw_rad: float, pitch_rad: float, roll_rad: float) -> "Quaternion":
+        """The orientation of a head that turns counter-clockwise by a yaw, then raises its nose by a pitch, then tilts
+        to its right by a roll (right ear down), each about its own axes. Raises ValueError if one is not finite."""
+        if not all(map(math.isfinite, (yaw_rad, pitch_rad, roll_rad))):
+            raise ValueError("yaw, pitch and roll must be finite numbers")
+        yaw, pitch, roll = yaw_rad / 2, -pitch_rad / 2, roll_rad / 2  # about y, which points left, the nose goes down
+        cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+        cr, sr = math.cos(roll), math.sin(roll)
+        return cls(
+            cy * cp * sr - sy * sp * cr,
+            cy * sp * cr + sy * cp * sr,
+            sy * cp * cr - cy * sp * sr,
+            cy * cp * cr + sy * sp * sr,
+        )
+
 
 LEVEL = Quaternion(0.0, 0.0, 0.0, 1.0)
 
@@ -77,6 +93,28 @@ def axes_of(orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDAr
             *(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
         )
     ).reshape(3, 3)
+
+
+def yaws_of(heads: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(B,) headings of the look directions, of heads that are given as orientations (B, 4); yaws (B,) of level heads
+    are returned as they are."""
+    given = np.asarray(heads, dtype=np.float64)
+    if given.ndim == 1:
+        return given
+    return np.array([_heading(*orientation) for orientation in given.tolist()], dtype=np.float64)
+
+
+def orientations_of(heads: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(B, 4) orientations of level heads that are given as yaws (B,); orientations (B, 4) are returned as they are."""
+    given = np.asarray(heads, dtype=np.float64)
+    if given.ndim != 1:
+        return given
+    level = np.zeros_like(given)
+    return np.stack([level, level, np.sin(given / 2), np.cos(given / 2)], axis=-1)
+
+
+def _heading(x: float, y: float, z: float, w: float) -> float:
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 @dataclass(frozen=True)
@@ -114,8 +152,7 @@ class Pose:
     @property
     def yaw(self) -> float:
         """The heading of the look direction in the horizontal plane, radians in [-pi, pi]."""
-        x, y, z, w = self.orientation
-        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return _heading(*self.orientation)
 
 
 @dataclass(frozen=True)

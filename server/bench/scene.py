@@ -7,10 +7,12 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.geometry import yaws_of
 from server.acoustics.sound_path import SoundPathFinder
 from server.bench.rooms import FloatArray, room
 from server.field.field import AcousticField
 from server.kernels.array_pool import ArrayPool
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from server.scene.geometry import Geometry, Material, Materials
 from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
@@ -62,16 +64,19 @@ class BankField(AcousticField):
         self._paths = SoundPathFinder(self.bundle.floor_plan, _MANIFEST.speed_of_sound)
         self._bank = np.stack([_LEVEL * room(seed, _SAMPLES) for seed in range(_BANK)])
 
+    def through(self, filters: HeadFilters) -> "BankField":  # noqa: ARG002  its responses were recorded
+        return self
+
     def impulse_responses(
         self,
         listeners: npt.ArrayLike,
         emitters: npt.ArrayLike,
-        yaws: npt.ArrayLike,
+        heads: npt.ArrayLike,
         *,
         remember: bool = False,  # noqa: ARG002  there is no phase to remember
     ) -> FloatArray:
         """IRs as of `AcousticField`; poses outside of the bounds are allowed."""
-        places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), np.atleast_1d(yaws)])
+        places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), yaws_of(np.atleast_1d(heads))])
         entry = np.floor(places @ np.arange(1, places.shape[1] + 1) * _POSES_PER_M).astype(np.int64)
         answer = _POOL.floats(len(entry), *self._bank.shape[1:])
         return self._bank.take(entry, axis=0, out=answer, mode="wrap")  # other modes make an additional copy

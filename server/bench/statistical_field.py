@@ -19,7 +19,7 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.field.kinds.every_pose import ComputedResponses
-from server.rendering.hrtf import kemar
+from server.rendering.hrtf import HeadFilters, kemar
 from server.responses.full_response import diffuse_energy
 from server.scene.bundle import Bundle
 from server.scene.geometry import Geometry, Material, Materials
@@ -110,11 +110,14 @@ class StatisticalField(AcousticField):
         self.source = ComputedResponses(self.impulse_responses)
         self._paths = SoundPathFinder(self.bundle.floor_plan, self.bundle.manifest.speed_of_sound)
 
+    def through(self, filters: HeadFilters) -> "StatisticalField":  # noqa: ARG002  one head is as good as another
+        return self
+
     def impulse_responses(
         self,
         listeners: npt.ArrayLike,
         emitters: npt.ArrayLike,
-        yaws: npt.ArrayLike,  # noqa: ARG002  diffuse sound comes from all directions
+        heads: npt.ArrayLike,  # noqa: ARG002  diffuse sound comes from all directions
         *,
         remember: bool = False,  # noqa: ARG002
     ) -> npt.NDArray[np.float32]:

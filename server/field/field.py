@@ -4,25 +4,31 @@ Reflected sound is everything after the direct sound, which `server.responses.fu
 bundle's `image_order` is 1, the first reflections are computed from geometry too. For measured scenes, whose
 `direct_sound` is the field's, responses are complete.
 
-Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds.
+Axes: B poses; responses (B, channel, sample), two ears or one microphone. Metres, radians, seconds. Heads are
+orientations (B, 4) as quaternions x, y, z, w, or yaws (B,) of level heads; a field of ears knows yaws only.
 """
 
+import copy
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.fast_length import next_fast_length
-from server.acoustics.geometry import Vector3
+from server.acoustics.geometry import Vector3, yaws_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError, FieldError
 from server.field.any_size_decoder import add_from, resized
+from server.field.band_tail import BandTail
 from server.field.decoder import Decoder
+from server.field.directional_graph import DirectionalGraph
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
+from server.field.graphs import graph_of
 from server.field.kinds.catalogue import kind_of
 from server.field.kinds.every_pose import ComputedResponses
 from server.field.kinds.level_kind import LevelKind
@@ -30,6 +36,7 @@ from server.field.lattice import Neighbourhood, Snapped
 from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.field.phase_cache import PhaseCache
 from server.field.response_source import ResponseSource
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from server.scene.manifest import Phase, QualityLevel
 
@@ -37,6 +44,10 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 _CHUNK = 32
+_HEADS_BYTES = 64 * 1024 * 1024
+"""Size of what a field of directions keeps prepared for heads. The longest tail that a scene may have fits in."""
+_HEAD_BYTES = 256 * 1024
+"""What a head takes besides its tail, roughly."""
 _NEVER = 2.0**31
 """Samples: larger than any index of a response."""
 _EAR_AHEAD_S = 0.00026
@@ -68,6 +79,8 @@ class AcousticField:
         self.bundle = bundle
         self.level = level
         self.graph = graph
+        if level.order is not None and isinstance(graph, DirectionalGraph):
+            self.graph = graph = graph.of_order(level.order)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
         is_whole = bundle.manifest.direct_sound == "field"
         # Measured sound may arrive earlier than geometry predicts: the gate opens with the first coded sample.
@@ -81,18 +94,20 @@ class AcousticField:
             gives_back=self._first_echo is not None,
         )
         self._decoder: Decoder | None = None
+        self._tail: BandTail | None = None
         if graph.gives_responses:
             if level.frames is not None or level.phase != Phase():
                 raise BundleError(
                     graph.path, RESPONSE, f"needs no decoding: take phase and frames from levels.{level.name}"
                 )
         else:
+            self._tail = self._open_tail()
             self._decoder = Decoder(
                 graph.parameters,
                 noise or frozen_noise(bundle, graph),
                 ir_samples=self.ir_samples,
                 phase=level.phase,
-                frames=level.frames,
+                frames=level.frames if self._tail is None else self._tail.early_frames,
             )
         self._cache = PhaseCache() if level.phase.warm else None
         node_cache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
@@ -109,7 +124,39 @@ class AcousticField:
         if not manifest.fields:
             return Silence(bundle, chosen)
         session = open_graph(bundle, manifest.fields[chosen.field].file, threads=threads)
-        return cls(bundle, chosen, FieldGraph(bundle, chosen.field, session))
+        return cls(bundle, chosen, graph_of(bundle, chosen.field, session))
+
+    def through(self, filters: HeadFilters) -> "AcousticField":
+        """The same field heard through this head; the field itself if it predicts the ears of one head."""
+        heard = self._heard.get(filters)
+        if heard is None:
+            graph = self.graph.through(filters)
+            if graph is self.graph:
+                return self
+            heard = self._with(graph)
+            tail_bytes = 0 if heard._tail is None else heard._tail.nbytes
+            self._heard.put(filters, heard, _HEAD_BYTES + tail_bytes)
+        return heard
+
+    def _with(self, graph: FieldGraph) -> "AcousticField":
+        """A copy whose graph gives the spectrograms of another head."""
+        other = copy.copy(self)
+        vars(other).pop("_heard", None)
+        other.graph = graph
+        other._tail = other._open_tail()
+        if other._cache is not None:
+            other._cache = PhaseCache()
+        other.source = other.kind.open(self.bundle, self._paths, other._compute_all, BoundedCache(NODE_CACHE_BYTES))
+        return other
+
+    def _open_tail(self) -> BandTail | None:
+        if self.level.tail == "stft" or not isinstance(self.graph, DirectionalGraph):
+            return None
+        return BandTail(self.graph, self.bundle.frozen_noise)
+
+    @cached_property
+    def _heard(self) -> BoundedCache[HeadFilters, "AcousticField"]:
+        return BoundedCache(_HEADS_BYTES)
 
     @cached_property
     def kind(self) -> LevelKind:
@@ -129,7 +176,7 @@ class AcousticField:
         return self.bundle.manifest.codec.samples
 
     def impulse_responses(
-        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike, *, remember: bool = False
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike, *, remember: bool = False
     ) -> Float32:
         """Responses (B, channel, ir_samples) without the parts that geometry adds. Sample 0 is emission; the source has
         unit pressure at one metre.
@@ -140,11 +187,48 @@ class AcousticField:
 
         Raises ValueError for poses that are not finite, and FieldError if a response would not be finite.
         """
-        listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
+        listeners, emitters, heads = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
         # guard: poses that are not finite reach no field
-        if not all(np.isfinite(part).all() for part in (listeners, emitters, yaws)):
-            raise ValueError("listeners, emitters and yaws must be finite")
-        return self.source.responses(listeners, emitters, yaws, remember=remember)
+        if not all(np.isfinite(part).all() for part in (listeners, emitters, heads)):
+            raise ValueError("listeners, emitters and heads must be finite")
+        return self.source.responses(listeners, emitters, heads, remember=remember)
+
+    @property
+    def knows_directions(self) -> bool:
+        """Whether `ambisonics` is possible: the field tells from where sound arrives, and not what one head hears."""
+        return self.graph.predicts_directions
+
+    def ambisonics(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, order: int) -> Float32:
+        """Ambisonic responses (B, (order + 1)**2, ir_samples) in world axes, ACN and SN3D, without the parts that
+        geometry adds. They have the levels of `impulse_responses` at a point without a head, whatever the level's
+        phase.
+
+        Raises ValueError for poses that are not finite or a field that knows no directions, and FieldError if a
+        response would not be finite.
+        """
+        listeners, emitters = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters))
+        # guard: poses that are not finite reach no ambisonic field
+        if not all(np.isfinite(part).all() for part in (listeners, emitters)):
+            raise ValueError("listeners and emitters must be finite")
+        if not self.knows_directions:
+            raise ValueError(f"field {self.graph.name} knows no directions")
+        return self._ambisonics(listeners, emitters, order)
+
+    def _ambisonics(self, listeners: Floats, emitters: Floats, order: int) -> Float32:
+        from server.field.ambisonic_decoder import AmbisonicDecoder
+
+        assert isinstance(self.graph, DirectionalGraph)
+        aligned = self._aligned(listeners, emitters)
+        decoder = AmbisonicDecoder(self.graph.parameters, ir_samples=self.ir_samples, frames=self.level.frames)
+        arrivals = self.graph.heard_arrivals(listeners, emitters)
+        responses = self._finite(
+            decoder.decode(arrivals, self.graph.between_bands, aligned, order), listeners, emitters
+        )
+        onsets, echoes = self._opening(listeners, emitters, aligned)
+        for response, onset, echo in zip(responses, onsets, onsets if echoes is None else echoes, strict=True):
+            # One gate for all channels, so that none changes its direction.
+            response *= self._gate.gains(response[0], int(onset), int(echo)).astype(np.float32)
+        return responses
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
         """The node that represents a pair of poses at this level: the poses themselves, unless the level reuses
@@ -156,33 +240,33 @@ class AcousticField:
         reuses responses."""
         return self.source.find(listener, emitter, yaw)
 
-    def _compute_all(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
+    def _compute_all(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool = False) -> Float32:
         cache = self._cache if remember else None
-        if 0 < len(yaws) <= _CHUNK:
-            return self._compute(listeners, emitters, yaws, cache)
-        responses = np.empty((len(yaws), self.channels, self.ir_samples), dtype=np.float32)
-        for start in range(0, len(yaws), _CHUNK):
+        if 0 < len(heads) <= _CHUNK:
+            return self._compute(listeners, emitters, heads, cache)
+        responses = np.empty((len(heads), self.channels, self.ir_samples), dtype=np.float32)
+        for start in range(0, len(heads), _CHUNK):
             part = slice(start, start + _CHUNK)
-            responses[part] = self._compute(listeners[part], emitters[part], yaws[part], cache)
+            responses[part] = self._compute(listeners[part], emitters[part], heads[part], cache)
         return responses
 
-    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Spectrograms that the network predicts, before they are decoded to responses. Only for a field that gives
-        spectrograms. Positions (B, 3), yaws (B,)."""
-        return self.graph.spectrograms(listeners, emitters, yaws)
+        spectrograms. Positions (B, 3)."""
+        return self.graph.spectrograms(listeners, emitters, heads)
 
-    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:
+    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Floats:
         """(B, channel) sum of the squared samples of each predicted response, from the spectrograms if there are any,
         without decoding."""
-        poses = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
-        listeners, emitters, yaws = self.source.computed_for(*poses)
+        poses = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
+        listeners, emitters, heads = self.source.computed_for(*poses)
         if self.graph.gives_responses:
-            aligned = self.graph.impulse_responses(listeners, emitters, yaws)
+            aligned = self.graph.impulse_responses(listeners, emitters, heads)
             return np.asarray(np.sum(aligned.astype(np.float64) ** 2, axis=-1))
         codec = self.graph.parameters.codec
         # Bins between DC and Nyquist count twice, for negative frequencies.
         weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
-        magnitude = codec.magnitude(self.graph.spectrograms(listeners, emitters, yaws).log_magnitude)
+        magnitude = codec.magnitude(self.graph.spectrograms(listeners, emitters, heads).log_magnitude)
         return np.asarray(np.einsum("bcft,f->bc", magnitude[..., : self.level.frames] ** 2, weight))
 
     def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
@@ -191,44 +275,58 @@ class AcousticField:
         length_m = [self._paths.find(*pair).length_m for pair in pairs]
         return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
 
-    def _compute(self, listeners: Floats, emitters: Floats, yaws: Floats, cache: PhaseCache | None) -> Float32:
+    def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, cache: PhaseCache | None) -> Float32:
+        aligned = self._aligned(listeners, emitters)
+        if self._decoder is None:
+            coded = self.graph.impulse_responses(listeners, emitters, heads)
+            responses = self._finite(self._placed(coded, aligned), listeners, emitters)
+        else:
+            responses = self._decoded(self._decoder, listeners, emitters, heads, aligned, cache)
+        self._gate.open(responses, *self._opening(listeners, emitters, aligned))
+        return responses
+
+    def _aligned(self, listeners: Floats, emitters: Floats) -> Floats:
+        """(B,) the sample of each response on which the first coded sample lies, with its fraction."""
         parameters = self.graph.parameters
         aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
         # guard: a way without end is no index of a sample
         if not (aligned < _NEVER).all():
             raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
-        if self._decoder is None:
-            coded = self.graph.impulse_responses(listeners, emitters, yaws)
-            responses = self._finite(self._placed(coded, aligned), listeners, emitters)
-        else:
-            responses = self._decoded(self._decoder, listeners, emitters, yaws, aligned, cache)
-        onsets, echoes = np.floor(aligned).astype(np.int64) + self._lead, None
-        if self._first_echo is not None:
-            echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
-            echoes = np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(np.int64)
-        self._gate.open(responses, onsets, echoes)
-        return responses
+        return aligned
+
+    def _opening(
+        self, listeners: Floats, emitters: Floats, aligned: Floats
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64] | None]:
+        """The samples (B,) from which sound arrives, and by which a surface can have reflected it."""
+        onsets = np.floor(aligned).astype(np.int64) + self._lead
+        if self._first_echo is None:
+            return onsets, None
+        echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
+        return onsets, np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(np.int64)
 
     def _decoded(
         self,
         decoder: Decoder,
         listeners: Floats,
         emitters: Floats,
-        yaws: Floats,
+        heads: Floats,
         aligned: Floats,
         cache: PhaseCache | None,
     ) -> Float32:
         """Decoded responses (B, channel, ir_samples), including the energy that windows smear to before the onset."""
-        predicted = self.graph.predictions(listeners, emitters, yaws)
+        if self._tail is not None:
+            responses = self._tail.responses(decoder, listeners, emitters, heads, aligned)
+            return self._finite(responses, listeners, emitters)
+        predicted = self.graph.predictions(listeners, emitters, heads)
         if self.channels == 1:
             # Decoders expect two ears; a single microphone is stored as the left one.
             predicted = predicted.twice()
         if cache is None:
             responses = self._finite(decoder.decode(predicted, aligned), listeners, emitters)
             return np.ascontiguousarray(responses[:, : self.channels])
-        responses = np.empty((len(yaws), 2, self.ir_samples), dtype=np.float32)
+        responses = np.empty((len(heads), 2, self.ir_samples), dtype=np.float32)
         # One after the other, because each may start from the one before it.
-        for row, pose in enumerate(zip(listeners, emitters, yaws, strict=True)):
+        for row, pose in enumerate(zip(listeners, emitters, yaws_of(heads), strict=True)):
             rows = slice(row, row + 1)
             responses[rows] = decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
             self._finite(responses[rows], listeners[rows], emitters[rows])  # check before later poses start from it
@@ -280,15 +378,25 @@ class Silence(AcousticField):
         self.source = ComputedResponses(self.impulse_responses)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
 
+    def through(self, filters: HeadFilters) -> "Silence":  # noqa: ARG002  all heads hear the same
+        return self
+
     def impulse_responses(
         self,
         listeners: npt.ArrayLike,  # noqa: ARG002  the same everywhere
         emitters: npt.ArrayLike,  # noqa: ARG002
-        yaws: npt.ArrayLike,
+        heads: npt.ArrayLike,
         *,
         remember: bool = False,  # noqa: ARG002
     ) -> Float32:
-        return np.zeros((np.size(yaws), self.channels, self.ir_samples), dtype=np.float32)
+        return np.zeros((len(np.asarray(heads)), self.channels, self.ir_samples), dtype=np.float32)
 
-    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Floats:  # noqa: ARG002
-        return np.zeros((np.size(yaws), self.channels))
+    @property
+    def knows_directions(self) -> bool:
+        return True
+
+    def _ambisonics(self, listeners: Floats, emitters: Floats, order: int) -> Float32:  # noqa: ARG002
+        return np.zeros((len(listeners), harmonic_count(order), self.ir_samples), dtype=np.float32)
+
+    def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Floats:  # noqa: ARG002
+        return np.zeros((len(np.asarray(heads)), self.channels))

@@ -7,6 +7,7 @@ from server.core.bounded_cache import BoundedCache
 from server.core.errors import RequestError
 from server.field.field import AcousticField, Silence, frozen_noise
 from server.field.graph import FieldGraph, open_graph
+from server.field.graphs import graph_of
 from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
 from server.field.runtime import InferenceSession
 from server.scene.bundle import Bundle
@@ -32,7 +33,7 @@ class FieldsByLevel(Mapping[str, AcousticField]):
             file = bundle.manifest.fields[name].file
             if file not in sessions:
                 sessions[file] = open_graph(bundle, file, threads=threads)
-            graphs[name] = FieldGraph(bundle, name, sessions[file])
+            graphs[name] = graph_of(bundle, name, sessions[file])
         noises: dict[CodecParameters, FrozenNoise] = {}
         node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES)
         fields = []

@@ -9,16 +9,20 @@ several frames (`CodecParameters.frame_cells`) in place of frames: late sound is
 take most of the time.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.cells import Axis
+from server.acoustics.geometry import yaws_of
 from server.core.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from server.scene.manifest import CodecParameters
 
@@ -90,52 +94,59 @@ class FieldGraph:
     Raises BundleError for a graph that does not fit the manifest.
     """
 
+    predicts_directions: ClassVar[bool] = False
+    _inputs: ClassVar[dict[str, list[int]]] = INPUTS
+
     def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
         entry = bundle.manifest.fields[name]
         self.name = name
         self.parameters: CodecParameters = entry.codec or bundle.manifest.codec
         self._session = session
         self._path = bundle.folder / entry.file
-        outputs = {output.name: output.type for output in session.get_outputs()}
-        self.gives_responses = RESPONSE in outputs
-        """Whether the graph gives impulse responses and not spectrograms."""
         self.channels = len(bundle.manifest.channels)
-        self._outputs = (RESPONSE,) if self.gives_responses else OUTPUTS[: 2 + self.channels]
+        outputs = {output.name: output.type for output in session.get_outputs()}
+        self.gives_responses = RESPONSE in outputs and entry.predicts == "ears"
+        """Whether the graph gives impulse responses and not spectrograms."""
         inputs = {given.name: given.shape[1:] for given in session.get_inputs()}
-        if inputs != INPUTS:
-            raise BundleError(self._path, "inputs", f"are {inputs}, expected {INPUTS} after the batch axis")
-        if any(outputs.get(output) != _TENSOR for output in self._outputs):
-            raise BundleError(
-                self._path,
-                "outputs",
-                f"are {outputs}, expected {_TENSOR} {OUTPUTS[: 2 + self.channels]}, or {RESPONSE} alone",
-            )
+        if inputs != self._inputs:
+            raise BundleError(self._path, "inputs", f"are {inputs}, expected {self._inputs} after the batch axis")
+        if any(outputs.get(output) != _TENSOR for output in self._shapes):
+            raise BundleError(self._path, "outputs", f"are {outputs}, expected {self._expected_outputs}")
         self._check_outputs(bundle)
 
     @property
     def path(self) -> Path:
         return self._path
 
-    def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> list[Float32]:
-        """Run the network for B poses: positions (B, 3), yaws (B,). Returns the outputs named in OUTPUTS (for one
-        channel without the last), or RESPONSE alone."""
-        return list(self._session.run(self._outputs, _feed(listeners, emitters, yaws)))
+    def through(self, filters: HeadFilters) -> "FieldGraph":  # noqa: ARG002  its ears are those of the data
+        """The same field heard through this head; the field itself if it predicts the ears of one head."""
+        return self
 
-    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+    def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> list[Float32]:
+        """Run the network for B poses: positions (B, 3), and heads as yaws (B,) or orientations (B, 4). Returns the
+        outputs in the order of the graph's contract."""
+        given = self._feed(listeners, emitters, heads)
+        return list(self._session.run(tuple(self._shapes), {name: given[name] for name in self._inputs}))
+
+    def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Predictions for every frame. Only for a graph that gives spectrograms."""
-        return self.predictions(listeners, emitters, yaws).spread(self.parameters.frame_axis)
+        return self.predictions(listeners, emitters, heads).spread(self.parameters.frame_axis)
 
-    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Spectrograms:
+    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Predictions as the graph gives them, per frame or per cell. Only for a graph that gives spectrograms."""
-        said = self.run(listeners, emitters, yaws)
+        return self.spectrograms_of(self.run(listeners, emitters, heads), heads)
+
+    def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:  # noqa: ARG002  for fields of any head
+        """Predictions from the outputs of `run` for these heads."""
+        said = list(outputs)
         if self.channels == 1:
             rows, _, *axes = said[0].shape
             said.append(np.zeros((rows, 2, *axes), np.float32))
         return Spectrograms(*said)
 
-    def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> Float32:
+    def impulse_responses(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Float32:
         """(B, channel, samples), aligned. Only for a graph that gives responses."""
-        return self.run(listeners, emitters, yaws)[0]
+        return self.run(listeners, emitters, heads)[0]
 
     def _check_outputs(self, bundle: Bundle) -> None:
         """Run the graph once, in the middle of the bounds, and check the shapes of its outputs."""
@@ -149,7 +160,7 @@ class FieldGraph:
             if values.shape != shape or not np.isfinite(values).all():
                 raise BundleError(self._path, output, f"has shape {values.shape}, expected {shape} and finite")
 
-    @property
+    @cached_property
     def _shapes(self) -> Mapping[str, tuple[int, ...]]:
         """The shape of each output for one pose."""
         if self.gives_responses:
@@ -157,15 +168,20 @@ class FieldGraph:
         codec, known = self.parameters.codec, self.parameters.known_frames
         every = (1, self.channels, codec.bins, self.parameters.columns)
         first = (1, self.channels, codec.bins, known)
-        return dict(zip(self._outputs, (every, first, first, every), strict=False))
+        # A single channel has no coherence.
+        return dict(zip(OUTPUTS[: 2 + self.channels], (every, first, first, every), strict=False))
 
+    @property
+    def _expected_outputs(self) -> str:
+        return f"{_TENSOR} {OUTPUTS[: 2 + self.channels]}, or {RESPONSE} alone"
 
-def _feed(listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike) -> dict[str, Float32]:
-    # guard: whole turns come off in double precision
-    return {
-        "listener": np.asarray(listeners, dtype=np.float32),
-        "emitter": np.asarray(emitters, dtype=np.float32),
-        # Subtract whole turns in double precision: in single precision, large angles lose their heading, or overflow.
-        "yaw": np.remainder(np.asarray(yaws, dtype=np.float64) + np.pi, 2 * np.pi).astype(np.float32)
-        - np.float32(np.pi),
-    }
+    @staticmethod
+    def _feed(listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> dict[str, Float32]:
+        # guard: whole turns come off in double precision
+        return {
+            "listener": np.asarray(listeners, dtype=np.float32),
+            "emitter": np.asarray(emitters, dtype=np.float32),
+            # Subtract whole turns in double precision: in single precision, large angles lose their heading, or
+            # overflow.
+            "yaw": np.remainder(yaws_of(heads) + np.pi, 2 * np.pi).astype(np.float32) - np.float32(np.pi),
+        }

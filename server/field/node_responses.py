@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from server.acoustics.geometry import Vector3
+from server.acoustics.geometry import Vector3, yaws_of
 from server.core.bounded_cache import BoundedCache
 from server.field.lattice import Neighbourhood, Node, Snapped, delay_response
 from server.field.response_source import Compute, Float32, Floats, ResponseSource
@@ -49,18 +49,18 @@ class NodeResponses(ResponseSource):
         self,
         listeners: Floats,
         emitters: Floats,
-        yaws: Floats,
+        heads: Floats,
         *,
         remember: bool = False,  # noqa: ARG002  a node's response does not depend on the one before it
     ) -> Float32:
-        found = [(self._at(node), later) for node, later in self._snapped(listeners, emitters, yaws)]
+        found = [(self._at(node), later) for node, later in self._snapped(listeners, emitters, heads)]
         responses = _POOL.floats(len(found), *found[0][0].shape)
         for (response, later), result in zip(found, responses, strict=True):
             delay_response(response, later, result)
         return responses
 
-    def computed_for(self, listeners: Floats, emitters: Floats, yaws: Floats) -> tuple[Floats, Floats, Floats]:
-        nodes = [node for node, _ in self._snapped(listeners, emitters, yaws)]
+    def computed_for(self, listeners: Floats, emitters: Floats, heads: Floats) -> tuple[Floats, Floats, Floats]:
+        nodes = [node for node, _ in self._snapped(listeners, emitters, heads)]
         return (
             np.array([node.listener for node in nodes]),
             np.array([node.emitter for node in nodes]),
@@ -92,8 +92,8 @@ class NodeResponses(ResponseSource):
             self._cache.put(key, response, response.nbytes)
         return response
 
-    def _snapped(self, listeners: Floats, emitters: Floats, yaws: Floats) -> list[Snapped]:
-        poses = zip(listeners.tolist(), emitters.tolist(), yaws.tolist(), strict=True)
+    def _snapped(self, listeners: Floats, emitters: Floats, heads: Floats) -> list[Snapped]:
+        poses = zip(listeners.tolist(), emitters.tolist(), yaws_of(heads).tolist(), strict=True)
         return [self._nodes.snap(_point(listener), _point(emitter), yaw) for listener, emitter, yaw in poses]
 
 

@@ -1,6 +1,7 @@
 """The interface through which a quality level gets responses: computed for each pose, or taken from nodes.
 
-Axes: B poses; responses (B, channel, sample). Metres, radians.
+Axes: B poses; responses (B, channel, sample). Metres, radians. Heads are orientations (B, 4) as quaternions x, y, z, w,
+or yaws (B,) of level heads.
 """
 
 from abc import ABC, abstractmethod
@@ -19,8 +20,8 @@ Floats = npt.NDArray[np.float64]
 class Compute(Protocol):
     """A function that computes responses with the network, in a new array."""
 
-    def __call__(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
-        """Compute responses for listeners (B, 3), emitters (B, 3) and yaws (B,). With `remember`, a warm phase starts
+    def __call__(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool = False) -> Float32:
+        """Compute responses for listeners (B, 3), emitters (B, 3) and heads. With `remember`, a warm phase starts
         from earlier responses."""
 
 
@@ -28,11 +29,11 @@ class ResponseSource(ABC):
     """The source of responses of one level in one scene. Safe to share between threads."""
 
     @abstractmethod
-    def responses(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
+    def responses(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool = False) -> Float32:
         """The responses (B, channel, sample), in a new array."""
 
     @abstractmethod
-    def computed_for(self, listeners: Floats, emitters: Floats, yaws: Floats) -> tuple[Floats, Floats, Floats]:
+    def computed_for(self, listeners: Floats, emitters: Floats, heads: Floats) -> tuple[Floats, Floats, Floats]:
         """The poses for which the network is run in place of these."""
 
     @abstractmethod

@@ -254,7 +254,7 @@ def _check_field(
             values = change_db(step.before, step.after) - laws.spreading_db(manifest, step.poses, step.moved)
             if len(values):
                 findings.append(_worst(law, graph.name, steps[what].poses, values, what))
-    if not graph.gives_responses:
+    if not graph.gives_responses and graph.parameters.known_frames:
         some = spread[:_CUT_POSES]
         share = laws.branch_cut_share(predictions.spectrograms(some).instantaneous_frequency)
         findings.append(Finding(BRANCH_CUT, graph.name, share, len(some)))

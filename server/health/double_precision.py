@@ -36,13 +36,14 @@ _Number = TypeVar("_Number", np.float64, np.complex128)
 class DoubleDecoder(Decoder):
     """A field's decoder in float64."""
 
-    def __init__(self, field: AcousticField) -> None:
+    def __init__(self, field: AcousticField, frames: int | None = None) -> None:
+        """`frames` are those before a tail of bands, if the field has one."""
         parameters = field.graph.parameters
         self.ir_samples = field.ir_samples
         self._codec = parameters.codec
         self._frame_axis = parameters.frame_axis
         self._phase = field.level.phase
-        self._used = field.level.frames or self._codec.frames
+        self._used = frames or field.level.frames or self._codec.frames
         self._known = min(parameters.known_frames, self._used)
         signal = _fitted(field.bundle.frozen_noise, self._codec.samples)
         self._white = self._codec.transform(signal) / np.sqrt(self._codec.window_energy)
@@ -137,7 +138,7 @@ class _DoubleField(AcousticField):
     def __init__(self, field: AcousticField) -> None:
         super().__init__(field.bundle, field.level, field.graph)
         if self._decoder is not None:
-            self._decoder = DoubleDecoder(field)
+            self._decoder = DoubleDecoder(field, None if self._tail is None else self._tail.early_frames)
         self._gate = DoubleGate(self._gate)
 
     def _placed(self, coded: _Float32, aligned: _Floats) -> _Float32:
@@ -203,7 +204,7 @@ class DoubleFullResponse(FullResponse):
     """`FullResponse` computed in float64."""
 
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
-        super().__init__(field if isinstance(field, Silence) else _DoubleField(field), filters)
+        super().__init__(field if isinstance(field, Silence) else _DoubleField(field.through(filters)), filters)
         paths = DoubleStillPaths(
             filters, speed_of_sound=field.bundle.manifest.speed_of_sound, air_db_per_m=self._air_db_per_m
         )

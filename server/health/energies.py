@@ -67,6 +67,6 @@ class Predictions:
         if self.graph.gives_responses:
             magnitude = np.abs(codec.transform(outputs[0])).astype(np.float32)
         else:
-            axis = self.graph.parameters.frame_axis
-            magnitude = codec.magnitude(outputs[0] if axis is None else outputs[0] @ axis.spread())
+            predicted = self.graph.spectrograms_of(outputs, poses[:, YAW])
+            magnitude = codec.magnitude(predicted.spread(self.graph.parameters.frame_axis).log_magnitude)
         return self.windows.energies(magnitude)

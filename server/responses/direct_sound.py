@@ -16,6 +16,7 @@ from server.acoustics.decibels import amplitude_to_db, db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
+from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.hrtf import HeadFilters, NoHead
 from server.rendering.limiter import CEILING
@@ -148,6 +149,10 @@ class DirectSound:
             outputs=outputs,
             has_head=has_head,
         )
+
+    def through_head(self, field: AcousticField) -> AcousticField:
+        """The field heard through the head of this direct sound."""
+        return field if self._filters is None else field.through(self._filters)
 
     def early(self, channels: int) -> EarlyReflections | None:
         """The first reflections for two ears, or for one channel without a head."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_power
-from server.acoustics.geometry import Pose
+from server.acoustics.geometry import Pose, Quaternion, orientations_of
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
@@ -31,7 +31,7 @@ class FullResponse:
 
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
         manifest = field.bundle.manifest
-        self.field = field
+        self.field = field.through(filters)
         self._filters = filters
         self._air_db_per_m = manifest.air.absorption_db_per_m
         self._paths = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
@@ -52,16 +52,17 @@ class FullResponse:
         return self.field.sample_rate
 
     def impulse_responses(
-        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, yaws: npt.ArrayLike
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike
     ) -> npt.NDArray[np.float32]:
         """Return responses (B, channel, ir_samples); sample 0 is the moment of emission, and 1 is unit pressure at one
-        metre."""
-        listeners, emitters, yaws = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, yaws))
-        responses = self.field.impulse_responses(listeners, emitters, yaws)
+        metre. Heads are yaws (B,) of level heads, or orientations (B, 4)."""
+        listeners, emitters, heads = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
+        responses = self.field.impulse_responses(listeners, emitters, heads)
         if self.bundle.manifest.direct_sound == "field":
             return responses
-        for response, listener, emitter, yaw in zip(responses, listeners, emitters, yaws, strict=True):
-            head = Pose.from_yaw(tuple(listener), float(yaw))
+        orientations = orientations_of(heads)
+        for response, listener, emitter, orientation in zip(responses, listeners, emitters, orientations, strict=True):
+            head = Pose(tuple(listener), Quaternion(*orientation))
             paths = self._paths.find(listener, emitter[None])
             self._direct.add(paths.length_m, paths.arrival, paths.screen_db, head.orientation, response)
             if self._early is not None:

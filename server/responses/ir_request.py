@@ -80,6 +80,7 @@ def composed_irs(
     """Return responses (B, channel, sample) with the parts that the emitters' effects call for. The field computes only
     those of emitters with `late` on. `remember` is as in `AcousticField.impulse_responses`."""
     count = len(emitters)
+    field = direct.through_head(field)
     held = _held(field, direct, listener, emitters, remember=remember)
     if direct.binauralization is not None:
         places = [emitter.pose.position for emitter in emitters]
@@ -110,9 +111,10 @@ def _held(
     channels = 2 if direct.binauralization is None else 1
     if not late:
         return np.zeros((len(emitters), channels, field.ir_samples), np.float32)
-    heads = np.tile(np.asarray(listener.position), (len(late), 1))
+    ears = np.tile(np.asarray(listener.position), (len(late), 1))
     places = np.array([emitters[row].pose.position for row in late])
-    answer = field.impulse_responses(heads, places, np.full(len(late), listener.yaw), remember=remember)
+    heads = np.tile(np.asarray(listener.orientation), (len(late), 1))
+    answer = field.impulse_responses(ears, places, heads, remember=remember)
     if direct.field_gain != 1.0:
         answer *= np.float32(direct.field_gain)
     if len(late) == len(emitters):

@@ -1,10 +1,13 @@
 """`scene.json`, the manifest of a scene bundle.
 
-Since format 2 the fields of a bundle hold the reflected field only, and the server computes the direct sound from
-geometry. With `image_order` 1 the server also computes the early reflections, and the fields hold only the late
-reverberation. Measured responses cannot be separated like that: with `direct_sound` "field" the fields hold everything,
-for one microphone or two ears. If the walls of such a place are unknown, there is no `geometry`, and the place is the
-box of `bounds`.
+A field predicts what arrives at the ears of one head, or what arrives from each direction, from which the server
+computes what any head hears. Only bundles with a field of directions have format 3; all others have format 2.
+
+The fields of a bundle hold the reflected field only, and the server computes the direct sound from geometry. With
+`image_order` 1 the server also computes the early reflections, and the fields hold only the late reverberation.
+Responses that were measured cannot be separated like that: with `direct_sound` "field" the fields hold everything, for
+one microphone or two ears. If the walls of such a place are unknown, there is no `geometry`, and the place is the box
+of `bounds`.
 """
 
 from collections.abc import Mapping
@@ -12,13 +15,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
 
 from server.acoustics.air import absorption_db_per_m
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
+from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.scene.effects import EffectName
 from server.scene.geometry import Finite, Geometry, Point, Strict
 from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
@@ -26,7 +30,9 @@ from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ,
 ARRAYS_FILE = "arrays.npz"
 NO_FIELD = "none"
 """Name of the field in the only level of a scene without fields."""
-FORMAT_VERSION: Literal[2] = 2
+EARS_FORMAT: Literal[2] = 2
+DIRECTIONS_FORMAT: Literal[3] = 3
+"""The format of a bundle with a field that predicts directions."""
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -119,12 +125,32 @@ class CodecParameters(Strict):
 
 class FieldFile(Strict):
     """One trained network: its ONNX file, the rank of its output basis if it has one, and its `codec` if that differs
-    from the bundle's."""
+    from the bundle's.
+
+    ears: the field predicts spectrograms at the ears of one head, or its response. directions: it predicts the power
+    that arrives per octave band, and from where, in spherical harmonics up to `order`.
+    """
 
     file: FileName
     architecture: str
     rank: Annotated[int, Field(ge=1)] | None = None
     codec: CodecParameters | None = None
+    predicts: Literal["ears", "directions"] = "ears"
+    order: Annotated[int, Field(ge=0, le=HIGHEST_ORDER)] | None = None
+
+    @model_validator(mode="after")
+    def _has_an_order_if_it_has_directions(self) -> "FieldFile":
+        if (self.predicts == "directions") != (self.order is not None):
+            raise ValueError("order: a field that predicts directions has one, any other has none")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_what_format_2_lacks(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+        document: dict[str, object] = write(self)
+        if self.predicts == "ears":
+            document.pop("predicts", None)
+            document.pop("order", None)
+        return document
 
 
 class Phase(Strict):
@@ -205,7 +231,10 @@ class QualityLevel(Strict):
 
     With `frames` only that many frames of a response are computed, and the rest is silent. An emitter gets at most
     `ir_rate_hz` responses per second or, without that, one for every pose. With `shared_tail` all emitters of a
-    listener share one late reverberation. With `reuse` poses near each other share responses.
+    listener share one late reverberation. With `reuse` poses near each other share responses. `tail` is how the end of
+    a response is made: as its beginning, by an inverse transform of spectrograms (stft), or from frozen noises in
+    octave bands, whose gains follow the prediction (bands; for fields of directions). `order` is the highest order of
+    the directions' harmonics that is used; by default, all are.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
@@ -215,8 +244,19 @@ class QualityLevel(Strict):
     reuse: Reuse | None = None
     ir_rate_hz: Positive | None = None
     shared_tail: bool = False
+    tail: Literal["stft", "bands"] = "stft"
+    order: Annotated[int, Field(ge=0, le=HIGHEST_ORDER)] | None = None
     accuracy: Accuracy | None = None
     cost: Cost | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_what_format_2_lacks(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+        document: dict[str, object] = write(self)
+        if self.tail == "stft":
+            document.pop("tail", None)
+        if self.order is None:
+            document.pop("order", None)
+        return document
 
 
 class FrontierPoint(Strict):
@@ -252,7 +292,8 @@ class AcceptedLaw(Strict):
 class Manifest(Strict):
     """The content of `scene.json`."""
 
-    format_version: Literal[2] = FORMAT_VERSION
+    format_version: Literal[2, 3] = EARS_FORMAT
+    """3 if a field predicts directions, else 2."""
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
     """Identifier by which clients ask for the scene."""
     name: str
@@ -310,12 +351,35 @@ class Manifest(Strict):
                 raise ValueError(f"fields.{name}.file: {field.file} is not listed in files")
             if field.codec is not None and field.codec.sample_rate != self.codec.sample_rate:
                 raise ValueError(f"fields.{name}.codec.sample_rate: must be the scene's, {self.codec.sample_rate}")
+            if field.predicts == "directions" and (field.codec or self.codec).known_frames:
+                raise ValueError(f"fields.{name}.codec.known_frames: must be 0, directions have no phase")
+        has_directions = any(field.predicts == "directions" for field in self.fields.values())
+        expected = DIRECTIONS_FORMAT if has_directions else EARS_FORMAT
+        if self.format_version != expected:
+            raise ValueError(f"format_version: is {self.format_version}, but fields like these make it {expected}")
+        if has_directions and (len(self.channels) == 1 or self.direct_sound == "field"):
+            raise ValueError("fields: directions are those of late reverberation; the direct sound is from geometry")
         if not self.fields:
             return self._has_no_field()
         for level in self.levels:
             if level.field not in self.fields:
                 raise ValueError(f"levels.{level.name}.field: there is no field {level.field}")
-            codec = (self.fields[level.field].codec or self.codec).codec
+            field = self.fields[level.field]
+            if field.predicts == "directions" and (level.reuse is not None or level.phase.kind == "integrated"):
+                raise ValueError(
+                    f"levels.{level.name}: a field of directions is heard anew at every pose and predicts no phase; "
+                    "leave out reuse, and take another phase than integrated"
+                )
+            if level.order is not None and (field.order is None or level.order > field.order):
+                has = "no directions" if field.order is None else f"order {field.order}"
+                raise ValueError(f"levels.{level.name}.order: is {level.order}, but field {level.field} has {has}")
+            if level.tail == "bands" and (
+                field.predicts == "ears" or level.frames is not None or level.phase.kind != "frozen"
+            ):
+                raise ValueError(
+                    f"levels.{level.name}.tail: bands are for fields of directions, with frozen phase and all frames"
+                )
+            codec = (field.codec or self.codec).codec
             if level.frames is not None and level.frames > codec.frames:
                 raise ValueError(f"levels.{level.name}.frames: the field has {codec.frames}")
         if len({level.name for level in self.levels}) < len(self.levels):
@@ -327,6 +391,10 @@ class Manifest(Strict):
     def _has_no_field(self) -> "Manifest":
         if len(self.levels) > 1 or self.levels[0].field != NO_FIELD or self.levels[0].reuse is not None:
             raise ValueError(f"levels: a scene without fields has one level, of field {NO_FIELD!r}")
+        if self.levels[0].tail != "stft":
+            raise ValueError(f"levels.{self.levels[0].name}.tail: bands are for fields of directions")
+        if self.levels[0].order is not None:
+            raise ValueError(f"levels.{self.levels[0].name}.order: a scene without fields has no directions")
         if self.direct_sound == "field":
             raise ValueError("direct_sound: there is no field that could hold it")
         return self

@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import json
 import re
@@ -15,8 +16,12 @@ from starlette.testclient import TestClient
 from server.api import app
 from server.api.app import create_app
 from server.api.settings import Settings
+from server.assets.hrtfs import HrtfLibrary
+from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.responses.impulse_response import ImpulseResponse, IrQuery
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.responses.impulse_response import MEDIA_TYPES, ImpulseResponse, IrQuery
+from tests.directional_flat import write_directional
 from tests.killing import kill, threads_may_die
 
 IR = "/v1/scenes/flat/impulse-response"
@@ -145,6 +150,73 @@ def test_an_impulse_response_is_what_the_command_line_would_write(shared_client,
     np.testing.assert_array_equal(samples.T, expected.samples)
 
 
+@pytest.fixture
+def directional_client(tmp_path):
+    field = AcousticField.load(write_directional(tmp_path / "flat"))
+    heads = HrtfLibrary((), [24_000])
+    heads._filters[("small", 24_000)] = small_head()
+    heads.names = ("kemar", "small")
+    with TestClient(create_app(Settings(), scenes={"flat": FieldsByLevel([field])}, hrtfs=heads)) as client:
+        wait_until_ready(client)
+        client.field = field
+        yield client
+
+
+def small_head():
+    head = Hrtf.read(KEMAR, 24_000)
+    return HeadFilters.from_hrtf(dataclasses.replace(head, impulse_responses=0.5 * head.impulse_responses))
+
+
+@pytest.mark.parametrize("name", ["wav", "npy", "json", "sofa"])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"yaw_deg": 30.0, "pitch_deg": -20.0, "roll_deg": 10.0},
+        {"orientation": "0.1,0.2,0.3,0.4"},
+        {"output": "ambisonics"},
+        {"output": "ambisonics", "order": 3, "pitch_deg": 90.0},
+        {"output": "mono"},
+        {"output": "binaural", "hrtf": "kemar"},
+    ],
+)
+def test_every_output_is_what_the_query_computes(directional_client, asked, name):
+    field = directional_client.field
+    expected = ImpulseResponse.compute(field, IrQuery.of(field, *PLACES.values(), **asked))
+    response = directional_client.get(IR, params={**PLACES, **asked, "format": name})
+    assert response.status_code == 200
+    assert response.content == expected.encode(name)
+    assert response.headers["content-type"] == MEDIA_TYPES[name]
+    again = directional_client.get(
+        IR, params={**PLACES, **asked, "format": name}, headers={"If-None-Match": response.headers["etag"]}
+    )
+    assert again.status_code == 304
+
+
+def test_another_head_has_another_response_and_tag(directional_client):
+    usual, small = (
+        directional_client.get(IR, params={**PLACES, "hrtf": hrtf, "format": "npy"}) for hrtf in ("kemar", "small")
+    )
+    assert usual.headers["etag"] != small.headers["etag"]
+    one, other = (np.load(io.BytesIO(answer.content)) for answer in (usual, small))
+    np.testing.assert_allclose(np.sum(other**2), np.sum(one**2) / 4, rtol=0.01)
+
+
+def test_every_parameter_has_its_tag(directional_client):
+    asked = [
+        {},
+        {"pitch_deg": 1},
+        {"roll_deg": 1},
+        {"orientation": "0,0,1,1"},
+        {"hrtf": "small"},
+        {"output": "mono"},
+        {"output": "ambisonics"},
+        {"output": "ambisonics", "order": 2},
+        {"format": "sofa"},
+    ]
+    tags = {directional_client.head(IR, params={**PLACES, **each}).headers["etag"] for each in asked}
+    assert len(tags) == len(asked)
+
+
 def test_what_a_client_has_is_not_sent_again(client, field):
     first = client.get(IR, params=PLACES)
     assert first.headers["cache-control"].startswith("public, max-age=")
@@ -182,6 +254,20 @@ def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_a
         (IR, {**PLACES, "listener": "١,2,1.5"}, 422, "malformed_pose", "listener"),
         (IR, {**PLACES, "yaw_deg": "1_0"}, 422, "malformed_pose", "yaw_deg"),
         (IR, {**PLACES, "yaw_deg": "٩"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "pitch_deg": "up"}, 422, "malformed_pose", "pitch_deg"),
+        (IR, {**PLACES, "roll_deg": "1e9"}, 422, "malformed_pose", "roll_deg"),
+        (IR, {**PLACES, "orientation": "0,0,0,0"}, 422, "malformed_pose", "orientation"),
+        (IR, {**PLACES, "orientation": "0,0,1"}, 422, "malformed_pose", "orientation"),
+        (IR, {**PLACES, "orientation": "0,0,inf,1"}, 422, "malformed_pose", "orientation"),
+        (IR, {**PLACES, "orientation": "0,0,1,1", "yaw_deg": 0}, 409, "contradicting_parameters", "orientation"),
+        (IR, {**PLACES, "hrtf": "moomin"}, 404, "unknown_hrtf", "hrtf"),
+        (IR, {**PLACES, "hrtf": "kemar", "output": "mono"}, 409, "contradicting_parameters", "hrtf"),
+        (IR, {**PLACES, "output": "stereo"}, 422, "unknown_output", "output"),
+        (IR, {**PLACES, "output": "ambisonics"}, 409, "no_directions", "output"),
+        (IR, {**PLACES, "order": 1}, 409, "contradicting_parameters", "order"),
+        (IR, {**PLACES, "output": "ambisonics", "order": 4}, 422, "malformed_request", "order"),
+        (IR, {**PLACES, "output": "ambisonics", "order": "first"}, 422, "malformed_request", "order"),
+        (IR, {**PLACES, "output": "ambisonics", "order": "1.5"}, 422, "malformed_request", "order"),
         (IR, {**PLACES, "level": "finest"}, 404, "unknown_level", "level"),
         ("/v1/scenes/flat/plan", {"effect": ["hrtf=on", "hrtf=off"]}, 409, "doubled_effect", "effect"),
         (IR, {**PLACES, "yaw_deg": "north"}, 422, "malformed_pose", "yaw_deg"),

@@ -10,7 +10,7 @@ from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset, Measurement
 from training.learning.runs import Configuration, NafRecipe
 from training.learning.train import load_learner, train
-from training.models.factorised import FieldShape
+from training.models.encoders import FieldShape
 from training.models.naf import NafShape
 
 RATE, SAMPLES = 8_000, 1_200

@@ -15,7 +15,8 @@ from server.field.graph import INPUTS, OUTPUTS
 from server.field.runtime import open_session
 from training.bundling.graphs import to_int8, to_onnx
 from training.models.cells import Cells
-from training.models.factorised import ExportedField, FactorisedField, FieldShape
+from training.models.encoders import FieldShape
+from training.models.factorised import ExportedField, FactorisedField
 
 PLAN = FloorPlan(((0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)), 2.5)
 DB = 20 / np.log(10)

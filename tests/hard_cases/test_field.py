@@ -19,7 +19,7 @@ from server.health.poses import EMITTER, LISTENER, YAW, allowed, corners, scatte
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.manifest import Phase
 from tests.damaged_field import write_ill_in_the_east
-from training.models.factorised import FeatureGrid
+from training.models.encoders import FeatureGrid
 from training.models.local_geometry import GaussianGrid, OrientationEmbedding
 from training.models.propagation import Propagation
 

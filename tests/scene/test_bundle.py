@@ -57,7 +57,8 @@ def test_missing_file_is_named(bundle_copy, name):
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
-        ({"format_version": 3}, "format_version"),
+        ({"format_version": 4}, "format_version"),
+        ({"format_version": 3}, "format_version: is 3, but fields like these make it 2"),
         ({"format_version": 1}, "format_version: .*train and export the scene anew"),
         ({"air": {"relative_humidity": 50}}, "air"),
         ({"speed_of_sound": -1}, "speed_of_sound"),

@@ -20,7 +20,7 @@ from training.data.responses import SimulatedResponses
 from training.data.scene_file import SceneFile
 from training.learning.runs import Configuration
 from training.learning.train import train
-from training.models.factorised import FieldShape
+from training.models.encoders import FieldShape
 from training.simulation.run import simulate
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation

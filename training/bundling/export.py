@@ -18,6 +18,7 @@ from torch import nn
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.core.errors import NafirError
+from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
 from server.field.graph import INPUTS, OUTPUTS, RESPONSE
 from server.field.runtime import open_session
 from server.health.check import Effort, Health, check, check_fields
@@ -32,12 +33,17 @@ from training.bundling.manifests import Fields, measured_manifest, simulated_man
 from training.bundling.noise import choose_noise
 from training.bundling.shaped_graph import ShapedNearestGraph
 from training.data.responses import FILE, ImportedDataset, ResponseSet, SimulatedResponses
+from training.learning.basis import BasisLearner
+from training.learning.directional import DirectionalLearner
 from training.learning.factorised import FactorisedLearner
 from training.learning.learner import Learner
 from training.learning.naf import NafLearner
 from training.learning.runs import Configuration
 from training.learning.train import load_learner
-from training.models.factorised import GEOMETRY, ExportedField
+from training.models.basis_field import BasisField
+from training.models.directional import ExportedDirections
+from training.models.encoders import GEOMETRY
+from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
 from training.models.targets import LEAD_SAMPLES, codec_of
@@ -50,14 +56,15 @@ SHAPED_NEAREST = "shaped-nearest"
 EFFORT = Effort()
 """The effort of the health check that a bundle must pass."""
 
-_CHECK_POSES = {"factorised": 64, "naf": 2, SHAPED_NEAREST: 8}
+_OF_A_BASIS = ("factorised", "directional")
+_CHECK_POSES = {**dict.fromkeys(_OF_A_BASIS, 64), "naf": 2, SHAPED_NEAREST: 8}
 _INT8_LEAST_WEIGHTS = 100_000
 _TRUNCATION_POSES = 3000
 # Rounding of weights is the only difference. Phases of uncertain bins may change, so frequency is compared where phase
 # is certain. Tolerances are for the largest difference in float32 (float16 weights), and the root mean square in int8.
 _TOLERANCES: dict[Precision, dict[str, float]] = {
-    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, RESPONSE: 1e-3},
-    "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, RESPONSE: 0.05},
+    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, DIRECTIONS: 0.02, RESPONSE: 1e-3},
+    "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, DIRECTIONS: 0.05, RESPONSE: 0.05},
 }
 _PHASE_TOLERANCE: dict[Precision, float] = {"float32": 0.05, "int8": 0.2}
 TABLED_TOLERANCE = 1e-4
@@ -70,7 +77,7 @@ class ExportError(NafirError):
 
 @dataclass(frozen=True)
 class _Variants:
-    """The forms in which each run is written: `ranks` for factorised fields, `exact_tables` for a `naf`."""
+    """The forms in which each run is written: `ranks` for fields with a basis, `exact_tables` for a `naf`."""
 
     precisions: Sequence[Precision]
     ranks: Sequence[int]
@@ -79,13 +86,14 @@ class _Variants:
 
 @dataclass(frozen=True)
 class _Exported:
-    """A checked graph and what the manifest says about it."""
+    """A checked graph and what the manifest says about it; `order` if it predicts directions."""
 
     name: str
     model: onnx.ModelProto
     architecture: str
     rank: int | None
     codec: CodecParameters
+    order: int | None = None
 
 
 def export(
@@ -100,15 +108,15 @@ def export(
     progress: Progress | None = None,
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision. The first field is the
-    default. Factorised fields are also written at each lower one of `ranks`, with the least loss. With `exact_tables`,
-    a `naf` is also written with less arithmetic for the same numbers. In place of a run, the folder of measured
-    responses stands for the field that needs no training, `ShapedNearest`, in one precision.
+    default. Factorised and directional fields are also written at each lower one of `ranks`, with the least loss. With
+    `exact_tables`, a `naf` is also written with less arithmetic for the same numbers. In place of a run, the folder of
+    measured responses stands for the field that needs no training, `ShapedNearest`, in one precision.
 
     Fields of a simulated scene leave direct sound and first reflections to the server. Fields of measured responses
-    include them, and so does `naf-whole`. If the first field of a simulated scene is factorised, the best of several
-    draws of frozen noise is chosen (`training.bundling.noise`); otherwise the noise is the first draw.
+    include them, and so does `naf-whole`. If the first field of a simulated scene is factorised or directional, the
+    best of several draws of frozen noise is chosen (`training.bundling.noise`); otherwise the noise is the first draw.
 
-    The name of a factorised field includes its width if that differs from the first one's.
+    The name of a factorised or directional field includes its width if that differs from the first one's.
 
     The fields are checked against the laws of `nafir check`, some of them relative to the data
     (`training.bundling.data_reference`), before the noise is chosen. `accepted` gives reasons, by name of a law, to
@@ -142,7 +150,7 @@ def export(
         found = check_fields(bundle, EFFORT)
         # guard: ill bundles are not exported
         found.health.require()
-        if isinstance(responses, SimulatedResponses) and exported[0].architecture == "factorised":
+        if isinstance(responses, SimulatedResponses) and exported[0].architecture in _OF_A_BASIS:
             files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
             bundle = write_bundle(Path(trial), manifest, files)
         health = check(bundle, EFFORT, fields=found)
@@ -158,8 +166,8 @@ def _graphs(
     for field, place in zip(fields, places, strict=True):
         if isinstance(field, ImportedDataset):
             exported.append(_shaped(field))
-        elif isinstance(field, FactorisedLearner):
-            exported += _factorised(field, Configuration.read(place), variants, _usual_width(fields))
+        elif isinstance(field, BasisLearner):
+            exported += _of_a_basis(field, Configuration.read(place), variants, _usual_width(fields))
         elif isinstance(field, NafLearner):
             exported += _naf(field, Configuration.read(place), variants)
         else:
@@ -169,8 +177,8 @@ def _graphs(
 
 
 def _usual_width(fields: Sequence[Learner | ImportedDataset]) -> int:
-    """The width of the first factorised field, which names leave out; 0 if there is none."""
-    return next((field.field.width for field in fields if isinstance(field, FactorisedLearner)), 0)
+    """The width of the first field with a basis, which names leave out; 0 if there is none."""
+    return next((field.field.width for field in fields if isinstance(field, BasisLearner)), 0)
 
 
 def _contents(exported: Sequence[_Exported], precision: Precision, seed: int) -> tuple[dict[str, bytes], Fields]:
@@ -186,6 +194,8 @@ def _contents(exported: Sequence[_Exported], precision: Precision, seed: int) ->
             architecture=each.architecture,
             rank=each.rank,
             codec=None if each.codec == codec else each.codec,
+            predicts="ears" if each.order is None else "directions",
+            order=each.order,
         )
         for title, each in zip(titles, exported, strict=True)
     }
@@ -234,15 +244,17 @@ def _opened(responses: ResponseSet, place: Path) -> Learner | ImportedDataset:
 def _name_of(field: Learner | ImportedDataset, place: Path, usual_width: int) -> str:
     if isinstance(field, ImportedDataset):
         return SHAPED_NEAREST
-    if isinstance(field, FactorisedLearner):
-        return _factorised_name(len(field.field.basis), field.field.width, usual_width)
-    return Configuration.read(place).name
+    configuration = Configuration.read(place)
+    if isinstance(field, BasisLearner):
+        return _sized_name(configuration.name, field.field, usual_width)
+    return configuration.name
 
 
-def _factorised_name(rank: int, width: int, usual_width: int) -> str:
-    """The name of a factorised field. It includes the width if that differs from the width of the bundle's first
-    factorised field."""
-    return f"factorised-r{rank}" if width == usual_width else f"factorised-w{width}-r{rank}"
+def _sized_name(kind: str, field: BasisField, usual_width: int) -> str:
+    """The name of a field with a basis. It includes the width if that differs from the width of the bundle's first such
+    field."""
+    rank = len(field.basis)
+    return f"{kind}-r{rank}" if field.width == usual_width else f"{kind}-w{field.width}-r{rank}"
 
 
 def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
@@ -255,8 +267,8 @@ def _hold_direct_sound(fields: Sequence[Learner | ImportedDataset]) -> bool:
 
 def _require_used(fields: Sequence[Learner | ImportedDataset], variants: _Variants) -> None:
     """Raises ExportError for options that apply to none of the fields."""
-    if variants.ranks and not any(isinstance(field, FactorisedLearner) for field in fields):
-        raise ExportError("ranks: none of the runs is a factorised field, and other fields have none; leave it out")
+    if variants.ranks and not any(isinstance(field, BasisLearner) for field in fields):
+        raise ExportError("ranks: none of the runs is a field with a basis, and other fields have none; leave it out")
     if variants.exact_tables and not any(isinstance(field, NafLearner) for field in fields):
         raise ExportError("exact-tables: none of the runs is a naf, and other fields have none; leave it out")
     if list(variants.precisions) != ["float32"] and all(isinstance(field, ImportedDataset) for field in fields):
@@ -268,29 +280,49 @@ def _require_different(names: list[str]) -> None:
         raise ExportError(f"{', '.join(sorted(duplicates))}: more than one run makes a field of that name")
 
 
-def _factorised(
-    learner: FactorisedLearner, configuration: Configuration, variants: _Variants, usual_width: int
+@dataclass(frozen=True)
+class _Form:
+    """How fields of one kind with a basis become graphs."""
+
+    module: type[ExportedField | ExportedDirections]
+    inputs: int
+    outputs: tuple[str, ...]
+    known_frames: int
+    order: int | None
+
+
+def _form_of(learner: BasisLearner) -> _Form:
+    if isinstance(learner, FactorisedLearner):
+        return _Form(ExportedField, 3, _outputs(learner), learner.cells.known_frames, None)
+    if isinstance(learner, DirectionalLearner):
+        order = learner.recipe.order
+        return _Form(ExportedDirections, 2, (LOG_MAGNITUDE, DIRECTIONS)[: 1 + (order > 0)], 0, order)
+    raise TypeError(f"{type(learner)} has no graph")
+
+
+def _of_a_basis(
+    learner: BasisLearner, configuration: Configuration, variants: _Variants, usual_width: int
 ) -> list[_Exported]:
-    """All graphs of a factorised field's run, each checked."""
-    cells, whole = learner.cells, learner.field
-    trained_at = _tensors(_poses(learner.responses, _TRUNCATION_POSES, configuration.seed), _TRUNCATION_POSES)
+    """All graphs of a run of a factorised or directional field, each checked."""
+    form, cells, whole, kind = _form_of(learner), learner.cells, learner.field, configuration.name
+    trained_at, poses = (
+        _poses(learner.responses, count, configuration.seed)[: form.inputs]
+        for count in (_TRUNCATION_POSES, _CHECK_POSES[kind])
+    )
     lower = sorted({rank for rank in variants.ranks if rank < len(whole.basis)}, reverse=True)
-    poses = _poses(learner.responses, _CHECK_POSES["factorised"], configuration.seed)
-    codec = _codec_parameters(cells.codec, cells.known_frames, cells.all_frames)
-    outputs = _outputs(learner)
-    traced = to_onnx(ExportedField(whole, cells).eval(), _tensors(poses, 2), outputs)
+    codec = _codec_parameters(cells.codec, form.known_frames, cells.all_frames)
+    traced = to_onnx(form.module(whole, cells).eval(), _tensors(poses, 2), form.outputs)
     exported = []
-    for field in (whole, *(whole.truncated(rank, *trained_at) for rank in lower)):
-        rank = len(field.basis)
-        module = ExportedField(field, cells).eval()
+    for field in (whole, *(whole.truncated(rank, *_tensors(trained_at, _TRUNCATION_POSES)) for rank in lower)):
+        module = form.module(field, cells).eval()
         graph = traced if field is whole else with_weights(traced, module)
         for precision in variants.precisions:
             least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
             small = to_int8(graph, least_weights=least_weights, exact=GEOMETRY) if precision == "int8" else graph
             model = halve_weights(small, exact=GEOMETRY)
-            _check(model, module, poses, outputs, precision)
-            name = f"{_factorised_name(rank, field.width, usual_width)}{_suffix(precision)}"
-            exported.append(_Exported(name, model, "factorised", rank, codec))
+            _check(model, module, poses, form.outputs, precision)
+            name = f"{_sized_name(kind, field, usual_width)}{_suffix(precision)}"
+            exported.append(_Exported(name, model, kind, len(field.basis), codec, form.order))
     return exported
 
 
@@ -371,7 +403,7 @@ def _check(
     precision: Precision,
 ) -> None:
     session = open_session(model.SerializeToString())
-    found = dict(zip(outputs, session.run(list(outputs), dict(zip(INPUTS, poses, strict=True))), strict=True))
+    found = dict(zip(outputs, session.run(list(outputs), dict(zip(INPUTS, poses, strict=False))), strict=True))
     with torch.no_grad():
         # One pose at a time, because a batch of `naf` would not fit into memory.
         rows = [module(*(torch.from_numpy(part[row : row + 1]) for part in poses)) for row in range(len(poses[0]))]

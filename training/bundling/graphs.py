@@ -21,18 +21,20 @@ _HALVE_ABOVE_BYTES = 16_384
 def to_onnx(
     module: nn.Module, poses: tuple[torch.Tensor, ...], outputs: tuple[str, ...], *, free_batch: bool = True
 ) -> onnx.ModelProto:
-    """The graph without metadata. Its batch axis is free, or has the length of that of the poses."""
+    """The graph without metadata. Its batch axis is free, or has the length of that of the poses. A graph without yaw
+    has the first two inputs only."""
+    inputs = list(INPUTS)[: len(poses)]
     batch = torch.export.Dim("batch")
     with warnings.catch_warnings():
-        # Warnings of PyTorch's exporter about its own pytrees, and about the name that all three batch axes share.
+        # Warnings of PyTorch's exporter about its own pytrees, and about the name that all batch axes share.
         warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
         warnings.filterwarnings("ignore", r"# The axis name: batch will not be used", UserWarning)
         program = torch.onnx.export(
             module,
             poses,
-            input_names=list(INPUTS),
+            input_names=inputs,
             output_names=list(outputs),
-            dynamic_shapes={name: {0: batch} for name in INPUTS} if free_batch else None,
+            dynamic_shapes={name: {0: batch} for name in inputs} if free_batch else None,
             opset_version=_OPSET,
             dynamo=True,
             verbose=False,

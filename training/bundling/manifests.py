@@ -10,7 +10,16 @@ import numpy as np
 from server.acoustics.decibels import power_to_db
 from server.scene.effects import EffectName
 from server.scene.geometry import Point
-from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
+from server.scene.manifest import (
+    DIRECTIONS_FORMAT,
+    EARS_FORMAT,
+    Bounds,
+    CodecParameters,
+    FieldFile,
+    Manifest,
+    QualityLevel,
+    Start,
+)
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.responses import ImportedDataset, ResponsesError, SimulatedResponses
 
@@ -32,6 +41,7 @@ class Fields:
 def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: bool = False) -> Manifest:
     """The manifest of a simulated scene. `whole`: the fields include direct sound and first reflections."""
     scene = responses.dataset.scene
+    has_directions = any(field.predicts == "directions" for field in fields.fields.values())
     low, high = np.min(scene.geometry.corners, axis=0), np.max(scene.geometry.corners, axis=0)
     return Manifest(
         id=scene.id,
@@ -49,6 +59,7 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: 
         transmission=responses.dataset.effects.transmission,
         start=scene.start,
         effects={name: scene.effects[name] for name in EffectName if name in scene.effects},
+        format_version=DIRECTIONS_FORMAT if has_directions else EARS_FORMAT,
         codec=fields.codec,
         fields=fields.fields,
         levels=fields.levels,

@@ -19,7 +19,8 @@ from rich.progress import Progress
 from server.acoustics.phase import FrozenNoise
 from server.core.errors import FieldError
 from server.field.field import AcousticField
-from server.field.graph import FieldGraph, open_graph
+from server.field.graph import open_graph
+from server.field.graphs import graph_of
 from server.scene.bundle import Bundle
 from training.data.dataset import Dataset
 from training.frontier.accuracy import Estimate, SampledPairs, Scores
@@ -42,7 +43,7 @@ def choose_noise(
     manifest = bundle.manifest
     codec = manifest.codec.codec
     level = manifest.levels[0]
-    graph = FieldGraph(bundle, level.field, open_graph(bundle, manifest.fields[level.field].file))
+    graph = graph_of(bundle, level.field, open_graph(bundle, manifest.fields[level.field].file))
     sample = SampledPairs(dataset, codec, pairs=_PAIRS, yaws=_YAWS, seed=seed, held_out=False)
     draws = [even_noise(codec, draw) for draw in np.random.default_rng([seed, 6]).spawn(DRAWS)]
     fields = [AcousticField(bundle, level, graph, FrozenNoise.from_signal(codec, noise)) for noise in draws]

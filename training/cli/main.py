@@ -74,13 +74,19 @@ def train(
     data: Annotated[Path, typer.Argument(help="Dataset folder from simulate or import.")],
     output: Folder,
     field: Annotated[
-        str, typer.Option(help="factorised, naf, naf-whole, naf-dual, naf-no-grid or naf-time-domain.")
+        str, typer.Option(help="factorised, directional, naf, naf-whole, naf-dual, naf-no-grid or naf-time-domain.")
     ] = "factorised",
     rank: Annotated[
-        int | None, typer.Option(min=16, max=256, help="Size of a factorised field's basis; 128 if not given.")
+        int | None,
+        typer.Option(min=16, max=256, help="Size of the field's basis, if it has one; 128 if not given."),
     ] = None,
     width: Annotated[
-        int | None, typer.Option(min=32, max=4096, help="Width of a factorised field's network; 256 if not given.")
+        int | None,
+        typer.Option(min=32, max=4096, help="Width of a field with a basis; 256 if not given."),
+    ] = None,
+    order: Annotated[
+        int | None,
+        typer.Option(min=0, max=3, help="Order of a directional field's spherical harmonics; 2 if not given."),
     ] = None,
     seed: Seed = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="Passes over the training set.")] = None,
@@ -118,6 +124,7 @@ def train(
         field,
         rank=rank,
         width=width,
+        order=order,
         points=points,
         teacher=teacher,
         seed=seed,

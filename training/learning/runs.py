@@ -13,7 +13,7 @@ import torch
 
 from server.core.errors import NafirError
 from training.data.responses import ResponseSet, SimulatedResponses
-from training.models.factorised import FieldShape
+from training.models.encoders import FieldShape
 from training.models.naf import NafShape
 
 CHECKPOINT = "checkpoint.pt"
@@ -53,6 +53,20 @@ class FactorisedRecipe:
 
 
 @dataclass(frozen=True)
+class DirectionalRecipe:
+    """How a directional field is trained. `order`: highest order of its spherical harmonics, 0 to 3. `fine_frames`:
+    number of frames that are predicted one by one, before cells. `energy_weight`: weight of the error of energies
+    (`training.learning.energies`). `noise_m`: standard deviation of noise that is added to positions. `reciprocal`:
+    learn the mean power of a pair and of the pair with exchanged ends, which differ only by the randomness of rays."""
+
+    order: int = 2
+    fine_frames: int = 24
+    energy_weight: float = 3.0
+    noise_m: float = 0.1
+    reciprocal: bool = True
+
+
+@dataclass(frozen=True)
 class NafRecipe:
     """How the paper's network is trained. `points`: points of each response per step. `noise_m`: standard deviation of
     noise that is added to positions. `padding`: probability that the silence after a response's end is trained on.
@@ -85,7 +99,7 @@ class Configuration:
     learning_rate: float = 2e-3
     patience: int | None = None
     shape: FieldShape | NafShape = dataclasses.field(default_factory=FieldShape)
-    recipe: FactorisedRecipe | NafRecipe = dataclasses.field(default_factory=FactorisedRecipe)
+    recipe: FactorisedRecipe | DirectionalRecipe | NafRecipe = dataclasses.field(default_factory=FactorisedRecipe)
 
     @classmethod
     def naf(cls, shape: NafShape, recipe: NafRecipe | None = None, **changes: Any) -> "Configuration":
@@ -93,9 +107,19 @@ class Configuration:
         settings = {"epochs": 200, "batch": 20, "learning_rate": 5e-4, **changes}
         return cls(shape=shape, recipe=recipe or NafRecipe(), **settings)
 
+    @classmethod
+    def directional(
+        cls, shape: FieldShape | None = None, recipe: DirectionalRecipe | None = None, **changes: Any
+    ) -> "Configuration":
+        """An epoch visits each pair once and not at every yaw, so there are more of them."""
+        settings = {"epochs": 100, "batch": 32, **changes}
+        return cls(shape=shape or FieldShape(), recipe=recipe or DirectionalRecipe(), **settings)
+
     @property
-    def kind(self) -> Literal["factorised", "naf"]:
-        return "naf" if isinstance(self.shape, NafShape) else "factorised"
+    def kind(self) -> Literal["factorised", "directional", "naf"]:
+        if isinstance(self.shape, NafShape):
+            return "naf"
+        return "directional" if isinstance(self.recipe, DirectionalRecipe) else "factorised"
 
     @property
     def name(self) -> str:
@@ -113,10 +137,10 @@ class Configuration:
         """Read the configuration of a run. Raises RunError if the folder holds no run."""
         values = read_json(run, "run.json")
         try:
-            naf = values.pop("kind") == "naf"
-            shape = (NafShape if naf else FieldShape)(**values.pop("shape"))
+            shape_type, recipe_type = _KINDS[values.pop("kind")]
+            shape = shape_type(**values.pop("shape"))
             recipe_values = {_FIELD_NAMES.get(name, name): value for name, value in values.pop("recipe").items()}
-            recipe = (NafRecipe if naf else FactorisedRecipe)(**recipe_values)
+            recipe = recipe_type(**recipe_values)
             return cls(**values, shape=shape, recipe=recipe)
         except (KeyError, TypeError) as exc:
             raise RunError(f"{run / 'run.json'}: not a configuration: {exc}") from exc
@@ -128,6 +152,11 @@ class Configuration:
         _write_whole(run / "run.json", {"kind": self.kind, **values})
 
 
+_KINDS: dict[str, tuple[type[FieldShape | NafShape], type[FactorisedRecipe | DirectionalRecipe | NafRecipe]]] = {
+    "factorised": (FieldShape, FactorisedRecipe),
+    "directional": (FieldShape, DirectionalRecipe),
+    "naf": (NafShape, NafRecipe),
+}
 _NAFS = {
     "naf": (NafShape(), NafRecipe()),
     "naf-whole": (NafShape(), NafRecipe(whole=True)),
@@ -135,7 +164,7 @@ _NAFS = {
     "naf-no-grid": (NafShape(grid="none"), NafRecipe()),
     "naf-time-domain": (NafShape(domain="time"), NafRecipe()),
 }
-FIELDS = ("factorised", *_NAFS)
+FIELDS = ("factorised", "directional", *_NAFS)
 
 
 def configure(
@@ -143,6 +172,7 @@ def configure(
     *,
     rank: int | None = None,
     width: int | None = None,
+    order: int | None = None,
     points: int | None = None,
     teacher: Path | None = None,
     **changes: Any,
@@ -153,16 +183,23 @@ def configure(
     """
     if field not in FIELDS:
         raise RunError(f"field: there is no {field!r}, but {', '.join(FIELDS)}")
-    if field == "factorised":
+    if order is not None and field != "directional":
+        raise RunError(f"order: only a directional field has one; leave it out for {field}")
+    if teacher is not None and field != "factorised":
+        raise RunError(f"teacher: only a factorised field has one; leave it out for {field}")
+    if field in ("factorised", "directional"):
         if points is not None:
-            raise RunError("points: a factorised field is trained on whole responses; leave it out")
+            raise RunError(f"points: a {field} field is trained on whole responses; leave it out")
         chosen = {"rank": rank, "width": width}
         shape = FieldShape(**{option: value for option, value in chosen.items() if value is not None})
-        recipe = FactorisedRecipe(teacher=None if teacher is None else str(teacher.resolve()))
-        return Configuration(shape=shape, recipe=recipe, **changes)
-    for option, value in (("rank", rank), ("width", width), ("teacher", teacher)):
+        if field == "directional":
+            recipe = DirectionalRecipe() if order is None else DirectionalRecipe(order=order)
+            return Configuration.directional(shape, recipe, **changes)
+        taught = FactorisedRecipe(teacher=None if teacher is None else str(teacher.resolve()))
+        return Configuration(shape=shape, recipe=taught, **changes)
+    for option, value in (("rank", rank), ("width", width)):
         if value is not None:
-            raise RunError(f"{option}: only a factorised field has one; leave it out for {field}")
+            raise RunError(f"{option}: only a factorised or directional field has one; leave it out for {field}")
     naf_shape, naf_recipe = _NAFS[field]
     if points is not None:
         naf_recipe = dataclasses.replace(naf_recipe, points=points)

@@ -50,6 +50,24 @@ class InterpolatedLevels(nn.Module):
         return torch.cat([fine, 0.5 * torch.log(power).flatten(1)], dim=1)
 
 
+class InterpolatedBands(nn.Module):
+    """Predicted levels of octave bands after decoding, in the layout in which they are predicted. Along time they are
+    those of `InterpolatedLevels`; a band's level is kept at its centre."""
+
+    _to_frames: Tensor
+    _of_frames: Tensor
+
+    def __init__(self, cells: Cells) -> None:
+        super().__init__()
+        self.register_buffer("_to_frames", torch.tensor(cells.all_frames.spread()), persistent=False)
+        self.register_buffer("_of_frames", torch.tensor(cells.all_frames.pool()), persistent=False)
+
+    def forward(self, levels: Tensor) -> Tensor:
+        """(B, n) levels of bands and cells, to the same number of decoded levels."""
+        columns = levels.unflatten(1, (-1, len(self._to_frames)))
+        return 0.5 * torch.log(torch.exp(2 * (columns @ self._to_frames)) @ self._of_frames).flatten(1)
+
+
 class PowerBalance:
     """Compares the mean power of targets and predictions, separately for pairs out of sight and in sight.
 

@@ -6,8 +6,10 @@ HDF5 lets one process at a time write the file. The rows lie in one piece, and a
 import hashlib
 import json
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
@@ -17,6 +19,7 @@ from rich.progress import Progress
 from training.data.dataset_check import DatasetError
 from training.data.responses import ResponseSet, SimulatedResponses
 from training.models.cells import Cells
+from training.models.directional_targets import DirectionalTargets
 from training.models.expected_targets import ExpectedTargets
 from training.models.targets import align, delay_samples, flat_targets
 
@@ -26,8 +29,8 @@ _FLUSH_S = 10.0
 
 @dataclass(frozen=True)
 class Targets:
-    """Poses and flat targets, one row per response that is not held out; `flat` is a memory map. `seconds` is the time
-    that their computation took."""
+    """Poses and flat targets, one row per response that is not held out, or one per pair; `flat` is a memory map.
+    `seconds` is the time that their computation took."""
 
     listener: npt.NDArray[np.float32]
     emitter: npt.NDArray[np.float32]
@@ -36,20 +39,50 @@ class Targets:
     seconds: float
 
 
+class _Computation(Protocol):
+    def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
+        """(row, n) flat targets of some responses of one pair."""
+        ...
+
+
 def load_targets(
     responses: ResponseSet, cells: Cells, folder: Path, progress: Progress, *, expected: bool = False
 ) -> Targets:
-    """Targets of all responses that are not held out, stored in `folder` in one file for each choice of `cells` and
-    `expected`. An interrupted computation continues where it stopped, and targets are computed again when the responses
-    have been rewritten.
+    """Targets at the ears for all responses that are not held out, stored in `folder` in one file for each choice of
+    `cells` and `expected`. An interrupted computation continues where it stopped, and targets are computed again when
+    the responses have been rewritten.
 
     With `expected`, for simulated responses only, targets are expected values over all draws of a response's noise.
     Raises DatasetError if the dataset has no energies, if another process is computing the same, or if the file is
     damaged.
     """
-    choice = json.dumps({"format": _FORMAT, "cells": asdict(cells), "expected": expected})
-    path = folder / f"targets-{hashlib.sha256(choice.encode()).hexdigest()[:12]}.h5"
+    choice = {"format": _FORMAT, "cells": asdict(cells), "expected": expected}
+
+    def computation() -> _Computation:
+        return _Expected(_simulated(responses), cells) if expected else _Drawn(responses, cells)
+
+    return _load(responses, np.flatnonzero(~responses.held_out), choice, computation, folder, progress)
+
+
+def load_directional_targets(responses: ResponseSet, cells: Cells, folder: Path, progress: Progress) -> Targets:
+    """Targets of directions, of the highest order, with one row for each pair that is not held out, in the order of
+    pairs. They are stored and raise errors like those at the ears."""
     rows = np.flatnonzero(~responses.held_out)
+    first = rows[np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))]
+    choice = {"format": _FORMAT, "cells": asdict(cells), "predicts": "directions"}
+    return _load(responses, first, choice, lambda: _Directional(_simulated(responses), cells), folder, progress)
+
+
+def _load(
+    responses: ResponseSet,
+    rows: npt.NDArray[np.int64],
+    choice: dict[str, Any],
+    computation: Callable[[], _Computation],
+    folder: Path,
+    progress: Progress,
+) -> Targets:
+    """Targets of these rows; `choice` names their file."""
+    path = folder / f"targets-{hashlib.sha256(json.dumps(choice).encode()).hexdigest()[:12]}.h5"
     key = json.dumps({"written": responses.file.stat().st_mtime_ns, "rows": len(rows)})
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -57,7 +90,7 @@ def load_targets(
             if file.attrs.get("key") != key:
                 file.clear()
                 file.attrs.update(key=key, pairs=0, seconds=0.0)
-            _complete(file, responses, cells, rows, progress, expected=expected)
+            _complete(file, responses.pair[rows], rows, computation, progress)
             offset, shape = file["flat"].id.get_offset(), file["flat"].shape
             seconds = float(file.attrs["seconds"])
     except BlockingIOError as exc:
@@ -72,19 +105,18 @@ def load_targets(
 
 def _complete(
     file: h5py.File,
-    responses: ResponseSet,
-    cells: Cells,
+    pairs: npt.NDArray[np.int64],
     rows: npt.NDArray[np.int64],
+    computation: Callable[[], _Computation],
     progress: Progress,
-    *,
-    expected: bool,
 ) -> None:
-    """Computes the pairs that the file does not have yet. Its attribute `pairs` counts those it has."""
-    starts = np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))
+    """Computes the pairs that the file does not have yet. Its attribute `pairs` counts those it has; `pairs` (row,) are
+    those of the rows."""
+    starts = np.flatnonzero(np.diff(pairs, prepend=-1))
     done = int(file.attrs["pairs"])
     if done == len(starts):
         return
-    targets = _Expected(responses, cells) if expected else _Drawn(responses, cells)
+    targets = computation()
     task = progress.add_task("targets", total=len(starts), completed=done)
     flushed_s = time.monotonic()
     for number in range(done, len(starts)):
@@ -102,6 +134,12 @@ def _complete(
             flushed_s = now_s
 
 
+def _simulated(responses: ResponseSet) -> SimulatedResponses:
+    if not isinstance(responses, SimulatedResponses):
+        raise DatasetError("expected targets exist for simulated responses only")
+    return responses
+
+
 @dataclass(frozen=True)
 class _Drawn:
     responses: ResponseSet
@@ -113,11 +151,17 @@ class _Drawn:
 
 
 class _Expected:
-    def __init__(self, responses: ResponseSet, cells: Cells) -> None:
-        if not isinstance(responses, SimulatedResponses):
-            raise DatasetError("expected targets exist for simulated responses only")
+    def __init__(self, responses: SimulatedResponses, cells: Cells) -> None:
         self._responses, self._targets = responses, ExpectedTargets(responses.dataset, cells)
 
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
         emitter, listener = self._responses.ends(rows[0])
         return self._targets.of_pair(emitter, listener)[rows % len(self._responses.dataset.yaws)]
+
+
+class _Directional:
+    def __init__(self, responses: SimulatedResponses, cells: Cells) -> None:
+        self._responses, self._targets = responses, DirectionalTargets(responses.dataset, cells)
+
+    def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
+        return self._targets.of_pair(*self._responses.ends(rows[0]))[None]

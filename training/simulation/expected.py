@@ -3,7 +3,8 @@ randomness.
 
 A response is a specular part, which is the same in every draw, and a diffuse part, which is Gaussian noise of known
 energy. So a cell of its spectrogram is a complex Gaussian, whose mean m is the specular part's cell and whose variance
-v follows from the energy.
+v follows from the energy. Without a head there is one spectrogram for each direction of arrival, of which only the
+power is of use.
 """
 
 from functools import cached_property
@@ -13,7 +14,7 @@ import numpy.typing as npt
 
 from server.acoustics.codec import Codec
 from server.rendering.hrtf import kemar
-from training.data.dataset import GEOMETRIC_ORDER, Dataset
+from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND, Dataset
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
@@ -22,6 +23,7 @@ _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
 
 _STEPS_PER_HOP = 4
+_LEAST_DISTANCE_M = 1e-6
 
 
 class ExpectedSpectrograms:
@@ -63,10 +65,7 @@ class ExpectedSpectrograms:
 
     def specular(self, emitter: int, listener: int) -> _Singles:
         """(yaw, ear, sample) the specular part of the stored response, which is the same in every draw."""
-        if self._images is None or self._images[0] != emitter:
-            # Images for all listeners take as long as images for one, and pairs come in the order of emitters.
-            self._images = emitter, self._tracer.images(self._dataset.probes[emitter])
-        positions, amplitudes = self._images[1][listener]
+        positions, amplitudes = self._images_at(emitter, listener)
         return self._synthesis.specular(positions, amplitudes, self._dataset.probes[listener])
 
     def diffuse_products(self, emitter: int, listener: int, pool: _Singles, advance_samples: float = 0.0) -> _Singles:
@@ -77,8 +76,43 @@ class ExpectedSpectrograms:
 
         Raises DatasetError if the dataset has no energies.
         """
+        energy, onset_s, times_s, weights = self._diffuse(emitter, listener, pool, advance_samples)
+        return self._synthesis.late_covariance(energy, onset_s, times_s, weights, self._arrival_products)
+
+    def arrivals(
+        self, emitter: int, listener: int, pool: _Singles, advance_samples: float = 0.0
+    ) -> tuple[_Floats, _Floats]:
+        """What arrives at the listener's place, diffuse and specular, without a head: (arrival, xyz) directions towards
+        the sound, in world axes, and (arrival, band, cell) expected squared magnitudes of the codec's transform.
+        `pool` and `advance_samples` are as in `diffuse_products`.
+
+        Raises DatasetError if the dataset has no energies.
+        """
+        codec = self._codec
+        diffuse = self._synthesis.late_power(*self._diffuse(emitter, listener, pool, advance_samples))
+        positions, amplitudes = self._images_at(emitter, listener)
+        offset = positions - self._dataset.probes[listener]
+        distance_m = np.linalg.norm(offset, axis=-1)
+        arrival_samples = distance_m / SPEED_OF_SOUND * codec.sample_rate - advance_samples
+        within = arrival_samples[:, None] - codec.frame_times_s * codec.sample_rate + codec.n_fft / 2
+        window = np.interp(within, np.arange(codec.n_fft + 1), np.append(codec.window, 0.0) ** 2, left=0, right=0)
+        specular = (amplitudes**2)[:, :, None] * (window @ pool)[:, None]
+        # guard: an image at the listener's place has some direction
+        towards = offset / np.maximum(distance_m, _LEAST_DISTANCE_M)[:, None]
+        return np.concatenate([self._synthesis.arrival_directions, towards]), np.concatenate([diffuse, specular])
+
+    def _diffuse(
+        self, emitter: int, listener: int, pool: _Singles, advance_samples: float
+    ) -> tuple[_Singles, float, _Floats, _Singles]:
+        """Energies, onset, and the times and weights with which the frames of a codec sum them to cells."""
         (energy,) = self._dataset.read_energy(np.array([[emitter, listener]]))
         times_s = (self._times_s + advance_samples / self._codec.sample_rate).ravel()
         weights = (pool[:, None, :] * self._window[:, None]).reshape(len(times_s), -1)
-        onset_s = self._dataset.onset_s[emitter, listener]
-        return self._synthesis.late_covariance(energy, onset_s, times_s, weights, self._arrival_products)
+        return energy, float(self._dataset.onset_s[emitter, listener]), times_s, weights
+
+    def _images_at(self, emitter: int, listener: int) -> tuple[_Floats, _Floats]:
+        """Positions (image, xyz) of the images of an emitter, and their pressures (image, band) at the listener."""
+        if self._images is None or self._images[0] != emitter:
+            # Images for all listeners take as long as images for one, and pairs come in the order of emitters.
+            self._images = emitter, self._tracer.images(self._dataset.probes[emitter])
+        return self._images[1][listener]

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
 from server.acoustics.minimum_phase import folded_cepstrum
 from server.kernels.simd import (
     LANES,
@@ -30,14 +30,6 @@ from server.rendering.sphere import find_triangle
 _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
 _Spectra = npt.NDArray[np.complex64]
-
-
-def band_weights(frequencies_hz: _Floats) -> _Floats:
-    """(band, frequency) weights that interpolate between octave bands linearly over log frequency; columns add up to
-    one."""
-    octave = np.log2(np.maximum(frequencies_hz, 1.0) / OCTAVE_BANDS_HZ[0])
-    position = np.clip(octave, 0, len(OCTAVE_BANDS_HZ) - 1)
-    return np.maximum(0.0, 1 - np.abs(position - np.arange(len(OCTAVE_BANDS_HZ))[:, None]))
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,13 @@ import numpy.typing as npt
 from scipy.fft import irfft, rfft
 from scipy.sparse import coo_array
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
+from server.acoustics.geometry import axes_of
 from server.rendering.hrtf import HeadFilters
 from server.scene.manifest import Air
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import HISTOGRAM_BIN_S
-from training.simulation.head_spectra import HeadSpectra, band_weights
+from training.simulation.head_spectra import HeadSpectra
 from training.simulation.tracing import Arrivals, free_field_amplitude
 
 _Floats = npt.NDArray[np.float64]
@@ -37,12 +38,14 @@ _DIFFUSE_RISE_S = 0.002
 _LEAD_S = 0.001
 
 
-def rotate_into_head(directions: _Floats, yaws: _Floats) -> _Floats:
-    """Rotate world directions into level heads that are turned counter-clockwise by each yaw (radians); returns
-    (direction, yaw, xyz)."""
+def rotate_into_head(directions: _Floats, heads: _Floats) -> _Floats:
+    """Rotate world directions into heads; returns (direction, head, xyz). Heads are level ones that are turned
+    counter-clockwise by yaws (head,) in radians, or have orientations (head, 4)."""
+    if heads.ndim == 2:
+        return np.stack([directions @ axes_of(orientation).T for orientation in heads], axis=1)
     x, y, z = (directions[:, None, axis] for axis in range(3))
-    cos, sin = np.cos(yaws), np.sin(yaws)
-    return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(yaws)))], axis=-1)
+    cos, sin = np.cos(heads), np.sin(heads)
+    return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(heads)))], axis=-1)
 
 
 def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
@@ -70,7 +73,8 @@ class BinauralSynthesis:
 
     head: HeadFilters
     arrival_directions: _Floats
-    yaws: _Floats
+    heads: _Floats
+    """Yaws (head,) of level heads, or orientations (head, 4)."""
     samples: int
 
     def render(self, arrivals: Arrivals, receiver: _Floats, onset_s: float, rng: np.random.Generator) -> _Singles:
@@ -81,7 +85,7 @@ class BinauralSynthesis:
 
     def specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats) -> _Singles:
         """The response to images alone: positions (image, xyz), with pressures (image, band) at the receiver."""
-        response = np.zeros((len(self.yaws), 2, self.samples), dtype=np.float32)
+        response = np.zeros((len(self.heads), 2, self.samples), dtype=np.float32)
         self._add_specular(positions, amplitudes, receiver, response)
         return response
 
@@ -96,37 +100,62 @@ class BinauralSynthesis:
         """(bin, product, yaw, cell) expected products per sample of the ears' spectra, for the diffuse part of
         `render`. They are summed over `times_s` (time,) with `weights` (time, cell); times outside the response add
         nothing. `products` is the result of `arrival_products`."""
-        step_s = self._n_fft // 2 / self._sample_rate
-        frames = -(-self.samples // (self._n_fft // 2)) + 1
-        per_sample = power_at(np.asarray(np.arange(frames) * step_s, np.float64), energy) / np.float32(
-            self._sample_rate
-        )
         frequencies_hz = np.linspace(0, self._sample_rate / 2, products.shape[0])
-        power = np.einsum("dbt,bn->ndt", per_sample, band_weights(frequencies_hz).astype(np.float32), optimize=True)
+        power = np.einsum(
+            "dbt,bn->ndt",
+            self._window_powers(energy),
+            band_weights(frequencies_hz).astype(np.float32),
+            optimize=True,
+        )
+        over_cells = self._sum_over_time(power, onset_s, times_s, weights)
+        # einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
+        return np.einsum("bpyd,bdc->bpyc", products, over_cells)
+
+    def late_power(self, energy: _Singles, onset_s: float, times_s: _Floats, weights: _Singles) -> _Singles:
+        """(direction, band, cell) expected power per sample that arrives from each direction, without a head; otherwise
+        as in `late_covariance`."""
+        return self._sum_over_time(self._window_powers(energy), onset_s, times_s, weights)
+
+    def _window_powers(self, energy: _Singles) -> _Singles:
+        """(direction, band, window) power per sample in the middle of each window of the noise."""
+        times_s = np.asarray(np.arange(self._windows) * self._window_step_s, np.float64)
+        return power_at(times_s, energy) / np.float32(self._sample_rate)
+
+    def _sum_over_time(self, power: _Singles, onset_s: float, times_s: _Floats, weights: _Singles) -> _Singles:
+        """(..., cell) the `power` (..., window) of the noise at `times_s` (time,), summed with `weights`
+        (time, cell)."""
         # Overlapping windows shape the same noise. Their amplitudes add up, so neighbouring windows also contribute a
         # product.
-        position = np.clip(times_s / step_s, 0, frames - 1)
-        before = np.minimum(position.astype(int), frames - 2)
+        windows = self._windows
+        position = np.clip(times_s / self._window_step_s, 0, windows - 1)
+        before = np.minimum(position.astype(int), windows - 2)
         share = np.sin(np.pi / 2 * (position - before)) ** 2
         rise = np.sin(np.pi / 2 * np.clip((times_s - onset_s) / _DIFFUSE_RISE_S, 0, 1)) ** 4
         rise[times_s >= self.samples / self._sample_rate] = 0
         at = np.arange(len(times_s))
         own = coo_array(
             (np.concatenate([rise * (1 - share) ** 2, rise * share**2]), (np.tile(at, 2), [*before, *(before + 1)])),
-            shape=(len(times_s), frames),
+            shape=(len(times_s), windows),
         )
-        shared = coo_array((2 * rise * share * (1 - share), (at, before)), shape=(len(times_s), frames - 1))
+        shared = coo_array((2 * rise * share * (1 - share), (at, before)), shape=(len(times_s), windows - 1))
         own_weights, shared_weights = ((part.T @ weights).astype(np.float32) for part in (own, shared))
         neighbours = np.sqrt(power[..., :-1] * power[..., 1:])
-        over_cells = np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
-        # einsum and not matmul: on a stack of small matrices, the threads of matmul mostly wait for each other.
-        return np.einsum("bpyd,bdc->bpyc", products, over_cells)
+        return np.tensordot(power, own_weights, 1) + np.tensordot(neighbours, shared_weights, 1)
+
+    @property
+    def _windows(self) -> int:
+        """The number of windows that shape the diffuse part. The first begins one step before sample 0."""
+        return -(-self.samples // (self._n_fft // 2)) + 1
+
+    @property
+    def _window_step_s(self) -> float:
+        return self._n_fft // 2 / self._sample_rate
 
     def arrival_products(self, bins: int) -> _Singles:
         """(bin, product, yaw, direction) products of the ears' spectra for a wave from each direction, at frequencies
         from 0 to half the sample rate: squared magnitudes of left and right, then real and imaginary parts of left
         times conjugate right."""
-        own = self._arrival_spectra.reshape(self._n_fft // 2 + 1, len(self.arrival_directions), len(self.yaws), 2)
+        own = self._arrival_spectra.reshape(self._n_fft // 2 + 1, len(self.arrival_directions), len(self.heads), 2)
         left, right = own[..., 0], own[..., 1]
         cross = left * np.conj(right)
         products = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag], axis=1)
@@ -142,7 +171,7 @@ class BinauralSynthesis:
         band). Overlapping bands are independent, so that their powers add up for any gains of the bands."""
         step = self._n_fft // 2
         frames = samples // step
-        at_ears = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
+        at_ears = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.heads), frames * step), dtype=np.float32)
         for neighbours in (0, 1):  # only neighbouring bands overlap
             noise = _unit_noise((len(directional), frames, step), rng)
             sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
@@ -155,14 +184,14 @@ class BinauralSynthesis:
                 within = slice(inside[0], inside[-1] + 1)
                 amplitudes = np.sqrt(directional[:, band]).astype(np.float32)
                 shape = np.sqrt(self._band_weights[band, within])[:, None, None]
-                shaped = np.zeros((2 * len(self.yaws), frames, len(spectra)), dtype=np.complex64)
+                shaped = np.zeros((2 * len(self.heads), frames, len(spectra)), dtype=np.complex64)
                 arriving = np.matmul(spectra[within] * (amplitudes * shape), self._arrival_spectra[within])
                 shaped[..., within] = arriving.transpose(2, 1, 0)
                 sections = irfft(shaped, self._n_fft)
                 sections *= self._window
                 later = np.roll(sections[..., step:], 1, axis=1)
                 at_ears[band] = (sections[..., :step] + later).reshape(len(sections), -1)
-        return at_ears.reshape(len(at_ears), len(self.yaws), 2, -1)
+        return at_ears.reshape(len(at_ears), len(self.heads), 2, -1)
 
     @property
     def _sample_rate(self) -> int:
@@ -192,13 +221,13 @@ class BinauralSynthesis:
     @cached_property
     def _arrival_spectra(self) -> npt.NDArray[np.complex64]:
         """(bin, direction, yaw and ear) spectra of waves from the directions of arrival."""
-        spectra = self._ears.arriving(rotate_into_head(self.arrival_directions, self.yaws))
+        spectra = self._ears.arriving(rotate_into_head(self.arrival_directions, self.heads))
         return np.ascontiguousarray(np.moveaxis(spectra.reshape(len(spectra), -1, spectra.shape[-1]), -1, 0))
 
     def late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
         """(yaw, ear, sample) diffuse sound of `energy` (direction, band, bin), which begins at `onset_s`."""
         step = self._n_fft // 2
-        frames = -(-self.samples // step) + 1  # the first begins one step before sample 0
+        frames = self._windows
         # Drawn frame by frame, so that a longer response begins with the same noise.
         noise = _unit_noise((frames + 1, len(energy), step), rng)
         sections = np.concatenate([noise[:-1], noise[1:]], axis=-1)
@@ -211,7 +240,7 @@ class BinauralSynthesis:
         sections = irfft(np.ascontiguousarray(at_ears.transpose(2, 1, 0)), self._n_fft)
         sections *= self._window
         late = sections[:, :-1, step:] + sections[:, 1:, :step]
-        response = late.reshape(len(self.yaws), 2, -1)[..., : self.samples]
+        response = late.reshape(len(self.heads), 2, -1)[..., : self.samples]
         # Windows smear energy to times before the direct sound, when no scattered sound can arrive.
         begins, risen = (round(time_s * self._sample_rate) for time_s in (onset_s, onset_s + _DIFFUSE_RISE_S))
         response[..., :begins] = 0
@@ -223,12 +252,12 @@ class BinauralSynthesis:
     def _add_specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats, response: _Singles) -> None:
         offset = positions - receiver
         distance = np.linalg.norm(offset, axis=-1)
-        directions = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
+        directions = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.heads)
         delay = distance / SPEED_OF_SOUND * self._sample_rate
         start = np.floor(delay).astype(int)
         lead = round(_LEAD_S * self._sample_rate)
         spectra = self._ears.specular(directions, amplitudes, lead + delay - start)
-        taps = irfft(spectra, self._n_fft).reshape(len(spectra), 2 * len(self.yaws), self._n_fft)
+        taps = irfft(spectra, self._n_fft).reshape(len(spectra), 2 * len(self.heads), self._n_fft)
         _add_at(start - lead, taps, response.reshape(-1, self.samples))
 
 

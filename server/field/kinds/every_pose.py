@@ -35,11 +35,11 @@ class ComputedResponses(ResponseSource):
     def __init__(self, compute: Compute) -> None:
         self._compute = compute
 
-    def responses(self, listeners: Floats, emitters: Floats, yaws: Floats, *, remember: bool = False) -> Float32:
-        return self._compute(listeners, emitters, yaws, remember=remember)
+    def responses(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool = False) -> Float32:
+        return self._compute(listeners, emitters, heads, remember=remember)
 
-    def computed_for(self, listeners: Floats, emitters: Floats, yaws: Floats) -> tuple[Floats, Floats, Floats]:
-        return listeners, emitters, yaws
+    def computed_for(self, listeners: Floats, emitters: Floats, heads: Floats) -> tuple[Floats, Floats, Floats]:
+        return listeners, emitters, heads
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
         return Snapped(Node(listener, emitter, yaw), 0)

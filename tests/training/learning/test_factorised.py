@@ -12,7 +12,8 @@ from training.learning.factorised import FactorisedLearner
 from training.learning.pairs import split
 from training.learning.runs import Configuration, FactorisedRecipe, NafRecipe, RecipeError, configure
 from training.learning.train import load_learner, train
-from training.models.factorised import ExportedField, FieldShape
+from training.models.encoders import FieldShape
+from training.models.factorised import ExportedField
 from training.models.naf import NafShape
 from training.models.targets import LEAD_SAMPLES, align, delay_samples, flat_targets
 

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -397,7 +398,9 @@ def test_bfloat16_is_chosen_where_it_is_faster():
     ("field", "options", "told"),
     [
         ("nerf", {}, "there is no 'nerf'"),
-        ("naf", {"rank": 64}, "only a factorised field"),
+        ("naf", {"rank": 64}, "only a factorised or directional field"),
+        ("directional", {"points": 100}, "whole responses"),
+        ("directional", {"teacher": Path("run")}, "only a factorised field"),
         ("factorised", {"points": 100}, "whole responses"),
     ],
 )

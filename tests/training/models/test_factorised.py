@@ -5,15 +5,8 @@ import torch
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from training.models.cells import Cells
-from training.models.factorised import (
-    GEOMETRY,
-    ExportedField,
-    FactorisedField,
-    FeatureGrid,
-    FieldShape,
-    Heads,
-    PoseEncoder,
-)
+from training.models.encoders import GEOMETRY, FeatureGrid, FieldShape, PoseEncoder
+from training.models.factorised import ExportedField, FactorisedField, Heads
 from training.models.site import Reach
 
 PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)

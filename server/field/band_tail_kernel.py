@@ -1,0 +1,174 @@
+"""The late tail of a response as band noises with changing gains, in compiled code.
+
+Axes: bands (7), columns of a prediction, harmonics k; noises (band, left or right, sample); responses (ear, sample).
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from server.kernels.compiled import compiled
+from server.kernels.simd import LANES, add, broadcast, load, multiply_add, store
+
+Float32 = npt.NDArray[np.float32]
+
+LEFT, RIGHT_LEFT, RIGHT_RIGHT = 0, 1, 2
+"""Gains: of the left noise at the left ear, of the left noise at the right ear, and of the right noise there."""
+_ALMOST = np.float32(0.999)
+"""The greatest coherence of the ears in a band."""
+_AT_ONCE = 1024
+_RAMP = np.arange(LANES, dtype=np.float32)
+
+
+@compiled
+def find_band_gains(
+    log_magnitude: Float32,
+    directions: Float32,
+    products: Float32,
+    diffuse: Float32,
+    first: int,
+    log_floor: float,
+    least: float,
+    gains: Float32,
+) -> None:
+    """Write the `gains` (3, band, column - first) of a prediction's columns from column `first` on.
+
+    `products` (band, product, k) are those of the turned head, averaged over each band. `diffuse` (band, 3) are the
+    band's powers at both ears and the coherence of its noises, in diffuse sound of unit power: the noises are that
+    sound. Where directions cancel, an ear's power is `least` times the diffuse one.
+    """
+    bands, columns = log_magnitude.shape
+    zero, one = np.float32(0.0), np.float32(1.0)
+    floor, lowest = np.float32(log_floor), np.float32(least)
+    for column in range(first, columns):
+        to = column - first
+        for band in range(bands):
+            left, right, real = products[band, 0, 0], products[band, 1, 0], products[band, 2, 0]
+            for k in range(1, products.shape[2]):
+                of_k = directions[k - 1, band, column]
+                left += products[band, 0, k] * of_k
+                right += products[band, 1, k] * of_k
+                real += products[band, 2, k] * of_k
+            # guard: where directions cancel, a band is left over
+            left = max(left, lowest * diffuse[band, 0])
+            right = max(right, lowest * diffuse[band, 1])
+            magnitude = max(np.exp(log_magnitude[band, column]) - floor, zero)
+            gains[0, band, to] = magnitude * np.sqrt(left / diffuse[band, 0])
+            gains[1, band, to] = magnitude * np.sqrt(right / diffuse[band, 1])
+            gains[2, band, to] = min(_ALMOST, max(-_ALMOST, real / np.sqrt(left * right)))
+        before_left, before_right = gains[0, 0, to], gains[1, 0, to]
+        for band in range(bands):
+            after = min(band + 1, bands - 1)
+            left, right, coherence = gains[0, band, to], gains[1, band, to], gains[2, band, to]
+            at_left = left * _balance(before_left, left, gains[0, after, to])
+            at_right = right * _balance(before_right, right, gains[1, after, to])
+            before_left, before_right = left, right
+            # Noises of coherence d with gains b and a have the coherence b + a d and the power a^2 + b^2 + 2 a b d.
+            of_diffuse = diffuse[band, 2]
+            own = np.sqrt((one - coherence * coherence) / (one - of_diffuse * of_diffuse))
+            gains[0, band, to] = at_left
+            gains[1, band, to] = at_right * (coherence - own * of_diffuse)
+            gains[2, band, to] = at_right * own
+
+
+@compiled
+def _balance(before: np.float32, gain: np.float32, after: np.float32) -> np.float32:
+    """The factor by which a band's gain makes up for what is lacking between bands.
+
+    There the bands' amplitudes add up, and not their powers. Over the octave between bands with gains g and h, this
+    gives (g^2 + g h + h^2) / 3 in place of (g^2 + h^2) / 2.
+    """
+    return np.sqrt(np.float32(0.5) * (_lacking(before, gain) + _lacking(gain, after)))
+
+
+@compiled
+def _lacking(one: np.float32, other: np.float32) -> np.float32:
+    squares = one * one + other * other
+    # guard: silent bands lack nothing
+    if not squares > np.float32(0.0):
+        return np.float32(1.0)
+    return np.float32(1.5) * squares / (squares + one * other)
+
+
+@compiled
+def add_band_tail(
+    gains: Float32,
+    places: npt.NDArray[np.float64],
+    noises: Float32,
+    fade_at: int,
+    share: float,
+    missing: Float32,
+    scratch: Float32,
+    response: Float32,
+) -> None:
+    """Add the noises with these gains, which hold at the samples `places` (column,) and are interpolated between them.
+
+    The tail begins at sample `fade_at`, where the first frame is `missing` from the response; `missing` (2, sample) is
+    the missing amplitude from there on, if that frame is there and if it is not. A `share` of it is there, since levels
+    are delayed by parts of a frame. Where all frames are missing, the response is silent before. `scratch` (2, sample)
+    is overwritten.
+    """
+    end = min(response.shape[1], noises.shape[2])
+    there, one = np.float32(share), np.float32(1.0)
+    begin, whole = max(0, fade_at), min(end, max(0, fade_at + missing.shape[1]))
+    if begin < whole:
+        for ear in range(2):
+            for n in range(whole - begin):
+                scratch[ear, n] = 0
+        _add(gains, places, noises, begin, whole, begin, scratch)
+        for ear in range(2):
+            for n in range(begin, whole):
+                amplitude = there * missing[0, n - fade_at] + (one - there) * missing[1, n - fade_at]
+                response[ear, n] += amplitude * scratch[ear, n - begin]
+    _add(gains, places, noises, whole, end, 0, response)
+
+
+@compiled
+def _add(gains, places, noises, begin, end, offset, out) -> None:
+    """Add samples `begin` to `end` to `out`, whose first sample is number `offset`."""
+    last = places.size - 1
+    at = begin
+    column = -1
+    while at < end:
+        while column < last and places[column + 1] <= at:
+            column += 1
+        stop = end if column == last else min(end, math.ceil(places[column + 1]))
+        stop = min(stop, at + _AT_ONCE)
+        low, high = max(column, 0), min(column + 1, last)
+        apart = places[high] - places[low]
+        share = (at - places[low]) / apart if apart > 0 else 0.0
+        step = 1.0 / apart if apart > 0 else 0.0
+        for band in range(noises.shape[0]):
+            _add_band(gains[:, band, low], gains[:, band, high], share, step, noises[band], at, stop, at - offset, out)
+        at = stop
+
+
+@compiled
+def _add_band(before, after, share, step, noise, at, stop, to, out) -> None:
+    """Add one band's samples `at` to `stop`, to `out` from its sample `to` on."""
+    left, left_step = _line(before[0], after[0], share, step)
+    other, other_step = _line(before[1], after[1], share, step)
+    own, own_step = _line(before[2], after[2], share, step)
+    at_left, at_right = noise[0].ctypes.data + 4 * at, noise[1].ctypes.data + 4 * at
+    to_left, to_right = out[0].ctypes.data + 4 * to, out[1].ctypes.data + 4 * to
+    count = stop - at
+    vectors = count // LANES * LANES
+    lefts, others, owns = broadcast(left), broadcast(other), broadcast(own)
+    left_steps, other_steps, own_steps = broadcast(left_step), broadcast(other_step), broadcast(own_step)
+    for n in range(0, vectors, LANES):
+        x = add(load(_RAMP.ctypes.data, 0), broadcast(np.float32(n)))
+        of_left, of_right = load(at_left, n), load(at_right, n)
+        store(to_left, n, multiply_add(multiply_add(x, left_steps, lefts), of_left, load(to_left, n)))
+        right = multiply_add(multiply_add(x, other_steps, others), of_left, load(to_right, n))
+        store(to_right, n, multiply_add(multiply_add(x, own_steps, owns), of_right, right))
+    for n in range(vectors, count):
+        x = np.float32(n)
+        out[0, to + n] += (left + left_step * x) * noise[0, at + n]
+        out[1, to + n] += (other + other_step * x) * noise[0, at + n] + (own + own_step * x) * noise[1, at + n]
+
+
+@compiled
+def _line(before, after, share, step):
+    """The value and the slope per sample of a gain, at a `share` of the way from `before` to `after`."""
+    return np.float32(before + (after - before) * share), np.float32((after - before) * step)

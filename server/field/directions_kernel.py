@@ -1,0 +1,124 @@
+"""The spectrograms of two ears from powers by direction, in compiled code.
+
+Axes: bands (7), bins, columns of frames, harmonics k; products as in `server.rendering.ear_products`.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from server.kernels.compiled import compiled
+from server.kernels.simd import (
+    LANES,
+    add,
+    at_least,
+    broadcast,
+    choose_below,
+    divide,
+    exponential,
+    load,
+    load_broadcast,
+    logarithm,
+    multiply,
+    multiply_add,
+    square_root,
+    store,
+    subtract,
+)
+
+Float32 = npt.NDArray[np.float32]
+
+_SILENT = np.float32(-80.0)
+"""A log magnitude below every floor."""
+
+
+@compiled
+def ears_of_directions(
+    log_magnitude: Float32,
+    directions: Float32,
+    products: Float32,
+    band: npt.NDArray[np.int64],
+    share: Float32,
+    log_floor: float,
+    least: float,
+    columns: int,
+    work: Float32,
+    levels: Float32,
+    coherence: Float32,
+) -> None:
+    """Write the log magnitudes `levels` (ear, bin, column) and the `coherence` (real and imaginary, bin, column) of two
+    ears.
+
+    `log_magnitude` (band, column) and `directions` (k - 1, band, column) are a field's predictions, `products` (bin,
+    product, k) those of the turned head. A bin lies between `band` (bin,) and the next, at this `share` (bin,) of the
+    way. Where directions cancel, an ear's power is `least` times that of the same sound from all directions. Only the
+    first `columns` are written. `work` is (k + 1, band, columns in whole vectors).
+    """
+    harmonics = products.shape[2]
+    floor, lowest = broadcast(np.float32(log_floor)), broadcast(np.float32(least))
+    zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
+    _find_powers(log_magnitude, directions, columns, floor, zero, work)
+    row, rest = work.shape[2], work[harmonics].ctypes.data
+    by_band, by_harmonic = 4 * row, 4 * row * work.shape[1]
+    for bin_ in range(products.shape[0]):
+        upper = broadcast(share[bin_])
+        lower = subtract(one, upper)
+        of_bin = products[bin_].ctypes.data
+        for column in range(0, columns, LANES):
+            at = work.ctypes.data + band[bin_] * by_band
+            power = multiply_add(upper, load(at + by_band, column), multiply(lower, load(at, column)))
+            left, right = multiply(load_broadcast(of_bin, 0), power), multiply(load_broadcast(of_bin, harmonics), power)
+            real = multiply(load_broadcast(of_bin, 2 * harmonics), power)
+            imaginary = multiply(load_broadcast(of_bin, 3 * harmonics), power)
+            least_left, least_right = multiply(lowest, left), multiply(lowest, right)
+            for k in range(1, harmonics):
+                at += by_harmonic
+                power = multiply_add(upper, load(at + by_band, column), multiply(lower, load(at, column)))
+                left = multiply_add(load_broadcast(of_bin, k), power, left)
+                right = multiply_add(load_broadcast(of_bin, harmonics + k), power, right)
+                real = multiply_add(load_broadcast(of_bin, 2 * harmonics + k), power, real)
+                imaginary = multiply_add(load_broadcast(of_bin, 3 * harmonics + k), power, imaginary)
+            # guard: where directions cancel, sound is left over
+            left_power = at_least(left, least_left)
+            left_size, right_size = square_root(left_power), square_root(at_least(right, least_right))
+            both = multiply(left_size, right_size)
+            # guard: silent ears have no coherence
+            scale = choose_below(zero, both, divide(one, both), zero)
+            real, imaginary = multiply(real, scale), multiply(imaginary, scale)
+            square = multiply_add(real, real, multiply(imaginary, imaginary))
+            # guard: coherence from directions is at most one
+            shrunk = divide(one, square_root(at_least(square, one)))
+            if column + LANES <= columns:
+                store(levels[0, bin_].ctypes.data, column, logarithm(add(left_size, floor)))
+                store(levels[1, bin_].ctypes.data, column, logarithm(add(right_size, floor)))
+                store(coherence[0, bin_].ctypes.data, column, multiply(real, shrunk))
+                store(coherence[1, bin_].ctypes.data, column, multiply(imaginary, shrunk))
+                continue
+            store(rest, 0, logarithm(add(left_size, floor)))
+            store(rest, row, logarithm(add(right_size, floor)))
+            store(rest, 2 * row, multiply(real, shrunk))
+            store(rest, 3 * row, multiply(imaginary, shrunk))
+            for lane in range(columns - column):
+                levels[0, bin_, column + lane] = work[harmonics, 0, lane]
+                levels[1, bin_, column + lane] = work[harmonics, 1, lane]
+                coherence[0, bin_, column + lane] = work[harmonics, 2, lane]
+                coherence[1, bin_, column + lane] = work[harmonics, 3, lane]
+
+
+@compiled
+def _find_powers(log_magnitude, directions, columns, floor, zero, work) -> None:
+    """Write the powers (k, band, column) of the first columns to `work`; whole vectors are filled up with silence."""
+    whole = work.shape[2]
+    for number in range(log_magnitude.shape[0]):
+        power = work[0, number]
+        for column in range(columns):
+            power[column] = log_magnitude[number, column]
+        for column in range(columns, whole):
+            power[column] = _SILENT
+        for column in range(0, whole, LANES):
+            magnitude = at_least(subtract(exponential(load(power.ctypes.data, column)), floor), zero)
+            store(power.ctypes.data, column, multiply(magnitude, magnitude))
+        for k in range(1, directions.shape[0] + 1):
+            for column in range(columns):
+                work[k, number, column] = power[column] * directions[k - 1, number, column]
+            for column in range(columns, whole):
+                work[k, number, column] = 0

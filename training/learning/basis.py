@@ -1,0 +1,121 @@
+"""What the learners of fields with a learned basis have in common: initial normalisation and basis, optimiser, and the
+correction of levels after training."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from training.data.responses import ResponseSet
+from training.learning.learner import Losses, Rows
+from training.learning.schedule import one_cycle
+from training.models.basis_field import BasisField
+from training.models.cells import Cells
+from training.models.level_correction import level_correction
+from training.models.stored_targets import Targets
+
+TARGETS = "targets"
+"""The folder of targets, inside that of the dataset."""
+_WEIGHT_DECAY = 1e-2
+_SAMPLE_ROWS = 3000
+
+
+class BasisLearner:
+    """Learns from targets that are computed once and stored beside the responses.
+
+    `spreads` and `weights` are those of each head: the unit in which its errors are measured, and the weight of their
+    squares. `decode` gives levels after decoding from predicted ones; without it levels are not corrected.
+    """
+
+    responses: ResponseSet
+    cells: Cells
+
+    def __init__(
+        self,
+        field: BasisField,
+        spreads: Mapping[str, float],
+        weights: Mapping[str, float],
+        decode: nn.Module | None,
+    ) -> None:
+        self.field = field
+        self._spreads, self._weights, self._decode = spreads, weights, decode
+        self._targets: Targets | None = None
+
+    @property
+    def prepared_s(self) -> float:
+        return self.targets.seconds
+
+    @property
+    def targets(self) -> Targets:
+        if self._targets is None:
+            raise RuntimeError("prepare comes first")
+        return self._targets
+
+    @torch.no_grad()
+    def initialise(self, rows: Rows, seed: int) -> None:
+        """Set the normalisation, and a basis that begins with the principal components of the training
+        targets."""
+        field = self.field
+        sample = np.sort(np.random.default_rng([seed, 4]).choice(rows, min(_SAMPLE_ROWS, len(rows)), replace=False))
+        flat = self._flat(sample)
+        field.mean.copy_(flat.mean(dim=0))
+        for name, part in field.heads.slices.items():
+            field.spread[part] = self._spreads[name]
+        normalised = (flat.to(field.mean.device) - field.mean) / field.spread
+        rank = field.basis.shape[0]
+        _, singular, basis = torch.svd_lowrank(normalised, q=min(rank, *normalised.shape), niter=2)
+        field.basis[: basis.shape[1]] = basis.T * (singular / len(sample) ** 0.5)[:, None]
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        return [{"params": list(self.field.parameters()), "weight_decay": _WEIGHT_DECAY}]
+
+    def momentum_and_rate(self, fraction: float) -> tuple[float, float]:
+        return one_cycle(fraction)
+
+    def validation(self, rows: Rows) -> Rows:
+        return rows
+
+    def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def finish(self, rows: Rows) -> None:
+        """Correct predicted levels by their mean deficit over the training set."""
+        if self._decode is None:
+            return
+        field, levels = self.field, self.field.heads.levels
+        device = field.mean.device
+        sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
+
+        def examples() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+            for start in range(0, len(sample), 256):
+                poses, (flat, *_) = self.batch(sample[start : start + 256], None)
+                features = field.encoder(*(pose.to(device) for pose in poses))
+                predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
+                yield flat[:, levels].to(device).float(), predicted[:, levels], field.encoder.sight(features)
+
+        field.level_correction[:, levels] = level_correction(examples, self._decode.to(device), field.heads.areas)
+
+    def _flat(self, rows: Rows) -> Tensor:
+        """(row, heads.size) flat targets."""
+        return torch.from_numpy(self.targets.flat[rows]).float()
+
+    def _head_losses(self, prediction: Tensor, flat: Tensor, counted: Mapping[str, Tensor]) -> Losses:
+        """The weighted mean squared error of each head, for normalised predictions of targets in physical units. Heads
+        in `counted` count only the rows (B,) that it marks."""
+        field = self.field
+        off = prediction - (flat - field.mean) / field.spread
+        squared = off * off  # its gradient is faster than that of a power
+        losses = {}
+        # Split in place of slicing, because the gradient of each slice would be as wide as the whole.
+        for name, part in zip(field.heads.shapes, squared.split(field.heads.sizes, dim=1), strict=True):
+            of_rows = part.mean(dim=1)
+            losses[name] = self._weights[name] * (of_rows * counted[name] if name in counted else of_rows).mean()
+        return losses
+
+    def _levels_of(self, prediction: Tensor) -> Tensor:
+        """Predicted levels in physical units."""
+        field, levels = self.field, self.field.heads.levels
+        return prediction[:, levels] * field.spread[levels] + field.mean[levels]

@@ -1,0 +1,105 @@
+"""The directional field and its loss."""
+
+from collections.abc import Sequence, Set
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from rich.progress import Progress
+from torch import Tensor
+
+from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
+from training.data.responses import ResponseSet, SimulatedResponses
+from training.learning.basis import TARGETS, BasisLearner
+from training.learning.energies import BandEnergyError
+from training.learning.learner import Losses, Rows
+from training.learning.pairs import split
+from training.learning.runs import Configuration, DirectionalRecipe, RecipeError
+from training.models.cells import Cells
+from training.models.directional import DirectionalField
+from training.models.encoders import FieldShape
+from training.models.level_correction import InterpolatedBands
+from training.models.site import Reach, Site
+from training.models.stored_targets import load_directional_targets
+from training.models.targets import codec_of
+
+# In nepers, and in shares of the power: about what no field can predict from the places alone.
+_SPREADS = {LOG_MAGNITUDE: 0.35, DIRECTIONS: 0.5}
+_HEAD_WEIGHTS = {LOG_MAGNITUDE: 1.0, DIRECTIONS: 1.0}
+
+
+class DirectionalLearner(BasisLearner):
+    """Learns where sound arrives from, one example for each pair: the orientations of a head do not matter."""
+
+    def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
+        shape, recipe = configuration.shape, configuration.recipe
+        if not isinstance(shape, FieldShape) or not isinstance(recipe, DirectionalRecipe):
+            raise TypeError(f"{configuration.kind} is no directional field")
+        if not isinstance(responses, SimulatedResponses):
+            raise RecipeError(
+                "field: measured responses do not tell where sound arrives from; train factorised in place of "
+                "directional"
+            )
+        self.responses = responses
+        self.recipe = recipe
+        codec = codec_of(responses)
+        self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), known_frames=0)
+        self.site = Site.of(responses)
+        try:
+            field = DirectionalField(self.site.plan, self.cells, shape, recipe.order, reach=Reach.of(responses))
+        except ValueError as exc:
+            raise RecipeError(str(exc)) from exc
+        super().__init__(field, _SPREADS, _HEAD_WEIGHTS, InterpolatedBands(self.cells))
+        self._energy_error = BandEnergyError(self.cells)
+        trainable = np.flatnonzero(~responses.held_out)
+        # Rows count responses, targets count pairs.
+        _, first, self._pair = np.unique(responses.pair[trainable], return_index=True, return_inverse=True)
+        used, _ = split(responses, share=configuration.share, seed=configuration.seed)
+        ends = [responses.ends(row) for row in trainable[first]]
+        self._partner = _exchanged(ends, set(self._pair[used].tolist())) if recipe.reciprocal else np.arange(len(ends))
+
+    def prepare(self, progress: Progress) -> None:
+        folder = self.responses.file.parent / TARGETS
+        self._targets = load_directional_targets(self.responses, self.cells, folder, progress)
+        power = np.exp(2 * self._targets.flat[:, self.field.heads.levels].astype(np.float32))
+        self._levels = 0.5 * np.log((power + power[self._partner]) / 2)
+
+    def epoch(self, rows: Rows, rng: np.random.Generator) -> Rows:
+        """Return one row of each pair in random order."""
+        return rng.permutation(self._one_of_each_pair(rows))
+
+    def validation(self, rows: Rows) -> Rows:
+        return self._one_of_each_pair(rows)
+
+    def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        pairs = self._pair[rows]
+        listener, emitter = (torch.from_numpy(end[pairs]) for end in (self.targets.listener, self.targets.emitter))
+        if rng is not None and self.recipe.noise_m:
+            listener, emitter = (
+                end + torch.from_numpy(rng.normal(0, self.recipe.noise_m, end.shape).astype(np.float32))
+                for end in (listener, emitter)
+            )
+        return (listener, emitter), (self._flat(rows),)
+
+    def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
+        (flat,) = targets
+        losses = self._head_losses(prediction, flat, {})
+        error = self._energy_error.to(flat.device)(self._levels_of(prediction), flat[:, self.field.heads.levels])
+        return {**losses, "energy": self.recipe.energy_weight * error}
+
+    def _flat(self, rows: Rows) -> Tensor:
+        """(row, heads.size) targets of the recipe's order, which are the beginning of those that are stored."""
+        pairs, levels, size = self._pair[rows], self.field.heads.levels, self.field.heads.size
+        shares = self.targets.flat[pairs, levels.stop : size].astype(np.float32)
+        return torch.from_numpy(np.concatenate([self._levels[pairs], shares], axis=1))
+
+    def _one_of_each_pair(self, rows: Rows) -> Rows:
+        _, first = np.unique(self._pair[rows], return_index=True)
+        return rows[np.sort(first)]
+
+
+def _exchanged(ends: Sequence[tuple[int, int]], used: Set[int]) -> npt.NDArray[np.int64]:
+    """(pair,) the number of the pair with exchanged ends, where both are used, else that of the pair itself."""
+    numbers = {pair: number for number, pair in enumerate(ends) if number in used}
+    partners = [numbers.get((listener, emitter), number) for number, (emitter, listener) in enumerate(ends)]
+    return np.array([partner if number in used else number for number, partner in enumerate(partners)])

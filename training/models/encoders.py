@@ -1,0 +1,177 @@
+"""Encodes where listener and emitter are, as features of a network: learned features of both places, and the geometry
+of the path between them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from server.acoustics.geometry import FloorPlan
+from training.models.propagation import Path, Propagation
+from training.models.site import Reach
+
+GEOMETRY = "_propagation"
+"""The name of the module whose constants are positions, not weights. Rounding them would let sound through walls."""
+_AZIMUTH_HARMONICS = 5
+_YAW_HARMONICS = 3
+_PATH_DIRECTIONS = 2 + 2
+"""Number of features that follow the sight feature: the path's directions at both ends."""
+_POSITION_OCTAVES = 3
+_MOST_LOG_PRECISION = 14.0
+"""Corresponds to a bandwidth of a millimetre."""
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """Sizes of the network."""
+
+    rank: int = 128
+    width: int = 256
+    depth: int = 4
+    grid_spacing_m: float = 0.5
+    grid_features: int = 32
+
+
+class FeatureGrid(nn.Module):
+    """Learned features on a grid in plan, interpolated by a Gaussian Nadaraya-Watson kernel with a learned bandwidth
+    for each node.
+
+    Listener and emitter use the same grid, because the surroundings of a place are the same for both. The kernel is a
+    softmax, so it cannot underflow to 0/0 far from every node.
+    """
+
+    _nodes: Tensor
+
+    def __init__(self, plan: FloorPlan, spacing_m: float, features: int) -> None:
+        super().__init__()
+        low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
+        steps = [np.linspace(a, b, max(2, round((b - a) / spacing_m) + 1)) for a, b in zip(low, high, strict=True)]
+        nodes = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.register_buffer("_nodes", torch.tensor(nodes, dtype=torch.float32), persistent=False)
+        self._log_precision = nn.Parameter(torch.full((len(nodes),), float(-2 * np.log(spacing_m / 2) - np.log(2))))
+        self._features = nn.Parameter(torch.randn(len(nodes), features) * 0.1)
+
+    def forward(self, position: Tensor) -> Tensor:
+        """(..., 2 or 3) metres to (..., features)."""
+        offset = position[..., :2, None] - self._nodes.T
+        squared = torch.sum(offset * offset, dim=-2)
+        # On a node, an infinite precision would give 0 times infinity.
+        # guard: a bandwidth of zero is none
+        precision = torch.exp(torch.clamp(self._log_precision, max=_MOST_LOG_PRECISION))
+        # guard: kernel weights are a softmax
+        return torch.softmax(squared * -precision, dim=-1) @ self._features
+
+
+class _Encoder(nn.Module):
+    """Features of the path from emitter to listener, and of both ends.
+
+    Outside its `reach` a network extrapolates without control. So positions are moved to the nearest within reach, and
+    distances are at least the shortest within reach. Directions and sight are those of the true positions.
+    """
+
+    _low: Tensor
+    _high: Tensor
+    _centre: Tensor
+    _half_size: Tensor
+    _octaves: Tensor
+    _octave_phases: Tensor
+    _turns: Tensor
+    _after_sight = _PATH_DIRECTIONS
+
+    def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
+        super().__init__()
+        self._nearest_m = reach.nearest_m
+        self.register_buffer("_low", torch.tensor(reach.low, dtype=torch.float32), persistent=False)
+        self.register_buffer("_high", torch.tensor(reach.high, dtype=torch.float32), persistent=False)
+        self._propagation = Propagation(plan)
+        self.sees_all = self._propagation.sees_all
+        """Whether all places see each other."""
+        self._grid = FeatureGrid(plan, shape.grid_spacing_m, shape.grid_features)
+        low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
+        box = np.array([(*low, 0.0), (*high, plan.height_m)], dtype=np.float32)
+        self.register_buffer("_centre", torch.tensor(box.mean(axis=0)), persistent=False)
+        self.register_buffer("_half_size", torch.tensor((box[1] - box[0]) / 2), persistent=False)
+        quarter = np.pi / 2
+        octaves = quarter * 2.0 ** np.arange(_POSITION_OCTAVES)
+        self._keep("octaves", np.hstack([np.tile(octave * np.eye(3), 2) for octave in octaves]))
+        self._keep("octave_phases", np.tile(np.repeat([0.0, quarter], 3), _POSITION_OCTAVES))
+        self._keep("turns", np.array([[1, 0, 0, 1], [0, 1, -1, 0]]))
+
+    def sight(self, features: Tensor) -> Tensor:
+        """(B, 1) the sight feature: 1 where listener and emitter see each other, falling to 0 behind a corner."""
+        return features[:, -self._after_sight - 1 : -self._after_sight]
+
+    def _keep(self, name: str, values: npt.NDArray[np.floating | np.integer]) -> None:
+        self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.float32), persistent=False)
+
+    def _features(self, listener: Tensor, emitter: Tensor, path: Path, azimuth: Tensor) -> Tensor:
+        """(B, feature) all features but those of the head, with the `azimuth` of the path at the listener."""
+        distance = torch.clamp(path.length, min=self._nearest_m)
+        visible = path.visible
+        ends = torch.minimum(torch.maximum(torch.stack([listener, emitter], dim=1), self._low), self._high)
+        scalars = torch.cat([torch.log(distance), 1 / (1 + distance), path.rise / distance], dim=-1)
+        return torch.cat(
+            [
+                self._grid(ends).flatten(1),
+                self._waves(ends).flatten(1),
+                azimuth,
+                azimuth * visible,
+                scalars,
+                scalars * visible,
+                visible,
+                path.directions.flatten(1),
+            ],
+            dim=-1,
+        )
+
+    def _waves(self, position: Tensor) -> Tensor:
+        scaled = (position - self._centre) / self._half_size
+        return torch.cat([scaled, torch.sin(scaled @ self._octaves + self._octave_phases)], dim=-1)
+
+    def _multiples(self, towards: Tensor) -> Tensor:
+        """Cosine and sine of the first multiples of the angle of a direction in plan (B, 1, 2), by recurrence (without
+        a branch cut)."""
+        harmonics = [towards]
+        turning = (towards @ self._turns).reshape(-1, 2, 2)
+        for _ in range(_AZIMUTH_HARMONICS - 1):
+            harmonics.append(harmonics[-1] @ turning)
+        return torch.cat(harmonics, dim=1).transpose(1, 2).flatten(1)
+
+
+class PathEncoder(_Encoder):
+    """Encodes listener and emitter, without a head, as `size` features in world axes."""
+
+    def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
+        super().__init__(plan, shape, reach)
+        self.size = self(torch.zeros(1, 3), torch.ones(1, 3)).shape[-1]
+
+    def forward(self, listener: Tensor, emitter: Tensor) -> Tensor:
+        path = self._propagation(listener, emitter)
+        return self._features(listener, emitter, path, self._multiples(path.directions[:, :1]))
+
+
+class PoseEncoder(_Encoder):
+    """Encodes listener, emitter and the yaw of the listener's head as `size` features."""
+
+    _yaw_multiples: Tensor
+    _yaw_phases: Tensor
+    _turns_back: Tensor
+    _after_sight = _PATH_DIRECTIONS + 2 * _YAW_HARMONICS
+
+    def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
+        super().__init__(plan, shape, reach)
+        turns_back = np.zeros((2 * _YAW_HARMONICS, 4))
+        turns_back[[0, _YAW_HARMONICS]] = [[1, 0, 0, 1], [0, -1, 1, 0]]
+        self._keep("yaw_multiples", np.tile(np.arange(1, _YAW_HARMONICS + 1), 2))
+        self._keep("yaw_phases", np.repeat([np.pi / 2, 0.0], _YAW_HARMONICS))
+        self._keep("turns_back", turns_back)
+        self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1)).shape[-1]
+
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
+        path = self._propagation(listener, emitter)
+        # Cosines are sines of angles a quarter turn ahead: this takes fewer nodes.
+        heading = torch.sin(yaw[:, None] * self._yaw_multiples + self._yaw_phases)
+        towards = path.directions[:, :1] @ (heading @ self._turns_back).reshape(-1, 2, 2)
+        return torch.cat([self._features(listener, emitter, path, self._multiples(towards)), heading], dim=-1)
