@@ -102,3 +102,18 @@ def test_a_command_imports_nothing_slow_that_it_does_not_need(command, needed, t
         subprocess.run(run, cwd=ROOT, capture_output=True, check=True)
     result = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True)
     assert set(filter(None, result.stderr.split(","))) == needed
+
+
+LOAD_AND_TELL = """
+import sys
+from server.api.app import create_app
+from server.api.catalogue import load_hrtfs, load_scenes
+load_hrtfs([], load_scenes([]))
+print(*(name for name in ("matplotlib", "requests", "scipy.spatial", "sofar", "torch") if name in sys.modules))
+"""
+
+
+def test_a_server_of_the_bundled_scenes_reads_no_measured_head():
+    """KEMAR is prepared at the sample rate of each bundled scene. Reading and filtering it takes two seconds."""
+    run = [sys.executable, "-c", LOAD_AND_TELL]
+    assert subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split() == []

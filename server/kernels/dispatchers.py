@@ -10,6 +10,7 @@ unless it is told that it may.
 import contextlib
 import gc
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import Any
 
 from numba.core.codegen import JITCodeLibrary
@@ -76,7 +77,13 @@ class CompiledFunction(CPUDispatcher):  # type: ignore[misc]
         self, py_func: Callable[..., Any], targetoptions: dict[str, Any], on_compiled: Callable[[], None]
     ) -> None:
         super().__init__(py_func, targetoptions={**targetoptions, "no_cfunc_wrapper": True})
-        self._called = _CalledFunction(py_func, targetoptions, on_compiled)
+        self._targetoptions = targetoptions
+        self._on_compiled = on_compiled
+
+    @cached_property
+    def _called(self) -> _CalledFunction:
+        """Made only where something is compiled: a start makes a hundred functions, and mostly loads them from disk."""
+        return _CalledFunction(self.py_func, self._targetoptions, self._on_compiled)
 
     def compile(self, sig: Any) -> Any:
         with _no_collections():

@@ -23,11 +23,9 @@ if TYPE_CHECKING:
 _Floats = npt.NDArray[np.float64]
 
 KEMAR = Path(__file__).parent / "hrtf_data" / "mit_kemar_normal_pinna.sofa"
-PREPARED_RATE = 24_000
-"""The sample rate of the bundled scenes, in Hz."""
-PREPARED_KEMAR = KEMAR.with_name(f"mit_kemar_normal_pinna_{PREPARED_RATE}_hz.npz")
-"""KEMAR's filters as `HeadFilters.save` writes them. Reading the measurements and computing the filters would add a
-second to every start."""
+PREPARED_KEMAR = {rate: KEMAR.with_name(f"{KEMAR.stem}_{rate}_hz.npz") for rate in (24_000, 48_000)}
+"""KEMAR's filters as `HeadFilters.save` writes them, at each sample rate of the bundled scenes, in Hz. Reading the
+measurements and computing the filters would add two seconds to every start."""
 
 _ROWS_AT_ONCE = 32
 """How many responses are resampled together. soxr needs 120 kB for each, and is slower with more at once."""
@@ -210,8 +208,8 @@ class HeadFilters:
 @cache
 def kemar(sample_rate: int) -> HeadFilters:
     """The default head: for single responses, maps and simulations, and for clients that name no other."""
-    if sample_rate == PREPARED_RATE:
-        return HeadFilters.load(PREPARED_KEMAR)
+    if sample_rate in PREPARED_KEMAR:
+        return HeadFilters.load(PREPARED_KEMAR[sample_rate])
     return HeadFilters.from_hrtf(Hrtf.read(KEMAR, sample_rate))
 
 
@@ -250,4 +248,5 @@ def _smooth(directions: _Floats, common_s: _Floats) -> _Floats:
 
 
 if __name__ == "__main__":
-    HeadFilters.from_hrtf(Hrtf.read(KEMAR, PREPARED_RATE)).save(PREPARED_KEMAR)
+    for rate, path in PREPARED_KEMAR.items():
+        HeadFilters.from_hrtf(Hrtf.read(KEMAR, rate)).save(path)

@@ -12,7 +12,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from server.acoustics.decibels import amplitude_to_db, power_to_db
 from server.rendering import hrtf as hrtf_module
-from server.rendering.hrtf import KEMAR, PREPARED_RATE, HeadFilters, Hrtf
+from server.rendering.hrtf import KEMAR, PREPARED_KEMAR, HeadFilters, Hrtf
 from server.rendering.sofa import HrtfError, read_sofa
 
 HEAD_RADIUS_M = 0.0875
@@ -328,10 +328,12 @@ def test_a_head_is_resampled_in_little_memory():
     assert float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) < 80
 
 
-def test_the_prepared_head_is_what_its_measurements_make(kemar):
+@pytest.mark.parametrize("rate", PREPARED_KEMAR)
+def test_the_prepared_head_is_what_its_measurements_make(rate):
     """`python -m server.rendering.hrtf` prepares it anew. Processors differ in the last bits of a logarithm, and so in
     which way four directions on a circle are cut into two triangles."""
-    prepared, made = hrtf_module.kemar(PREPARED_RATE), HeadFilters.from_hrtf(kemar)
+    prepared, made = hrtf_module.kemar(rate), HeadFilters.from_hrtf(Hrtf.read(KEMAR, rate))
+    assert prepared.sample_rate == rate
     for name in ("directions", "cepstra", "delays_s"):
         np.testing.assert_allclose(getattr(prepared, name), getattr(made, name), rtol=1e-6, atol=1e-6)
     triangles, across, inverses = prepared.triangulation
