@@ -23,16 +23,22 @@ SWEEP ?= --phases-of none --reuse-of factorised-r16
 MEASURE ?=
 # How long either fuzzer runs, in seconds.
 FUZZ_SECONDS ?= 60
+# Folders with tests that watch the clock: collecting the others takes as long as many a test.
+TIMED := $(addprefix tests/,api bench integration runtime streaming)
 VENV := .venv
 BIN := $(VENV)/bin
-# Bytecode is compiled afterwards, on all cores; pip would use one. Some packages ship templates that do not compile.
+# The server alone is installed by uv, in a quarter of the time, or by pip where uv or its packages cannot be
+# had. Its bytecode is compiled by the first start, which needs a third of the modules.
+UV := $(BIN)/python -m uv pip install --quiet --python $(BIN)/python
+# Elsewhere bytecode is compiled afterwards, on all cores; pip would use one. Some packages ship templates that do not
+# compile.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 BYTECODE := $(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
-.PHONY: mutants attacks docs docs-serve results lock
+.PHONY: long mutants attacks docs docs-serve results lock
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
 
 help: ## show this list
@@ -41,9 +47,9 @@ help: ## show this list
 serve: $(VENV)/installed-server ## install the server and open a scene at http://127.0.0.1:8000 (HOST=, PORT=)
 	$(BIN)/nafir serve --host $(HOST) --port $(PORT)
 
-test: lint ## install what tests need, then lint, check types and run every test
-	$(BIN)/pytest --numprocesses auto --dist loadfile -m 'not timed'
-	$(BIN)/pytest -m 'timed and not attack'
+test: lint ## install what tests need, then lint, check types and run all tests but the long
+	$(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m 'not timed and not long'
+	$(BIN)/pytest $(TIMED) -m 'timed and not attack'
 
 lint: $(VENV)/installed-dev ## lint, check what imports what, and check types
 	$(BIN)/ruff check .
@@ -82,6 +88,9 @@ office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere
 
 own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kinds, and how long they ring beside other simulations: runs/own-scenes.md
 	$(BIN)/python -m training.trials.own_scenes runs/own-scenes
+
+long: $(VENV)/installed-dev ## tests that take very long for what they may find: recipes followed to the end, scenes at random
+	$(BIN)/pytest --numprocesses auto --dist worksteal -m long
 
 attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
 	$(BIN)/pytest -m attack
@@ -164,8 +173,7 @@ $(BIN)/python:
 
 $(VENV)/installed-server: pyproject.toml | $(BIN)/python
 	@echo "Installing the server into $(VENV), once ..."
-	$(PIP) --editable .
-	@$(BYTECODE)
+	@{ $(PIP) uv && $(UV) --editable .; } 2>/dev/null || $(PIP) --editable .
 	@touch $@
 
 # torch first and alone, so that no other requirement chooses a different build of it.

@@ -4,6 +4,7 @@ Sound decays, is louder nearby (1 / distance), and louder in the ear on its side
 """
 
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,47 @@ from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, 
 # How long an example takes depends on what else the machine does.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
+
+_LONG_FIRST = (
+    "training/bundling",
+    "training/simulation",
+    "training",
+    "streaming",
+    "scene",
+    "cli",
+    "page",
+    "integration",
+)
+"""Folders of the files that take longest, in this order: what begins last should be short."""
+
+_TIMED = ("api/", "bench/", "integration/", "runtime/", "streaming/")
+"""Folders with `timed` tests: TIMED of the Makefile."""
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Before workers start, what they would all compile is compiled."""
+    if session.config.getoption("dist", "no") != "no" and not hasattr(session.config, "workerinput"):
+        from tests.compiling import compile_kernels
+
+        compile_kernels()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Raises UsageError for a `timed` test where `make test` would not look for it."""
+
+    def folder(item: pytest.Item) -> str:
+        return item.path.parent.relative_to(Path(__file__).parent).as_posix() + "/"
+
+    for item in items:
+        if item.get_closest_marker("timed") and not folder(item).startswith(_TIMED):
+            raise pytest.UsageError(
+                f"{item.nodeid} is timed: `make test` has to be told its folder, as has conftest.py"
+            )
+    orders = [f"{name}/" for name in _LONG_FIRST]
+    items.sort(
+        key=lambda item: next((at for at, name in enumerate(orders) if folder(item).startswith(name)), len(orders))
+    )
+
 
 CODEC = CodecParameters(
     sample_rate=24_000, n_fft=256, hop=64, samples=4_000, lead_samples=64, known_frames=4, log_floor=1e-3
@@ -244,6 +286,15 @@ def hrtfs() -> HrtfLibrary:
 @pytest.fixture(scope="session")
 def filters(hrtfs) -> HeadFilters:
     return hrtfs.filters(DEFAULT_HRTF, CODEC.sample_rate)
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[str]:
+    """Address of `nafir serve` with its own scenes, for all tests of the page that leave it as it was."""
+    from tests import visitor  # without playwright, importing it skips what asks for it
+
+    with visitor.serving(visitor.free_port()) as url:
+        yield url
 
 
 @pytest.fixture

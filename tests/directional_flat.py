@@ -3,6 +3,7 @@ emitter, from everywhere, or from where a test wants it."""
 
 import io
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import onnx
@@ -22,14 +23,14 @@ FILE = "directional.onnx"
 BANDS = len(OCTAVE_BANDS_HZ)
 
 
-def directional_manifest(order: int) -> Manifest:
+def directional_manifest(order: int, tail: Literal["stft", "bands"] = "stft") -> Manifest:
     field = FieldFile(file=FILE, architecture="arithmetic", rank=1, predicts="directions", order=order)
     changes = {
         "format_version": 3,
         "codec": DIRECTIONAL_CODEC,
         "image_order": 1,
         "fields": {"directional": field},
-        "levels": (QualityLevel(name="standard", field="directional"),),
+        "levels": (QualityLevel(name="standard", field="directional", tail=tail),),
         "files": {FILE: "0" * 64, "arrays.npz": "0" * 64},
     }
     return Manifest.model_validate(MANIFEST.model_dump() | changes)
@@ -79,8 +80,13 @@ def directional_graph(order: int, towards: tuple[float, float, float] | None, le
     return model.SerializeToString()
 
 
-def write_directional(folder: Path, order: int = 2, towards: tuple[float, float, float] | None = None) -> Bundle:
+def write_directional(
+    folder: Path,
+    order: int = 2,
+    towards: tuple[float, float, float] | None = None,
+    tail: Literal["stft", "bands"] = "stft",
+) -> Bundle:
     noise = io.BytesIO()
     np.savez(noise, frozen_noise=np.random.default_rng(7).standard_normal((2, CODEC.samples), dtype=np.float32))
     files = {FILE: directional_graph(order, towards), "arrays.npz": noise.getvalue()}
-    return write_bundle(folder, directional_manifest(order), files)
+    return write_bundle(folder, directional_manifest(order, tail), files)

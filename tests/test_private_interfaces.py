@@ -20,6 +20,9 @@ import pytest
 import typer
 from numba.core import cgutils, config, imputils
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult, Flags
+from numba.core.registry import CPUDispatcher
 from numba.core.typing import templates, typeof
 from packaging.requirements import Requirement
 from typer.core import TyperCommand
@@ -32,6 +35,10 @@ ROOT = Path(__file__).parents[1]
 MODULES = {
     "numba.core.caching": "server/kernels/compiled.py",
     "numba.core": "server/kernels/",
+    "numba.core.codegen": "server/kernels/dispatchers.py",
+    "numba.core.compiler": "server/kernels/dispatchers.py",
+    "numba.core.compiler_lock": "server/kernels/dispatchers.py",
+    "numba.core.registry": "server/kernels/dispatchers.py",
     "numba.core.imputils": "server/kernels/by_reference.py",
     "numba.core.typing.templates": "server/kernels/by_reference.py",
     "numba.core.typing.typeof": "server/kernels/by_reference.py",
@@ -333,6 +340,24 @@ def test_numbas_cache_takes_a_locator_of_ours(tmp_path: Path) -> None:
         relies(sum(dispatcher.stats.cache_hits.values()) == times, "numba", COMPILED, "a second one reads what is kept")
     index = next(iter(tmp_path.glob("*.nbi")), None)
     relies(index and b" ours" in index.read_bytes(), "numba", COMPILED, "an index begins with the cache's _version")
+
+
+def test_numba_lets_a_dispatcher_and_its_library_decide_what_becomes_machine_code() -> None:
+    """What becomes of it, tests/kernels/test_dispatchers.py says."""
+    where = MODULES["numba.core.codegen"]
+    dispatcher = {"add_overload": ["cres"], "get_call_template": ["args", "kws"], "get_overload": ["sig"]}
+    has_methods(CPUDispatcher, "numba", where, dispatcher)
+    has_methods(Compiler, "numba", where, {"compile_extra": ["func"]})
+    library: dict[str, list[str]] = {
+        "_optimize_final_module": [],
+        "_finalize_final_module": [],
+        "_finalize_dynamic_globals": [],
+    }
+    has_methods(JITCodeLibrary, "numba", where, library)
+    has_methods(CompileResult, "numba", where, {"_find_referenced_environments": []})
+    flags = Flags()
+    for name in ("no_compile", "no_cpython_wrapper", "no_cfunc_wrapper"):
+        relies(hasattr(flags, name), "numba", where, f"a compilation has the flag {name}")
 
 
 def test_numba_does_without_blas_where_it_is_told_that_there_is_none() -> None:

@@ -3,12 +3,14 @@
 Levels are in decibels relative to full scale. Modules that visit take the fixtures they need by name.
 """
 
+import base64
 import contextlib
 import os
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -62,10 +64,50 @@ def serving(port: int, *options: str, settings: Mapping[str, str] | None = None)
         process.wait(timeout=20)
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    with serving(free_port()) as url:
-        yield url
+@contextlib.contextmanager
+def passing_on(port: int, url: str) -> Iterator[str]:
+    """A way to a server, at a port of its own. At the end it refuses connections, and those there are break."""
+    _, _, address = url.rpartition("/")
+    host, _, number = address.partition(":")
+    ends: list[socket.socket] = []
+    threads: list[threading.Thread] = []
+
+    def begin(work, *given) -> None:
+        threads.append(threading.Thread(target=work, args=given))
+        threads[-1].start()
+
+    def pass_on(source: socket.socket, to: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65_536):
+                to.sendall(data)
+        with contextlib.suppress(OSError):
+            to.shutdown(socket.SHUT_WR)
+
+    def accept() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = listener.accept()
+                ends.append(client)
+                server = socket.create_connection((host, int(number)))
+                ends.append(server)
+                begin(pass_on, client, server)
+                begin(pass_on, server, client)
+
+    listener = socket.create_server(("127.0.0.1", port))
+    begin(accept)
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        listener.shutdown(socket.SHUT_RDWR)
+        listener.close()
+        threads[0].join()
+        for end in ends:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+        for thread in threads:
+            thread.join()
+        for end in ends:
+            end.close()
 
 
 @pytest.fixture(scope="module")
@@ -100,13 +142,19 @@ def start(page) -> None:
     page.wait_for_function("nafir.state().connection === 'live' && nafir.state().poses.heard >= 0", timeout=20_000)
 
 
+_CAPTURE = """seconds => nafir.capture(seconds).then(({ left, right }) => [left, right].map((ear) => {
+  const bytes = new Uint8Array(ear.buffer, ear.byteOffset, ear.byteLength);
+  let text = "";
+  for (let at = 0; at < bytes.length; at += 8192) text += String.fromCharCode(...bytes.subarray(at, at + 8192));
+  return btoa(text);
+}))"""
+"""As base64: playwright passes an array number by number, which takes seconds."""
+
+
 def listen(page, *, seconds: float = LISTENING_S) -> np.ndarray:
     """(2, n): what is played in the seconds to come."""
     page.wait_for_timeout(1000 * seconds)
-    ears = page.evaluate(
-        "seconds => nafir.capture(seconds).then(({ left, right }) => [left, right].map((ear) => Array.from(ear)))",
-        seconds,
-    )
+    ears = [np.frombuffer(base64.b64decode(ear), np.float32) for ear in page.evaluate(_CAPTURE, seconds)]
     return np.asarray(ears, np.float64)
 
 

@@ -17,7 +17,12 @@ from server.api.settings import Settings
 from server.protocol.codes import CLOSE_CODES, ERROR_CODES
 
 _HEADING: Final = ["field", "type", "default", "meaning"]
-_PATTERNED: Final = {"listener": "x,y,z", "emitter": "x,y,z", "effect": "NAME=on or NAME=off"}
+_PATTERNED: Final = {
+    "listener": "x,y,z",
+    "emitter": "x,y,z",
+    "orientation": "x,y,z,w",
+    "effect": "NAME=on or NAME=off",
+}
 """Short forms of parameters that the schema describes by long patterns."""
 
 

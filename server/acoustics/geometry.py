@@ -62,6 +62,22 @@ class Quaternion(_Components):
             raise ValueError("yaw must be a finite number")
         return cls(0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
+    @classmethod
+    def from_angles(cls, yaw_rad: float, pitch_rad: float, roll_rad: float) -> "Quaternion":
+        """The orientation of a head that turns counter-clockwise by a yaw, then raises its nose by a pitch, then tilts
+        to its right by a roll (right ear down), each about its own axes. Raises ValueError if one is not finite."""
+        if not all(map(math.isfinite, (yaw_rad, pitch_rad, roll_rad))):
+            raise ValueError("yaw, pitch and roll must be finite numbers")
+        yaw, pitch, roll = yaw_rad / 2, -pitch_rad / 2, roll_rad / 2  # about y, which points left, the nose goes down
+        cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+        cr, sr = math.cos(roll), math.sin(roll)
+        return cls(
+            cy * cp * sr - sy * sp * cr,
+            cy * sp * cr + sy * cp * sr,
+            sy * cp * cr - cy * sp * sr,
+            cy * cp * cr + sy * sp * sr,
+        )
+
 
 LEVEL = Quaternion(0.0, 0.0, 0.0, 1.0)
 

@@ -74,10 +74,9 @@ def rotation(orientation: Sequence[float] | npt.NDArray[np.floating], order: int
     A rotation turns harmonics of one degree into each other. So their values at a few directions, before and after the
     rotation, determine the matrix.
     """
-    turned = even_directions(_SAMPLED) @ axes_of(orientation).T
-    matrix = (_inverse(order) @ real_harmonics(turned, order)).T
-    n = degrees(order)
-    matrix[n[:, None] != n] = 0
+    directions, inverse, is_apart = _sampled(order)
+    matrix = (inverse @ real_harmonics(directions @ axes_of(orientation).T, order)).T
+    matrix[is_apart] = 0
     return matrix
 
 
@@ -91,6 +90,9 @@ def even_directions(count: int) -> _Floats:
 
 
 @cache
-def _inverse(order: int) -> _Floats:
-    """(k, direction) what gives the coefficients of a function from its values at the sampled directions."""
-    return np.asarray(np.linalg.pinv(real_harmonics(even_directions(_SAMPLED), order)))
+def _sampled(order: int) -> tuple[_Floats, _Floats, npt.NDArray[np.bool_]]:
+    """Directions (direction, 3), the matrix (k, direction) from a function's values there to its coefficients, and (k,
+    k) which harmonics are of different degrees."""
+    directions, n = even_directions(_SAMPLED), degrees(order)
+    inverse = np.asarray(np.linalg.pinv(real_harmonics(directions, order)), dtype=np.float64)
+    return directions, inverse, np.not_equal.outer(n, n)

@@ -31,7 +31,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.effect_costs import measure_costs
 from server.planning.places import place_of_field
 from server.protocol.client_messages import AUTO, PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
-from server.rendering.warm_up import warm_up
+from server.rendering.warm_up import compile_rendering, warm_up
 from server.responses.ir_request import compute_irs
 from server.runtime.drain import Drain
 from server.runtime.memory import collect_as_usual, collect_rarely
@@ -61,9 +61,10 @@ def create_app(
     scenes: Mapping[str, FieldsByLevel] | None = None,
     hrtfs: HrtfLibrary | None = None,
     drain: Drain | None = None,
+    compiler: CompilingProcess | None = None,
 ) -> FastAPI:
     """The application. A caller that wants to report loading errors first passes the loaded `scenes`, by id, and
-    `hrtfs`. `drain` lets the caller begin the shutdown.
+    `hrtfs`. `drain` lets the caller begin the shutdown. `compiler` may have begun to compile already.
 
     Without `scenes` or `hrtfs` they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError
     for a damaged HRTF file.
@@ -82,7 +83,7 @@ def create_app(
                 waiting=settings.max_waiting_requests,
                 is_urgent=lambda: workers.are_busy,
             ) as responses,
-            CompilingProcess() as compiler,
+            CompilingProcess() if compiler is None else compiler as compiling,
         ):
             audio = AudioEngine(
                 asyncio.get_running_loop().call_soon_threadsafe,
@@ -104,7 +105,7 @@ def create_app(
                 become_prompt()
             audio.start()
             tasks = [
-                asyncio.create_task(_become_ready(host, compiler)),
+                asyncio.create_task(_become_ready(host, compiling)),
                 asyncio.create_task(host.readiness.watch.run()),
             ]
             try:
@@ -173,9 +174,10 @@ def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:
 def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
     """Decode clips, compute responses and render once, so that the first stream does not have to wait for it. Also
     measure how long this host takes for a response of each level."""
-    compiler.begin(next(iter(host.scenes.values())).bundle, cores=usable_cores())
+    compiler.begin((levels.bundle for levels in host.scenes.values()), cores=usable_cores())
+    compile_rendering()
+    compiler.wait()  # all else is on disk then
     warm_up(get_args(BlockSize))
-    compiler.wait()
     for scene, levels in host.scenes.items():
         host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)

@@ -1,7 +1,8 @@
-"""The first start compiles for minutes of processor time. It does so on two cores at once, and tells how far it is.
+"""The first start compiles for a minute of processor time. It does so on two cores at once, and tells how far it is.
 
-Numba compiles one function at a time in each process. So a second process compiles the code that computes responses,
-while the server compiles the code that renders blocks. Each reads from disk what the other has compiled.
+Numba compiles one function at a time in each process. So a second process compiles the code that computes responses and
+prepares them for rendering, while the server compiles the code that renders blocks. The server then reads from disk
+what the process has compiled.
 """
 
 import asyncio
@@ -9,14 +10,17 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 
 from server.field.fields_by_level import FieldsByLevel
 from server.kernels.compiled import functions_compiled, is_kept
+from server.rendering.hrtf import kemar
 from server.rendering.output_kernel import mix_listeners
 from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import Bundle
+from server.streaming.calibration import calibrate
 
 _TOLD_EVERY_S = 5.0
 
@@ -41,13 +45,14 @@ class CompilingProcess:
                 self._process.kill()
                 self._process.wait()
 
-    def begin(self, bundle: Bundle, *, cores: int) -> None:
-        """Start compiling. Do nothing on one core, for a scene without a field, or if an earlier start has compiled
-        everything."""
-        if cores < 2 or not bundle.manifest.fields or is_kept(mix_listeners):
+    def begin(self, bundles: Iterable[Bundle], *, cores: int) -> None:
+        """Start compiling for the first of the bundles that has a field. Do nothing on one core, if none has a field,
+        if an earlier start has compiled everything, or if it has begun already."""
+        if self._process is not None or cores < 2 or is_kept(mix_listeners):
             return
+        bundle = next((bundle for bundle in bundles if bundle.manifest.fields), None)
         with self._lock:
-            if not self._has_ended:
+            if bundle is not None and not self._has_ended:
                 self._process = subprocess.Popen(
                     [sys.executable, "-m", "server.api.first_start", str(bundle.folder)],
                     stdin=subprocess.DEVNULL,
@@ -76,10 +81,12 @@ async def tell_while_compiling() -> None:
 
 
 def _compile(folder: Path) -> None:
-    """Compute one response of a bundle, so that the code for it is on disk."""
-    field = FieldsByLevel.load(Bundle.load(folder)).default
+    """Compute responses of a bundle, at its default level and at each for rendering, so that the code is on disk."""
+    levels = FieldsByLevel.load(Bundle.load(folder))
+    field = levels.default
     start = field.bundle.manifest.start
     ImpulseResponse.compute(field, IrQuery(start.listener, start.emitter))
+    calibrate(levels, kemar(field.sample_rate), poses=1)
 
 
 if __name__ == "__main__":

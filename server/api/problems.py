@@ -10,7 +10,7 @@ from starlette.exceptions import HTTPException
 
 from server.core.errors import RequestError
 
-_POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "height_m"})
+_POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "pitch_deg", "roll_deg", "orientation", "height_m"})
 _STATUSES = {"position_out_of_bounds": 404, "unknown_level": 404, "map_too_fine": 409, "map_too_slow": 409}
 """Statuses of well-formed requests that ask for something that does not exist, or for too much. Malformed ones get
 422."""

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response, WebSocket
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import BeforeValidator, Field
 
+from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.api.asyncapi import document
 from server.api.catalogue import describe_scene, playable_clips
 from server.api.connection import Connection, StreamHost
@@ -19,13 +20,15 @@ from server.api.web_socket import fast_path
 from server.assets.hrtfs import DEFAULT_HRTF
 from server.core.entity_tags import content_tag
 from server.core.errors import RequestError
-from server.core.numerals import parse_decimal
+from server.core.numerals import parse_decimal, parse_integer
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.plan_query import EFFECT_PATTERN, OUTPUTS, PlanDocument, PlanQuery, parse_effects, rounded
 from server.responses.full_response import FullResponse
 from server.responses.impulse_response import (
     IR_FORMATS,
+    IR_OUTPUTS,
     MEDIA_TYPES,
+    ORIENTATION_PATTERN,
     POSITION_PATTERN,
     ImpulseResponse,
     IrQuery,
@@ -57,12 +60,12 @@ def _between(low: float, high: float) -> dict[str, Any]:
     return {"ge": low, "le": high, "json_schema_extra": {"minimum": low, "maximum": high}}
 
 
+_TURNS = _between(-36_000, 36_000)
 Number = Annotated[float, BeforeValidator(lambda value: parse_decimal(value) if isinstance(value, str) else value)]
+WholeNumber = Annotated[int, BeforeValidator(lambda value: parse_integer(value) if isinstance(value, str) else value)]
 LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
 PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"], json_schema_extra=_PLACE)]
-YawDeg = Annotated[
-    Number, Query(**_between(-36_000, 36_000), description="of the head, counter-clockwise, 0 looks along +x")
-]
+YawDeg = Annotated[Number, Query(**_TURNS, description="of the head, counter-clockwise, 0 looks along +x")]
 EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
 _IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
 _IR_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
@@ -125,19 +128,54 @@ async def impulse_response(
     listener: PositionText,
     emitter: PositionText,
     yaw_deg: YawDeg = 0.0,
+    pitch_deg: Annotated[Number, Query(**_TURNS, description="of the head after its yaw, nose up")] = 0.0,
+    roll_deg: Annotated[Number, Query(**_TURNS, description="of the head after its pitch, right ear down")] = 0.0,
+    orientation: Annotated[
+        str | None,
+        Query(
+            description="x,y,z,w: a quaternion of the head, of any length but zero, in place of the three angles",
+            examples=["0,0,0.707,0.707"],
+            json_schema_extra={"pattern": ORIENTATION_PATTERN},
+        ),
+    ] = None,
+    hrtf: Annotated[
+        str | None, Query(description="head of a binaural response, one of GET /v1/hrtfs; by default kemar")
+    ] = None,
+    output: Annotated[
+        str | None,
+        Query(
+            description="binaural, ambisonics or mono; by default binaural, or mono where one microphone measured",
+            json_schema_extra={"enum": [*IR_OUTPUTS]},
+        ),
+    ] = None,
+    order: Annotated[
+        WholeNumber | None, Query(**_between(1, HIGHEST_ORDER), description="of ambisonics; by default 1")
+    ] = None,
     level: LevelText = None,
-    format: Annotated[str, Query(description="wav, npy or json", json_schema_extra={"enum": [*IR_FORMATS]})] = "wav",  # noqa: A002  the parameter's name
+    format: Annotated[  # noqa: A002  the parameter's name
+        str, Query(description="wav, npy, json or sofa", json_schema_extra={"enum": [*IR_FORMATS]})
+    ] = "wav",
 ) -> Response:
     """The impulse response between two places, as `nafir ir` writes it."""
     field = _levels(request, scene).choose(level)
     name = parse_format(format)
-    query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
-    query.require_inside(field)
+    angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
+    query = IrQuery.of(
+        field,
+        listener,
+        emitter,
+        **{angle: degrees if angle in request.query_params else None for angle, degrees in angles.items()},
+        orientation=orientation,
+        output=output,
+        order=order,
+        hrtf=hrtf,
+    )
+    filters = _host(request).hrtfs.filters(query.hrtf, field.sample_rate)
     return await _cached(
         request,
-        query.etag(field, name),
+        query.etag(field, name, filters),
         MEDIA_TYPES[name],
-        lambda _: ImpulseResponse.compute(field, query).encode(name),
+        lambda _: ImpulseResponse.compute(field, query, filters).encode(name),
     )
 
 

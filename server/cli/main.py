@@ -6,7 +6,6 @@ Errors that a user can correct end the process with one line and exit code 2, as
 import contextlib
 import io
 import json
-import math
 import sys
 import time
 from pathlib import Path
@@ -39,6 +38,11 @@ app.command()(soak)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]
+Hrtf = Annotated[Path | None, typer.Option(help="SOFA file with the head to use instead of KEMAR.")]
+Ambisonics = Annotated[
+    bool, typer.Option("--ambisonics", help="AmbiX channels (ACN, SN3D) in place of two ears, in the head's axes.")
+]
+Order = Annotated[int | None, typer.Option(help="Order of the ambisonics, 1 to 3. [default: 1]", metavar="N")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, for programs.")]
 
 
@@ -78,10 +82,12 @@ def serve(
     from server.api import serving
     from server.api.app import create_app
     from server.api.catalogue import load_hrtfs, load_scenes
-    from server.api.settings import Settings
+    from server.api.first_start import CompilingProcess
+    from server.api.settings import Settings, usable_cores
     from server.runtime.drain import Drain
     from server.runtime.memory import give_back_large_arrays
     from server.runtime.open_files import allow_connections
+    from server.scene.bundle import Bundle, bundled_scenes
 
     give_back_large_arrays()
     given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf}
@@ -98,12 +104,14 @@ def serve(
     with contextlib.ExitStack() as opened:
         # Before the slow part, so that a port that cannot be bound is reported at once.
         listeners = [opened.enter_context(listener) for listener in serving.bind(settings.host, settings.port)]
+        compiler = opened.enter_context(CompilingProcess())
+        compiler.begin(map(Bundle.load, bundled_scenes()), cores=usable_cores())
         scenes = load_scenes(settings.bundles)
         if not scenes:
             raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
         hrtfs = load_hrtfs(settings.hrtfs, scenes)
         drain = Drain(settings.drain_s)
-        application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain)
+        application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain, compiler=compiler)
         url = serving.url(listeners[0], settings.host)
         announcement = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
         serving.serve(
@@ -120,28 +128,63 @@ def ir(
     listener: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
     emitter: Annotated[str, typer.Option(help="x,y,z in metres.", metavar="X,Y,Z")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="File to write: .wav, .npy or .json.", callback=writable_file)
+        Path,
+        typer.Option("--output", "-o", help="File to write: .wav, .npy, .json or .sofa.", callback=writable_file),
     ],
     yaw_deg: Annotated[
-        float, typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x.", metavar="DEGREES")
-    ] = 0.0,
+        float | None,
+        typer.Option(help="Heading of the head, counter-clockwise; 0 looks along +x. [default: 0]", metavar="DEGREES"),
+    ] = None,
+    pitch_deg: Annotated[
+        float | None, typer.Option(help="Pitch of the head after its yaw, nose up. [default: 0]", metavar="DEGREES")
+    ] = None,
+    roll_deg: Annotated[
+        float | None,
+        typer.Option(help="Roll of the head after its pitch, right ear down. [default: 0]", metavar="DEGREES"),
+    ] = None,
+    orientation: Annotated[
+        str | None,
+        typer.Option(help="Quaternion of the head, in place of the three angles.", metavar="X,Y,Z,W"),
+    ] = None,
+    hrtf: Hrtf = None,
+    binaural: Annotated[
+        bool, typer.Option("--binaural", help="Two ears, where a scene was measured with one microphone.")
+    ] = False,
+    ambisonics: Ambisonics = False,
+    order: Order = None,
+    mono: Annotated[bool, typer.Option("--mono", help="One channel, without a head.")] = False,
     level: Level = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the binaural impulse response between two places."""
+    """Write the impulse response between two places: two ears, ambisonics or one channel."""
+    from server.assets.hrtfs import HrtfLibrary
     from server.field.field import AcousticField
     from server.field.fields_by_level import require_level
-    from server.responses.impulse_response import ImpulseResponse, IrQuery, parse_format, parse_position
+    from server.responses.impulse_response import ImpulseResponse, IrQuery, parse_format
     from server.scene.bundle import Bundle, find_bundle
 
     name = parse_format(output.suffix.removeprefix("."))
-    if not math.isfinite(yaw_deg):
-        raise RequestError("malformed_pose", "yaw-deg is not finite", field="yaw_deg")
-    query = IrQuery(parse_position(listener, "listener"), parse_position(emitter, "emitter"), yaw_deg)
+    outputs = {"binaural": binaural, "ambisonics": ambisonics, "mono": mono}
+    require_at_most_one({f"--{each}": is_given for each, is_given in outputs.items()})
     bundle = Bundle.load(find_bundle(scene))
     field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
+    query = IrQuery.of(
+        field,
+        listener,
+        emitter,
+        yaw_deg=yaw_deg,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
+        orientation=orientation,
+        output=next((each for each, is_given in outputs.items() if is_given), None),
+        order=order,
+        hrtf=None if hrtf is None else hrtf.stem,
+    )
+    filters = None
+    if hrtf is not None:
+        filters = HrtfLibrary([hrtf], [field.sample_rate]).filters(hrtf.stem, field.sample_rate)
     started_s = time.perf_counter()
-    response = ImpulseResponse.compute(field, query)
+    response = ImpulseResponse.compute(field, query, filters)
     duration_ms = (time.perf_counter() - started_s) * 1000
     _write(output, response.encode(name))
     _report(
@@ -153,6 +196,7 @@ def ir(
             "scene": response.scene,
             "level": response.level,
             "sample_rate": response.sample_rate,
+            "channels": list(response.channels),
             "samples": response.samples.shape[1],
             "duration_ms": round(duration_ms, 3),
         },
@@ -177,7 +221,7 @@ def render(
     ] = 256,
     level: Level = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
-    hrtf: Annotated[Path | None, typer.Option(help="SOFA file with the head to use instead of KEMAR.")] = None,
+    hrtf: Hrtf = None,
     effects: Annotated[
         str,
         typer.Option(

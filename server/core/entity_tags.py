@@ -14,7 +14,10 @@ from pathlib import Path
 
 import llvmlite.binding as llvm
 
-_COMPUTE = ("numpy", "scipy", "numba", "llvmlite", "onnxruntime", "pillow", "pydantic", "sofar", "soxr", "soundfile")
+_COMPUTE = (
+    *("numpy", "scipy", "numba", "llvmlite", "onnxruntime"),
+    *("netcdf4", "pillow", "pydantic", "sofar", "soxr", "soundfile"),
+)
 """Python distributions whose arithmetic or encoding affects the bytes of a body."""
 _PACKAGE = Path(__file__).parents[1]
 

@@ -106,8 +106,8 @@ def add_band_tail(
 
     The tail begins at sample `fade_at`, where the first frame is `missing` from the response; `missing` (2, sample) is
     the missing amplitude from there on, if that frame is there and if it is not. A `share` of it is there, since levels
-    are delayed by parts of a frame. Where all frames are missing, what the response holds is replaced. `scratch` (2,
-    sample) is overwritten.
+    are delayed by parts of a frame. Where all frames are missing, the response is silent before. `scratch` (2, sample)
+    is overwritten.
     """
     end = min(response.shape[1], noises.shape[2])
     there, one = np.float32(share), np.float32(1.0)
@@ -121,9 +121,6 @@ def add_band_tail(
             for n in range(begin, whole):
                 amplitude = there * missing[0, n - fade_at] + (one - there) * missing[1, n - fade_at]
                 response[ear, n] += amplitude * scratch[ear, n - begin]
-    for ear in range(2):
-        for n in range(whole, response.shape[1]):
-            response[ear, n] = 0
     _add(gains, places, noises, whole, end, 0, response)
 
 

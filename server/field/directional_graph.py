@@ -22,6 +22,7 @@ from server.acoustics.spherical_harmonics import harmonic_count
 from server.field.directions_kernel import ears_of_directions
 from server.field.graph import INPUTS, FieldGraph, Spectrograms
 from server.field.runtime import InferenceSession
+from server.kernels.simd import LANES
 from server.rendering.ear_products import EarProducts
 from server.rendering.hrtf import HeadFilters, kemar
 from server.scene.bundle import Bundle
@@ -62,12 +63,16 @@ class DirectionalGraph(FieldGraph):
     Raises BundleError for a graph that does not fit the manifest.
     """
 
+    predicts_directions: ClassVar[bool] = True
     _inputs: ClassVar[dict[str, list[int]]] = DIRECTIONAL_INPUTS
 
     def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:
         order = bundle.manifest.fields[name].order
         assert order is not None  # by the manifest
         self.order = order
+        """The order of the predicted harmonics."""
+        self.heard_order = order
+        """The order up to which they are heard."""
         self._turned: _Turned | None = None
         super().__init__(bundle, name, session)
 
@@ -78,10 +83,20 @@ class DirectionalGraph(FieldGraph):
     def through(self, filters: HeadFilters) -> "DirectionalGraph":
         if filters is self._filters:
             return self
+        other = self._copy()
+        other._filters = filters
+        return other
+
+    def of_order(self, order: int) -> "DirectionalGraph":
+        """The same field with harmonics up to a lower order only."""
+        other = self._copy()
+        other.heard_order = min(order, self.order)
+        return other
+
+    def _copy(self) -> "DirectionalGraph":
         other = copy.copy(self)
         other._turned = None
         vars(other).pop("_products", None)
-        other._filters = filters
         return other
 
     def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
@@ -96,6 +111,11 @@ class DirectionalGraph(FieldGraph):
             said.append(np.zeros((rows, 0, *axes), np.float32))
         return Arrivals(*said)
 
+    def heard_arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
+        """What arrives, with directions up to the heard order."""
+        arrivals = self.arrivals(listeners, emitters)
+        return Arrivals(arrivals.log_magnitude, arrivals.directions[:, : harmonic_count(self.heard_order) - 1])
+
     def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:
         return self.at_ears(self._arrivals_of(outputs), heads)
 
@@ -106,18 +126,21 @@ class DirectionalGraph(FieldGraph):
         orientations = orientations_of(heads)
         rows, all_columns = len(orientations), arrivals.log_magnitude.shape[-1]
         levels, coherence = np.empty((2, rows, 2, codec.bins, all_columns), np.float32)
-        work = np.empty((harmonic_count(self.order) + 1, len(OCTAVE_BANDS_HZ), all_columns), np.float32)
-        band, share = self._between_bands
+        written = all_columns if columns is None else columns
+        whole = -(-written // LANES) * LANES
+        harmonics = harmonic_count(self.heard_order)
+        work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
+        band, share = self.between_bands
         for row, orientation in enumerate(orientations):
             ears_of_directions(
                 arrivals.log_magnitude[row],
-                arrivals.directions[row],
+                arrivals.directions[row, : harmonics - 1],
                 self._turned_to(orientation).of_bins,
                 band,
                 share,
                 codec.log_floor,
                 LEAST_POWER,
-                columns or all_columns,
+                written,
                 work,
                 levels[row],
                 coherence[row],
@@ -157,15 +180,16 @@ class DirectionalGraph(FieldGraph):
         key, last = orientation.tobytes(), self._turned
         if last is None or last.orientation != key:
             of_bins = self._products.turned(orientation)
-            last = self._turned = _Turned(key, of_bins, np.tensordot(self._mean_over_band, of_bins, 1))
+            of_bands = self._mean_over_band @ of_bins.reshape(len(of_bins), -1)
+            last = self._turned = _Turned(key, of_bins, of_bands.reshape(-1, *of_bins.shape[1:]))
         return last
 
     @cached_property
     def _products(self) -> EarProducts:
-        return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.order)
+        return EarProducts.of(self._filters, bins=self.parameters.codec.bins, order=self.heard_order)
 
     @cached_property
-    def _between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
+    def between_bands(self) -> tuple[npt.NDArray[np.int64], Float32]:
         """For each bin, the octave band below it and its share of the way to the next, over the logarithm of frequency;
         the outermost bands reach to the ends."""
         codec = self.parameters.codec

@@ -7,8 +7,28 @@ import numpy as np
 import numpy.typing as npt
 
 from server.kernels.compiled import compiled
+from server.kernels.simd import (
+    LANES,
+    add,
+    at_least,
+    broadcast,
+    choose_below,
+    divide,
+    exponential,
+    load,
+    load_broadcast,
+    logarithm,
+    multiply,
+    multiply_add,
+    square_root,
+    store,
+    subtract,
+)
 
 Float32 = npt.NDArray[np.float32]
+
+_SILENT = np.float32(-80.0)
+"""A log magnitude below every floor."""
 
 
 @compiled
@@ -31,57 +51,74 @@ def ears_of_directions(
     `log_magnitude` (band, column) and `directions` (k - 1, band, column) are a field's predictions, `products` (bin,
     product, k) those of the turned head. A bin lies between `band` (bin,) and the next, at this `share` (bin,) of the
     way. Where directions cancel, an ear's power is `least` times that of the same sound from all directions. Only the
-    first `columns` are written. `work` is (k + 1, band, column).
+    first `columns` are written. `work` is (k + 1, band, columns in whole vectors).
     """
-    bands = log_magnitude.shape[0]
     harmonics = products.shape[2]
-    zero, one = np.float32(0.0), np.float32(1.0)
-    floor = np.float32(log_floor)
-    for number in range(bands):
-        for column in range(columns):
-            magnitude = max(np.exp(log_magnitude[number, column]) - floor, zero)
-            power = magnitude * magnitude
-            work[0, number, column] = power
-            for k in range(1, harmonics):
-                work[k, number, column] = power * directions[k - 1, number, column]
-    left, right = work[harmonics, 0], work[harmonics, 1]
-    real, imaginary = work[harmonics, 2], work[harmonics, 3]
+    floor, lowest = broadcast(np.float32(log_floor)), broadcast(np.float32(least))
+    zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
+    _find_powers(log_magnitude, directions, columns, floor, zero, work)
+    row, rest = work.shape[2], work[harmonics].ctypes.data
+    by_band, by_harmonic = 4 * row, 4 * row * work.shape[1]
     for bin_ in range(products.shape[0]):
-        low = band[bin_]
-        upper = share[bin_]
-        lower = one - upper
-        for column in range(columns):
-            power = lower * work[0, low, column] + upper * work[0, low + 1, column]
-            left[column] = products[bin_, 0, 0] * power
-            right[column] = products[bin_, 1, 0] * power
-            real[column] = products[bin_, 2, 0] * power
-            imaginary[column] = products[bin_, 3, 0] * power
-            levels[0, bin_, column] = np.float32(least) * left[column]
-            levels[1, bin_, column] = np.float32(least) * right[column]
-        for k in range(1, harmonics):
-            of_left, of_right = products[bin_, 0, k], products[bin_, 1, k]
-            of_real, of_imaginary = products[bin_, 2, k], products[bin_, 3, k]
-            for column in range(columns):
-                power = lower * work[k, low, column] + upper * work[k, low + 1, column]
-                left[column] += of_left * power
-                right[column] += of_right * power
-                real[column] += of_real * power
-                imaginary[column] += of_imaginary * power
-        for column in range(columns):
+        upper = broadcast(share[bin_])
+        lower = subtract(one, upper)
+        of_bin = products[bin_].ctypes.data
+        for column in range(0, columns, LANES):
+            at = work.ctypes.data + band[bin_] * by_band
+            power = multiply_add(upper, load(at + by_band, column), multiply(lower, load(at, column)))
+            left, right = multiply(load_broadcast(of_bin, 0), power), multiply(load_broadcast(of_bin, harmonics), power)
+            real = multiply(load_broadcast(of_bin, 2 * harmonics), power)
+            imaginary = multiply(load_broadcast(of_bin, 3 * harmonics), power)
+            least_left, least_right = multiply(lowest, left), multiply(lowest, right)
+            for k in range(1, harmonics):
+                at += by_harmonic
+                power = multiply_add(upper, load(at + by_band, column), multiply(lower, load(at, column)))
+                left = multiply_add(load_broadcast(of_bin, k), power, left)
+                right = multiply_add(load_broadcast(of_bin, harmonics + k), power, right)
+                real = multiply_add(load_broadcast(of_bin, 2 * harmonics + k), power, real)
+                imaginary = multiply_add(load_broadcast(of_bin, 3 * harmonics + k), power, imaginary)
             # guard: where directions cancel, sound is left over
-            left_power = max(left[column], levels[0, bin_, column])
-            right_power = max(right[column], levels[1, bin_, column])
-            both = left_power * right_power
+            left_power = at_least(left, least_left)
+            left_size, right_size = square_root(left_power), square_root(at_least(right, least_right))
+            both = multiply(left_size, right_size)
             # guard: silent ears have no coherence
-            scale = one / np.sqrt(both) if both > zero else zero
-            real_part, imaginary_part = real[column] * scale, imaginary[column] * scale
-            square = real_part * real_part + imaginary_part * imaginary_part
+            scale = choose_below(zero, both, divide(one, both), zero)
+            real, imaginary = multiply(real, scale), multiply(imaginary, scale)
+            square = multiply_add(real, real, multiply(imaginary, imaginary))
             # guard: coherence from directions is at most one
-            if square > one:
-                shrunk = one / np.sqrt(square)
-                real_part *= shrunk
-                imaginary_part *= shrunk
-            coherence[0, bin_, column] = real_part
-            coherence[1, bin_, column] = imaginary_part
-            levels[0, bin_, column] = np.log(np.sqrt(left_power) + floor)
-            levels[1, bin_, column] = np.log(np.sqrt(right_power) + floor)
+            shrunk = divide(one, square_root(at_least(square, one)))
+            if column + LANES <= columns:
+                store(levels[0, bin_].ctypes.data, column, logarithm(add(left_size, floor)))
+                store(levels[1, bin_].ctypes.data, column, logarithm(add(right_size, floor)))
+                store(coherence[0, bin_].ctypes.data, column, multiply(real, shrunk))
+                store(coherence[1, bin_].ctypes.data, column, multiply(imaginary, shrunk))
+                continue
+            store(rest, 0, logarithm(add(left_size, floor)))
+            store(rest, row, logarithm(add(right_size, floor)))
+            store(rest, 2 * row, multiply(real, shrunk))
+            store(rest, 3 * row, multiply(imaginary, shrunk))
+            for lane in range(columns - column):
+                levels[0, bin_, column + lane] = work[harmonics, 0, lane]
+                levels[1, bin_, column + lane] = work[harmonics, 1, lane]
+                coherence[0, bin_, column + lane] = work[harmonics, 2, lane]
+                coherence[1, bin_, column + lane] = work[harmonics, 3, lane]
+
+
+@compiled
+def _find_powers(log_magnitude, directions, columns, floor, zero, work) -> None:
+    """Write the powers (k, band, column) of the first columns to `work`; whole vectors are filled up with silence."""
+    whole = work.shape[2]
+    for number in range(log_magnitude.shape[0]):
+        power = work[0, number]
+        for column in range(columns):
+            power[column] = log_magnitude[number, column]
+        for column in range(columns, whole):
+            power[column] = _SILENT
+        for column in range(0, whole, LANES):
+            magnitude = at_least(subtract(exponential(load(power.ctypes.data, column)), floor), zero)
+            store(power.ctypes.data, column, multiply(magnitude, magnitude))
+        for k in range(1, directions.shape[0] + 1):
+            for column in range(columns):
+                work[k, number, column] = power[column] * directions[k - 1, number, column]
+            for column in range(columns, whole):
+                work[k, number, column] = 0

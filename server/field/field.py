@@ -19,6 +19,7 @@ from server.acoustics.geometry import Vector3, yaws_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError, FieldError
 from server.field.any_size_decoder import add_from, resized
@@ -76,6 +77,8 @@ class AcousticField:
         self.bundle = bundle
         self.level = level
         self.graph = graph
+        if level.order is not None and isinstance(graph, DirectionalGraph):
+            self.graph = graph = graph.of_order(level.order)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
         is_whole = bundle.manifest.direct_sound == "field"
         # Measured sound may arrive earlier than geometry predicts: the gate opens with the first coded sample.
@@ -185,6 +188,43 @@ class AcousticField:
             raise ValueError("listeners, emitters and heads must be finite")
         return self.source.responses(listeners, emitters, heads, remember=remember)
 
+    @property
+    def knows_directions(self) -> bool:
+        """Whether `ambisonics` is possible: the field tells from where sound arrives, and not what one head hears."""
+        return self.graph.predicts_directions
+
+    def ambisonics(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, order: int) -> Float32:
+        """Ambisonic responses (B, (order + 1)**2, ir_samples) in world axes, ACN and SN3D, without the parts that
+        geometry adds. They have the levels of `impulse_responses` at a point without a head, whatever the level's
+        phase.
+
+        Raises ValueError for poses that are not finite or a field that knows no directions, and FieldError if a
+        response would not be finite.
+        """
+        listeners, emitters = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters))
+        # guard: poses that are not finite reach no ambisonic field
+        if not all(np.isfinite(part).all() for part in (listeners, emitters)):
+            raise ValueError("listeners and emitters must be finite")
+        if not self.knows_directions:
+            raise ValueError(f"field {self.graph.name} knows no directions")
+        return self._ambisonics(listeners, emitters, order)
+
+    def _ambisonics(self, listeners: Floats, emitters: Floats, order: int) -> Float32:
+        from server.field.ambisonic_decoder import AmbisonicDecoder
+
+        assert isinstance(self.graph, DirectionalGraph)
+        aligned = self._aligned(listeners, emitters)
+        decoder = AmbisonicDecoder(self.graph.parameters, ir_samples=self.ir_samples, frames=self.level.frames)
+        arrivals = self.graph.heard_arrivals(listeners, emitters)
+        responses = self._finite(
+            decoder.decode(arrivals, self.graph.between_bands, aligned, order), listeners, emitters
+        )
+        onsets, echoes = self._opening(listeners, emitters, aligned)
+        for response, onset, echo in zip(responses, onsets, onsets if echoes is None else echoes, strict=True):
+            # One gate for all channels, so that none changes its direction.
+            response *= self._gate.gains(response[0], int(onset), int(echo)).astype(np.float32)
+        return responses
+
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:
         """The node that represents a pair of poses at this level: the poses themselves, unless the level reuses
         responses."""
@@ -231,22 +271,33 @@ class AcousticField:
         return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
 
     def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, cache: PhaseCache | None) -> Float32:
-        parameters = self.graph.parameters
-        aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
-        # guard: a way without end is no index of a sample
-        if not (aligned < _NEVER).all():
-            raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
+        aligned = self._aligned(listeners, emitters)
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, heads)
             responses = self._finite(self._placed(coded, aligned), listeners, emitters)
         else:
             responses = self._decoded(self._decoder, listeners, emitters, heads, aligned, cache)
-        onsets, echoes = np.floor(aligned).astype(np.int64) + self._lead, None
-        if self._first_echo is not None:
-            echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
-            echoes = np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(np.int64)
-        self._gate.open(responses, onsets, echoes)
+        self._gate.open(responses, *self._opening(listeners, emitters, aligned))
         return responses
+
+    def _aligned(self, listeners: Floats, emitters: Floats) -> Floats:
+        """(B,) the sample of each response on which the first coded sample lies, with its fraction."""
+        parameters = self.graph.parameters
+        aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
+        # guard: a way without end is no index of a sample
+        if not (aligned < _NEVER).all():
+            raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
+        return aligned
+
+    def _opening(
+        self, listeners: Floats, emitters: Floats, aligned: Floats
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64] | None]:
+        """The samples (B,) from which sound arrives, and by which a surface can have reflected it."""
+        onsets = np.floor(aligned).astype(np.int64) + self._lead
+        if self._first_echo is None:
+            return onsets, None
+        echo_s = self._first_echo.length_m(listeners, emitters) / self.bundle.manifest.speed_of_sound
+        return onsets, np.floor((echo_s - _EAR_AHEAD_S) * self.sample_rate).astype(np.int64)
 
     def _decoded(
         self,
@@ -334,6 +385,13 @@ class Silence(AcousticField):
         remember: bool = False,  # noqa: ARG002
     ) -> Float32:
         return np.zeros((len(np.asarray(heads)), self.channels, self.ir_samples), dtype=np.float32)
+
+    @property
+    def knows_directions(self) -> bool:
+        return True
+
+    def _ambisonics(self, listeners: Floats, emitters: Floats, order: int) -> Float32:  # noqa: ARG002
+        return np.zeros((len(listeners), harmonic_count(order), self.ir_samples), dtype=np.float32)
 
     def energy(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Floats:  # noqa: ARG002
         return np.zeros((len(np.asarray(heads)), self.channels))

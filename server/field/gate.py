@@ -50,6 +50,29 @@ class Gate:
         begins = begins - len(self._answer)
         self._open(responses, onsets, begins)
 
+    def gains(self, reference: Float32, onset: int, echo: int) -> npt.NDArray[np.float64]:
+        """The factors (sample,) by which `open` multiplies one response (sample,), for others that are to keep their
+        proportions to it."""
+        begin, size = echo - len(self._answer), len(reference)
+        gains = np.zeros(size)
+        opens = max(0, onset, begin)
+        if opens >= size:
+            return gains
+        gains[opens:] = 1.0
+        for start, rise in ((onset, self._rise), (begin, self._answer)):
+            first, last = max(opens, start), min(size, start + len(rise))
+            if first < last:
+                gains[first:last] *= rise[first - start : last - start]
+        power = np.square(reference.astype(np.float64))
+        taken = float(np.sum(power * (1 - gains * gains)))
+        given = self._given[: size - opens].astype(np.float64)
+        until = opens + len(given)
+        held = float(np.sum(given * power[opens:until] * gains[opens:until] ** 2))
+        # guard: channels that share a gate are made up to the same extent
+        share = taken / held if taken < MOST_GIVEN * held else MOST_GIVEN
+        gains[opens:until] *= np.sqrt(1 + share * given)
+        return gains
+
     def _open(self, responses: Float32, onsets: Indices, begins: Indices) -> None:
         open_gates(self._rise, self._answer, self._given, MOST_GIVEN, onsets, begins, responses)
 

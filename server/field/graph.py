@@ -94,6 +94,7 @@ class FieldGraph:
     Raises BundleError for a graph that does not fit the manifest.
     """
 
+    predicts_directions: ClassVar[bool] = False
     _inputs: ClassVar[dict[str, list[int]]] = INPUTS
 
     def __init__(self, bundle: Bundle, name: str, session: InferenceSession) -> None:

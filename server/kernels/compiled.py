@@ -17,10 +17,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numba
+from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
 from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
+
+from server.kernels.dispatchers import CompiledFunction
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -37,10 +39,13 @@ def compiled_in_place(function: Function) -> Function:
     return _compile(function, _nrt=False)
 
 
-def _compile(function: Function, **options: bool) -> Function:
-    dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
+def _compile(function: Function, **more: bool) -> Function:
+    if config.DISABLE_JIT:
+        return function
+    options = {"nopython": True, "nogil": True, "error_model": "numpy", **more}
+    dispatcher = CompiledFunction(function, options, _Cache.count)
     dispatcher._cache = _Cache(function)
-    return dispatcher  # type: ignore[no-any-return]
+    return dispatcher
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
@@ -146,7 +151,12 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             _look_for_no_blas()
         return loaded
 
+    @classmethod
+    def count(cls) -> None:
+        """Note that a function was compiled."""
+        cls.compiled += 1
+
     def save_overload(self, signature: Any, result: Any) -> None:
-        _Cache.compiled += 1
+        self.count()
         if _is_writable(Path(self.cache_path)):
             super().save_overload(signature, result)

@@ -29,6 +29,20 @@ _LN_2 = (0.693359375, math.log(2) - 0.693359375)
 # (exp(x) - 1 - x) / x**2, the highest power first. For x within half of ln 2, the resulting exp(x) has a relative error
 # of at most 1.05e-7.
 _EXPONENTIAL = [8.31250137619232e-3, 4.1890331599848334e-2, 0.16667115387827203, 0.49999230308875753]
+# (ln(1 + x) - x + x**2 / 2) / x**3, the highest power first: a weighted least-squares fit. For 1 + x within half an
+# octave of 1, the resulting ln(1 + x) has a relative error of at most 3.6e-8.
+_LOGARITHM = [
+    0.08511602133512497,
+    -0.1418604999780655,
+    0.1494355946779251,
+    -0.16589199006557465,
+    0.199615478515625,
+    -0.2500094175338745,
+    0.3333394229412079,
+]
+_ROOT_HALF_BITS = 0x3F3504F3
+"""The bits of the square root of 1/2."""
+_SMALLEST_NORMAL = 2.0**-126
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
 
@@ -372,6 +386,27 @@ def exponential(_context: Any, x: Any) -> Any:
         bits = builder.shl(halvings, _integer(rest, 23))
         scale = builder.add(bits, _integer(rest, 127 << 23))
         return builder.fmul(value, builder.bitcast(scale, value.type))
+
+    return (x(x), generate) if _same(x) else None
+
+
+@intrinsic
+def logarithm(_context: Any, x: Any) -> Any:
+    """ln(x) to 2e-7 of the larger of 1 and |ln(x)|; x is at least 2**-126 and finite."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        (value,) = args
+        smallest = _constant(value, _SMALLEST_NORMAL)
+        value = builder.select(builder.fcmp_ordered("<", value, smallest), smallest, value)
+        bits = builder.bitcast(value, _integers(value))
+        doublings = builder.ashr(builder.sub(bits, _integer(value, _ROOT_HALF_BITS)), _integer(value, 23))
+        mantissa = builder.bitcast(builder.sub(bits, builder.shl(doublings, _integer(value, 23))), value.type)
+        rest = builder.fsub(mantissa, _constant(value, 1.0))
+        higher = _call(builder, "fma", _polynomial(builder, rest, _LOGARITHM), rest, _constant(value, -0.5))
+        times = builder.sitofp(doublings, value.type)
+        small = _call(builder, "fma", builder.fmul(rest, rest), higher, builder.fmul(times, _constant(value, _LN_2[1])))
+        found = _call(builder, "fma", times, _constant(value, _LN_2[0]), builder.fadd(rest, small))
+        return builder.select(builder.fcmp_unordered("uno", value, value), value, found)
 
     return (x(x), generate) if _same(x) else None
 

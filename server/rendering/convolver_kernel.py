@@ -29,6 +29,7 @@ from numba import carray
 
 from server.kernels import odd_fft
 from server.kernels.compiled import compiled
+from server.kernels.copying import copy
 from server.kernels.simd import add, broadcast, load, load_int, multiply_add, pointer, store
 from server.rendering.convolver_records import CONVOLVER, STAGE
 from server.rendering.multiply_accumulate import (
@@ -91,9 +92,12 @@ def process_block(address: int, blocks: npt.NDArray[np.float32], output: npt.NDA
     if blocks.shape != taken or output.shape != made:
         return False
     samples = carray(pointer(convolver.input), taken, np.float32)
-    samples[:] = blocks
+    for source in range(convolver.sources):
+        copy(blocks[source], samples[source])
     process_convolver(address)
-    output[:] = carray(pointer(convolver.output), made, np.float32)
+    mix = carray(pointer(convolver.output), made, np.float32)
+    for channel in range(convolver.channels):
+        copy(mix[channel], output[channel])
     return True
 
 

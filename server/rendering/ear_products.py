@@ -12,6 +12,7 @@ part of left times conjugate right.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -48,7 +49,13 @@ class EarProducts:
 
     def turned(self, orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
         """(bin, product, k) the products for harmonics in world axes, of a head with this orientation (x, y, z, w)."""
-        return np.asarray(self.matrix @ rotation(orientation, self.order), dtype=np.float32)
+        # As one product of two matrices: of many small ones, NumPy computes one after the other.
+        turned = self._flat @ rotation(orientation, self.order).astype(np.float32)
+        return turned.reshape(self.matrix.shape)
+
+    @cached_property
+    def _flat(self) -> npt.NDArray[np.float32]:
+        return self.matrix.reshape(-1, self.matrix.shape[-1]).astype(np.float32)
 
 
 _KEPT: "WeakKeyDictionary[HeadFilters, dict[tuple[int, int], EarProducts]]" = WeakKeyDictionary()

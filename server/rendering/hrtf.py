@@ -4,6 +4,7 @@ Directions are unit vectors in the head's frame (x ahead, y left, z up). Ear 0 i
 because the receiver order in public files is not reliable.
 """
 
+import hashlib
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -187,6 +188,14 @@ class HeadFilters:
     @property
     def taps(self) -> int:
         return int(self.cepstra.shape[-1])
+
+    @cached_property
+    def digest(self) -> str:
+        """Equal for equal filters, in this process and in others."""
+        contents = hashlib.sha256(str(self.sample_rate).encode())
+        for array in (self.directions, self.cepstra, self.delays_s):
+            contents.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        return contents.hexdigest()
 
     @cached_property
     def longest_advance_s(self) -> float:

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from server.kernels.by_reference import Reference
 from server.kernels.compiled import compiled
+from server.kernels.copying import copy
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
@@ -138,26 +139,35 @@ def _limit(state: LimiterState, block: FloatArray, ceiling: np.float32, safe: np
         silenced = _silence_what_is_not_finite(block)
     gain[0] = gain[-1]
     if is_loud:
-        signal[:, before:] = block
+        for channel in range(channels):
+            copy(block[channel], signal[channel, before:])
         _find_peaks(signal, state.table, peak)
-        is_loud = bool(np.max(peak) > ceiling)
+        is_loud = bool(_largest(peak) > ceiling)
     for channel in range(channels):
-        signal[channel, :before] = block[channel, size - before :]
+        copy(block[channel, size - before :], signal[channel])
     if not is_loud and gain[0] == 1:
         return False, silenced
     if not is_loud:
         peak[:] = 0
     _follow(peak, ceiling, state.keep, state.hold, gain, state.held)
-    rise = np.arange(1, _STEP + 1) / _STEP
     for step in range(gain.size - 1):
-        at = step * _STEP
-        line = (gain[step] + (gain[step + 1] - gain[step]) * rise).astype(np.float32)
-        if step == 0:
-            # guard: a peak at the beginning of a block is held
-            line = np.minimum(line, ceiling / np.maximum(peak[:_STEP], ceiling))
-        for channel in range(channels):
-            block[channel, at : at + _STEP] *= line
+        change = gain[step + 1] - gain[step]
+        for n in range(_STEP):
+            factor = np.float32(gain[step] + change * ((n + 1) / _STEP))
+            if step == 0:
+                # guard: a peak at the beginning of a block is held
+                factor = min(factor, ceiling / max(peak[n], ceiling))
+            for channel in range(channels):
+                block[channel, step * _STEP + n] *= factor
     return True, silenced
+
+
+@compiled
+def _largest(values: FloatArray) -> Any:
+    largest = values[0]
+    for value in values:
+        largest = max(largest, value)
+    return largest
 
 
 @compiled
@@ -191,9 +201,10 @@ def _raise_to(samples: FloatArray, peak: FloatArray) -> None:
 def _silence_what_is_not_finite(block: FloatArray) -> int:
     silenced = 0
     for channel in range(block.shape[0]):
-        is_finite = np.isfinite(block[channel])
-        silenced += is_finite.size - np.sum(is_finite)
-        block[channel] = np.where(is_finite, block[channel], np.float32(0))
+        for n in range(block.shape[1]):
+            if not np.isfinite(block[channel, n]):
+                silenced += 1
+                block[channel, n] = 0
     return silenced
 
 
@@ -212,8 +223,8 @@ def _find_peaks(signal: FloatArray, table: FloatArray, peak: FloatArray) -> None
             _interpolate(signal[channel], table[phase], read)
             _raise_to(read, between)
     known = size - ahead
-    peak[:known] = np.maximum(peak[:known], between[ahead:])
-    peak[: known + 1] = np.maximum(peak[: known + 1], between[ahead - 1 :])
+    _raise_to(between[ahead:], peak[:known])
+    _raise_to(between[ahead - 1 :], peak[: known + 1])
 
 
 @compiled
@@ -221,7 +232,7 @@ def _follow(peak: FloatArray, ceiling: np.float32, keep: float, hold: int, gain:
     """Compute the gain at the ends of steps from the gain at the beginning of the block."""
     steps = gain.size - 1
     for step in range(steps):
-        allowed = float(ceiling) / max(float(ceiling), float(np.max(peak[step * _STEP : (step + 1) * _STEP])))
+        allowed = float(ceiling) / max(float(ceiling), float(_largest(peak[step * _STEP : (step + 1) * _STEP])))
         gain[step + 1] = allowed
         if step > 0:
             gain[step] = min(gain[step], allowed)

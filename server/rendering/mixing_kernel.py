@@ -8,6 +8,7 @@ from numba import carray
 
 from server.kernels.by_reference import Reference, reference_at
 from server.kernels.compiled import compiled
+from server.kernels.copying import copy
 from server.kernels.simd import broadcast, load, multiply, multiply_add, pointer, store
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
@@ -76,7 +77,7 @@ def _play(mixer) -> None:
             if count == 0:  # a clip that does not loop is over
                 dry[slot, written:] = 0
                 break
-            dry[slot, written : written + count] = values[at[slot] : at[slot] + count]
+            copy(values[at[slot] : at[slot] + count], dry[slot, written:])
             written += count
             at[slot] += count
             if loops[slot] != 0 and at[slot] == samples[slot]:

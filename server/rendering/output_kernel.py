@@ -94,8 +94,7 @@ def mixing_with(kind: ReferenceType | None, limiter: ReferenceType | None) -> Ca
         types.none if kind is None else kind,
         types.none if limiter is None else limiter,
     )
-    mix_listeners.compile(signature)  # type: ignore[attr-defined]
-    return mix_listeners.get_overload(signature)  # type: ignore[attr-defined]
+    return mix_listeners.compile(signature)  # type: ignore[attr-defined]
 
 
 def record_of(output: Any) -> npt.NDArray[np.void]:

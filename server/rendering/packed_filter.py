@@ -10,6 +10,7 @@ import numpy.typing as npt
 from server.kernels import odd_fft
 from server.kernels.array_pool import ArrayPool
 from server.kernels.compiled import compiled
+from server.kernels.copying import copy
 from server.rendering.multiply_accumulate import filter_offset
 from server.rendering.partitions import Partitioning
 
@@ -111,7 +112,7 @@ def _pack(ir: FloatArray, words: Any, stages: IntArray, header: IntArray, digest
             for channel in range(channels):
                 first = ir[channel, begin:end].ctypes.data
                 if end < begin + size:
-                    padded[: end - begin] = ir[channel, begin:end]
+                    copy(ir[channel, begin:end], padded)
                     padded[end - begin : size] = 0
                     first = padded.ctypes.data
                 digest = _digest(words[channel, begin:end], size, digest)

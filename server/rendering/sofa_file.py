@@ -23,7 +23,7 @@ SLOWEST_RATE_HZ, FASTEST_RATE_HZ = 4_000.0, 768_000.0
 MOST_BYTES = 8 * 2**30
 """The maximum size of a file's variables, unpacked to 64 bits."""
 
-_ONE_READER = threading.Lock()
+ONE_AT_A_TIME = threading.Lock()
 """HDF5's C library keeps global state without a lock of its own (unless it is built thread-safe, which netCDF4's wheels
 are not): two threads in it at once sometimes crash the process."""
 
@@ -69,7 +69,7 @@ class SofaFile:
             raise SofaError(path, "file", "a SOFA file's name ends in .sofa")
         if not path.is_file():
             raise SofaError(path, "file", "no such file")
-        with _ONE_READER:
+        with ONE_AT_A_TIME:
             return cls._read(path)
 
     @classmethod

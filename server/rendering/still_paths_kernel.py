@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 import server.rendering.path_loops as loops
 from server.kernels.compiled import compiled
+from server.kernels.copying import copy
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.sphere import find_triangle
 
@@ -73,7 +74,8 @@ def add_still_paths(
             for band in range(bands):
                 level_db = gains_db[path, band] - tables.air_db_per_m[band] * length
                 loops.add_scaled(tables.band_cepstra[band], level_db, of_ear)
-            of_ear *= tables.orders
+            for n in range(count):
+                of_ear[n] *= tables.orders[n]
         loops.series_exponential(cepstrum, tables.reciprocals, sums, taps)
         gain = np.float32(1.0 / max(length, tables.nearest_m))
         for ear in range(ears):
@@ -86,7 +88,7 @@ def add_still_paths(
             phase = (whole - delay) * PHASES
             row = min(PHASES - 1, int(phase))
             loops.interpolate_reversed(tables.sinc[row], phase - row, still_taps)
-            padded[TAPS - 1 : TAPS - 1 + count] = taps[ear]
+            copy(taps[ear], padded[TAPS - 1 :])
             loops.filter_block(padded, still_taps, heard)
             begin = whole + BEFORE - (TAPS - 1)
             # Outside the reach of filter and sinc there are only zeros.

@@ -13,6 +13,22 @@ from server.rendering.sources import ClipPlayer
 from server.rendering.still_paths import StillPaths
 
 
+def compile_rendering() -> None:
+    """Compile the code that renders blocks, or load it from disk. This is the longest of all compilations."""
+    sample_rate = 24_000
+    renderer = Renderer(
+        block_size=256,
+        ir_samples=256,
+        sample_rate=sample_rate,
+        filters=kemar(sample_rate),
+        speed_of_sound=343.0,
+        air_db_per_m=np.zeros(len(OCTAVE_BANDS_HZ)),
+        max_emitters=1,
+        ceiling=CEILING,
+    )
+    renderer.process()
+
+
 def warm_up(block_sizes: Iterable[int]) -> None:
     """Compile the rendering code, or load it from disk, and compute the constants of each block size: later renderers
     and responses of static paths have no start-up cost."""
@@ -35,6 +51,5 @@ def warm_up(block_sizes: Iterable[int]) -> None:
         renderer.set_ir("", np.ones((2, longest), np.float32))
         renderer.set_path("", PathTarget(1.0, (1.0, 0.0, 0.0), flat))
         renderer.process()
-    # This comes last: at a first start another process compiles responses meanwhile.
     still = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=flat)
     still.add(np.ones(1), ahead, flat[None], (0.0, 0.0, 0.0, 1.0), np.zeros((2, 1), np.float32))

@@ -10,6 +10,7 @@ impulse response, and impulse responses are crossfaded.
 Axes: B poses; responses (B, ear, sample). Lengths are in metres; positions and directions are in the world's axes.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -86,6 +87,12 @@ class EarlyReflections:
         A renderer multiplies these responses by the emitter's `reverberation_gain`, which is right for diffuse sound.
         Here it is divided out, and each path has the gain of its own direction.
         """
+        for response, paths in zip(responses, self.paths(listener, emitters), strict=True):
+            self._paths.add(*paths, listener.orientation, response)
+
+    def paths(self, listener: Pose, emitters: Sequence[EmitterState]) -> list[tuple[_Floats, _Floats, _Floats]]:
+        """For each emitter the n paths that `add` adds: lengths (n,), arrivals (n, 3), and gains (n, band) in dB
+        without distance and air."""
         found = self._finder.find(listener.position, [emitter.pose.position for emitter in emitters])
         gains_db = found.gain_db
         for path, number in enumerate(found.emitter):
@@ -94,11 +101,8 @@ class EarlyReflections:
                 played_db = amplitude_to_db(reverberation_gain(emitter.directivity))
                 gains_db[path] += departure_gain_db(emitter, found.departure[path]) - played_db
         starts = np.searchsorted(found.emitter, np.arange(len(emitters) + 1))
-        for response, start, stop in zip(responses, starts[:-1], starts[1:], strict=True):
-            paths = slice(start, stop)
-            self._paths.add(
-                found.length_m[paths], found.arrival[paths], gains_db[paths], listener.orientation, response
-            )
+        parts = [slice(start, stop) for start, stop in itertools.pairwise(starts)]
+        return [(found.length_m[part], found.arrival[part], gains_db[part]) for part in parts]
 
     def band_power(self, listeners: _Floats, emitter: npt.ArrayLike) -> _Floats:
         """Return the squared pressure (B, band) of the reflections at `listeners` (B, 3) from one omnidirectional

@@ -232,7 +232,8 @@ class QualityLevel(Strict):
     `ir_rate_hz` responses per second or, without that, one for every pose. With `shared_tail` all emitters of a
     listener share one late reverberation. With `reuse` poses near each other share responses. `tail` is how the end of
     a response is made: as its beginning, by an inverse transform of spectrograms (stft), or from frozen noises in
-    octave bands, whose gains follow the prediction (bands; for fields of directions).
+    octave bands, whose gains follow the prediction (bands; for fields of directions). `order` is the highest order of
+    the directions' harmonics that is used; by default, all are.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
@@ -243,6 +244,7 @@ class QualityLevel(Strict):
     ir_rate_hz: Positive | None = None
     shared_tail: bool = False
     tail: Literal["stft", "bands"] = "stft"
+    order: Annotated[int, Field(ge=0, le=HIGHEST_ORDER)] | None = None
     accuracy: Accuracy | None = None
     cost: Cost | None = None
 
@@ -251,6 +253,8 @@ class QualityLevel(Strict):
         document: dict[str, object] = write(self)
         if self.tail == "stft":
             del document["tail"]
+        if self.order is None:
+            del document["order"]
         return document
 
 
@@ -365,6 +369,9 @@ class Manifest(Strict):
                     f"levels.{level.name}: a field of directions is heard anew at every pose and predicts no phase; "
                     "leave out reuse, and take another phase than integrated"
                 )
+            if level.order is not None and (field.order is None or level.order > field.order):
+                has = "no directions" if field.order is None else f"order {field.order}"
+                raise ValueError(f"levels.{level.name}.order: is {level.order}, but field {level.field} has {has}")
             if level.tail == "bands" and (
                 field.predicts == "ears" or level.frames is not None or level.phase.kind != "frozen"
             ):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import shortest_path
 
-from server.acoustics.geometry import FloorPlan, Pose
+from server.acoustics.geometry import FloorPlan, Pose, Quaternion, axes_of
 
 APARTMENT = FloorPlan(
     ((0, 0), (4, 0), (4, 2), (4.2, 2), (4.2, 0), (8, 0), (8, 5), (4.2, 5), (4.2, 3), (4, 3), (4, 5), (0, 5)), 2.8
@@ -41,6 +41,45 @@ def test_orientation_without_a_direction_is_rejected(orientation: tuple[float, .
 def test_non_finite_position_is_rejected() -> None:
     with pytest.raises(ValueError, match="position"):
         Pose((math.inf, 0, 0))
+
+
+def ahead_left_up(orientation: Quaternion) -> np.ndarray:
+    """(3, 3) the axes of a head as rows in world axes."""
+    return axes_of(orientation)
+
+
+def test_yaw_pitch_and_roll_turn_each_about_the_heads_own_axes() -> None:
+    quarter = math.pi / 2
+    x, y, z = np.eye(3)
+    # Nose up: what was ahead is now below the look direction, and the top of the head points back.
+    np.testing.assert_allclose(ahead_left_up(Quaternion.from_angles(0, quarter, 0)), [z, y, -x], atol=1e-12)
+    # Rolled to the right: the left ear points up.
+    np.testing.assert_allclose(ahead_left_up(Quaternion.from_angles(0, 0, quarter)), [x, z, -y], atol=1e-12)
+    np.testing.assert_allclose(ahead_left_up(Quaternion.from_angles(quarter, 0, 0)), [y, -x, z], atol=1e-12)
+    # To the north, then up, then rolled: the left ear, which pointed west, points south after the roll.
+    np.testing.assert_allclose(ahead_left_up(Quaternion.from_angles(quarter, quarter, 0)), [z, -x, -y], atol=1e-12)
+    np.testing.assert_allclose(ahead_left_up(Quaternion.from_angles(quarter, quarter, quarter)), [z, -y, x], atol=1e-12)
+
+
+@given(*[st.floats(-math.pi, math.pi)] * 3)
+def test_angles_are_three_turns_one_after_another(yaw: float, pitch: float, roll: float) -> None:
+    def about(axis: int, angle: float) -> np.ndarray:
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        matrix = np.eye(3)
+        matrix[first, first] = matrix[second, second] = math.cos(angle)
+        matrix[second, first], matrix[first, second] = math.sin(angle), -math.sin(angle)
+        return matrix
+
+    expected = about(2, yaw) @ about(1, -pitch) @ about(0, roll)
+    np.testing.assert_allclose(ahead_left_up(Quaternion.from_angles(yaw, pitch, roll)).T, expected, atol=1e-12)
+
+
+def test_a_level_head_by_angles_is_one_by_its_yaw() -> None:
+    for yaw in (0.0, 1.0, -2.5, math.pi):
+        assert Quaternion.from_angles(yaw, 0.0, 0.0) == Quaternion.from_yaw(yaw)
+    for angles in ((math.nan, 0, 0), (0, math.inf, 0), (0, 0, -math.inf)):
+        with pytest.raises(ValueError, match="finite"):
+            Quaternion.from_angles(*angles)
 
 
 def test_long_quaternion_is_normalised() -> None:

@@ -10,6 +10,7 @@ import pytest
 from server.api import first_start
 from server.api.first_start import CompilingProcess, tell_while_compiling
 from server.responses.impulse_response import ImpulseResponse
+from server.scene.bundle import Bundle, find_bundle
 
 
 @pytest.fixture
@@ -26,9 +27,11 @@ def begun(monkeypatch):
     return processes
 
 
-def test_another_process_computes_a_response_and_ends_with_the_context(field, begun):
+def test_another_process_computes_a_response_of_the_first_field_and_ends_with_the_context(field, begun):
+    bundles = [Bundle.load(find_bundle("open-field")), field.bundle]
     with CompilingProcess() as compiler:
-        compiler.begin(field.bundle, cores=2)
+        compiler.begin(bundles, cores=2)
+        compiler.begin([], cores=2)
         ((arguments, process),) = begun
         assert process.poll() is None
     assert arguments[1:] == ["-m", "server.api.first_start", str(field.bundle.folder)]
@@ -36,20 +39,23 @@ def test_another_process_computes_a_response_and_ends_with_the_context(field, be
     compiler.wait()
 
 
-def test_the_other_process_computes_a_whole_response_of_the_bundle(field, monkeypatch):
+def test_the_other_process_computes_a_whole_response_of_the_bundle_and_prepares_one_of_each_level(field, monkeypatch):
+    prepared, calibrate = [], first_start.calibrate
+    monkeypatch.setattr(first_start, "calibrate", lambda *asked, **more: prepared.append(calibrate(*asked, **more)))
     made, compute = [], ImpulseResponse.compute
     monkeypatch.setattr(ImpulseResponse, "compute", lambda *asked: made.append(compute(*asked)))
     first_start._compile(field.bundle.folder)
     (response,) = made
     assert response.scene == field.bundle.id
     assert np.abs(response.samples).max() > 0
+    assert [set(times_ms) for times_ms in prepared] == [{level.name for level in field.bundle.manifest.levels}]
 
 
 @pytest.mark.parametrize(("cores", "is_kept"), [(1, False), (2, True)])
 def test_on_one_core_or_with_all_compiled_none_is_begun(field, begun, monkeypatch, cores, is_kept):
     monkeypatch.setattr(first_start, "is_kept", lambda _: is_kept)
     with CompilingProcess() as compiler:
-        compiler.begin(field.bundle, cores=cores)
+        compiler.begin([field.bundle], cores=cores)
         compiler.wait()
     assert not begun
 
@@ -57,7 +63,7 @@ def test_on_one_core_or_with_all_compiled_none_is_begun(field, begun, monkeypatc
 def test_after_the_end_none_is_begun(field, begun):
     with CompilingProcess() as compiler:
         pass
-    compiler.begin(field.bundle, cores=2)
+    compiler.begin([field.bundle], cores=2)
     assert not begun
 
 

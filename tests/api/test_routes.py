@@ -1,8 +1,11 @@
+import dataclasses
 import io
 import json
 import re
 import threading
 import time
+from contextlib import contextmanager
+from itertools import count
 
 import numpy as np
 import pytest
@@ -13,12 +16,17 @@ from starlette.testclient import TestClient
 from server.api import app
 from server.api.app import create_app
 from server.api.settings import Settings
+from server.assets.hrtfs import HrtfLibrary
+from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.responses.impulse_response import ImpulseResponse, IrQuery
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.responses.impulse_response import MEDIA_TYPES, ImpulseResponse, IrQuery
+from tests.directional_flat import write_directional
 from tests.killing import kill, threads_may_die
 
 IR = "/v1/scenes/flat/impulse-response"
 PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
+HEADINGS_DEG = count(1)
 
 
 def wait_until_ready(client):
@@ -29,13 +37,26 @@ def wait_until_ready(client):
     raise AssertionError("never ready")
 
 
-@pytest.fixture
-def client(field, hrtfs):
+@contextmanager
+def serving(levels, hrtfs):
     settings = Settings(ir_workers=1, max_waiting_requests=1)
     with TestClient(
-        create_app(settings, scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs), raise_server_exceptions=False
+        create_app(settings, scenes={"flat": levels}, hrtfs=hrtfs), raise_server_exceptions=False
     ) as client:
         wait_until_ready(client)
+        yield client
+
+
+@pytest.fixture
+def client(field, hrtfs):
+    with serving(FieldsByLevel([field]), hrtfs) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def shared_client(bundle, hrtfs):
+    """Of a server for tests that leave it as it was."""
+    with serving(FieldsByLevel.load(bundle), hrtfs) as client:
         yield client
 
 
@@ -52,9 +73,9 @@ def check_problem(response, status, code, field=None):
     assert body["detail"]
 
 
-def test_health(client):
-    assert client.get("/livez").json() == {"status": "live"}
-    assert client.get("/readyz").json() == {"status": "ready"}
+def test_health(shared_client):
+    assert shared_client.get("/livez").json() == {"status": "live"}
+    assert shared_client.get("/readyz").json() == {"status": "ready"}
 
 
 def test_ready_only_after_the_field_has_been_used(field, hrtfs):
@@ -86,24 +107,24 @@ def test_a_failing_warm_up_leaves_the_server_live_and_not_ready(field, hrtfs, ca
         check_problem(client.get("/readyz"), 503, "not_ready")
 
 
-def test_scenes(client):
-    listed = client.get("/v1/scenes").json()
+def test_scenes(shared_client):
+    listed = shared_client.get("/v1/scenes").json()
     (scene,) = listed["scenes"]
     assert listed["max_emitters"] == Settings().max_emitters
-    assert scene == client.get("/v1/scenes/flat").json()
+    assert scene == shared_client.get("/v1/scenes/flat").json()
     assert (scene["id"], scene["sample_rate"], scene["height_m"]) == ("flat", 24_000, 2.8)
     assert scene["bounds"] == {"minimum": [0.3, 0.3, 0.5], "maximum": [7.7, 4.7, 2.3]}
     assert scene["listener"] == {"position": [2.0, 2.5, 1.5], "yaw": pytest.approx(np.pi / 2)}
 
 
-def test_clips(client):
-    clips = client.get("/v1/clips").json()["clips"]
+def test_clips(shared_client):
+    clips = shared_client.get("/v1/clips").json()["clips"]
     assert "woman-reading" in {clip["name"] for clip in clips}
     assert all(clip["duration_s"] > 0 and clip["title"] for clip in clips)
 
 
-def test_heads_are_named_and_kemar_is_the_default(client):
-    assert client.get("/v1/hrtfs").json() == {"default": "kemar", "hrtfs": ["kemar"]}
+def test_heads_are_named_and_kemar_is_the_default(shared_client):
+    assert shared_client.get("/v1/hrtfs").json() == {"default": "kemar", "hrtfs": ["kemar"]}
 
 
 def test_a_clip_that_cannot_be_decoded_is_left_out_and_the_log_says_why(field, hrtfs, tmp_path, caplog):
@@ -115,18 +136,85 @@ def test_a_clip_that_cannot_be_decoded_is_left_out_and_the_log_says_why(field, h
     assert "noise.flac" in caplog.text
 
 
-def test_an_impulse_response_is_what_the_command_line_would_write(client, field):
+def test_an_impulse_response_is_what_the_command_line_would_write(shared_client, field):
     query = IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5), 90.0)
     expected = ImpulseResponse.compute(field, query)
     for name, media_type in [("wav", "audio/wav"), ("npy", "application/octet-stream"), ("json", "application/json")]:
-        response = client.get(IR, params={**PLACES, "yaw_deg": 90, "format": name})
+        response = shared_client.get(IR, params={**PLACES, "yaw_deg": 90, "format": name})
         assert response.headers["content-type"] == media_type
         assert response.content == expected.encode(name)
     samples, rate = soundfile.read(
-        io.BytesIO(client.get(IR, params={**PLACES, "yaw_deg": 90}).content), dtype="float32"
+        io.BytesIO(shared_client.get(IR, params={**PLACES, "yaw_deg": 90}).content), dtype="float32"
     )
     assert rate == 24_000
     np.testing.assert_array_equal(samples.T, expected.samples)
+
+
+@pytest.fixture
+def directional_client(tmp_path):
+    field = AcousticField.load(write_directional(tmp_path / "flat"))
+    heads = HrtfLibrary((), [24_000])
+    heads._filters[("small", 24_000)] = small_head()
+    heads.names = ("kemar", "small")
+    with TestClient(create_app(Settings(), scenes={"flat": FieldsByLevel([field])}, hrtfs=heads)) as client:
+        wait_until_ready(client)
+        client.field = field
+        yield client
+
+
+def small_head():
+    head = Hrtf.read(KEMAR, 24_000)
+    return HeadFilters.from_hrtf(dataclasses.replace(head, impulse_responses=0.5 * head.impulse_responses))
+
+
+@pytest.mark.parametrize("name", ["wav", "npy", "json", "sofa"])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"yaw_deg": 30.0, "pitch_deg": -20.0, "roll_deg": 10.0},
+        {"orientation": "0.1,0.2,0.3,0.4"},
+        {"output": "ambisonics"},
+        {"output": "ambisonics", "order": 3, "pitch_deg": 90.0},
+        {"output": "mono"},
+        {"output": "binaural", "hrtf": "kemar"},
+    ],
+)
+def test_every_output_is_what_the_query_computes(directional_client, asked, name):
+    field = directional_client.field
+    expected = ImpulseResponse.compute(field, IrQuery.of(field, *PLACES.values(), **asked))
+    response = directional_client.get(IR, params={**PLACES, **asked, "format": name})
+    assert response.status_code == 200
+    assert response.content == expected.encode(name)
+    assert response.headers["content-type"] == MEDIA_TYPES[name]
+    again = directional_client.get(
+        IR, params={**PLACES, **asked, "format": name}, headers={"If-None-Match": response.headers["etag"]}
+    )
+    assert again.status_code == 304
+
+
+def test_another_head_has_another_response_and_tag(directional_client):
+    usual, small = (
+        directional_client.get(IR, params={**PLACES, "hrtf": hrtf, "format": "npy"}) for hrtf in ("kemar", "small")
+    )
+    assert usual.headers["etag"] != small.headers["etag"]
+    one, other = (np.load(io.BytesIO(answer.content)) for answer in (usual, small))
+    np.testing.assert_allclose(np.sum(other**2), np.sum(one**2) / 4, rtol=0.01)
+
+
+def test_every_parameter_has_its_tag(directional_client):
+    asked = [
+        {},
+        {"pitch_deg": 1},
+        {"roll_deg": 1},
+        {"orientation": "0,0,1,1"},
+        {"hrtf": "small"},
+        {"output": "mono"},
+        {"output": "ambisonics"},
+        {"output": "ambisonics", "order": 2},
+        {"format": "sofa"},
+    ]
+    tags = {directional_client.head(IR, params={**PLACES, **each}).headers["etag"] for each in asked}
+    assert len(tags) == len(asked)
 
 
 def test_what_a_client_has_is_not_sent_again(client, field):
@@ -142,9 +230,9 @@ def test_what_a_client_has_is_not_sent_again(client, field):
     assert client.get(IR, params=PLACES, headers={"If-None-Match": '"other"'}).content == first.content
 
 
-def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_another(client):
+def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_another(shared_client):
     def tag(**changes):
-        return client.get(IR, params={**PLACES, **changes}).headers["etag"]
+        return shared_client.get(IR, params={**PLACES, **changes}).headers["etag"]
 
     assert tag() == tag(listener="1.0, 2.0,1.50", yaw_deg="0.0", format="wav")
     assert len({tag(), tag(yaw_deg=1), tag(format="npy"), tag(listener="1,2,1.6")}) == 4
@@ -166,6 +254,20 @@ def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_a
         (IR, {**PLACES, "listener": "١,2,1.5"}, 422, "malformed_pose", "listener"),
         (IR, {**PLACES, "yaw_deg": "1_0"}, 422, "malformed_pose", "yaw_deg"),
         (IR, {**PLACES, "yaw_deg": "٩"}, 422, "malformed_pose", "yaw_deg"),
+        (IR, {**PLACES, "pitch_deg": "up"}, 422, "malformed_pose", "pitch_deg"),
+        (IR, {**PLACES, "roll_deg": "1e9"}, 422, "malformed_pose", "roll_deg"),
+        (IR, {**PLACES, "orientation": "0,0,0,0"}, 422, "malformed_pose", "orientation"),
+        (IR, {**PLACES, "orientation": "0,0,1"}, 422, "malformed_pose", "orientation"),
+        (IR, {**PLACES, "orientation": "0,0,inf,1"}, 422, "malformed_pose", "orientation"),
+        (IR, {**PLACES, "orientation": "0,0,1,1", "yaw_deg": 0}, 409, "contradicting_parameters", "orientation"),
+        (IR, {**PLACES, "hrtf": "moomin"}, 404, "unknown_hrtf", "hrtf"),
+        (IR, {**PLACES, "hrtf": "kemar", "output": "mono"}, 409, "contradicting_parameters", "hrtf"),
+        (IR, {**PLACES, "output": "stereo"}, 422, "unknown_output", "output"),
+        (IR, {**PLACES, "output": "ambisonics"}, 409, "no_directions", "output"),
+        (IR, {**PLACES, "order": 1}, 409, "contradicting_parameters", "order"),
+        (IR, {**PLACES, "output": "ambisonics", "order": 4}, 422, "malformed_request", "order"),
+        (IR, {**PLACES, "output": "ambisonics", "order": "first"}, 422, "malformed_request", "order"),
+        (IR, {**PLACES, "output": "ambisonics", "order": "1.5"}, 422, "malformed_request", "order"),
         (IR, {**PLACES, "level": "finest"}, 404, "unknown_level", "level"),
         ("/v1/scenes/flat/plan", {"effect": ["hrtf=on", "hrtf=off"]}, 409, "doubled_effect", "effect"),
         (IR, {**PLACES, "yaw_deg": "north"}, 422, "malformed_pose", "yaw_deg"),
@@ -182,14 +284,14 @@ def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_a
         ("/nothing", {}, 404, "not_found", None),
     ],
 )
-def test_bad_requests_are_answered_with_a_problem(client, path, params, status, code, at_fault):
-    check_problem(client.get(path, params=params), status, code, at_fault)
-    # And the server goes on.
-    assert client.get(IR, params=PLACES).status_code == 200
+def test_bad_requests_are_answered_with_a_problem(shared_client, path, params, status, code, at_fault):
+    check_problem(shared_client.get(path, params=params), status, code, at_fault)
+    # And the server goes on, with a response that it has not kept.
+    assert shared_client.get(IR, params={**PLACES, "yaw_deg": next(HEADINGS_DEG)}).status_code == 200
 
 
-def test_a_wrong_method_is_a_problem_too(client):
-    response = client.post("/v1/scenes")
+def test_a_wrong_method_is_a_problem_too(shared_client):
+    response = shared_client.post("/v1/scenes")
     check_problem(response, 405, "method_not_allowed")
     assert "GET" in response.headers["allow"]
 
@@ -204,12 +306,12 @@ def test_a_crash_is_a_problem_that_tells_nothing_of_the_inside(client, field):
     assert "secret" not in response.text
 
 
-def test_the_loudness_map_is_a_picture_or_numbers_and_loudest_at_the_emitter(client):
+def test_the_loudness_map_is_a_picture_or_numbers_and_loudest_at_the_emitter(shared_client):
     params = {"emitter": "6,3,1.5", "spacing_m": 0.5}
-    picture = client.get("/v1/scenes/flat/loudness", params=params)
+    picture = shared_client.get("/v1/scenes/flat/loudness", params=params)
     assert picture.headers["content-type"] == "image/png"
     assert Image.open(io.BytesIO(picture.content)).format == "PNG"
-    numbers = client.get("/v1/scenes/flat/loudness", params={**params, "format": "json"})
+    numbers = shared_client.get("/v1/scenes/flat/loudness", params={**params, "format": "json"})
     assert numbers.headers["etag"] != picture.headers["etag"]
     levels = np.array(json.loads(numbers.content)["levels_db"], float)
     row, column = np.unravel_index(np.nanargmax(levels), levels.shape)
@@ -249,14 +351,14 @@ def test_too_many_waiting_requests_are_turned_away_and_health_is_answered_meanwh
     assert sorted(statuses) == [200] * 3 + [503] * 3
 
 
-def test_the_interface_describes_itself(client):
-    paths = client.get("/openapi.json").json()["paths"]
+def test_the_interface_describes_itself(shared_client):
+    paths = shared_client.get("/openapi.json").json()["paths"]
     assert IR.replace("flat", "{scene}") in paths
 
 
 @pytest.mark.parametrize("path", ["/livez", "/readyz"])
-def test_load_balancers_may_probe_with_head(client, path):
-    assert client.head(path).status_code == 200
+def test_load_balancers_may_probe_with_head(shared_client, path):
+    assert shared_client.head(path).status_code == 200
 
 
 def wait_for_status(client, path, status):

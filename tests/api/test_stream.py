@@ -2,6 +2,7 @@ import json
 import math
 import struct
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -30,23 +31,36 @@ HELLO = Hello(protocol=PROTOCOL, scene="flat")
 TALKER = AddEmitter(id="talker", clip="tone", position=(6.0, 3.0, 1.5))
 
 
-@pytest.fixture
-def clip_files(tmp_path):
-    tone = tmp_path / "tone.wav"
+@pytest.fixture(scope="module")
+def clip_files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips")
+    tone = folder / "tone.wav"
     soundfile.write(tone, np.sin(np.arange(24_000) * 0.1) / 4, 24_000)
-    broken = tmp_path / "broken.wav"
+    broken = folder / "broken.wav"
     broken.write_bytes(b"RIFF but not really")
     return tone, broken
 
 
-@pytest.fixture
-def client(field, hrtfs, clip_files):
-    settings = Settings(clips=clip_files, hello_timeout_s=0.5, max_streams=2)
-    with TestClient(create_app(settings, scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+@contextmanager
+def serving(settings, bundle, hrtfs):
+    with TestClient(create_app(settings, scenes={"flat": FieldsByLevel.load(bundle)}, hrtfs=hrtfs)) as client:
         for _ in range(3_600):  # the first time ever, everything is compiled
             if client.get("/readyz").status_code == 200:
                 break
             time.sleep(0.05)
+        yield client
+
+
+@pytest.fixture(scope="module")
+def client(bundle, hrtfs, clip_files):
+    with serving(Settings(clips=clip_files, hello_timeout_s=0.5), bundle, hrtfs) as client:
+        yield client
+
+
+@pytest.fixture
+def client_of_few(bundle, hrtfs):
+    """Of a server of two streams."""
+    with serving(Settings(max_streams=2), bundle, hrtfs) as client:
         yield client
 
 
@@ -250,17 +264,20 @@ def test_a_bad_hello_is_answered_and_ends_the_connection(client, first, code):
         assert (closed.value.code, closed.value.reason) == (1008, code)
 
 
-def test_a_full_server_says_so_and_has_room_again_when_someone_leaves(client):
-    with client.websocket_connect("/v1/stream") as first, client.websocket_connect("/v1/stream") as second:
+def test_a_full_server_says_so_and_has_room_again_when_someone_leaves(client_of_few):
+    with (
+        client_of_few.websocket_connect("/v1/stream") as first,
+        client_of_few.websocket_connect("/v1/stream") as second,
+    ):
         Ears(first), Ears(second)
-        with client.websocket_connect("/v1/stream") as third:
+        with client_of_few.websocket_connect("/v1/stream") as third:
             assert parse_server_message(third.receive_text()).code == "server_busy"
             with pytest.raises(WebSocketDisconnect) as closed:
                 third.receive_text()
             assert closed.value.code == 1013
         second.close()
         for _ in range(100):
-            with client.websocket_connect("/v1/stream") as socket:
+            with client_of_few.websocket_connect("/v1/stream") as socket:
                 socket.send_text(HELLO.serialize())
                 if parse_server_message(socket.receive_text()).type == "welcome":
                     return

@@ -19,6 +19,7 @@ from server.acoustics.geometry import Pose
 from server.api.asyncapi import document
 from server.assets.clips import ClipLibrary
 from server.cli.main import main
+from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, render
 from server.rendering.hrtf import KEMAR
@@ -26,6 +27,7 @@ from server.responses.direct_sound import DirectSound
 from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import write_bundle
 from server.scene.manifest import QualityLevel
+from tests.directional_flat import write_directional
 
 NAFIR = [sys.executable, "-c", "from server.cli.main import main; main()"]
 PLACES = ("--listener", "1,2,1.5", "--emitter", "6,3,1.5")
@@ -62,6 +64,38 @@ def test_ir_writes_what_http_answers(nafir, bundle, field, tmp_path, suffix):
     assert str(output) in said
     query = IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5), 90.0)
     assert output.read_bytes() == ImpulseResponse.compute(field, query).encode(suffix)
+
+
+@pytest.mark.parametrize(
+    ("options", "asked"),
+    [
+        (("--ambisonics",), {"output": "ambisonics"}),
+        (("--ambisonics", "--order", "3"), {"output": "ambisonics", "order": 3}),
+        (("--mono",), {"output": "mono"}),
+        (("--pitch-deg", "20", "--roll-deg", "-5"), {"pitch_deg": 20.0, "roll_deg": -5.0}),
+        (("--orientation", "0,0.1,0,1"), {"orientation": "0,0.1,0,1"}),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["wav", "sofa"])
+def test_ir_of_every_output_is_what_http_answers(nafir, tmp_path, options, asked, suffix):
+    directional = write_directional(tmp_path / "flat")
+    field = AcousticField.load(directional)
+    output = tmp_path / f"ir.{suffix}"
+    assert nafir("ir", directional.folder, *PLACES, *options, "-o", output)[0] == 0
+    query = IrQuery.of(field, *PLACES[1::2], **asked)
+    assert output.read_bytes() == ImpulseResponse.compute(field, query).encode(suffix)
+
+
+def test_ir_is_heard_through_the_head_of_a_file(nafir, bundle, field, tmp_path):
+    head = shutil.copy(KEMAR, tmp_path / "mine.sofa")
+    output = tmp_path / "ir.json"
+    code, said, _ = nafir("ir", bundle.folder, *PLACES, "--hrtf", head, "-o", output, "--json")
+    assert code == 0
+    assert json.loads(said)["channels"] == ["left", "right"]
+    document = json.loads(output.read_text())
+    assert document["hrtf"] == "mine"
+    usual = ImpulseResponse.compute(field, IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5))).samples
+    np.testing.assert_allclose(document["samples"], usual, atol=1e-4)
 
 
 @pytest.fixture
@@ -106,6 +140,15 @@ def test_ir_tells_programs_what_it_did(nafir, bundle, tmp_path):
         ((*PLACES, "--yaw-deg", "0_1", "-o", "ir.wav"), "--yaw-deg: '0_1' is not a number"),
         ((*PLACES, "--yaw-deg", "90", "--yaw-deg", "0", "-o", "ir.wav"), "--yaw-deg is given 2 times"),
         (("--listener", "0_1,2,1.5", "--emitter", "6,3,1.5", "-o", "ir.wav"), "listener: in x,y,z '0_1'"),
+        ((*PLACES, "--roll-deg", "nan", "-o", "ir.wav"), "--roll-deg: 'nan' is not finite"),
+        ((*PLACES, "--orientation", "0,0,0,0", "-o", "ir.wav"), "orientation must be a quaternion of non-zero length"),
+        ((*PLACES, "--orientation", "0,0,0,1", "--yaw-deg", "0", "-o", "ir.wav"), "orientation: contradicts yaw_deg"),
+        ((*PLACES, "--ambisonics", "-o", "ir.wav"), "knows what one head hears"),
+        ((*PLACES, "--ambisonics", "--order", "4", "-o", "ir.wav"), "order: 4 is not 1 to 3"),
+        ((*PLACES, "--order", "1", "-o", "ir.wav"), "order: belongs to ambisonics alone"),
+        ((*PLACES, "--mono", "--ambisonics", "-o", "ir.wav"), "--ambisonics and --mono contradict each other"),
+        ((*PLACES, "--mono", "--hrtf", "head.sofa", "-o", "ir.wav"), "hrtf: a head hears binaural output alone"),
+        ((*PLACES, "--hrtf", "head.sofa", "-o", "ir.wav"), "head.sofa: no such file"),
         ((*PLACES, "-o", "ir.mp3"), "mp3"),
         ((*PLACES, "-o", "no/such/folder/ir.wav"), "there is no folder"),
     ],

@@ -21,10 +21,12 @@ def test_it_takes_three_files() -> None:
     assert len(made_by(PAGE)) == 2
 
 
+@pytest.mark.long
 def test_its_test_passes_and_so_do_those_of_the_planner(tree: Path) -> None:
     pytest_passes(tree, "tests/planning/effects", "tests/planning/test_planner.py", "tests/planning/test_catalogue.py")
 
 
+@pytest.mark.long
 def test_its_test_fails_where_the_effect_does_nothing(tree: Path) -> None:
     (module,) = [tree / name for name in made_by(PAGE) if name.startswith("server/")]
     text = module.read_text()
@@ -37,6 +39,7 @@ def test_its_test_fails_where_the_effect_does_nothing(tree: Path) -> None:
         module.write_text(text)
 
 
+@pytest.mark.long
 def test_plans_of_the_command_line_have_it_with_its_cost(tree: Path) -> None:
     asked = "plan", "apartment", "--json", "--effect", "turbulence=on"
     plan = json.loads(python(tree, "-m", "server", *asked))

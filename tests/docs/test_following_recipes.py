@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.recipes import RecipeError, Step, follow, made_by, python, steps_of
+from tests.docs.recipes import ROOT, RecipeError, Step, follow, made_by, python, steps_of
 
 PAGE = '''# Do a thing
 
@@ -75,6 +75,21 @@ def test_a_new_file_overwrites_none_and_a_change_needs_one(tmp_path: Path) -> No
         Step("there.py", "b\n", is_change=False).apply(tmp_path)
     with pytest.raises(RecipeError, match="not there"):
         Step("gone.py", "-a\n", is_change=True).apply(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in (ROOT / "docs/how-to").glob("*.md") if steps_of(page)], ids=lambda p: p.stem
+)
+def test_every_recipe_fits_the_tree_as_it_is(tmp_path: Path, page: Path) -> None:
+    """`make long` follows them to the end."""
+    for step in steps_of(page):
+        here, there = tmp_path / step.path, ROOT / step.path
+        if there.exists() and not here.exists():
+            here.parent.mkdir(parents=True, exist_ok=True)
+            here.write_text(there.read_text())
+        step.apply(tmp_path)
+        if here.suffix == ".py":
+            compile(here.read_text(), step.path, "exec")
 
 
 def test_a_copy_runs_its_own_code(tmp_path: Path) -> None:

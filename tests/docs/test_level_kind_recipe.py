@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.docs.recipes import ROOT, follow, pytest_passes, python, steps_of
 
 PAGE = ROOT / "docs/how-to/add-a-level-kind.md"
@@ -16,6 +18,7 @@ def test_a_kind_touches_four_files_and_no_more() -> None:
     }
 
 
+@pytest.mark.long
 def test_who_follows_the_recipe_has_the_kind(tmp_path: Path) -> None:
     tree = follow(PAGE, tmp_path / "tree")
     python(tree, "-m", "ruff", "check", "server/field", "server/scene", "tests/field")

@@ -6,6 +6,8 @@ import pytest
 
 from tests.docs.recipes import follow, made_by, pytest_passes, python, steps_of
 
+pytestmark = pytest.mark.long
+
 HOW_TO = Path(__file__).parents[2] / "docs" / "how-to"
 
 

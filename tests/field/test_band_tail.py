@@ -8,7 +8,7 @@ from scipy.signal import butter, sosfilt
 from server.acoustics.geometry import Quaternion
 from server.acoustics.spherical_harmonics import real_harmonics
 from server.field.band_tail import early_frames
-from server.field.directional_graph import Arrivals, DirectionalGraph
+from server.field.directional_graph import DirectionalGraph
 from server.field.field import AcousticField
 from server.rendering.hrtf import HeadFilters, kemar
 from server.scene.bundle import BUNDLED, Bundle
@@ -26,15 +26,14 @@ class _Predicted(DirectionalGraph):
     """A graph whose predictions a test chooses, with the codec and noise of the apartment."""
 
     def __init__(self, log_magnitude, relative) -> None:
-        self.name, self.channels, self.gives_responses, self.order = "predicted", 2, False, 2
+        self.name, self.channels, self.gives_responses = "predicted", 2, False
+        self.order = self.heard_order = 2
         self.parameters = PARAMETERS
         self._turned = None
         self.said = log_magnitude, relative
 
-    def arrivals(self, listeners, emitters):  # noqa: ARG002  the same everywhere
-        log_magnitude, relative = self.said
-        count = len(np.asarray(listeners))
-        return Arrivals(np.repeat(log_magnitude[None], count, 0), np.repeat(relative[None], count, 0))
+    def run(self, listeners, emitters, heads):  # noqa: ARG002  the same everywhere
+        return [np.repeat(said[None], len(np.asarray(listeners)), 0) for said in self.said]
 
 
 def fields(decay_db_s=(100.0,) * 7, towards=None, share=1.0):

@@ -182,3 +182,15 @@ def test_a_graph_of_ears_is_refused_as_one_of_directions(tmp_path, bundle):
     wrong = write_bundle(tmp_path / "flat", directional_manifest(2), files)
     with pytest.raises(BundleError, match=r"inputs: are .*yaw"):
         AcousticField.load(wrong)
+
+
+@pytest.mark.parametrize("tail", ["stft", "bands"])
+def test_a_level_may_hear_a_lower_order(tmp_path, tail):
+    """As if the field had predicted no more."""
+    high, low = (write_directional(tmp_path / str(order), order, (0.0, 1.0, 0.0), tail) for order in (3, 1))
+    level = high.manifest.levels[0].model_copy(update={"order": 1})
+    limited = AcousticField(high, level, AcousticField.load(high).graph)
+    for head in (LEVEL, Quaternion(0.3, 0.2, 0.1, 0.9)):
+        found = limited.impulse_responses([LISTENER], [EMITTER], [head])
+        assert_array_equal(found, AcousticField.load(low).impulse_responses([LISTENER], [EMITTER], [head]))
+        assert not np.array_equal(found, AcousticField.load(high).impulse_responses([LISTENER], [EMITTER], [head]))

@@ -116,3 +116,17 @@ def test_as_many_responses_as_there_are_onsets(is_compiled):
         gate.open(_noise(), np.array([1, 2, 3]))
     with pytest.raises(ValueError, match="1 onsets and 2 echoes"):
         gate.open(_noise(), np.array([1]), np.array([1, 2]))
+
+
+@pytest.mark.parametrize(("onset", "echo"), [(300, 300), (300, 420), (10, 3), (-5, -2), (990, 1_200), (1_000, 1_000)])
+@pytest.mark.parametrize("after", [1.0, 1e-3, 0.0])
+@pytest.mark.parametrize("gives_back", [False, True])
+def test_gains_for_other_channels_are_those_of_the_gate(onset, echo, after, gives_back):
+    gate = Gate(PARAMETERS, rise_s=0.004, gives_back=gives_back)
+    responses = _noise()[:1, :1].copy()
+    responses[..., 300:] *= after
+    gains = gate.gains(responses[0, 0], onset, echo)
+    expected = responses[0, 0] * gains
+    assert np.isfinite(gains).all()
+    gate.open(responses, np.array([onset]), np.array([echo]))
+    assert_allclose(responses[0, 0], expected, rtol=1e-5, atol=1e-12)

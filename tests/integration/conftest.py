@@ -23,11 +23,12 @@ _LEFT_CLOSING = "ignore:unclosed transport <_SelectorSocketTransport closing:Res
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Servers and browsers here are measured while they run: every test is `timed`. A loop that ends while a connection
-    is being closed leaves its transport to the collector, which is no fault."""
+    """Servers and browsers here are measured while they run: every test is `timed` that is not `untimed`. A loop that
+    ends while a connection is being closed leaves its transport to the collector, which is no fault."""
     for item in items:
         if HERE in item.path.parents:
-            item.add_marker(pytest.mark.timed)
+            if item.get_closest_marker("untimed") is None:
+                item.add_marker(pytest.mark.timed)
             item.add_marker(pytest.mark.filterwarnings(_LEFT_CLOSING))
 
 
@@ -48,15 +49,22 @@ def _serving(levels: FieldsByLevel, hrtfs: HrtfLibrary) -> Iterator[str]:
         thread.join()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def serving() -> Callable[[FieldsByLevel, HrtfLibrary], AbstractContextManager[str]]:
     """Makes HOST:PORT of a server of a scene's levels, ready, with the options of `nafir serve`."""
     return _serving
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def served(bundle, hrtfs) -> Iterator[str]:
-    """HOST:PORT of a server of the arithmetic scene."""
+    """HOST:PORT of a server of the arithmetic scene, for tests that leave it as it was."""
+    with _serving(FieldsByLevel.load(bundle), hrtfs) as address:
+        yield address
+
+
+@pytest.fixture
+def served_anew(bundle, hrtfs) -> Iterator[str]:
+    """The same, of a server for one test alone, with the environment of that test."""
     with _serving(FieldsByLevel.load(bundle), hrtfs) as address:
         yield address
 

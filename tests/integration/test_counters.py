@@ -5,9 +5,12 @@ import threading
 import urllib.request
 from itertools import pairwise
 
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.integration.churn import churn
+
+pytestmark = pytest.mark.untimed
 
 VISITS = 300
 PERIOD_S = 0.05

@@ -16,6 +16,8 @@ from server.streaming.session import Session
 from server.streaming.stream import Stream
 from tests.integration.churn import HELLO, visit
 
+pytestmark = pytest.mark.untimed
+
 PATIENCE_S = 5.0
 
 
@@ -95,7 +97,7 @@ ENDS = {
 @pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
 def test_nothing_outlives_its_connection(monkeypatch, request, made, end):
     monkeypatch.setenv("NAFIR_STALL_TIMEOUT_S", "0.5")
-    served = request.getfixturevalue("served")
+    served = request.getfixturevalue("served_anew")
     asyncio.run(end(served))
     until_s = time.monotonic() + PATIENCE_S
     while any(left(made).values()) and time.monotonic() < until_s:

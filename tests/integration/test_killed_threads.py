@@ -103,7 +103,7 @@ def engines(monkeypatch):
 
 @pytest.fixture
 def engine(engines, request):
-    request.getfixturevalue("served")
+    request.getfixturevalue("served_anew")
     return engines[-1]
 
 
@@ -120,9 +120,9 @@ def die(*_):
 
 
 @threads_may_die
-def test_streams_of_a_thread_that_is_killed_between_two_ticks_go_on(engine, served):
+def test_streams_of_a_thread_that_is_killed_between_two_ticks_go_on(engine, served_anew):
     async def scenario():
-        listeners = await listening(served)
+        listeners = await listening(served_anew)
         dead = engine.threads[0]
         dead.tick = lambda: 60.0  # so that it dies at rest
         await until(lambda: dead.work_number is None, _SLACK_S)
@@ -130,7 +130,7 @@ def test_streams_of_a_thread_that_is_killed_between_two_ticks_go_on(engine, serv
         dead._wake.set()
         await until(lambda: dead not in engine.threads, WITHIN_S)
         await asyncio.gather(*(listener.hear(50) for listener in listeners))
-        await readiness_is(served, 200, WITHIN_S)
+        await readiness_is(served_anew, 200, WITHIN_S)
         for listener in listeners:
             assert listener.sequences == list(range(len(listener.sequences)))
             assert listener.error is None
@@ -140,16 +140,16 @@ def test_streams_of_a_thread_that_is_killed_between_two_ticks_go_on(engine, serv
 
 
 @threads_may_die
-def test_streams_that_a_thread_is_killed_at_are_told_and_newcomers_are_served(engine, served):
+def test_streams_that_a_thread_is_killed_at_are_told_and_newcomers_are_served(engine, served_anew):
     async def scenario():
-        listeners = await listening(served)
+        listeners = await listening(served_anew)
         dead = engine.threads[0]
         dead.turns.deal = die
         await until(lambda: sum(listener.task.done() for listener in listeners) == STREAMS // 2, WITHIN_S)
         told = [listener for listener in listeners if listener.task.done()]
         assert [(each.error, each.close_code) for each in told] == [("internal_error", 1011)] * len(told)
         staying = [listener for listener in listeners if listener not in told]
-        newcomers = await listening(served)
+        newcomers = await listening(served_anew)
         assert dead not in engine.threads
         for listener in (*staying, *newcomers):
             await listener.hear()
@@ -160,32 +160,32 @@ def test_streams_that_a_thread_is_killed_at_are_told_and_newcomers_are_served(en
 
 
 @threads_may_die
-def test_a_server_whose_threads_die_again_and_again_is_not_ready(engine, served):
+def test_a_server_whose_threads_die_again_and_again_is_not_ready(engine, served_anew):
     async def scenario():
         for _ in range(3):
-            listeners = await listening(served)
+            listeners = await listening(served_anew)
             dead = engine.threads[0]
             dead.turns.deal = die
             await until(lambda dead=dead: dead not in engine.threads, WITHIN_S)
             for listener in listeners:
                 listener.task.cancel()
-        await readiness_is(served, 503, WITHIN_S)
+        await readiness_is(served_anew, 503, WITHIN_S)
 
     asyncio.run(scenario())
 
 
-def test_a_server_with_a_thread_that_is_stuck_is_not_ready_until_it_goes_on(engine, served):
+def test_a_server_with_a_thread_that_is_stuck_is_not_ready_until_it_goes_on(engine, served_anew):
     async def scenario():
-        listeners = await listening(served)
+        listeners = await listening(served_anew)
         stuck, release = engine.threads[0], threading.Event()
         deal = stuck.turns.deal
         stuck.turns.deal = lambda streams: (release.wait(30), deal(streams))
         try:
-            await readiness_is(served, 503, WITHIN_S)
+            await readiness_is(served_anew, 503, WITHIN_S)
         finally:
             stuck.turns.deal = deal
             release.set()
-        await readiness_is(served, 200, WITHIN_S)
+        await readiness_is(served_anew, 200, WITHIN_S)
         for listener in listeners:
             await listener.hear()
             listener.task.cancel()

@@ -56,6 +56,7 @@ def test_without_a_recording_it_claps(served, tmp_path):
     assert np.sqrt(np.mean(heard[:rate] ** 2)) > 1e-3
 
 
+@pytest.mark.untimed
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [

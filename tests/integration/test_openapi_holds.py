@@ -7,6 +7,8 @@ import urllib.request
 
 import pytest
 
+pytestmark = pytest.mark.untimed
+
 
 def schemathesis(address, folder, *, config, examples):
     """Ends by itself; with a seed, so that what fails fails again."""

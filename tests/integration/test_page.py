@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from tests import visitor
-from tests.visitor import LISTENING_S, free_port, level_db, listen, open_page, serving, start
+from tests.visitor import LISTENING_S, free_port, level_db, listen, open_page, passing_on, start
 
 browser = visitor.browser
-server = visitor.server
 page = visitor.page
 pytestmark = visitor.needs_browser
 
@@ -156,6 +155,7 @@ def test_a_second_source_is_heard_too(page):
     assert np.all(level_db(listen(page)) > -70)
 
 
+@pytest.mark.untimed
 def test_an_error_of_the_server_is_shown_and_the_stream_goes_on(browser, server):
     context = browser.new_context()
     context.route(
@@ -172,10 +172,10 @@ def test_an_error_of_the_server_is_shown_and_the_stream_goes_on(browser, server)
     context.close()
 
 
-def test_a_lost_connection_is_taken_up_again(browser):
+def test_a_lost_connection_is_taken_up_again(browser, server):
     port = free_port()
     context = browser.new_context()
-    with serving(port) as url:
+    with passing_on(port, server) as url:
         page = open_page(context, url)
         start(page)
         page.wait_for_function("nafir.state().effects !== null")
@@ -187,7 +187,7 @@ def test_a_lost_connection_is_taken_up_again(browser):
     assert page.locator(".meter output").all_inner_texts() == ["–", "–"]
     assert set(page.locator("#effects .reason").all_inner_texts()) == {"–"}
     assert "".join(page.locator("#effects .cost").all_inner_texts()) == ""
-    with serving(port):
+    with passing_on(port, server):
         page.wait_for_function("nafir.state().connection === 'live'", timeout=20_000)
         page.evaluate("nafir.setListener({ yaw: 1 })")
         assert np.all(level_db(listen(page)) > -70)

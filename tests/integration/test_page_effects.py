@@ -7,7 +7,6 @@ from tests import visitor
 from tests.visitor import level_db, listen, open_page, start
 
 browser = visitor.browser
-server = visitor.server
 pytestmark = visitor.needs_browser
 
 

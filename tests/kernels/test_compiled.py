@@ -23,7 +23,7 @@ MODULES = {
         "@compiled\ndef outer(x):\n    return 10 * inner(x)\n"
     ),
 }
-COMPILED = Path(server.__file__).parent / "kernels" / "compiled.py"
+KERNELS = Path(server.__file__).parent / "kernels"
 RUN = "from server.outer import outer; print(outer(1), sum(outer.stats.cache_hits.values()))"
 
 
@@ -32,7 +32,8 @@ def package(tmp_path):
     for name, source in MODULES.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(source)
-    shutil.copy(COMPILED, tmp_path / "server" / "kernels")
+    for name in ("compiled.py", "dispatchers.py"):
+        shutil.copy(KERNELS / name, tmp_path / "server" / "kernels")
     return tmp_path
 
 

@@ -61,6 +61,7 @@ RESULTS = (
     "exponential",
     "cosine",
     "sine",
+    "logarithm",
 )
 
 
@@ -91,6 +92,7 @@ def lane_by_lane(lanes):
             cosine, sine = simd.cosine_sine(w)
             simd.store(to, 13 * size + n, cosine)
             simd.store(to, 14 * size + n, sine)
+            simd.store(to, 15 * size + n, simd.logarithm(w))
             flags[n // lanes] = simd.any_above(w, x)
 
     return run
@@ -463,6 +465,26 @@ def test_exponential_of_anything_is_finite_and_of_nothing_nothing(lanes):
     assert exponentials[0] == exponentials[3] == exponentials[9] < 1e-37
     assert exponentials[1] == exponentials[2] == exponentials[10] > 1e38
     assert (exponentials[5:8] == 1).all()
+
+
+@EACH
+def test_logarithm_is_right_to_the_last_digits(lanes):
+    a, _, _, _, found = results(lanes, np.exp(np.linspace(-87, 88, 100_003)))
+    expected = np.log(a.astype(np.float64))
+    assert_allclose(found["logarithm"], expected, rtol=2e-7, atol=1e-7)
+    near_one = np.linspace(0.7, 1.5, 100_003)
+    a, _, _, _, found = results(lanes, near_one)
+    assert_allclose(found["logarithm"], np.log(a.astype(np.float64)), rtol=2e-7, atol=1e-9)
+
+
+@EACH
+def test_logarithm_of_nothing_is_that_of_the_smallest_number(lanes):
+    values = [0.0, -0.0, -1.0, -np.inf, TINIEST, SMALLEST_NORMAL, 1.0, np.nan]
+    *_, found = results(lanes, values)
+    logarithms = found["logarithm"][: len(values)]
+    assert_allclose(logarithms[:6], np.log(np.float64(SMALLEST_NORMAL)), rtol=2e-7)
+    assert logarithms[6] == 0
+    assert np.isnan(logarithms[7])
 
 
 @EACH

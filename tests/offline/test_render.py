@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL
-from server.acoustics.geometry import FloorPlan, Pose
+from server.acoustics.geometry import FloorPlan, Pose, yaws_of
 from server.field.fields_by_level import FieldsByLevel
 from server.field.kinds.catalogue import kind_of
 from server.offline.render import PathError, PathPoint, RenderedEmitter, read_path, render
@@ -34,8 +34,11 @@ class NoiseField:
     level = QualityLevel(name="noise", field="noise")
     kind = kind_of(level)
 
-    def impulse_responses(self, listeners, emitters, yaws, *, remember=False):  # noqa: ARG002  there is no phase
-        return np.stack([self.one(*poses) for poses in zip(listeners, emitters, yaws, strict=True)])
+    def through(self, filters):  # noqa: ARG002  it knows no head
+        return self
+
+    def impulse_responses(self, listeners, emitters, heads, *, remember=False):  # noqa: ARG002  there is no phase
+        return np.stack([self.one(*poses) for poses in zip(listeners, emitters, yaws_of(heads), strict=True)])
 
     def one(self, listener, emitter, yaw):
         seed = np.array([*listener, *emitter, yaw], np.float64).view(np.uint32)

@@ -11,7 +11,6 @@ from tests import visitor
 from tests.visitor import open_page, start
 
 browser = visitor.browser
-server = visitor.server
 pytestmark = visitor.needs_browser
 
 LEAST_CONTRAST = 4.5

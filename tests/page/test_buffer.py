@@ -8,7 +8,6 @@ import pytest
 from tests import visitor
 
 browser = visitor.browser
-server = visitor.server
 page = visitor.page
 pytestmark = visitor.needs_browser
 

@@ -8,7 +8,6 @@ from tests import visitor
 from tests.visitor import open_page
 
 browser = visitor.browser
-server = visitor.server
 pytestmark = visitor.needs_browser
 
 

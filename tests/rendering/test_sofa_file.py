@@ -155,6 +155,7 @@ def grid_file(path, angles):
     return path
 
 
+@pytest.mark.long
 def test_more_directions_than_a_resampler_has_channels(tmp_path):
     """Each of them as in a file that has few."""
     angles = np.array([(a, e) for e in range(-80, 81) for a in np.arange(0.0, 360.0, 1.5)] + [(0, 90), (0, -90)])

@@ -62,3 +62,20 @@ def test_directions_are_heard_anew_and_have_no_phase_to_integrate(level):
     levels = [{"name": "standard", "field": "arithmetic"} | level]
     with pytest.raises(ValidationError, match=r"levels\.standard: a field of directions is heard anew"):
         Manifest.model_validate(with_field(DIRECTIONAL, format_version=3, levels=levels))
+
+
+@pytest.mark.parametrize(
+    ("field", "order", "told"),
+    [(DIRECTIONAL, 3, "order 2"), (FieldFile(file="arithmetic.onnx", architecture="a"), 1, "no directions")],
+)
+def test_a_level_uses_no_more_harmonics_than_there_are(field, order, told):
+    version = 3 if field is DIRECTIONAL else 2
+    levels = [{"name": "standard", "field": "arithmetic", "order": order}]
+    with pytest.raises(ValidationError, match=rf"levels.standard.order: is {order}, but field arithmetic has {told}"):
+        Manifest.model_validate(with_field(field, format_version=version, levels=levels))
+
+
+def test_bands_are_for_directions_alone():
+    levels = [{"name": "standard", "field": "arithmetic", "tail": "bands"}]
+    with pytest.raises(ValidationError, match="bands are for fields of directions"):
+        Manifest.model_validate(MANIFEST.model_dump(mode="json") | {"levels": levels})

@@ -4,6 +4,7 @@ use.
 Axes: the responses of one pair are `(yaw, channel, sample)`, whole, with the direct sound. Metres, radians.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,12 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from server.core.errors import NafirError
+from server.rendering.hrtf import HeadFilters, Hrtf, kemar
 from server.scene.bundle import Bundle
 from training.baselines.baselines import PairResponses, TrainingPairs
-from training.data.dataset import Dataset
+from training.data.dataset import TAKES, Dataset
 from training.data.dataset_check import DatasetError
 from training.data.responses import ImportedDataset, SimulatedResponses, open_responses
-from training.simulation.references import References
+from training.simulation.references import References, ReheardReferences
 
 Responses = npt.NDArray[np.floating]
 _Floats = npt.NDArray[np.float64]
@@ -36,8 +38,8 @@ class HeldOut:
 
     pairs: all pairs of the dataset, and which of them a method may use. held_out: (index,) numbers of the held-out
     pairs among those. repeats: a second independent take of each pair, if there is one. delays_s: (pair,) seconds until
-    the first sound can arrive. yaws: (yaw,) of all responses. yaw_indices: (n,) indices of the yaws that are evaluated.
-    visible: (index,) whether the ends see each other.
+    the first sound can arrive. yaws: (yaw,) of all responses, or orientations (yaw, 4) of heads that are tilted too.
+    yaw_indices: (n,) indices of the yaws that are evaluated. visible: (index,) whether the ends see each other.
     """
 
     folder: Path
@@ -55,6 +57,8 @@ class HeldOut:
     simulated: Dataset | None
     left_out: int = 0
     """Number of pairs that are not used because they lack a response at one of the orientations."""
+    filters: HeadFilters | None = None
+    """The head through which the responses are heard, if it is not that of the data."""
 
     def __post_init__(self) -> None:
         if not len(self.held_out):
@@ -77,6 +81,29 @@ class HeldOut:
         """The responses at the orientations that are evaluated."""
         return self.pairs.response(int(self.held_out[index]))[self.yaw_indices]
 
+    def reheard(self, hrtf: Path | None, *, tilt_deg: float = 0.0) -> "HeldOut":
+        """The same pairs heard through another head (a SOFA file), or with the head tilted up, down, to the left and to
+        the right in turn. Responses are simulated anew. Their repeats differ in noise only, and not in rays.
+
+        Raises EvaluationError for measured responses, which know one head, and HrtfError for a file that is no head.
+        """
+        if self.simulated is None:
+            raise EvaluationError(f"{self.name}: a measurement knows one head; another is for simulated data only")
+        heads = tilted(self.yaws, math.radians(tilt_deg)) if tilt_deg else self.yaws
+        rate = self.sample_rate
+        filters = kemar(rate) if hrtf is None else HeadFilters.from_hrtf(Hrtf.read(hrtf, rate))
+        first, second = (ReheardReferences(self.simulated, filters, heads, take) for take in TAKES)
+        told = [f"through {hrtf.stem}"] if hrtf is not None else []
+        told += [f"tilted by {tilt_deg:g} degrees"] if tilt_deg else []
+        return replace(
+            self,
+            name=", ".join([self.name, *told]),
+            pairs=replace(self.pairs, responses=first),
+            repeats=second,
+            yaws=heads,
+            filters=filters,
+        )
+
     def sample(self, *, pairs: int | None, yaws: int | None, seed: int) -> "HeldOut":
         """A random subset of `pairs` pairs, and `yaws` evenly spaced orientations; all of them if there are fewer."""
         chosen = np.arange(len(self))
@@ -86,6 +113,19 @@ class HeldOut:
         if yaws is not None and yaws < len(yaw_indices):
             yaw_indices = yaw_indices[np.linspace(0, len(yaw_indices), yaws, endpoint=False).astype(int)]
         return replace(self, held_out=self.held_out[chosen], yaw_indices=yaw_indices, visible=self.visible[chosen])
+
+
+def tilted(yaws: _Floats, angle_rad: float) -> _Floats:
+    """(yaw, 4) orientations of heads at these yaws, in turn tilted up, down, to the left and to the right."""
+    orientations = []
+    for number, yaw in enumerate(yaws):
+        sign = 1 if number % 2 else -1
+        # About the head's own axes: a turn to the left is about z, up is about -y, a tilt to the left about -x.
+        axis = np.array([0.0, sign, 0.0] if number % 4 < 2 else [sign, 0.0, 0.0]) * np.sin(angle_rad / 2)
+        x, y, _ = axis
+        w, turn_w, turn_z = np.cos(angle_rad / 2), np.cos(yaw / 2), np.sin(yaw / 2)
+        orientations.append((turn_w * x - turn_z * y, turn_w * y + turn_z * x, turn_z * w, turn_w * w))
+    return np.array(orientations)
 
 
 @contextmanager

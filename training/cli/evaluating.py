@@ -26,6 +26,12 @@ def evaluate(
     pairs: Annotated[int | None, typer.Option(min=1, help="Held-out pairs to draw; all if not given.")] = None,
     yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
     draws: Annotated[int, typer.Option(min=1, help="Compare with medians of so many more simulations.")] = 1,
+    hrtf: Annotated[
+        Path | None, typer.Option(help="Hear simulated data and fields through this head (SOFA, SimpleFreeFieldHRIR).")
+    ] = None,
+    tilt: Annotated[
+        float, typer.Option(min=0, max=90, help="Tilt heads by so many degrees up, down, left and right in turn.")
+    ] = 0.0,
     figure: Annotated[
         Path | None, typer.Option(help="Draw decays and errors to this PNG.", callback=figure_file)
     ] = None,
@@ -58,6 +64,9 @@ def evaluate(
     if record and (len(bundles) != 1 or runs or draws > 1):
         problem = "takes one bundle, and errors from one simulation, as a frontier's are"
         raise typer.BadParameter(problem, param_hint="--record")
+    if record and (hrtf is not None or tilt):
+        problem = "takes errors through the head of the data, level: leave out --hrtf and --tilt"
+        raise typer.BadParameter(problem, param_hint="--record")
     if record:
         require_writable(bundles[0].folder / MANIFEST_FILE, "--record")
     console = Console(stderr=True)
@@ -69,6 +78,8 @@ def evaluate(
         pairs=pairs,
         yaws=yaws,
         draws=draws,
+        hrtf=hrtf,
+        tilt_deg=tilt,
         seed=seed,
         figure=figure,
         keep=None if output is None else Path(f"{output}.partial"),

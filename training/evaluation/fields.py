@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
+from server.rendering.hrtf import kemar
 from server.responses.full_response import FullResponse
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy, QualityLevel
@@ -66,7 +67,8 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
     rng = np.random.default_rng(_LATTICE_POSITIONS)
     is_moved = field.kind.reuses_responses
     fields = [with_moved_nodes(field, rng) for _ in range(_LATTICE_POSITIONS)] if is_moved else [field]
-    wholes = [FullResponse.through_kemar(moved) for moved in fields]
+    filters = held_out.filters or kemar(held_out.sample_rate)
+    wholes = [FullResponse(moved, filters) for moved in fields]
     listeners, emitters = held_out.listeners, held_out.emitters
 
     def source(index: int, yaw_indices: npt.NDArray[np.integer]) -> Responses:

@@ -7,7 +7,7 @@ import numpy as np
 
 from server.scene.bundle import Bundle
 from training.baselines.coded import Track
-from training.baselines.held_out import HeldOut, open_held_out
+from training.baselines.held_out import EvaluationError, HeldOut, open_held_out
 from training.data.responses import open_responses
 from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import Column, Evaluation, Kind, evaluate
@@ -27,6 +27,8 @@ def evaluate_bundles(
     pairs: int | None = None,
     yaws: int | None = None,
     draws: int = 1,
+    hrtf: Path | None = None,
+    tilt_deg: float = 0.0,
     seed: int = 0,
     figure: Path | None = None,
     keep: Path | None = None,
@@ -35,14 +37,18 @@ def evaluate_bundles(
     """Evaluate each quality level of each bundle, and the field of each run folder on measured data, beside `methods`
     and the floor. All are evaluated on the same held-out pairs and orientations: all of them, or the numbers given by
     `pairs` and `yaws`. Parameters are compared with medians over `draws` simulations, or with those of the dataset's
-    own simulation. `figure` is the path of a PNG to draw. Errors are stored in the file `keep` pair by pair, so that an
-    interrupted evaluation can be resumed; the file is removed at the end.
+    own simulation. With `hrtf` (a SOFA file) or `tilt_deg`, all are heard through that head, or with the head tilted by
+    so many degrees. `figure` is the path of a PNG to draw. Errors are stored in the file `keep` pair by pair, so that
+    an interrupted evaluation can be resumed; the file is removed at the end.
 
     Raises EvaluationError, DatasetError if the dataset and a bundle are of different scenes, and RunError for a run on
     other data.
     """
     with open_held_out(data) as everything:
         held_out = everything.sample(pairs=pairs, yaws=yaws, seed=seed)
+        if hrtf is not None or tilt_deg:
+            _require_waveforms(methods, draws)
+            held_out = held_out.reheard(hrtf, tilt_deg=tilt_deg)
         truth = median_parameters(held_out, draws, track=track) if draws > 1 else []
         columns = field_columns(bundles, held_out)
         if runs:
@@ -56,7 +62,9 @@ def evaluate_bundles(
         stored = None
         if keep is not None:
             depends_on = [[bundle.digest for bundle in bundles], [signature(folder) for folder in (*runs, data)]]
-            stored = StoredErrors(keep, [depends_on, [column.name for column in measured], pairs, yaws, draws, seed])
+            stored = StoredErrors(
+                keep, [depends_on, [column.name for column in measured], pairs, yaws, draws, seed, held_out.name]
+            )
         evaluation = evaluate(
             held_out,
             measured,
@@ -71,6 +79,21 @@ def evaluate_bundles(
         if stored is not None:
             stored.discard()
         return evaluation, published_table(simulated=held_out.simulated is not None)
+
+
+def _require_waveforms(methods: Sequence[str], draws: int) -> None:
+    """Raises EvaluationError for methods that hear through the data's own head, or for medians over simulations of
+    it."""
+    if draws > 1:
+        raise EvaluationError(
+            "--draws: are simulations through the data's own head; leave it out with --hrtf or --tilt"
+        )
+    for name in methods:
+        if name not in DEFAULT_METHODS:
+            known = ", ".join(DEFAULT_METHODS)
+            raise EvaluationError(
+                f"--methods: {name} knows the data's own head only; with --hrtf or --tilt take {known}"
+            )
 
 
 def _draw(evaluation: Evaluation, path: Path, held_out: HeldOut, columns: Sequence[Column]) -> None:

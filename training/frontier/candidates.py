@@ -24,7 +24,8 @@ def candidates(
 
     `phases_of` names the fields for which all methods of finding the phase are measured, by default all fields; the
     time of Griffin and Lim's iteration does not depend on the field. `reuse_of` names the fields for which all kinds
-    of reuse are measured. Either may be `NONE`. Raises BundleError for a name that is not a field.
+    of reuse are measured. Either may be `NONE`. A field of directions is measured at each order, with both ways to make
+    the tail; it has no reuse. Raises BundleError for a name that is not a field, or for reuse of directions.
     """
     fields = bundle.manifest.fields
     reused = set(reuse_of)
@@ -35,12 +36,21 @@ def candidates(
         if NONE in named and len(named) > 1:
             other = min(named - {NONE})
             raise BundleError(bundle.folder, "fields", f"{NONE!r} and {other!r} contradict each other: leave one out")
+    if directional := sorted(name for name in reused - {NONE} if fields[name].order is not None):
+        raise BundleError(
+            bundle.folder, f"fields.{directional[0]}", "predicts directions, of which no response is reused"
+        )
     levels = [level for name, file in fields.items() for level in _levels(bundle.manifest, name, file, name in swept)]
     return [*levels, *(level for name in fields if name in reused for kind in KINDS for level in kind.candidates(name))]
 
 
 def _levels(manifest: Manifest, name: str, file: FieldFile, with_phases: bool) -> Iterator[QualityLevel]:
     yield QualityLevel(name=name, field=name)
+    if file.order is not None:
+        yield QualityLevel(name=f"{name}-bands", field=name, tail="bands")
+        for order in range(file.order):
+            yield QualityLevel(name=f"{name}-o{order}", field=name, order=order)
+            yield QualityLevel(name=f"{name}-o{order}-bands", field=name, order=order, tail="bands")
     # A field in the time domain predicts samples: there is no phase to choose.
     if not with_phases or file.architecture.endswith("time-domain"):
         return

@@ -21,6 +21,7 @@ from scipy.fft import irfft, rfft
 from scipy.sparse import coo_array
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
+from server.acoustics.geometry import axes_of
 from server.rendering.hrtf import HeadFilters
 from server.scene.manifest import Air
 from training.data.dataset import SPEED_OF_SOUND
@@ -37,12 +38,14 @@ _DIFFUSE_RISE_S = 0.002
 _LEAD_S = 0.001
 
 
-def rotate_into_head(directions: _Floats, yaws: _Floats) -> _Floats:
-    """Rotate world directions into level heads that are turned counter-clockwise by each yaw (radians); returns
-    (direction, yaw, xyz)."""
+def rotate_into_head(directions: _Floats, heads: _Floats) -> _Floats:
+    """Rotate world directions into heads; returns (direction, head, xyz). Heads are level ones that are turned
+    counter-clockwise by yaws (head,) in radians, or have orientations (head, 4)."""
+    if heads.ndim == 2:
+        return np.stack([directions @ axes_of(orientation).T for orientation in heads], axis=1)
     x, y, z = (directions[:, None, axis] for axis in range(3))
-    cos, sin = np.cos(yaws), np.sin(yaws)
-    return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(yaws)))], axis=-1)
+    cos, sin = np.cos(heads), np.sin(heads)
+    return np.stack([x * cos + y * sin, y * cos - x * sin, np.broadcast_to(z, (len(directions), len(heads)))], axis=-1)
 
 
 def power_at(times_s: _Floats, energy: _Singles) -> _Singles:
@@ -70,7 +73,8 @@ class BinauralSynthesis:
 
     head: HeadFilters
     arrival_directions: _Floats
-    yaws: _Floats
+    heads: _Floats
+    """Yaws (head,) of level heads, or orientations (head, 4)."""
     samples: int
 
     def render(self, arrivals: Arrivals, receiver: _Floats, onset_s: float, rng: np.random.Generator) -> _Singles:
@@ -81,7 +85,7 @@ class BinauralSynthesis:
 
     def specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats) -> _Singles:
         """The response to images alone: positions (image, xyz), with pressures (image, band) at the receiver."""
-        response = np.zeros((len(self.yaws), 2, self.samples), dtype=np.float32)
+        response = np.zeros((len(self.heads), 2, self.samples), dtype=np.float32)
         self._add_specular(positions, amplitudes, receiver, response)
         return response
 
@@ -151,7 +155,7 @@ class BinauralSynthesis:
         """(bin, product, yaw, direction) products of the ears' spectra for a wave from each direction, at frequencies
         from 0 to half the sample rate: squared magnitudes of left and right, then real and imaginary parts of left
         times conjugate right."""
-        own = self._arrival_spectra.reshape(self._n_fft // 2 + 1, len(self.arrival_directions), len(self.yaws), 2)
+        own = self._arrival_spectra.reshape(self._n_fft // 2 + 1, len(self.arrival_directions), len(self.heads), 2)
         left, right = own[..., 0], own[..., 1]
         cross = left * np.conj(right)
         products = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag], axis=1)
@@ -167,7 +171,7 @@ class BinauralSynthesis:
         band). Overlapping bands are independent, so that their powers add up for any gains of the bands."""
         step = self._n_fft // 2
         frames = samples // step
-        at_ears = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.yaws), frames * step), dtype=np.float32)
+        at_ears = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.heads), frames * step), dtype=np.float32)
         for neighbours in (0, 1):  # only neighbouring bands overlap
             noise = _unit_noise((len(directional), frames, step), rng)
             sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
@@ -180,14 +184,14 @@ class BinauralSynthesis:
                 within = slice(inside[0], inside[-1] + 1)
                 amplitudes = np.sqrt(directional[:, band]).astype(np.float32)
                 shape = np.sqrt(self._band_weights[band, within])[:, None, None]
-                shaped = np.zeros((2 * len(self.yaws), frames, len(spectra)), dtype=np.complex64)
+                shaped = np.zeros((2 * len(self.heads), frames, len(spectra)), dtype=np.complex64)
                 arriving = np.matmul(spectra[within] * (amplitudes * shape), self._arrival_spectra[within])
                 shaped[..., within] = arriving.transpose(2, 1, 0)
                 sections = irfft(shaped, self._n_fft)
                 sections *= self._window
                 later = np.roll(sections[..., step:], 1, axis=1)
                 at_ears[band] = (sections[..., :step] + later).reshape(len(sections), -1)
-        return at_ears.reshape(len(at_ears), len(self.yaws), 2, -1)
+        return at_ears.reshape(len(at_ears), len(self.heads), 2, -1)
 
     @property
     def _sample_rate(self) -> int:
@@ -217,7 +221,7 @@ class BinauralSynthesis:
     @cached_property
     def _arrival_spectra(self) -> npt.NDArray[np.complex64]:
         """(bin, direction, yaw and ear) spectra of waves from the directions of arrival."""
-        spectra = self._ears.arriving(rotate_into_head(self.arrival_directions, self.yaws))
+        spectra = self._ears.arriving(rotate_into_head(self.arrival_directions, self.heads))
         return np.ascontiguousarray(np.moveaxis(spectra.reshape(len(spectra), -1, spectra.shape[-1]), -1, 0))
 
     def late(self, energy: _Singles, onset_s: float, rng: np.random.Generator) -> _Singles:
@@ -236,7 +240,7 @@ class BinauralSynthesis:
         sections = irfft(np.ascontiguousarray(at_ears.transpose(2, 1, 0)), self._n_fft)
         sections *= self._window
         late = sections[:, :-1, step:] + sections[:, 1:, :step]
-        response = late.reshape(len(self.yaws), 2, -1)[..., : self.samples]
+        response = late.reshape(len(self.heads), 2, -1)[..., : self.samples]
         # Windows smear energy to times before the direct sound, when no scattered sound can arrive.
         begins, risen = (round(time_s * self._sample_rate) for time_s in (onset_s, onset_s + _DIFFUSE_RISE_S))
         response[..., :begins] = 0
@@ -248,12 +252,12 @@ class BinauralSynthesis:
     def _add_specular(self, positions: _Floats, amplitudes: _Floats, receiver: _Floats, response: _Singles) -> None:
         offset = positions - receiver
         distance = np.linalg.norm(offset, axis=-1)
-        directions = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.yaws)
+        directions = rotate_into_head(offset / np.maximum(distance, 1e-6)[:, None], self.heads)
         delay = distance / SPEED_OF_SOUND * self._sample_rate
         start = np.floor(delay).astype(int)
         lead = round(_LEAD_S * self._sample_rate)
         spectra = self._ears.specular(directions, amplitudes, lead + delay - start)
-        taps = irfft(spectra, self._n_fft).reshape(len(spectra), 2 * len(self.yaws), self._n_fft)
+        taps = irfft(spectra, self._n_fft).reshape(len(spectra), 2 * len(self.heads), self._n_fft)
         _add_at(start - lead, taps, response.reshape(-1, self.samples))
 
 

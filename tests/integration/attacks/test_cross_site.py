@@ -8,6 +8,8 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+pytestmark = pytest.mark.untimed
+
 
 def ask(address, path, **headers):
     connection = http.client.HTTPConnection(address, timeout=10)

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from server.acoustics.geometry import Quaternion, axes_of
 from server.acoustics.metrics import spectral_loss
 from server.field.field import AcousticField
+from server.rendering.hrtf import KEMAR
 from server.responses.full_response import FullResponse
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy, QualityLevel, Reuse
-from training.baselines.held_out import EvaluationError, open_held_out, require_same_scene
+from training.baselines.held_out import EvaluationError, open_held_out, require_same_scene, tilted
 from training.data.dataset import DatasetError
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset, Measurement
@@ -211,3 +213,46 @@ class TestMeasured:
         with open_held_out(tmp_path) as held_out:
             assert held_out.left_out == 2
             assert len(held_out.pairs.training) == 10
+
+
+@pytest.mark.parametrize(
+    ("number", "axis", "towards"),
+    [
+        (0, (1, 0, 0), (0.8, 0, 0.6)),
+        (1, (1, 0, 0), (0.8, 0, -0.6)),
+        (2, (0, 1, 0), (0, 0.8, -0.6)),
+        (3, (0, 1, 0), (0, 0.8, 0.6)),
+    ],
+    ids=["up", "down", "to the left", "to the right"],
+)
+def test_heads_are_tilted_up_down_left_and_right(number, axis, towards):
+    """Where the head's nose or its left ear points, in the axes of the untilted head."""
+    yaws = np.array([0.3, 1.0, -2.0, 3.0])
+    orientation = tilted(yaws, np.arcsin(0.6))[number]
+    level = axes_of(Quaternion.from_yaw(yaws[number]))
+    np.testing.assert_allclose(level @ axes_of(orientation).T @ axis, towards, atol=1e-12)
+
+
+def test_an_evaluation_is_heard_with_the_head_tilted_or_through_another(tiny_bundle, dataset):
+    found = {
+        name: evaluate_bundles([tiny_bundle], dataset.folder, methods=["nearest"], pairs=2, yaws=2, **options)[0]
+        for name, options in {"tilted": {"tilt_deg": 30.0}, "other": {"hrtf": KEMAR}}.items()
+    }
+    assert "tilted by 30 degrees" in found["tilted"].data
+    assert f"through {KEMAR.stem}" in found["other"].data
+    for evaluation in found.values():
+        errors = {result.name: result.summaries["level"].mean for result in evaluation.results}
+        assert all(np.isfinite(error) for error in errors.values()), errors
+        assert errors["floor"] < errors["nearest"]
+
+
+@pytest.mark.parametrize("options", [{"methods": ["image-sources"]}, {"draws": 2}])
+def test_what_knows_the_data_s_own_head_alone_is_not_tilted(tiny_bundle, dataset, options):
+    with pytest.raises(EvaluationError, match="own head"):
+        evaluate_bundles([tiny_bundle], dataset.folder, tilt_deg=30.0, **options)
+
+
+def test_measured_responses_are_not_heard_through_another_head(tmp_path):
+    TestMeasured().write(tmp_path)
+    with open_held_out(tmp_path) as opened, pytest.raises(EvaluationError, match="a measurement knows one head"):
+        opened.reheard(None, tilt_deg=30.0)

@@ -318,7 +318,8 @@ def test_lower_ranks_become_fields_that_cost_less(dataset, run, tmp_path):
     assert list(FieldsByLevel.load(bundle)) == ["standard", "factorised-r8", "factorised-r4"]
 
 
-def test_a_field_of_another_width_says_so_and_shares_a_bundle_with_the_first(dataset, run, tmp_path):
+def test_a_field_of_another_width_says_so_and_shares_a_bundle_with_the_first(dataset, run, tmp_path, monkeypatch):
+    _accept_any_health(monkeypatch)
     usual = Configuration.read(run)
     wide = replace(usual, epochs=1, shape=replace(usual.shape, width=48))
     responses = SimulatedResponses(dataset)

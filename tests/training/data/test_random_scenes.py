@@ -93,6 +93,7 @@ def test_the_usual_scene_is_planned(tmp_path):
     assert planner_of(SceneFile.read(path), 0).plan({}).rays > 0
 
 
+@pytest.mark.long
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
 @given(SCENES)
 @example({**USUAL, "absorption": 0.0, "scattering": 0.0, "duration_s": 60.0})

@@ -237,7 +237,13 @@ def test_a_run_interrupted_within_an_epoch_goes_on_to_the_same_field(dataset, na
     assert losses(tmp_path / "pieces", "training") == losses(tmp_path / "whole", "training")
 
 
-@pytest.mark.parametrize("field", ["naf", "naf-whole", "naf-dual", "naf-no-grid", "naf-time-domain"])
+@pytest.mark.parametrize(
+    "field",
+    [
+        "naf",
+        *(pytest.param(f"naf-{name}", marks=pytest.mark.long) for name in ("whole", "dual", "no-grid", "time-domain")),
+    ],
+)
 def test_every_variant_of_the_papers_network_learns(dataset, field, tmp_path):
     usual = configure(field, seed=1, epochs=30, batch=4, points=60, learning_rate=3e-3)
     small = dataclasses.replace(usual, shape=dataclasses.replace(usual.shape, width=32, grid_features=4))

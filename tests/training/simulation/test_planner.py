@@ -38,31 +38,55 @@ def two_rooms(scene, **walls):
     return with_materials(with_geometry(scene, corners=TWO_ROOMS, openings=(passage,)), walls=walls)
 
 
-def decided(scene, name, overrides=None):
-    plan = planner_of(scene, 0).plan(overrides or {})
-    (decision,) = (each for each in plan.decisions if each.name == name)
-    return plan, decision
+def predicted(scene):
+    return Predictions(scene, scene.probe_positions(0))
+
+
+@pytest.fixture(scope="module")
+def planned():
+    """The plan of a scene, made once for all tests."""
+    plans = {}
+
+    def plan(scene):
+        text = scene.model_dump_json()
+        if text not in plans:
+            plans[text] = planner_of(scene, 0).plan({})
+        return plans[text]
+
+    return plan
+
+
+@pytest.fixture(scope="module")
+def decided(planned):
+    """The plan of a scene, and what it says of an effect."""
+
+    def decide(scene, name):
+        plan = planned(scene)
+        (decision,) = (each for each in plan.decisions if each.name == name)
+        return plan, decision
+
+    return decide
 
 
 def test_the_same_scene_has_the_same_plan(box):
     assert planner_of(box, 3).plan({}) == planner_of(box, 3).plan({})
 
 
-def test_an_effect_is_on_where_its_change_reaches_the_threshold(apartment, box):
+def test_an_effect_is_on_where_its_change_reaches_the_threshold(planned, apartment, box):
     for scene in (apartment, box):
-        for each in planner_of(scene, 0).plan({}).decisions:
+        for each in planned(scene).decisions:
             assert np.isfinite(each.change_jnd)
             assert each.called_for == (each.change_jnd >= THRESHOLD.enter_jnd)
             assert each.reason
 
 
-def test_an_anechoic_room_has_no_rays_and_no_images(box):
+def test_an_anechoic_room_has_no_rays_and_no_images(box, decided):
     plan, late = decided(with_materials(box, absorption=1.0), SimulatedEffect.LATE_REVERBERATION)
     assert (plan.rays, plan.tail_rays, plan.image_order, plan.tail_start_s) == (0, 0, 1, None)
     assert late.change_jnd < 0.01
 
 
-def test_one_room_shares_its_tail_and_two_do_not(box):
+def test_one_room_shares_its_tail_and_two_do_not(box, decided):
     alone, _ = decided(box, SimulatedEffect.PER_SOURCE_TAIL)
     parted, decision = decided(two_rooms(box), SimulatedEffect.PER_SOURCE_TAIL)
     assert alone.tail_start_s is not None
@@ -70,14 +94,14 @@ def test_one_room_shares_its_tail_and_two_do_not(box):
     assert decision.change_jnd > 1
 
 
-def test_the_tail_is_shared_only_after_everything_has_mixed_everywhere(box):
+def test_the_tail_is_shared_only_after_everything_has_mixed_everywhere(box, decided):
     plan, _ = decided(box, SimulatedEffect.PER_SOURCE_TAIL)
     probes = box.probe_positions(0)
     farthest_m = np.linalg.norm(probes[:, None] - probes[None], axis=-1).max()
     assert plan.tail_start_s == pytest.approx(farthest_m / 343 + 50.1e-3 + 0.0117e-3 * 30)
 
 
-def test_a_tail_that_would_start_after_the_response_is_not_shared(box):
+def test_a_tail_that_would_start_after_the_response_is_not_shared(box, decided):
     short = box.simulation.model_copy(update={"duration_s": 0.25})
     hall = with_geometry(box, corners=((0, 0), (78, 0), (78, 3), (0, 3)))
     wide = box.probes.model_copy(update={"spacing_m": 12.0})
@@ -93,9 +117,9 @@ def test_smooth_walls_need_no_scattering(box):
     """By a trial of sixteen times as many rays the changes are 0.06, 0.40 and 2.05 JND: 0.02 of scattering shorten
     reverberation by 2 %, which is above the threshold of 0.25, as many reflections follow."""
     smooth, smoother_than_most, rough = (
-        decided(with_materials(box, scattering=share), SimulatedEffect.SCATTERING)[1] for share in (0.002, 0.02, 0.2)
+        predicted(with_materials(box, scattering=share)).scattering(has_rays=True) for share in (0.002, 0.02, 0.2)
     )
-    assert not smooth.called_for
+    assert smooth.change_jnd < THRESHOLD.enter_jnd
     assert smoother_than_most.change_jnd == pytest.approx(0.40, abs=0.1)
     assert rough.change_jnd == pytest.approx(2.05, abs=0.2)
 
@@ -106,10 +130,9 @@ def test_little_scattering_is_heard_where_many_reflections_follow(box):
     tiled = with_materials(tiled, absorption=0.02, scattering=0.05)
     grid = box.probes.model_copy(update={"spacing_m": 0.5, "jitter_m": 0.08, "wall_clearance_m": 0.3})
     longer = box.simulation.model_copy(update={"duration_s": 3.0})
-    _, decision = decided(tiled.model_copy(update={"probes": grid, "simulation": longer}), SimulatedEffect.SCATTERING)
-    assert decision.called_for
-    assert decision.parameter == "t60"
-    assert 1.2 < decision.change_jnd < 2.2
+    change = predicted(tiled.model_copy(update={"probes": grid, "simulation": longer})).scattering(has_rays=True)
+    assert change.parameter == "t60"
+    assert 1.2 < change.change_jnd < 2.2
 
 
 def test_without_rays_nothing_is_decided_about_what_only_rays_do(box):
@@ -136,10 +159,9 @@ def test_responses_shorter_than_reverberation_are_told(box):
     assert "simulation.duration_s" in note
     assert "T60" in note
     needed_s = float(note.split(" s would hold")[0].rpartition(" ")[2])
-    room = Predictions(hard, hard.probe_positions(0)).room
-    assert needed_s == pytest.approx(room.reverberation_time_s.max(), rel=0.1)
+    assert needed_s == pytest.approx(predicted(hard).room.reverberation_time_s.max(), rel=0.1)
     long = hard.simulation.model_copy(update={"duration_s": 1.05 * needed_s})
-    assert planner_of(hard.model_copy(update={"simulation": long}), 0).plan({}).notes == ()
+    assert predicted(hard.model_copy(update={"simulation": long})).notes(has_rays=True) == ()
 
 
 def test_responses_that_end_before_sound_arrives_are_refused(box):
@@ -190,7 +212,7 @@ def test_air_matters_less_where_walls_take_most(box):
     assert THRESHOLD.enter_jnd < dead.change_jnd < 1
 
 
-def test_sound_bends_where_there_are_corners(box):
+def test_sound_bends_where_there_are_corners(box, decided):
     alone, none = decided(box, SimulatedEffect.DIFFRACTION)
     parted, round_corners = decided(two_rooms(box), SimulatedEffect.DIFFRACTION)
     assert (alone.diffraction, none.change_jnd) == (False, 0.0)
@@ -198,17 +220,15 @@ def test_sound_bends_where_there_are_corners(box):
     assert round_corners.change_jnd > THRESHOLD.enter_jnd
 
 
-def test_only_thin_walls_let_anything_heard_through(box):
+def test_only_thin_walls_let_anything_heard_through(box, decided):
     changes = [
-        decided(two_rooms(box, surface_mass_kg_m2=mass), SimulatedEffect.TRANSMISSION)[1].change_jnd
-        for mass in (0.5, 5.0, 50.0, 500.0)
+        predicted(two_rooms(box, surface_mass_kg_m2=mass)).transmission().change_jnd for mass in (0.5, 5.0, 50.0, 500.0)
     ]
     assert changes == sorted(changes, reverse=True)
     assert changes[0] > THRESHOLD.enter_jnd > changes[-1]
-    assert decided(two_rooms(box), SimulatedEffect.TRANSMISSION)[1].change_jnd == 0.0
-    assert (
-        decided(with_materials(box, walls={"surface_mass_kg_m2": 0.5}), SimulatedEffect.TRANSMISSION)[1].change_jnd == 0
-    )
+    assert decided(two_rooms(box, surface_mass_kg_m2=0.5), SimulatedEffect.TRANSMISSION)[1].called_for
+    assert predicted(two_rooms(box)).transmission().change_jnd == 0.0
+    assert predicted(with_materials(box, walls={"surface_mass_kg_m2": 0.5})).transmission().change_jnd == 0
 
 
 def test_fewer_rays_do_in_a_smaller_room(box):
@@ -252,6 +272,6 @@ def test_a_scene_file_names_effects_that_exist(tiny_scene, tmp_path):
         SceneFile.read(path)
 
 
-def test_a_plan_survives_json(apartment):
-    plan = replace(planner_of(apartment, 0).plan({}), cost_s=12.5)
+def test_a_plan_survives_json(planned, apartment):
+    plan = replace(planned(apartment), cost_s=12.5)
     assert SimulationPlan.from_json(json.loads(json.dumps(plan.to_json()))) == plan

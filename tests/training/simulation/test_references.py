@@ -9,9 +9,10 @@ import pytest
 
 from server.acoustics.decibels import power_to_db
 from server.rendering.hrtf import KEMAR, Hrtf, kemar
+from training.data.dataset import TAKES
 from training.data.responses import SimulatedResponses
 from training.simulation.rays import sphere_directions
-from training.simulation.references import GeometricSound, References, WholeResponses
+from training.simulation.references import GeometricSound, References, ReheardReferences, WholeResponses
 from training.simulation.synthesis import BinauralSynthesis
 
 
@@ -95,3 +96,35 @@ def test_first_reflections_in_a_shoebox_are_direct_sounds_of_six_mirrored_emitte
         found = geometric.first_reflections(emitter, listener)
         assert np.abs(found).max() > 0.01
         np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(found).max())
+
+
+def test_heard_anew_through_its_own_head_a_reference_differs_in_noise_alone(dataset):
+    own = kemar(dataset.sample_rate)
+    anew, other = (ReheardReferences(dataset, own, dataset.yaws, take) for take in TAKES)
+    with h5py.File(dataset.folder / "pairs.h5", "r") as file:
+        stored = References(dataset, file)
+        for emitter, listener in dataset.pairs(held_out=True):
+            pair = emitter * len(dataset.probes) + listener
+            found, expected = anew[pair], stored[pair]
+            assert found.shape == expected.shape
+            assert not np.array_equal(found, expected)
+            ratio_db = 10 * np.log10(np.sum(found**2, axis=-1) / np.sum(expected**2, axis=-1))
+            assert np.abs(ratio_db).max() < 1.5
+            np.testing.assert_array_equal(found, anew[pair])  # the noise is that of the pair
+            assert not np.array_equal(found, other[pair])
+            # What comes before any diffuse sound is the same: the direct sound, from the same side.
+            first = round(dataset.onset_s[emitter, listener] * dataset.sample_rate)
+            np.testing.assert_allclose(found[..., :first], expected[..., :first], atol=1e-3 * np.abs(expected).max())
+
+
+def test_a_head_on_its_side_hears_above_what_it_heard_at_its_left(dataset):
+    own = kemar(dataset.sample_rate)
+    level, rolled = (
+        GeometricSound(dataset, own, np.array([orientation]))
+        for orientation in ((0.0, 0.0, 0.0, 1.0), (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)))
+    )
+    receiver = np.array([1.0, 1.0, 1.0])
+    above, left, amplitude = receiver + np.eye(3)[2], receiver + np.eye(3)[1], np.ones((1, 7))
+    # Rolled to the right, the left ear points up: sound from above comes from its left.
+    found = rolled.synthesis.specular(above[None], amplitude, receiver)
+    np.testing.assert_allclose(found, level.synthesis.specular(left[None], amplitude, receiver), atol=1e-5)
