@@ -36,6 +36,9 @@ class Laborious:
         self.onset_s = field.onset_s
         self._ir = (0.01 * np.random.default_rng(1).standard_normal((2, self.ir_samples))).astype(np.float32)
 
+    def through(self, filters):  # noqa: ARG002  all heads hear the same
+        return self
+
     def impulse_responses(self, listeners, *_, **__):
         until_s = time.thread_time() + self._cost_s * len(listeners)
         while time.thread_time() < until_s:

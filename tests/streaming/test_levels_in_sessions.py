@@ -34,6 +34,9 @@ class Room:
     def ir_samples(self):
         return self._ir.shape[1]
 
+    def through(self, filters):  # noqa: ARG002  all heads hear the same
+        return self
+
     def impulse_responses(self, listeners, *_, **__):
         return np.tile(self._ir, (len(listeners), 1, 1))
 
