@@ -93,6 +93,15 @@ def test_an_image_arrives_in_the_frames_whose_window_it_falls_into(dataset, cell
     np.testing.assert_allclose(powers[-1][4], np.abs(cells.codec.transform(click)[40]) ** 2, atol=1e-9)
 
 
+def test_an_image_at_the_listeners_place_has_a_finite_direction(dataset, cells, monkeypatch):
+    spectrograms = ExpectedSpectrograms(dataset, cells.codec)
+    image = dataset.probes[3][None], np.full((1, 7), 0.3)
+    monkeypatch.setattr(spectrograms, "_images", (0, [image] * len(dataset.probes)))
+    directions, powers = spectrograms.arrivals(0, 3, np.eye(cells.codec.frames, dtype=np.float32), 0.0)
+    assert np.isfinite(directions).all()
+    assert np.isfinite(powers).all()
+
+
 def test_levels_are_those_of_drawn_responses(dataset, cells):
     """Those of the ears of drawn responses, without the mean gain of the head."""
     (drawn,) = dataset.read(np.array([[0, 3]]))
