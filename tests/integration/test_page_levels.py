@@ -43,6 +43,7 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     context = browser.new_context(viewport={"width": width, "height": 800})
     page = open_page(context, several_levels)
     marks = page.locator("#frontier .level")
+    marks.first.wait_for(state="attached")
     assert [mark.get_attribute("data-level") for mark in marks.all()] == ["quick", "standard", "fine"]
     boxes = [mark.locator(".dot").bounding_box() for mark in marks.all()]
     assert boxes[0]["x"] < boxes[1]["x"] < boxes[2]["x"], "costlier is further right"
