@@ -2,6 +2,7 @@
 emitter, from everywhere, or from where a test wants it."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.spherical_harmonics import harmonic_count, real_harmonics
+from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import FieldFile, Manifest, QualityLevel
 from tests.conftest import CODEC, MANIFEST
@@ -90,3 +92,8 @@ def write_directional(
     np.savez(noise, frozen_noise=np.random.default_rng(7).standard_normal((2, CODEC.samples), dtype=np.float32))
     files = {FILE: directional_graph(order, towards), "arrays.npz": noise.getvalue()}
     return write_bundle(folder, directional_manifest(order, tail), files)
+
+
+def with_ears_exchanged(head: HeadFilters) -> HeadFilters:
+    """A head that hears at the left ear what the given one hears at the right, and the other way round."""
+    return replace(head, cepstra=head.cepstra[:, ::-1].copy(), delays_s=head.delays_s[:, ::-1].copy())

@@ -157,7 +157,6 @@ def ir(
     as_json: AsJson = False,
 ) -> None:
     """Write the impulse response between two places: two ears, ambisonics or one channel."""
-    from server.assets.hrtfs import HrtfLibrary
     from server.field.field import AcousticField
     from server.field.fields_by_level import require_level
     from server.responses.impulse_response import ImpulseResponse, IrQuery, parse_format
@@ -182,6 +181,8 @@ def ir(
     )
     filters = None
     if hrtf is not None:
+        from server.assets.hrtfs import HrtfLibrary
+
         filters = HrtfLibrary([hrtf], [field.sample_rate]).filters(hrtf.stem, field.sample_rate)
     started_s = time.perf_counter()
     response = ImpulseResponse.compute(field, query, filters)

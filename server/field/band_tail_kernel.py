@@ -13,8 +13,6 @@ from server.kernels.simd import LANES, add, broadcast, load, multiply_add, store
 
 Float32 = npt.NDArray[np.float32]
 
-LEFT, RIGHT_LEFT, RIGHT_RIGHT = 0, 1, 2
-"""Gains: of the left noise at the left ear, of the left noise at the right ear, and of the right noise there."""
 _ALMOST = np.float32(0.999)
 """The greatest coherence of the ears in a band."""
 _AT_ONCE = 1024
@@ -32,7 +30,8 @@ def find_band_gains(
     least: float,
     gains: Float32,
 ) -> None:
-    """Write the `gains` (3, band, column - first) of a prediction's columns from column `first` on.
+    """Write the `gains` (3, band, column - first) of a prediction's columns from column `first` on: of the left noise
+    at the left ear, of the left noise at the right ear, and of the right noise there.
 
     `products` (band, product, k) are those of the turned head, averaged over each band. `diffuse` (band, 3) are the
     band's powers at both ears and the coherence of its noises, in diffuse sound of unit power: the noises are that
@@ -106,8 +105,8 @@ def add_band_tail(
 
     The tail begins at sample `fade_at`, where the first frame is `missing` from the response; `missing` (2, sample) is
     the missing amplitude from there on, if that frame is there and if it is not. A `share` of it is there, since levels
-    are delayed by parts of a frame. Where all frames are missing, the response is silent before. `scratch` (2, sample)
-    is overwritten.
+    are delayed by parts of a frame. Where all frames are missing, the response must be silent. `scratch` (2, sample) is
+    overwritten.
     """
     end = min(response.shape[1], noises.shape[2])
     there, one = np.float32(share), np.float32(1.0)

@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
+from server.acoustics.bands import OCTAVE_BANDS_HZ, band_positions, band_weights
 from server.acoustics.geometry import orientations_of
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.field.directions_kernel import ears_of_directions
@@ -200,8 +200,6 @@ class DirectionalGraph(FieldGraph):
         """For each bin, the octave band below it and its share of the way to the next, over the logarithm of frequency;
         the outermost bands reach to the ends."""
         codec = self.parameters.codec
-        frequency = np.linspace(0, codec.sample_rate / 2, codec.bins)
-        octave = np.log2(np.maximum(frequency, 1.0) / OCTAVE_BANDS_HZ[0])
-        position = np.clip(octave, 0, len(OCTAVE_BANDS_HZ) - 1)
+        position = band_positions(np.linspace(0, codec.sample_rate / 2, codec.bins))
         band = np.minimum(position.astype(np.int64), len(OCTAVE_BANDS_HZ) - 2)
         return band, (position - band).astype(np.float32)

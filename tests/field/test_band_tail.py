@@ -10,9 +10,10 @@ from server.acoustics.spherical_harmonics import real_harmonics
 from server.field.band_tail import early_frames
 from server.field.directional_graph import DirectionalGraph
 from server.field.field import AcousticField
-from server.rendering.hrtf import HeadFilters, kemar
+from server.rendering.hrtf import kemar
 from server.scene.bundle import BUNDLED, Bundle
 from server.scene.manifest import QualityLevel
+from tests.directional_flat import with_ears_exchanged
 
 APARTMENT = Bundle.load(BUNDLED / "apartment")
 PARAMETERS = AcousticField.load(APARTMENT).graph.parameters.model_copy(update={"known_frames": 0})
@@ -112,9 +113,7 @@ def test_a_head_that_turns_hears_the_side_change():
 def test_another_head_has_a_tail_of_its_own():
     _, bands = fields(towards=(0.0, 1.0, 0.0))
     own = kemar(RATE)
-    mirrored = HeadFilters(
-        own.sample_rate, own.directions, own.cepstra[:, ::-1].copy(), own.delays_s[:, ::-1].copy(), own.triangulation
-    )
+    mirrored = with_ears_exchanged(own)
     poses = [LISTENER], [EMITTER], [(0.0, 0.0, 0.0, 1.0)]
     late = np.sum(bands.through(mirrored).impulse_responses(*poses)[0, :, 3000:].astype(float) ** 2, axis=-1)
     assert late[1] > 2 * late[0]

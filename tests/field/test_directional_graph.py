@@ -18,10 +18,18 @@ from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.health.check import Effort, check
 from server.rendering.ear_products import EarProducts
-from server.rendering.hrtf import HeadFilters, kemar
+from server.rendering.hrtf import kemar
 from server.responses.full_response import FullResponse
 from server.scene.bundle import write_bundle
-from tests.directional_flat import BANDS, COLUMNS, FILE, directional_graph, directional_manifest, write_directional
+from tests.directional_flat import (
+    BANDS,
+    COLUMNS,
+    FILE,
+    directional_graph,
+    directional_manifest,
+    with_ears_exchanged,
+    write_directional,
+)
 
 LISTENER, EMITTER = (2.0, 2.5, 1.5), (6.0, 3.0, 1.4)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -92,9 +100,7 @@ def test_energies_are_those_of_the_responses(diffuse, from_the_north):
 
 def test_another_head_hears_another_room(from_the_north):
     own = kemar(24_000)
-    mirrored = HeadFilters(
-        own.sample_rate, own.directions, own.cepstra[:, ::-1].copy(), own.delays_s[:, ::-1].copy(), own.triangulation
-    )
+    mirrored = with_ears_exchanged(own)
     through = from_the_north.through(mirrored)
     assert through is from_the_north.through(mirrored)
     assert from_the_north.through(own) is from_the_north

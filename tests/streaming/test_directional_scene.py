@@ -8,13 +8,12 @@ from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, render
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose
-from server.rendering.hrtf import HeadFilters
 from server.responses.direct_sound import DirectSound
 from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs, compute_irs
 from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
-from tests.directional_flat import write_directional
+from tests.directional_flat import with_ears_exchanged, write_directional
 
 HERE, THERE = (2.0, 2.5, 1.5), (6.0, 3.0, 1.4)
 CLIP = 0.005 * np.random.default_rng(3).standard_normal(2_000).astype(np.float32)  # no limiter acts
@@ -51,13 +50,7 @@ def test_a_head_on_its_side_hears_what_is_above_at_the_ear_that_points_there(fie
 
 
 def test_another_head_hears_another_reverberation(field, filters):
-    exchanged = HeadFilters(
-        filters.sample_rate,
-        filters.directions,
-        filters.cepstra[:, ::-1].copy(),
-        filters.delays_s[:, ::-1].copy(),
-        filters.triangulation,
-    )
+    exchanged = with_ears_exchanged(filters)
     own, other = (late_energy(response_of(field, head, ON_ITS_SIDE)) for head in (filters, exchanged))
     assert own[0] > 2 * own[1]
     assert other[1] > 2 * other[0]

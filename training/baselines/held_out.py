@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.geometry import Quaternion
 from server.core.errors import NafirError
 from server.rendering.hrtf import HeadFilters, Hrtf, kemar
 from server.scene.bundle import Bundle
@@ -121,15 +122,8 @@ class HeldOut:
 
 def tilted(yaws: _Floats, angle_rad: float) -> _Floats:
     """(yaw, 4) orientations of heads at these yaws, in turn tilted up, down, to the left and to the right."""
-    orientations = []
-    for number, yaw in enumerate(yaws):
-        sign = 1 if number % 2 else -1
-        # About the head's own axes: a turn to the left is about z, up is about -y, a tilt to the left about -x.
-        axis = np.array([0.0, sign, 0.0] if number % 4 < 2 else [sign, 0.0, 0.0]) * np.sin(angle_rad / 2)
-        x, y, _ = axis
-        w, turn_w, turn_z = np.cos(angle_rad / 2), np.cos(yaw / 2), np.sin(yaw / 2)
-        orientations.append((turn_w * x - turn_z * y, turn_w * y + turn_z * x, turn_z * w, turn_w * w))
-    return np.array(orientations)
+    tilts = [(angle_rad, 0.0), (-angle_rad, 0.0), (0.0, -angle_rad), (0.0, angle_rad)]
+    return np.array([Quaternion.from_angles(yaw, *tilts[number % 4]) for number, yaw in enumerate(yaws)])
 
 
 @contextmanager

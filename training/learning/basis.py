@@ -1,6 +1,7 @@
 """What the learners of fields with a learned basis have in common: initial normalisation and basis, optimiser, and the
 correction of levels after training."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -22,7 +23,7 @@ _WEIGHT_DECAY = 1e-2
 _SAMPLE_ROWS = 3000
 
 
-class BasisLearner:
+class BasisLearner(ABC):
     """Learns from targets that are computed once and stored beside the responses.
 
     `spreads` and `weights` are those of each head: the unit in which its errors are measured, and the weight of their
@@ -77,8 +78,9 @@ class BasisLearner:
     def validation(self, rows: Rows) -> Rows:
         return rows
 
+    @abstractmethod
     def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        raise NotImplementedError
+        """Inputs of the field, and targets of which the first are flat, for these rows."""
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> None:

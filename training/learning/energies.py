@@ -6,6 +6,8 @@ compares energies of runs of frames, and the energy still to come after each fra
 Axes: levels are natural logarithms of magnitude, flat in the heads' layout; energies are (B, channel, octave, step).
 """
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -23,7 +25,7 @@ _EVERY = 4
 _TINY = 1e-12
 
 
-class _ErrorOfSums(nn.Module):
+class _ErrorOfSums(nn.Module, ABC):
     """Mean squared differences of energies, in squared nepers of amplitude.
 
     `deficit` is how far the predicted levels of single bins lie below those of their expected power.
@@ -47,8 +49,9 @@ class _ErrorOfSums(nn.Module):
         picked = to_come[..., ::_EVERY]
         return [0.5 * torch.log(energy + _TINY) for energy in (picked, picked.sum(-2), runs)]
 
+    @abstractmethod
     def _by_octave(self, flat: Tensor, deficit: float) -> Tensor:
-        raise NotImplementedError
+        """Energies (B, ..., octave, step) of flat levels that lie `deficit` too low."""
 
 
 class EnergyError(_ErrorOfSums):

@@ -20,9 +20,10 @@ import numpy.typing as npt
 import typer
 from scipy.special import eval_legendre, spherical_jn, spherical_yn
 
+from training.data.dataset import SPEED_OF_SOUND
+
 _Floats = npt.NDArray[np.float64]
 
-SPEED_OF_SOUND = 343.0
 SAMPLE_RATE = 48_000
 EAR_AZIMUTH_DEG = 100.0
 _SAMPLES = 512

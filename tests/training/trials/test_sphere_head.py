@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 
 from server.rendering.hrtf import HeadFilters, Hrtf
-from training.trials.sphere_head import (
-    SAMPLE_RATE,
-    SPEED_OF_SOUND,
-    sphere_response,
-    sphere_responses,
-    write_sphere_head,
-)
+from training.data.dataset import SPEED_OF_SOUND
+from training.trials.sphere_head import SAMPLE_RATE, sphere_response, sphere_responses, write_sphere_head
 
 
 def test_low_frequencies_pass_as_if_nothing_were_there():
