@@ -150,9 +150,9 @@ def test_an_impulse_response_is_what_the_command_line_would_write(shared_client,
     np.testing.assert_array_equal(samples.T, expected.samples)
 
 
-@pytest.fixture
-def directional_client(tmp_path):
-    field = AcousticField.load(write_directional(tmp_path / "flat"))
+@pytest.fixture(scope="module")
+def directional_client(tmp_path_factory):
+    field = AcousticField.load(write_directional(tmp_path_factory.mktemp("directional") / "flat"))
     heads = HrtfLibrary((), [24_000])
     heads._filters[("small", 24_000)] = small_head()
     heads.names = ("kemar", "small")

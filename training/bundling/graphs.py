@@ -1,8 +1,11 @@
 """Trained fields as ONNX graphs: exports them from torch, reduces and quantises weights, and makes them run pose by
 pose."""
 
+import logging
 import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +28,7 @@ def to_onnx(
     has the first two inputs only."""
     inputs = list(INPUTS)[: len(poses)]
     batch = torch.export.Dim("batch")
-    with warnings.catch_warnings():
+    with _quiet("torch.onnx"), warnings.catch_warnings():
         # Warnings of PyTorch's exporter about its own pytrees, and about the name that all batch axes share.
         warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
         warnings.filterwarnings("ignore", r"# The axis name: batch will not be used", UserWarning)
@@ -140,17 +143,30 @@ def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = N
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
         onnx.save(copy, source)
-        # guard: small products are computed exactly
-        # guard: each column of weights has a scale of its own
-        quantize_dynamic(
-            source,
-            target,
-            per_channel=True,
-            weight_type=QuantType.QInt8,
-            nodes_to_exclude=kept,
-            op_types_to_quantize=["MatMul", "Gemm"],
-        )
+        with _quiet(None):  # the quantiser advises of steps that these graphs do not need
+            # guard: small products are computed exactly
+            # guard: each column of weights has a scale of its own
+            quantize_dynamic(
+                source,
+                target,
+                per_channel=True,
+                weight_type=QuantType.QInt8,
+                nodes_to_exclude=kept,
+                op_types_to_quantize=["MatMul", "Gemm"],
+            )
         return onnx.load(target)
+
+
+@contextmanager
+def _quiet(name: str | None) -> Iterator[None]:
+    """Errors alone are logged meanwhile, of the logger of that name or of the root logger."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _has_part(name: str, part: str | None) -> bool:

@@ -1,7 +1,6 @@
 """`nafir-train`: simulate, train, export, evaluate."""
 
 import json
-import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -204,8 +203,6 @@ def export(
         raise typer.BadParameter(f"knows {', '.join(PRECISIONS)}", param_hint="--precision")
     lower = [_rank(text) for text in ranks.split(",") if ranks]
     accepted = _accepted(accept or ())
-    for talkative in (None, "torch.onnx"):
-        logging.getLogger(talkative).setLevel(logging.ERROR)
     responses = open_responses(data or (runs[0] if (runs[0] / FILE).is_file() else dataset_folder(runs[0])))
     with _progress() as progress:
         bundle = export_bundle(

@@ -1,3 +1,4 @@
+import logging
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.field.runtime import open_session
 from training.bundling import export as export_module
 from training.bundling.export import INPUTS, MODEL_FILE, OUTPUTS, ExportError, export
-from training.bundling.graphs import halve_weights
+from training.bundling.graphs import halve_weights, to_int8
 from training.data.responses import SimulatedResponses
 from training.learning.runs import Configuration, NafRecipe
 from training.learning.train import load_learner, train
@@ -53,6 +54,13 @@ def test_the_graph_computes_what_torch_does(session, dataset, run):
         for frequency, certainty in ((found["instantaneous_frequency"], found["phase_certainty"]), expected[1:3])
     ]
     np.testing.assert_allclose(phasors[0], phasors[1], atol=0.03)
+
+
+def test_graphs_leave_the_logs_of_their_process_as_they_were(tiny_bundle):
+    logger = logging.getLogger()
+    assert logger.level == logging.WARNING  # the graphs of the bundle were exported in this process
+    to_int8(onnx.load_from_string(tiny_bundle.models[MODEL_FILE]), least_weights=1)
+    assert logger.level == logging.WARNING
 
 
 def test_poses_in_a_batch_do_not_meet(session):
