@@ -1,12 +1,16 @@
 """Decoding of what arrives at a point, by direction, to ambisonic channels.
 
-The sound of each band and column of frames is spread over virtual directions, with powers that are never negative and
-whose harmonics are those predicted, as nearly as such powers can have them. Each direction plays a frozen noise of its
-own as a plane wave. So the covariance of the channels is that of the powers, and rotating the channels is the same as
-turning the listener.
+The channels are frozen noises in octave bands, one noise for each channel, mixed so that the channels have the
+covariance of the arriving sound: gains of each band and column of a prediction, interpolated in between. A first order
+follows exactly from harmonics of the second (`server.field.ambisonic_kernel`). For higher orders, sound is spread over
+virtual directions, with powers that are never negative and whose harmonics are those predicted, as nearly as such
+powers can have them. The first channel is the same at all orders.
+
+Where nothing but a level changes, the same noise sounds: equal poses have equal responses, and neighbours nearly so. A
+root of a covariance is taken that is continuous, and that turns with the sound.
 
 Channels are ACN and SN3D (`server.acoustics.spherical_harmonics`), in world axes. Axes: B poses; k channels; d
-directions; bands; columns of frames; responses (B, k, sample).
+directions; bands; columns of a prediction; responses (B, k, sample).
 """
 
 from functools import cache, lru_cache
@@ -14,11 +18,13 @@ from functools import cache, lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
 from server.acoustics.codec import Codec
-from server.acoustics.phase import delayed
 from server.acoustics.spherical_harmonics import harmonic_count, mean_squares, real_harmonics
-from server.field.any_size_decoder import resized
+from server.field.ambisonic_kernel import find_first_order, mix_bands
 from server.field.directional_graph import Arrivals
+from server.kernels.cache_lines import zeros_on_lines
+from server.kernels.simd import LANES
 from server.scene.manifest import CodecParameters
 
 Float32 = npt.NDArray[np.float32]
@@ -72,69 +78,78 @@ class AmbisonicDecoder:
     def __init__(self, parameters: CodecParameters, *, ir_samples: int, frames: int | None = None) -> None:
         codec = parameters.codec
         self._codec = codec
-        self._axis = parameters.frame_axis
         self._ir_samples = ir_samples
-        self._used = codec.frames if frames is None else min(frames, codec.frames)
+        edges = np.arange(codec.frames + 1) if parameters.frame_axis is None else parameters.frame_axis.edges
+        centres = (edges[:-1] + edges[1:] - 1) / 2
+        self._places = centres * codec.hop - codec.frame_lead_samples + codec.n_fft / 2
+        self._end: float | None = None
+        if frames is not None and frames < codec.frames:
+            self._end = (frames - 1) * codec.hop - codec.frame_lead_samples + codec.n_fft
 
-    def decode(
-        self,
-        arrivals: Arrivals,
-        between_bands: tuple[npt.NDArray[np.int64], Float32],
-        aligned: Floats,
-        order: int,
-    ) -> Float32:
+    def decode(self, arrivals: Arrivals, aligned: Floats, order: int) -> Float32:
         """Decode to channels of `order`. The first sample of each prediction lies at sample `aligned` (B,) of its
-        response. `between_bands` says for each bin the band below it, and its share of the way to the next."""
-        encode = real_harmonics(virtual_directions(), order).T.astype(np.float32)
-        responses = np.empty((len(aligned), harmonic_count(order), self._ir_samples), np.float32)
-        for row, response in enumerate(responses):
-            magnitude, powers = self._frames_of(
-                arrivals.log_magnitude[row], arrivals.directions[row], between_bands, aligned[row] / self._codec.hop
-            )
-            waves = np.sqrt(powers) * magnitude * _noises(self._codec)
-            spectra = np.tensordot(encode, waves, axes=1)
-            response[:] = resized(self._codec.synthesise(spectra), self._ir_samples)
+        response."""
+        channels = harmonic_count(order)
+        noises, steps = _noises(self._codec, channels)
+        responses = np.empty((len(aligned), channels, self._ir_samples), np.float32)
+        for row, (response, start) in enumerate(zip(responses, aligned.tolist(), strict=True)):
+            log_magnitude, directions = arrivals.log_magnitude[row], arrivals.directions[row]
+            mixing = _mixing(directions, channels)
+            places = self._places + start
+            begin = int(np.floor(places[0])) - self._codec.hop
+            mix_bands(log_magnitude, mixing, self._codec.log_floor, places, noises, steps, begin, response)
+            if self._end is not None:
+                self._cut(response, int(self._end + start))
         return responses
 
-    def _frames_of(
-        self,
-        log_magnitude: Float32,
-        directions: Float32,
-        between_bands: tuple[npt.NDArray[np.int64], Float32],
-        delay: float,
-    ) -> tuple[Float32, Float32]:
-        """The omnidirectional magnitude (bin, frame), and the powers (d, bin, frame) relative to it, delayed by so many
-        frames."""
-        codec = self._codec
-        power = np.square(codec.magnitude(log_magnitude.astype(np.float64)))
-        moments = np.concatenate([np.ones_like(log_magnitude)[None], directions])
-        shared = np.moveaxis(powers_by_direction(np.moveaxis(moments, 0, -1)), -1, 0)
-        band, share = between_bands
-        upper = share[:, None].astype(np.float64)
-
-        def at_bins(by_band: Floats) -> Floats:
-            return (1 - upper) * by_band[..., band, :] + upper * by_band[..., band + 1, :]
-
-        whole = at_bins(power)
-        parts = at_bins(shared * power)
-        # guard: where nothing arrives, nothing is divided
-        shares = np.where(whole > 0, parts / np.where(whole > 0, whole, 1), 1 / len(parts))
-        level = np.log(np.sqrt(whole) + codec.log_floor)
-        if self._axis is not None:
-            to_frames = self._axis.spread().astype(np.float64)
-            level, shares = level @ to_frames, shares @ to_frames
-        magnitude = codec.magnitude(level)
-        magnitude[..., self._used :] = 0
-        delay_of_one = np.array([delay])
-        magnitude = delayed(magnitude[None].astype(np.float32), delay_of_one)[0]
-        shares = delayed(shares[None].astype(np.float32), delay_of_one)[0]
-        total = shares.sum(axis=0)
-        shares /= np.where(total > 0, total, 1)
-        return magnitude, shares
+    def _cut(self, response: Float32, end: int) -> None:
+        """Fade a response out before a sample, as the windows of its last frames do."""
+        length = self._codec.n_fft - self._codec.hop
+        left = (end - np.arange(response.shape[1])) / length
+        response *= (np.sin(np.pi / 2 * np.clip(left, 0, 1)) ** 2).astype(np.float32)
 
 
-@lru_cache(maxsize=4)
-def _noises(codec: Codec) -> npt.NDArray[np.complex64]:
-    """(d, frequency, frame) independent noises of unit expected power, the same in every process."""
-    white = np.random.default_rng(_SEED).standard_normal((len(virtual_directions()), codec.samples))
-    return np.asarray(codec.transform(white) / np.sqrt(codec.window_energy), dtype=np.complex64)
+def _mixing(directions: Float32, channels: int) -> Float32:
+    """(k, noise, band, column) by which noises become channels, relative to the first."""
+    bands, columns = directions.shape[1:]
+    mixing = np.zeros((channels, channels, bands, columns), np.float32)
+    if channels == 1:
+        mixing[:] = 1
+    elif channels == harmonic_count(1):
+        find_first_order(directions, zeros_on_lines(9, -(-columns // LANES) * LANES), mixing)
+    else:
+        mixing[:] = np.moveaxis(_roots(np.moveaxis(directions, 0, -1), channels), (-2, -1), (0, 1))
+    return mixing
+
+
+def _roots(directions: npt.NDArray[np.floating], channels: int) -> Floats:
+    """(..., k, noise) roots of the covariance of the channels: the first has a noise alone, which the others share, and
+    the rest is symmetric."""
+    moments = np.concatenate([np.ones((*directions.shape[:-1], 1)), directions], axis=-1)
+    harmonics = real_harmonics(virtual_directions(), round(channels**0.5) - 1)
+    powers = powers_by_direction(moments)
+    shared = powers @ harmonics[:, 1:]
+    away = harmonics[:, 1:] - shared[..., None, :]  # of each direction
+    values, vectors = np.linalg.eigh(np.swapaxes(away, -1, -2) @ (powers[..., None] * away))
+    # guard: rounding leaves no negative power
+    sizes = np.sqrt(np.maximum(values, 0))
+    roots = np.zeros((*directions.shape[:-1], channels, channels))
+    roots[..., 0, 0] = 1
+    roots[..., 1:, 0] = shared
+    roots[..., 1:, 1:] = (vectors * sizes[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return roots
+
+
+@lru_cache(maxsize=8)
+def _noises(codec: Codec, channels: int) -> tuple[npt.NDArray[np.int16], Float32]:
+    """(noise, band, sample) independent noises of unit power density in octave bands, the same in every process, and
+    their units (noise, band). Squares of the bands' amplitudes add up to one."""
+    bands = np.sqrt(band_weights(np.fft.rfftfreq(codec.samples, 1 / codec.sample_rate)))
+    noises = np.empty((channels, len(OCTAVE_BANDS_HZ), codec.samples), np.int16)
+    steps = np.empty(noises.shape[:2], np.float32)
+    for channel, (noise, step) in enumerate(zip(noises, steps, strict=True)):
+        white = np.random.default_rng([_SEED, channel]).standard_normal((len(noise), codec.samples))
+        filtered = np.fft.irfft(bands * np.fft.rfft(white), codec.samples) / np.sqrt(codec.window_energy)
+        step[:] = np.maximum(np.abs(filtered).max(axis=-1) / np.iinfo(np.int16).max, 1e-12)
+        noise[:] = np.round(filtered / step[:, None])
+    return noises, steps

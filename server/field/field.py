@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.fast_length import next_fast_length
-from server.acoustics.geometry import Vector3, orientations_of, yaws_of
+from server.acoustics.geometry import Vector3, orientations_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
@@ -267,9 +267,7 @@ class AcousticField:
         aligned = self._aligned(listeners, emitters)
         decoder = AmbisonicDecoder(self.graph.parameters, ir_samples=self.ir_samples, frames=self.level.frames)
         arrivals = self.graph.heard_arrivals(listeners, emitters)
-        responses = self._finite(
-            decoder.decode(arrivals, self.graph.between_bands, aligned, order), listeners, emitters
-        )
+        responses = self._finite(decoder.decode(arrivals, aligned, order), listeners, emitters)
         onsets, echoes = self._opening(listeners, emitters, aligned)
         for response, onset, echo in zip(responses, onsets, onsets if echoes is None else echoes, strict=True):
             # One gate for all channels, so that none changes its direction.
@@ -390,7 +388,7 @@ class AcousticField:
             return np.ascontiguousarray(responses[:, : self.channels])
         responses = np.empty((len(heads), 2, self.ir_samples), dtype=np.float32)
         # One after the other, because each may start from the one before it.
-        for row, pose in enumerate(zip(listeners, emitters, yaws_of(heads), strict=True)):
+        for row, pose in enumerate(zip(listeners, emitters, orientations_of(heads), strict=True)):
             rows = slice(row, row + 1)
             responses[rows] = decoder.decode(predicted[rows], aligned[rows], [cache.nearest(*pose)])
             self._finite(responses[rows], listeners[rows], emitters[rows])  # check before later poses start from it

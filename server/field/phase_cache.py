@@ -1,6 +1,6 @@
 """A cache of recent responses, whose phases are the starting points for nearby poses.
 
-Metres, radians.
+Metres. Orientations are quaternions (4,) x, y, z, w.
 """
 
 import math
@@ -9,6 +9,8 @@ from collections import OrderedDict
 
 import numpy as np
 import numpy.typing as npt
+
+from server.acoustics.geometry import axes_of
 
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -30,12 +32,12 @@ class PhaseCache:
     def __init__(self, capacity: int = CAPACITY) -> None:
         self._lock = threading.Lock()
         self._places: OrderedDict[tuple[int, ...], int] = OrderedDict()
-        self._poses = np.full((capacity, 8), _NOWHERE)
+        self._poses = np.full((capacity, 9), _NOWHERE)
         self._responses: list[Float32 | None] = [None] * capacity
 
-    def nearest(self, listener: Floats, emitter: Floats, yaw: float) -> Float32 | None:
+    def nearest(self, listener: Floats, emitter: Floats, orientation: Floats) -> Float32 | None:
         """The response of the nearest pose within RADIUS_M, or None; read-only."""
-        pose = _pose(listener, emitter, yaw)
+        pose = _pose(listener, emitter, orientation)
         with self._lock:
             distance = np.linalg.norm(self._poses - pose, axis=-1)
             place = int(np.argmin(distance))
@@ -45,12 +47,12 @@ class PhaseCache:
             self._places.move_to_end(_cell(self._poses[place]))
             return self._responses[place]
 
-    def keep(self, listener: Floats, emitter: Floats, yaw: float, response: Float32) -> None:
+    def keep(self, listener: Floats, emitter: Floats, orientation: Floats, response: Float32) -> None:
         """Store a copy of a response; a silent one has no phase and is not stored."""
         # guard: a silent response gives no phase
         if not response.any():
             return
-        pose, own = _pose(listener, emitter, yaw), response.copy()
+        pose, own = _pose(listener, emitter, orientation), response.copy()
         cell = _cell(pose)
         with self._lock:
             if cell in self._places:
@@ -65,10 +67,11 @@ class PhaseCache:
             self._responses[place] = own
 
 
-def _pose(listener: Floats, emitter: Floats, yaw: float) -> Floats:
-    """(8,) metres: coordinates of the poses, with the heading as the position of an ear, such that their Euclidean
-    distance measures how far two pairs of poses are apart."""
-    return np.array([*listener, *emitter, _EAR_M * math.cos(yaw), _EAR_M * math.sin(yaw)])
+def _pose(listener: Floats, emitter: Floats, orientation: Floats) -> Floats:
+    """(9,) metres: coordinates of the poses, with the head as the position of an ear, such that their
+    Euclidean distance measures how far two pairs of poses are apart."""
+    _, left, _ = axes_of(orientation)
+    return np.array([*listener, *emitter, *(_EAR_M * left)])
 
 
 def _cell(pose: Floats) -> tuple[int, ...]:

@@ -1,5 +1,7 @@
 """Ambisonic decoding: channels have the covariance that the predicted powers give them."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,12 +11,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import Quaternion
 from server.acoustics.spherical_harmonics import harmonic_count, mean_squares, real_harmonics, rotation
-from server.field.ambisonic_decoder import AmbisonicDecoder, powers_by_direction, virtual_directions
+from server.field.ambisonic_decoder import AmbisonicDecoder, _mixing, powers_by_direction, virtual_directions
 from server.field.directional_graph import Arrivals
 from server.rendering.ear_products import EarProducts
 from server.rendering.hrtf import KEMAR, Hrtf
 from server.rendering.sphere import solid_angles
 from server.scene.manifest import CodecParameters
+from tests.oracles.ambisonic_decoder import SlowAmbisonicDecoder
 
 BANDS = len(OCTAVE_BANDS_HZ)
 COLUMNS = 12
@@ -29,6 +32,7 @@ LONG = CodecParameters(
     log_floor=1e-5,
     frame_cells=(1,) * 11 + (SAMPLES // 64 + 2 - 11 + 1,),
 )
+DECAYING = LONG.model_copy(update={"frame_cells": (1,) * 24 + (8,) * 184 + (SAMPLES // 64 + 3 - 24 - 8 * 184,)})
 AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, -0.48, 0.64], [-0.36, 0.48, -0.8]])
 
 
@@ -48,7 +52,7 @@ def steady(moments):
 
 def decoded(moments, order, aligned=0.0):
     decoder = AmbisonicDecoder(LONG, ir_samples=SAMPLES)
-    return decoder.decode(steady(moments), between_bands(), np.array([aligned]), order)[0]
+    return decoder.decode(steady(moments), np.array([aligned]), order)[0]
 
 
 def covariance(channels):
@@ -136,12 +140,132 @@ def test_the_covariance_is_that_of_the_powers(towards):
     assert_allclose(expected[0, :9], moments, atol=0.02)
 
 
-def test_lower_orders_are_the_first_channels_of_higher_ones():
+def test_the_first_channel_is_the_same_at_all_orders():
     moments = np.r_[1, 0.3, -0.2, 0.5]
-    whole = decoded(moments, 3, aligned=100.3)
-    for order in (0, 1, 2):
-        assert_allclose(decoded(moments, order, aligned=100.3), whole[: harmonic_count(order)], atol=1e-6)
-    assert_array_equal(decoded(moments, 3, aligned=100.3), whole)
+    first = decoded(moments, 0, aligned=100.3)[0]
+    for order in (1, 2, 3):
+        channels = decoded(moments, order, aligned=100.3)
+        assert_array_equal(channels[0], first)
+        assert_array_equal(decoded(moments, order, aligned=100.3), channels)
+
+
+def test_lower_orders_have_the_covariance_of_the_first_channels_of_higher_ones():
+    moments = mixed((0.6, -0.48, 0.64), 0.5)
+    whole = covariance(decoded(moments, 3))
+    for order in (1, 2):
+        found = covariance(decoded(moments, order))
+        assert_allclose(found, whole[: len(found), : len(found)], atol=0.04)
+
+
+def mixing(moments, order):
+    """(k, noise) of one prediction."""
+    directions = np.asarray(moments, np.float32)[1:, None, None] * np.ones((1, BANDS, 13), np.float32)
+    found = _mixing(directions, harmonic_count(order)).astype(np.float64)
+    assert_array_equal(found, found[..., :1, :1] * np.ones_like(found))
+    return found[..., 0, 0]
+
+
+def second_moments(directions, powers):
+    harmonics = real_harmonics(directions, 1)
+    return np.einsum("d,dk,dl->kl", powers, harmonics, harmonics)
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 30))
+def test_a_first_order_has_exactly_the_covariance_of_the_sound(seed, count):
+    """One wave alone, a few, or many; also opposite ones, whose first harmonics cancel."""
+    rng = np.random.default_rng(seed)
+    directions = rng.standard_normal((count, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    if count % 2:
+        directions = np.concatenate([directions, -directions])
+    powers = rng.dirichlet(np.full(len(directions), 0.5))
+    root = mixing(powers @ real_harmonics(directions, 2), 1)
+    assert_allclose(root @ root.T, second_moments(directions, powers), atol=2e-4)
+
+
+@pytest.mark.parametrize("towards", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1), (0.6, 0, 0.8)])
+@pytest.mark.parametrize("known", [1, 2, 3])
+def test_one_wave_alone_is_a_plane_wave(towards, known):
+    root = mixing(real_harmonics(np.array(towards, float), known), 1)
+    assert_allclose(root @ root.T, np.outer(*[real_harmonics(np.array(towards, float), 1)] * 2), atol=2e-3)
+
+
+@given(seed=st.integers(0, 2**32 - 1), known=st.sampled_from([4, 9, 16]))
+def test_whatever_harmonics_a_network_gives_a_first_order_is_finite_and_has_its_level(seed, known):
+    moments = np.r_[1, np.random.default_rng(seed).uniform(-1, 1, known - 1)]
+    root = mixing(moments, 1)
+    found = root @ root.T
+    assert np.isfinite(root).all()
+    assert found[0, 0] == 1
+    # The three axes share the power of the sound, as they do of a wave from anywhere; and never have more of it.
+    rest = np.linalg.norm(moments[1:4])
+    assert np.trace(found[1:, 1:]) == pytest.approx(1, abs=1e-3) or rest > 0.99
+    assert np.trace(found[1:, 1:]) < 1 + 1e-3
+
+
+@given(seed=st.integers(0, 2**32 - 1), known=st.sampled_from([4, 9]))
+def test_a_root_turns_with_the_sound(seed, known):
+    """So the channels of a turned scene have the covariance of turned channels."""
+    rng = np.random.default_rng(seed)
+    order = round(known**0.5) - 1
+    moments = np.r_[1, rng.uniform(-0.5, 0.5, known - 1)]
+    turn = Quaternion(*rng.standard_normal(4))
+    one, other = mixing(moments, 1), mixing(rotation(turn, order) @ moments, 1)
+    matrix = rotation(turn, 1)
+    assert_allclose(other, matrix @ one @ matrix.T, atol=5e-3)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_root_does_not_jump(seed):
+    """On the way from any sound to any other, by way of one that has a single direction."""
+    rng = np.random.default_rng(seed)
+    towards = rng.standard_normal((3, 3))
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    ends = real_harmonics(towards, 2)
+    way = [
+        before + (after - before) * share
+        for before, after in ((ends[0], ends[1]), (ends[1], np.eye(9)[0]), (np.eye(9)[0], -ends[2] + 2 * np.eye(9)[0]))
+        for share in np.linspace(0, 1, 40)
+    ]
+    roots = np.array([mixing(moments, 1) for moments in way])
+    # A root changes at most by the root of the change.
+    most = np.sqrt(np.abs(np.diff(way, axis=0)).max(axis=-1) * 4)
+    assert (np.abs(np.diff(roots, axis=0)).max(axis=(1, 2)) < most + 2e-3).all()
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_levels_are_those_of_the_slow_way(order):
+    """Sound that decays, unlike in each band, from one side: by channel and part of the response, in decibels."""
+    edges = DECAYING.frame_axis.edges
+    centres_s = (edges[:-1] + edges[1:] - 1) / 2 * 64 / 24_000
+    log = (-np.outer(np.linspace(20, 35, BANDS), centres_s) / 20 * np.log(10)).astype(np.float32)[None]
+    relative = mixed((0.6, -0.48, 0.64), 0.6).astype(np.float32)
+    arrivals = Arrivals(log, np.ones((1, 8, *log.shape[1:]), np.float32) * relative[1:, None, None])
+    quick = AmbisonicDecoder(DECAYING, ir_samples=SAMPLES).decode(arrivals, np.array([333.3]), order)[0]
+    slow = SlowAmbisonicDecoder(DECAYING, ir_samples=SAMPLES).decode(
+        arrivals, between_bands(), np.array([333.3]), order
+    )[0]
+    parts = slice(600, 12_600), slice(12_600, 36_600), slice(36_600, 84_600)
+    for part in parts:
+        found, expected = (np.sum(each[:, part].astype(float) ** 2, axis=-1) for each in (quick, slow))
+        assert_allclose(10 * np.log10(found / expected)[: 4 if order < 2 else None], 0, atol=0.8)
+
+
+def test_responses_are_the_same_in_any_batch_and_on_any_thread():
+    rng = np.random.default_rng(3)
+    log = rng.uniform(-3, 0, (4, BANDS, COLUMNS)).astype(np.float32)
+    directions = rng.uniform(-0.4, 0.4, (4, 8, BANDS, COLUMNS)).astype(np.float32)
+    aligned = np.array([0.0, 10.5, 333.3, 5.0])
+    decoder = AmbisonicDecoder(LONG, ir_samples=SAMPLES)
+    for order in (1, 2):
+        together = decoder.decode(Arrivals(log, directions), aligned, order)
+
+        def one(row, order=order):
+            rows = slice(row, row + 1)
+            return decoder.decode(Arrivals(log[rows], directions[rows]), aligned[rows], order)[0]
+
+        with ThreadPoolExecutor(4) as pool:
+            assert_array_equal(list(pool.map(one, range(4))), together)
 
 
 def test_sound_begins_with_its_delay():
@@ -154,7 +278,7 @@ def test_silence_is_silent():
     moments = np.eye(4)[0]
     quiet = Arrivals(np.full((1, BANDS, COLUMNS), -30.0, np.float32), steady(moments).directions)
     decoder = AmbisonicDecoder(LONG, ir_samples=SAMPLES)
-    assert np.abs(decoder.decode(quiet, between_bands(), np.zeros(1), 1)).max() < 1e-12  # what rounding leaves
+    assert np.abs(decoder.decode(quiet, np.zeros(1), 1)).max() < 1e-12  # what rounding leaves
 
 
 BINS = LONG.codec.bins

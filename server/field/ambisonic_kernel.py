@@ -1,0 +1,235 @@
+"""Ambisonic channels from frozen noises in octave bands, in compiled code.
+
+The first channel is a noise of its own, times the magnitude that arrives. Every other channel has a share of that noise
+and of noises of its own. Axes: B poses; bands (7), columns of a prediction, k channels and as many noises; responses
+(B, k, sample).
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from server.kernels.compiled import compiled
+from server.kernels.simd import (
+    LANES,
+    add,
+    at_least,
+    broadcast,
+    choose_below,
+    divide,
+    load,
+    load_shorts,
+    multiply,
+    multiply_add,
+    multiply_subtract,
+    square_root,
+    store,
+    subtract,
+)
+
+Float32 = npt.NDArray[np.float32]
+Int16 = npt.NDArray[np.int16]
+Floats = npt.NDArray[np.float64]
+
+_SWEEPS = 5
+_TINY = np.float32(1e-20)
+_AT_ONCE = 1024
+_RAMP = np.arange(LANES, dtype=np.float32)
+_ROOT_THIRD = np.float32(1 / math.sqrt(3.0))
+
+
+@compiled
+def find_first_order(directions: Float32, moments: Float32, mixing: Float32) -> None:
+    """Write the `mixing` (4, 4, band, column) of the channels W, Y, Z and X from four noises, for unit power.
+
+    `directions` (k - 1, band, column) are harmonics of the arriving power. Those of the second order give the
+    covariance of Y, Z and X. Where they are not known, it is that of the smoothest sound of these first ones
+    (Levermore, J. Quant. Spectrosc. Radiat. Transf. 31, 149, 1984). What W does not share with them is the symmetric
+    root of the rest of the covariance, without its negative part: a root that is continuous and turns with the sound.
+    `moments` (9, columns in whole vectors) is a buffer.
+    """
+    known, bands, columns = directions.shape
+    for band in range(bands):
+        for k in range(min(known, 8)):
+            for column in range(moments.shape[1]):
+                moments[k, column] = directions[k, band, column] if column < columns else np.float32(0.0)
+        for k in range(known, 8):
+            for column in range(moments.shape[1]):
+                moments[k, column] = 0
+        if known < 8:
+            _smoothest(moments)
+        for column in range(0, columns, LANES):
+            _find_root(moments, column)
+            for lane in range(min(LANES, columns - column)):
+                _store_root(moments, column + lane, mixing, band)
+
+
+@compiled
+def _smoothest(moments) -> None:
+    """Write the second moments that belong to the first ones."""
+    for column in range(moments.shape[1]):
+        y, z, x = moments[0, column], moments[1, column], moments[2, column]
+        square = min(np.float32(1.0), x * x + y * y + z * z)
+        ahead = (3 + 4 * square) / (5 + 2 * math.sqrt(4 - 3 * square))
+        # guard: sound from all sides comes from none
+        scale = (3 * ahead - 1) / 2 / max(square, 1e-12)
+        root = math.sqrt(3.0)
+        moments[3, column] = scale * root * x * y
+        moments[4, column] = scale * root * y * z
+        moments[5, column] = scale * 0.5 * (2 * z * z - x * x - y * y)
+        moments[6, column] = scale * root * x * z
+        moments[7, column] = scale * 0.5 * root * (x * x - y * y)
+
+
+@compiled
+def _find_root(moments, column) -> None:
+    """Replace eight columns of the moments: by the shares of W's noise in Y, Z and X, and the root (yy, yz, yx, zz, zx,
+    xx) for their own noises."""
+    at, row = moments.ctypes.data, moments.shape[1]
+    zero, one, half = broadcast(np.float32(0.0)), broadcast(np.float32(1.0)), broadcast(np.float32(0.5))
+    tiny, third = broadcast(_TINY), broadcast(_ROOT_THIRD)
+    y, z, x = load(at, column), load(at, row + column), load(at, 2 * row + column)
+    square = multiply_add(x, x, multiply_add(y, y, multiply(z, z)))
+    # guard: no channel has more of a wave than there is
+    shrunk = divide(one, square_root(at_least(square, one)))
+    y, z, x = multiply(y, shrunk), multiply(z, shrunk), multiply(x, shrunk)
+    xy, yz = multiply(third, load(at, 3 * row + column)), multiply(third, load(at, 4 * row + column))
+    xz, apart = multiply(third, load(at, 6 * row + column)), multiply(third, load(at, 7 * row + column))
+    zz = multiply(
+        broadcast(np.float32(1 / 3)), multiply_add(broadcast(np.float32(2.0)), load(at, 5 * row + column), one)
+    )
+    level = multiply(half, subtract(one, zz))
+    # The rest, after W's share; 0, 1 and 2 are y, z and x.
+    a00 = multiply_subtract(y, y, subtract(level, apart))
+    a11 = multiply_subtract(z, z, zz)
+    a22 = multiply_subtract(x, x, add(level, apart))
+    a01, a02, a12 = multiply_subtract(y, z, yz), multiply_subtract(x, y, xy), multiply_subtract(x, z, xz)
+    left_over = at_least(add(a00, add(a11, a22)), zero)
+    u0, u1, u2 = one, zero, zero
+    v0, v1, v2 = zero, one, zero
+    w0, w1, w2 = zero, zero, one
+    for _ in range(_SWEEPS):  # of Jacobi's method
+        t, c, s = _angle(a00, a11, a01)
+        a00, a11, a01 = multiply_subtract(t, a01, a00), multiply_add(t, a01, a11), zero
+        a02, a12 = multiply_subtract(s, a12, multiply(c, a02)), multiply_add(s, a02, multiply(c, a12))
+        u0, v0 = multiply_subtract(s, v0, multiply(c, u0)), multiply_add(s, u0, multiply(c, v0))
+        u1, v1 = multiply_subtract(s, v1, multiply(c, u1)), multiply_add(s, u1, multiply(c, v1))
+        u2, v2 = multiply_subtract(s, v2, multiply(c, u2)), multiply_add(s, u2, multiply(c, v2))
+        t, c, s = _angle(a00, a22, a02)
+        a00, a22, a02 = multiply_subtract(t, a02, a00), multiply_add(t, a02, a22), zero
+        a01, a12 = multiply_subtract(s, a12, multiply(c, a01)), multiply_add(s, a01, multiply(c, a12))
+        u0, w0 = multiply_subtract(s, w0, multiply(c, u0)), multiply_add(s, u0, multiply(c, w0))
+        u1, w1 = multiply_subtract(s, w1, multiply(c, u1)), multiply_add(s, u1, multiply(c, w1))
+        u2, w2 = multiply_subtract(s, w2, multiply(c, u2)), multiply_add(s, u2, multiply(c, w2))
+        t, c, s = _angle(a11, a22, a12)
+        a11, a22, a12 = multiply_subtract(t, a12, a11), multiply_add(t, a12, a22), zero
+        a01, a02 = multiply_subtract(s, a02, multiply(c, a01)), multiply_add(s, a01, multiply(c, a02))
+        v0, w0 = multiply_subtract(s, w0, multiply(c, v0)), multiply_add(s, v0, multiply(c, w0))
+        v1, w1 = multiply_subtract(s, w1, multiply(c, v1)), multiply_add(s, v1, multiply(c, w1))
+        v2, w2 = multiply_subtract(s, w2, multiply(c, v2)), multiply_add(s, v2, multiply(c, w2))
+    # guard: no power is negative
+    a00, a11, a22 = at_least(a00, zero), at_least(a11, zero), at_least(a22, zero)
+    positive = add(a00, add(a11, a22))
+    # guard: where W has all, nothing is left over
+    scale = choose_below(tiny, positive, divide(left_over, positive), zero)
+    p, q, r = square_root(multiply(a00, scale)), square_root(multiply(a11, scale)), square_root(multiply(a22, scale))
+    store(at, column, y)
+    store(at, row + column, z)
+    store(at, 2 * row + column, x)
+    pu0, qv0, rw0 = multiply(p, u0), multiply(q, v0), multiply(r, w0)
+    pu1, qv1, rw1 = multiply(p, u1), multiply(q, v1), multiply(r, w1)
+    pu2, qv2, rw2 = multiply(p, u2), multiply(q, v2), multiply(r, w2)
+    store(at, 3 * row + column, multiply_add(pu0, u0, multiply_add(qv0, v0, multiply(rw0, w0))))
+    store(at, 4 * row + column, multiply_add(pu0, u1, multiply_add(qv0, v1, multiply(rw0, w1))))
+    store(at, 5 * row + column, multiply_add(pu0, u2, multiply_add(qv0, v2, multiply(rw0, w2))))
+    store(at, 6 * row + column, multiply_add(pu1, u1, multiply_add(qv1, v1, multiply(rw1, w1))))
+    store(at, 7 * row + column, multiply_add(pu1, u2, multiply_add(qv1, v2, multiply(rw1, w2))))
+    store(at, 8 * row + column, multiply_add(pu2, u2, multiply_add(qv2, v2, multiply(rw2, w2))))
+
+
+@compiled
+def _angle(one, other, between):
+    """Tangent, cosine and sine of the smaller angle by which Jacobi's method turns a pair of axes."""
+    zero, unit = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
+    apart, twice = subtract(other, one), add(between, between)
+    size = at_least(apart, subtract(zero, apart))
+    length = add(size, square_root(multiply_add(apart, apart, multiply(twice, twice))))
+    tangent = divide(choose_below(apart, zero, subtract(zero, twice), twice), at_least(length, broadcast(_TINY)))
+    cosine = divide(unit, square_root(multiply_add(tangent, tangent, unit)))
+    return tangent, cosine, multiply(tangent, cosine)
+
+
+@compiled
+def _store_root(moments, column, mixing, band) -> None:
+    mixing[0, 0, band, column] = 1
+    number = 3
+    for i in range(3):
+        mixing[0, i + 1, band, column] = 0
+        mixing[i + 1, 0, band, column] = moments[i, column]
+        for j in range(i, 3):
+            mixing[i + 1, j + 1, band, column] = moments[number, column]
+            mixing[j + 1, i + 1, band, column] = moments[number, column]
+            number += 1
+
+
+@compiled
+def mix_bands(
+    log_magnitude: Float32,
+    mixing: Float32,
+    log_floor: float,
+    places: Floats,
+    noises: Int16,
+    steps: Float32,
+    begin: int,
+    response: Float32,
+) -> None:
+    """Write a response (k, sample) that begins at sample `begin`.
+
+    `log_magnitude` (band, column) is what an ideal omnidirectional microphone hears, and `mixing` (k, noise, band,
+    column) makes channels of unit power from the `noises` (noise, band, sample), whose units are `steps` (noise, band).
+    It is multiplied by the magnitudes. Values hold at the samples `places` (column,), and are interpolated between
+    them.
+    """
+    channels, bands, columns = response.shape[0], log_magnitude.shape[0], log_magnitude.shape[1]
+    for band in range(bands):
+        for column in range(columns):
+            magnitude = max(np.exp(log_magnitude[band, column]) - np.float32(log_floor), np.float32(0.0))
+            for i in range(channels):
+                for j in range(channels):
+                    mixing[i, j, band, column] *= magnitude * steps[j, band]
+    for channel in range(channels):
+        for n in range(response.shape[1]):
+            response[channel, n] = 0
+    last, end = columns - 1, min(response.shape[1], noises.shape[2])
+    at, column = max(0, begin), -1
+    while at < end:
+        while column < last and places[column + 1] <= at:
+            column += 1
+        stop = end if column == last else min(end, math.ceil(places[column + 1]))
+        stop = min(stop, at + _AT_ONCE)
+        low, high = max(column, 0), min(column + 1, last)
+        apart = places[high] - places[low]
+        share = (at - places[low]) / apart if apart > 0 else 0.0
+        step = 1.0 / apart if apart > 0 else 0.0
+        for band in range(bands):
+            for i in range(channels):
+                # The first channel has a noise alone.
+                for j in range(channels if i > 0 else 1):
+                    before, after = mixing[i, j, band, low], mixing[i, j, band, high]
+                    first, slope = np.float32(before + (after - before) * share), np.float32((after - before) * step)
+                    _add(first, slope, noises[j, band], response[i], at, stop)
+        at = stop
+
+
+@compiled
+def _add(first, slope, noise, out, at, stop) -> None:
+    """Add samples `at` to `stop` of a noise with a gain that begins with `first`."""
+    source, to, count = noise.ctypes.data + 2 * at, out.ctypes.data + 4 * at, stop - at
+    vectors = count // LANES * LANES
+    gain, step = multiply_add(load(_RAMP.ctypes.data, 0), broadcast(slope), broadcast(first)), broadcast(slope * LANES)
+    for n in range(0, vectors, LANES):
+        store(to, n, multiply_add(gain, load_shorts(source, n), load(to, n)))
+        gain = add(gain, step)
+    for n in range(vectors, count):
+        out[at + n] += (first + slope * np.float32(n)) * np.float32(noise[at + n])
