@@ -96,8 +96,8 @@ def axes_of(orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDAr
 
 
 def yaws_of(heads: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """(B,) headings of the look directions, of heads that are given as orientations (B, 4); yaws (B,) of level heads
-    are returned as they are."""
+    """(B,) headings of heads that are given as orientations (B, 4): of their noses as seen from above, so backwards for
+    a head that is tilted back beyond the zenith. Yaws (B,) of level heads are returned as they are."""
     given = np.asarray(heads, dtype=np.float64)
     if given.ndim == 1:
         return given

@@ -359,6 +359,11 @@ class Manifest(Strict):
             raise ValueError(f"format_version: is {self.format_version}, but fields like these make it {expected}")
         if has_directions and (len(self.channels) == 1 or self.direct_sound == "field"):
             raise ValueError("fields: directions are those of late reverberation; the direct sound is from geometry")
+        if has_directions and self.image_order == 0:
+            raise ValueError(
+                "image_order: must be 1: fields of directions hold what follows the first reflections; the server "
+                "computes these"
+            )
         if not self.fields:
             return self._has_no_field()
         for level in self.levels:

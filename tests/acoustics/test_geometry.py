@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import shortest_path
 
-from server.acoustics.geometry import FloorPlan, Pose, Quaternion, axes_of
+from server.acoustics.geometry import FloorPlan, Pose, Quaternion, axes_of, yaws_of
 
 APARTMENT = FloorPlan(
     ((0, 0), (4, 0), (4, 2), (4.2, 2), (4.2, 0), (8, 0), (8, 5), (4.2, 5), (4.2, 3), (4, 3), (4, 5), (0, 5)), 2.8
@@ -144,3 +144,15 @@ def test_lengths_round_corners_are_scipys_to_the_bit(corners: int, monkeypatch: 
     direct = np.where(sees, np.linalg.norm(bends[:, None] - bends[None], axis=-1), np.inf)
     plan = FloorPlan(((0, 0), (1, 0), (0, 1)), 2.5)
     np.testing.assert_array_equal(plan.bend_lengths_m, shortest_path(direct, method="D", directed=False))
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-3.1, 3.1), st.floats(-3.1, 3.1))
+def test_a_heading_is_that_of_the_nose_in_plan(yaw, pitch, roll):
+    """Beyond the zenith the nose points backwards, and so does the heading. Only straight up and down there is none."""
+    head = Quaternion.from_angles(yaw, pitch, roll)
+    x, y, _ = axes_of(head)[0]
+    if math.hypot(x, y) > 1e-3:
+        away = yaws_of([head])[0] - math.atan2(y, x)
+        assert abs(math.remainder(away, 2 * math.pi)) < 1e-6
+        backwards = math.pi if math.cos(pitch) < 0 else 0.0
+        assert abs(math.remainder(yaws_of([head])[0] - yaw - backwards, 2 * math.pi)) < 1e-6

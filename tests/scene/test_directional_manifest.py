@@ -12,6 +12,7 @@ DIRECTIONAL = FieldFile(file="arithmetic.onnx", architecture="arithmetic", predi
 def with_field(field: FieldFile, **changes: object) -> dict[str, object]:
     document = MANIFEST.model_dump(mode="json")
     document["codec"]["known_frames"] = 0
+    document["image_order"] = 1
     return document | {"fields": {"arithmetic": field.model_dump(mode="json")}} | changes
 
 
@@ -20,6 +21,11 @@ def test_a_bundle_with_directions_has_format_3():
     assert manifest.fields["arithmetic"].order == 2
     with pytest.raises(ValidationError, match="format_version: is 2, but fields like these make it 3"):
         Manifest.model_validate(with_field(DIRECTIONAL))
+
+
+def test_directions_are_of_what_follows_the_first_reflections():
+    with pytest.raises(ValidationError, match="image_order: must be 1: fields of directions hold what follows"):
+        Manifest.model_validate(with_field(DIRECTIONAL, format_version=3, image_order=0))
 
 
 @pytest.mark.parametrize("choice", [{"predicts": "directions"}, {"predicts": "ears", "order": 1}, {"order": 0}])
