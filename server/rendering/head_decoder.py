@@ -81,7 +81,7 @@ def _design(filters: HeadFilters, order: int) -> tuple[npt.NDArray[np.float32], 
     window = _window(delay, taps)[:, None, None]
     directions = even_directions(_DIRECTIONS)
     harmonics = real_harmonics(directions, order)
-    inverse = np.linalg.pinv(harmonics)
+    inverse = np.asarray(np.linalg.pinv(harmonics), dtype=np.float64)
     waves = np.moveaxis(wave_spectra(filters, directions, _BINS), -1, 0)
     is_free = _share(frequencies, _FITS_PHASE_BELOW_HZ, _FITS_MAGNITUDE_FROM_HZ)
     is_mixed = _share(frequencies, order * _DIFFUSE_FROM_HZ, order * _DIFFUSE_FULLY_FROM_HZ)
@@ -125,7 +125,7 @@ def _least_squares(inverse: _Floats, waves: _Complex) -> _Complex:
 
 def _with_free_phase(waves: _Complex, heard: _Complex, is_free: _Floats) -> _Complex:
     """The waves, but with the phases that are heard where the phase is free."""
-    return (1 - is_free) * waves + is_free * np.abs(waves) * np.exp(1j * np.angle(heard))
+    return np.asarray((1 - is_free) * waves + is_free * np.abs(waves) * np.exp(1j * np.angle(heard)))
 
 
 def _with_diffuse_field(fitted: _Complex, waves: _Complex, powers: _Floats) -> _Complex:
