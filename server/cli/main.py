@@ -6,6 +6,7 @@ Errors that a user can correct end the process with one line and exit code 2, as
 import contextlib
 import io
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -19,6 +20,7 @@ from server.core.errors import NafirError, RequestError
 from server.core.files import require_readable
 from server.health.cli import check
 from server.rendering.partitions import BLOCK_SIZES, is_block_size
+from server.runtime.memory import collect_rarely_at_start
 from server.soak.cli import soak
 
 if TYPE_CHECKING:
@@ -48,6 +50,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, 
 
 def main() -> None:
     """Entry point of the console script."""
+    collect_rarely_at_start()
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # to look for them, all packages are read
     try:
         app()
     except NafirError as exc:
