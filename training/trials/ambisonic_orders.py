@@ -88,13 +88,13 @@ def compare(bundle: Bundle, *, pairs: int, seed: int, level: str | None = None) 
     other_noise = AcousticField.load(replace(bundle, frozen_noise=bundle.frozen_noise[:, ::-1].copy()), level=level)
     rate, filters = field.sample_rate, kemar(field.sample_rate)
 
-    def ears(of: AcousticField) -> Callable[[IrQuery], _Floats]:
+    def ears(of: AcousticField) -> Callable[[IrQuery], npt.NDArray[np.floating]]:
         return lambda query: ImpulseResponse.compute(of, query, filters).samples
 
-    def decoded(order: int) -> Callable[[IrQuery], _Floats]:
+    def decoded(order: int) -> Callable[[IrQuery], npt.NDArray[np.floating]]:
         decoder = HeadDecoder.of(filters, order)
 
-        def response(query: IrQuery) -> _Floats:
+        def response(query: IrQuery) -> npt.NDArray[np.floating]:
             asked = replace(query, output="ambisonics", order=order)
             channels = ImpulseResponse.compute(field, asked).samples
             size = channels.shape[-1] + decoder.filters.shape[-1]
@@ -126,7 +126,7 @@ def _queries(bundle: Bundle, pairs: int, seed: int) -> Iterator[IrQuery]:
     while pairs:
         listener, emitter = (tuple(rng.uniform(bounds.minimum, bounds.maximum).tolist()) for _ in range(2))
         if (
-            not bundle.floor_plan.contains([listener, emitter]).all()
+            not bundle.floor_plan.contains(np.array([listener, emitter])).all()
             or np.linalg.norm(np.subtract(listener, emitter)) < 1
         ):
             continue
