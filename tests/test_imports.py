@@ -111,7 +111,11 @@ LOAD_AND_TELL = """
 import sys
 from server.api.app import create_app
 from server.api.catalogue import load_hrtfs, load_scenes
-load_hrtfs([], load_scenes([]))
+from server.planning.places import place_of_field
+scenes = load_scenes([])
+load_hrtfs([], scenes)
+for levels in scenes.values():
+    place_of_field(levels.default)
 print(*(name for name in ("matplotlib", "requests", "scipy.spatial", "sofar", "torch") if name in sys.modules))
 """
 
