@@ -10,15 +10,13 @@ spherical_harmonics`). Axes: bins from 0 to half the sample rate; products left 
 part of left times conjugate right.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.spherical_harmonics import even_directions, mean_squares, real_harmonics, rotation
+from server.acoustics.spherical_harmonics import even_directions, mean_squares, real_harmonics
 from server.rendering.hrtf import HeadFilters
 from server.rendering.sphere import find_triangle
 
@@ -46,16 +44,6 @@ class EarProducts:
         if (bins, order) not in kept:
             kept[bins, order] = cls(order, _project(filters, bins, order))
         return kept[bins, order]
-
-    def turned(self, orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-        """(bin, product, k) the products for harmonics in world axes, of a head with this orientation (x, y, z, w)."""
-        # As one product of two matrices: of many small ones, NumPy computes one after the other.
-        turned = self._flat @ rotation(orientation, self.order).astype(np.float32)
-        return turned.reshape(self.matrix.shape)
-
-    @cached_property
-    def _flat(self) -> npt.NDArray[np.float32]:
-        return self.matrix.reshape(-1, self.matrix.shape[-1]).astype(np.float32)
 
 
 _KEPT: "WeakKeyDictionary[HeadFilters, dict[tuple[int, int], EarProducts]]" = WeakKeyDictionary()
