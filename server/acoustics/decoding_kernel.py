@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from server.acoustics.columns_kernel import NOTHING, Columns, spread_columns
 from server.acoustics.phase import MOST_COHERENT, UNDECIDED
-from server.acoustics.stft_kernel import Windows, one_before, place_bin, synthesise_next
+from server.acoustics.stft_kernel import Windows, add_up, one_before, place_bin, synthesise_next
 from server.kernels.cache_lines import zeros_on_lines
 from server.kernels.compiled import compiled
 from server.kernels.simd import (
@@ -242,11 +242,10 @@ def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, nois
     for t in range(first, stop, LANES):
         _compose(t, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, work)
         if purpose != TARGETS:
-            at = _sound(t * hop - shape.frame_lead, 0, end, False, windows, work, response)
+            at = _sound(t * hop - shape.frame_lead, 0, end, False, True, windows, work, response)
     if purpose != TARGETS:
         if first < stop and at < end:
-            _clear(work.frames)
-            at = _sound(at, 0, end, False, windows, work, response)
+            at = _sound(at, 0, end, False, False, windows, work, response)
         silence(response, min(end, at), response.shape[1])
     if purpose != WHOLE:
         for bin_ in range(shape.bins):
@@ -332,26 +331,35 @@ def _add_known(log_magnitude, interaural, start, columns, shape, windows, work, 
                 multiply(mr, load(known, 2 * width + LANES + j)),
                 multiply(mr, load(known, 3 * width + LANES + j)),
             )
-        at = _sound(at, begin, end, True, windows, work, response)
+        at = _sound(at, begin, end, True, True, windows, work, response)
     if shape.known > 0 and shape.known + 3 > whole_vectors(shape.known):
-        _clear(work.frames)
-        _sound(at, begin, end, True, windows, work, response)
+        _sound(at, begin, end, True, False, windows, work, response)
 
 
 @compiled
-def _sound(at, begin, end, is_added, windows, work, response):
-    """Synthesise eight more frames and write the samples that are now complete to the response from sample `at` on,
-    within `begin` and `end`. Returns the sample after the last."""
+def _sound(at, begin, end, is_added, has_frames, windows, work, response):
+    """Synthesise eight more frames, silent ones unless it `has_frames`, and write the samples that are now complete to
+    the response from sample `at` on, within `begin` and `end`. Returns the sample after the last."""
+    if not has_frames:
+        _clear(work.frames)
     frames, carried, rows = work.frames.ctypes.data, work.carried.ctypes.data, work.rows.ctypes.data
     sounded, stop = work.sounded, at + work.sounded.shape[1]
     if not is_added and at >= begin and stop <= end:
-        synthesise_next(frames, windows, carried, rows, response.ctypes.data + 4 * at, response.strides[0] // 4)
+        _synthesise(frames, has_frames, windows, carried, rows, response.ctypes.data + 4 * at, response.strides[0] // 4)
         return stop
-    synthesise_next(frames, windows, carried, rows, sounded.ctypes.data, sounded.shape[1])
+    _synthesise(frames, has_frames, windows, carried, rows, sounded.ctypes.data, sounded.shape[1])
     for ear in range(2):
         for n in range(max(begin, at), min(end, stop)):
             response[ear, n] = sounded[ear, n - at] + (response[ear, n] if is_added else np.float32(0.0))
     return stop
+
+
+@compiled
+def _synthesise(frames, has_frames, windows, carried, rows, to, other) -> None:
+    if has_frames:
+        synthesise_next(frames, windows, carried, rows, to, other)
+    else:  # the transform of silence is silence
+        add_up(frames, windows, carried, rows, to, other)
 
 
 @compiled

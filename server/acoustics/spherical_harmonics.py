@@ -5,8 +5,10 @@ Directions are unit vectors (x ahead, y left, z up). Axes: k harmonics, (order +
 everywhere, the next three are y, z and x.
 """
 
+import math
 from collections.abc import Sequence
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +16,7 @@ import numpy.typing as npt
 from server.acoustics.geometry import axes_of
 
 _Floats = npt.NDArray[np.float64]
+_Number = TypeVar("_Number", float, npt.NDArray[np.float64])
 
 HIGHEST_ORDER = 3
 _SAMPLED = 24
@@ -36,30 +39,29 @@ def real_harmonics(directions: npt.ArrayLike, order: int) -> _Floats:
     """(..., k) harmonics of unit vectors (..., 3). Raises ValueError for an order that is not 0 to HIGHEST_ORDER."""
     count = harmonic_count(order)
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
-    harmonics = [np.ones_like(x)]
-    if order >= 1:
-        harmonics += [y, z, x]
-    if order >= 2:
-        root = np.sqrt(3.0)
-        harmonics += [
-            root * x * y,
-            root * y * z,
-            0.5 * (3 * z * z - 1),
-            root * x * z,
-            0.5 * root * (x * x - y * y),
-        ]
-    if order >= 3:
-        outer, inner, middle = np.sqrt(5 / 8), np.sqrt(3 / 8), np.sqrt(15.0)
-        harmonics += [
-            outer * y * (3 * x * x - y * y),
-            middle * x * y * z,
-            inner * y * (5 * z * z - 1),
-            0.5 * z * (5 * z * z - 3),
-            inner * x * (5 * z * z - 1),
-            0.5 * middle * z * (x * x - y * y),
-            outer * x * (x * x - 3 * y * y),
-        ]
-    return np.stack(harmonics[:count], axis=-1)
+    return np.stack([np.ones_like(x), *harmonics_after_first(x, y, z)[: count - 1]], axis=-1)
+
+
+def harmonics_after_first(x: _Number, y: _Number, z: _Number) -> tuple[_Number, ...]:
+    """All harmonics but the first, which is 1, of a unit vector."""
+    root, outer, inner, middle = math.sqrt(3.0), math.sqrt(5 / 8), math.sqrt(3 / 8), math.sqrt(15.0)
+    return (
+        y,
+        z,
+        x,
+        root * x * y,
+        root * y * z,
+        0.5 * (3 * z * z - 1),
+        root * x * z,
+        0.5 * root * (x * x - y * y),
+        outer * y * (3 * x * x - y * y),
+        middle * x * y * z,
+        inner * y * (5 * z * z - 1),
+        0.5 * z * (5 * z * z - 3),
+        inner * x * (5 * z * z - 1),
+        0.5 * middle * z * (x * x - y * y),
+        outer * x * (x * x - 3 * y * y),
+    )
 
 
 def mean_squares(order: int) -> _Floats:
@@ -74,7 +76,7 @@ def rotation(orientation: Sequence[float] | npt.NDArray[np.floating], order: int
     A rotation turns harmonics of one degree into each other. So their values at a few directions, before and after the
     rotation, determine the matrix.
     """
-    directions, inverse, is_apart = _sampled(order)
+    directions, inverse, is_apart = sampled(order)
     matrix = (inverse @ real_harmonics(directions @ axes_of(orientation).T, order)).T
     matrix[is_apart] = 0
     return matrix
@@ -90,7 +92,7 @@ def even_directions(count: int) -> _Floats:
 
 
 @cache
-def _sampled(order: int) -> tuple[_Floats, _Floats, npt.NDArray[np.bool_]]:
+def sampled(order: int) -> tuple[_Floats, _Floats, npt.NDArray[np.bool_]]:
     """Directions (direction, 3), the matrix (k, direction) from a function's values there to its coefficients, and (k,
     k) which harmonics are of different degrees."""
     directions, n = even_directions(_SAMPLED), degrees(order)

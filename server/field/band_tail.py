@@ -15,11 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import band_weights
-from server.acoustics.geometry import LEVEL, orientations_of
+from server.acoustics.geometry import LEVEL
 from server.field.band_tail_kernel import add_band_tail, find_band_gains
 from server.field.decoder import Decoder
 from server.field.directional_graph import LEAST_POWER, Arrivals, DirectionalGraph
-from server.kernels.cache_lines import on_lines
+from server.field.directional_response_kernel import Buffers, Early, Tail, respond
+from server.field.directions_kernel import TURNED_SCRATCH
+from server.field.graph import Spectrograms
+from server.kernels.cache_lines import zeros_on_lines
+from server.kernels.simd import LANES
 from server.scene.manifest import CodecParameters
 
 Float32 = npt.NDArray[np.float32]
@@ -53,42 +57,91 @@ class BandTail:
         edges = np.arange(codec.frames + 1) if parameters.frame_axis is None else parameters.frame_axis.edges
         centres = (edges[:-1] + edges[1:] - 1) / 2
         # The fade lies before the first late column, so begin with the column before it.
-        self._first = max(0, int(np.searchsorted(edges, self.early_frames)) - 2)
+        first = max(0, int(np.searchsorted(edges, self.early_frames)) - 2)
         self._early_columns = min(len(centres), int(np.searchsorted(edges, self.early_frames)) + 1)
-        self._places = centres[self._first :] * codec.hop - codec.frame_lead_samples + codec.n_fft / 2
-        self._missing = _missing(codec.window * codec.dual_window, codec.hop)
-        self._noises, self._diffuse = _band_noises(graph, frozen_noise)
+        places = centres[first:] * codec.hop - codec.frame_lead_samples + codec.n_fft / 2
+        missing = _missing(codec.window * codec.dual_window, codec.hop)
+        noises, diffuse = _band_noises(graph, frozen_noise)
+        steps = np.max(np.abs(noises), axis=-1, keepdims=True) / np.iinfo(np.int16).max
+        # A scene without noise has a step too.
+        steps = np.maximum(steps, _SMALLEST)
+        # As 16-bit integers, half as much has to be read, which is most of the work.
+        rounded = np.round(noises / steps).astype(np.int16)
+        self.parts = Tail(first, diffuse, np.ascontiguousarray(steps[..., 0], np.float32), rounded, places, missing)
+        self._buffers: list[Buffers] = []
 
     @property
     def nbytes(self) -> int:
         """The size of the noises, which is nearly all that a tail holds."""
-        return self._noises.nbytes
+        return self.parts.noises.nbytes
 
-    def responses(
-        self, decoder: Decoder, listeners: Floats, emitters: Floats, heads: npt.ArrayLike, aligned: Floats
-    ) -> Float32:
-        """Responses (B, 2, sample): the first frames by `decoder`, which uses `early_frames` of them, then the tail.
-        The first coded sample lies at sample `aligned` (B,), which may be a fraction. Heads are orientations (B, 4) or
-        yaws (B,) of level heads."""
-        orientations = orientations_of(heads)
-        arrivals = self._graph.arrivals(listeners, emitters)
-        early = self._graph.at_ears(arrivals, orientations, columns=self._early_columns)
-        responses = decoder.decode(early, aligned)
-        self._add(arrivals, orientations, aligned, responses)
+    def responses(self, decoder: Decoder, arrivals: Arrivals, orientations: Floats, aligned: Floats) -> Float32:
+        """Responses (B, 2, sample) of heads with these orientations (B, 4): the first frames by `decoder`, which uses
+        `early_frames` of them, then the tail. The first coded sample lies at sample `aligned` (B,), which may be a
+        fraction."""
+        constants = decoder.constants
+        if constants is None:
+            responses = decoder.decode(self._early(arrivals, orientations), aligned)
+            self._add(arrivals, orientations, aligned, responses)
+            return responses
+        graph = self._graph
+        band, share = graph.between_bands
+        try:
+            buffers = self._buffers.pop()
+        except IndexError:
+            buffers = self._new_buffers()
+        with decoder.workspace() as workspace:
+            responses = decoder.room(len(aligned))
+            respond(
+                arrivals.log_magnitude,
+                arrivals.directions,
+                orientations,
+                aligned,
+                graph.turning,
+                Early(band, share, self._early_columns, *constants),
+                self.parts,
+                LEAST_POWER,
+                buffers,
+                workspace,
+                responses,
+            )
+        self._buffers.append(buffers)
         return responses
 
+    def _early(self, arrivals: Arrivals, orientations: Floats) -> Spectrograms:
+        """The spectrograms at the ears, as far as the first frames need them."""
+        return self._graph.at_ears(arrivals, orientations, columns=self._early_columns)
+
+    def _new_buffers(self) -> Buffers:
+        codec, bands = self._codec, len(self.parts.diffuse)
+        columns = self._graph.parameters.columns
+        ears = zeros_on_lines(2, 1, 2, codec.bins, columns)
+        row = -(-self._early_columns // LANES) * LANES
+        turning = self._graph.turning.level
+        return Buffers(
+            turned=zeros_on_lines(turning.size + TURNED_SCRATCH),
+            levels=ears[0],
+            coherence=ears[1],
+            no_phase=zeros_on_lines(1, 2, codec.bins, 0),
+            work=zeros_on_lines(turning.shape[1] + 1, bands, row),
+            gains=zeros_on_lines(3, bands, columns - self.parts.first),
+            scratch=zeros_on_lines(2, codec.n_fft + codec.hop),
+        )
+
     def _add(self, arrivals: Arrivals, orientations: Floats, aligned: Floats, responses: Float32) -> None:
-        codec = self._codec
+        """Add tails to responses whose first frames are decoded by NumPy."""
+        codec, parts = self._codec, self.parts
         bands, columns = arrivals.log_magnitude.shape[1:]
-        gains = np.empty((3, bands, columns - self._first), np.float32)
+        gains = np.empty((3, bands, columns - parts.first), np.float32)
         scratch = np.empty((2, codec.n_fft + codec.hop), np.float32)
         for row, (orientation, start) in enumerate(zip(orientations, aligned, strict=True)):
             find_band_gains(
                 arrivals.log_magnitude[row],
                 arrivals.directions[row],
                 self._graph.band_products(orientation),
-                self._diffuse,
-                self._first,
+                parts.diffuse,
+                parts.steps,
+                parts.first,
                 codec.log_floor,
                 LEAST_POWER,
                 gains,
@@ -96,8 +149,16 @@ class BandTail:
             delay = float(start) / codec.hop
             whole = math.floor(delay)
             fade_at = (whole + self.early_frames) * codec.hop - codec.frame_lead_samples
-            places = self._places + start
-            add_band_tail(gains, places, self._noises, fade_at, delay - whole, self._missing, scratch, responses[row])
+            add_band_tail(
+                gains,
+                parts.places + start,
+                parts.noises,
+                fade_at,
+                delay - whole,
+                parts.missing,
+                scratch,
+                responses[row],
+            )
 
 
 def _missing(product: Floats, hop: int) -> Float32:
@@ -112,7 +173,7 @@ def _missing(product: Floats, hop: int) -> Float32:
     return np.stack([after_it, with_it]).astype(np.float32)
 
 
-def _band_noises(graph: DirectionalGraph, frozen_noise: Float32) -> tuple[Float32, Float32]:
+def _band_noises(graph: DirectionalGraph, frozen_noise: Float32) -> tuple[Floats, Float32]:
     """The noises (band, ear, sample) of diffuse sound of unit power at a head's ears, by octave band; and (band, 3)
     what `find_band_gains` needs to know of them.
 
@@ -137,4 +198,4 @@ def _band_noises(graph: DirectionalGraph, frozen_noise: Float32) -> tuple[Float3
     of_bands = graph.band_products(np.array(LEVEL))[..., 0]
     coherent = of_bands[:, 2] / np.sqrt(of_bands[:, 0] * of_bands[:, 1])
     diffuse = np.stack([of_bands[:, 0], of_bands[:, 1], np.clip(coherent, -0.999, 0.999)], axis=-1)
-    return on_lines(noises), np.ascontiguousarray(diffuse, np.float32)
+    return noises, np.ascontiguousarray(diffuse, np.float32)

@@ -9,12 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from server.kernels.compiled import compiled
-from server.kernels.simd import LANES, add, broadcast, load, multiply_add, store
+from server.kernels.simd import LANES, add, broadcast, load, load_shorts, multiply_add, store
 
 Float32 = npt.NDArray[np.float32]
+Int16 = npt.NDArray[np.int16]
 
-_ALMOST = np.float32(0.999)
+MOST_IN_A_BAND = 0.999
 """The greatest coherence of the ears in a band."""
+_ALMOST = np.float32(MOST_IN_A_BAND)
 _AT_ONCE = 1024
 _RAMP = np.arange(LANES, dtype=np.float32)
 
@@ -25,6 +27,7 @@ def find_band_gains(
     directions: Float32,
     products: Float32,
     diffuse: Float32,
+    steps: Float32,
     first: int,
     log_floor: float,
     least: float,
@@ -35,7 +38,8 @@ def find_band_gains(
 
     `products` (band, product, k) are those of the turned head, averaged over each band. `diffuse` (band, 3) are the
     band's powers at both ears and the coherence of its noises, in diffuse sound of unit power: the noises are that
-    sound. Where directions cancel, an ear's power is `least` times the diffuse one.
+    sound. Gains are in units of `steps` (band, left or right), those of the noises. Where directions cancel, an ear's
+    power is `least` times the diffuse one.
     """
     bands, columns = log_magnitude.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -66,9 +70,9 @@ def find_band_gains(
             # Noises of coherence d with gains b and a have the coherence b + a d and the power a^2 + b^2 + 2 a b d.
             of_diffuse = diffuse[band, 2]
             own = np.sqrt((one - coherence * coherence) / (one - of_diffuse * of_diffuse))
-            gains[0, band, to] = at_left
-            gains[1, band, to] = at_right * (coherence - own * of_diffuse)
-            gains[2, band, to] = at_right * own
+            gains[0, band, to] = at_left * steps[band, 0]
+            gains[1, band, to] = at_right * (coherence - own * of_diffuse) * steps[band, 0]
+            gains[2, band, to] = at_right * own * steps[band, 1]
 
 
 @compiled
@@ -94,7 +98,7 @@ def _lacking(one: np.float32, other: np.float32) -> np.float32:
 def add_band_tail(
     gains: Float32,
     places: npt.NDArray[np.float64],
-    noises: Float32,
+    noises: Int16,
     fade_at: int,
     share: float,
     missing: Float32,
@@ -149,7 +153,7 @@ def _add_band(before, after, share, step, noise, at, stop, to, out) -> None:
     left, left_step = _line(before[0], after[0], share, step)
     other, other_step = _line(before[1], after[1], share, step)
     own, own_step = _line(before[2], after[2], share, step)
-    at_left, at_right = noise[0].ctypes.data + 4 * at, noise[1].ctypes.data + 4 * at
+    at_left, at_right = noise[0].ctypes.data + 2 * at, noise[1].ctypes.data + 2 * at
     to_left, to_right = out[0].ctypes.data + 4 * to, out[1].ctypes.data + 4 * to
     count = stop - at
     vectors = count // LANES * LANES
@@ -157,14 +161,15 @@ def _add_band(before, after, share, step, noise, at, stop, to, out) -> None:
     left_steps, other_steps, own_steps = broadcast(left_step), broadcast(other_step), broadcast(own_step)
     for n in range(0, vectors, LANES):
         x = add(load(_RAMP.ctypes.data, 0), broadcast(np.float32(n)))
-        of_left, of_right = load(at_left, n), load(at_right, n)
+        of_left, of_right = load_shorts(at_left, n), load_shorts(at_right, n)
         store(to_left, n, multiply_add(multiply_add(x, left_steps, lefts), of_left, load(to_left, n)))
         right = multiply_add(multiply_add(x, other_steps, others), of_left, load(to_right, n))
         store(to_right, n, multiply_add(multiply_add(x, own_steps, owns), of_right, right))
     for n in range(vectors, count):
         x = np.float32(n)
-        out[0, to + n] += (left + left_step * x) * noise[0, at + n]
-        out[1, to + n] += (other + other_step * x) * noise[0, at + n] + (own + own_step * x) * noise[1, at + n]
+        of_one, of_other = np.float32(noise[0, at + n]), np.float32(noise[1, at + n])
+        out[0, to + n] += (left + left_step * x) * of_one
+        out[1, to + n] += (other + other_step * x) * of_one + (own + own_step * x) * of_other
 
 
 @compiled

@@ -3,7 +3,8 @@
 Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sample).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import numpy.typing as npt
@@ -88,18 +89,35 @@ class Decoder:
         near = near or [None] * len(aligned)
         if self._any_size is not None:
             return self._any_size.decode(predicted, aligned, near)
-        responses = _POOL.floats(len(aligned), 2, self.ir_samples)
+        responses = self.room(len(aligned))
+        with self.workspace() as work:
+            if self._phase.kind == "griffin_lim":
+                for row, response in enumerate(near):
+                    self._iterate(predicted[row : row + 1], aligned[row : row + 1], response, work, responses[row])
+            else:
+                self._run(predicted, aligned, WHOLE, work, responses)
+        return responses
+
+    @property
+    def constants(self) -> tuple[Columns, Shape, Windows, Float32] | None:
+        """What compiled code needs to decode spectrograms as this does; None if NumPy decodes them."""
+        if self._any_size is not None:
+            return None
+        return self._columns, self._shape, self._windows, self._noise.parts
+
+    def room(self, count: int) -> Float32:
+        """Room for so many responses, not initialised."""
+        return _POOL.floats(count, 2, self.ir_samples)
+
+    @contextmanager
+    def workspace(self) -> Iterator[Workspace]:
+        """Lend buffers of compiled code."""
         try:
             work = self._workspaces.pop()
         except IndexError:
             work = Workspace.of(self._shape, self._codec.n_fft, iterates=self._phase.kind == "griffin_lim")
-        if self._phase.kind == "griffin_lim":
-            for row, response in enumerate(near):
-                self._iterate(predicted[row : row + 1], aligned[row : row + 1], response, work, responses[row])
-        else:
-            self._run(predicted, aligned, WHOLE, work, responses)
+        yield work
         self._workspaces.append(work)
-        return responses
 
     def _iterate(
         self, predicted: Spectrograms, aligned: Floats, near: Float32 | None, work: "Workspace", response: Float32

@@ -11,19 +11,19 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ, band_positions, band_weights
 from server.acoustics.geometry import orientations_of
-from server.acoustics.spherical_harmonics import harmonic_count
-from server.field.directions_kernel import ears_of_directions
+from server.acoustics.spherical_harmonics import harmonic_count, sampled
+from server.field.directions_kernel import TURNED_SCRATCH, Turning, ears_of_directions, turn_products
 from server.field.graph import INPUTS, FieldGraph, Spectrograms
 from server.field.runtime import InferenceSession
 from server.kernels.simd import LANES
-from server.rendering.ear_products import EarProducts
+from server.rendering.ear_products import PRODUCTS, EarProducts
 from server.rendering.hrtf import HeadFilters, kemar
 from server.scene.bundle import Bundle
 
@@ -48,15 +48,6 @@ class Arrivals:
     directions: Float32
 
 
-class _Turned(NamedTuple):
-    """A turned head's products: `of_bins` (bin, product, k), and averaged over each octave band, `of_bands` (band,
-    product, k)."""
-
-    orientation: bytes
-    of_bins: Float32
-    of_bands: Float32
-
-
 class DirectionalGraph(FieldGraph):
     """The graph of a field that predicts directions, heard through one head: KEMAR, or that of `through`.
 
@@ -73,7 +64,6 @@ class DirectionalGraph(FieldGraph):
         """The order of the predicted harmonics."""
         self.heard_order = order
         """The order up to which they are heard."""
-        self._turned: _Turned | None = None
         super().__init__(bundle, name, session)
 
     @cached_property
@@ -95,8 +85,8 @@ class DirectionalGraph(FieldGraph):
 
     def _copy(self) -> "DirectionalGraph":
         other = copy.copy(self)
-        other._turned = None
-        vars(other).pop("_products", None)
+        for kept in ("_products", "turning"):
+            vars(other).pop(kept, None)
         return other
 
     def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
@@ -134,11 +124,14 @@ class DirectionalGraph(FieldGraph):
         harmonics = harmonic_count(self.heard_order)
         work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
         band, share = self.between_bands
+        turned: Float32 | None = None
         for row, orientation in enumerate(orientations):
+            if turned is None or not np.array_equal(orientation, orientations[row - 1]):
+                turned = self._turned(orientation)
             ears_of_directions(
                 arrivals.log_magnitude[row],
                 arrivals.directions[row, : harmonics - 1],
-                self._turned_to(orientation).of_bins,
+                turned[: codec.bins],
                 band,
                 share,
                 codec.log_floor,
@@ -153,7 +146,7 @@ class DirectionalGraph(FieldGraph):
 
     def band_products(self, orientation: Floats) -> Float32:
         """(band, product, k) the products of the turned head, averaged over each octave band."""
-        return self._turned_to(orientation).of_bands
+        return self._turned(orientation)[self.parameters.codec.bins :]
 
     @property
     def diffuse_products(self) -> Floats:
@@ -181,15 +174,22 @@ class DirectionalGraph(FieldGraph):
     def _expected_outputs(self) -> str:
         return f"float {', '.join(self._shapes)}"
 
-    def _turned_to(self, orientation: Floats) -> "_Turned":
-        """The products of the turned head. Those of the last orientation are kept, since all emitters of a listener
-        have the same."""
-        key, last = orientation.tobytes(), self._turned
-        if last is None or last.orientation != key:
-            of_bins = self._products.turned(orientation)
-            of_bands = self._mean_over_band @ of_bins.reshape(len(of_bins), -1)
-            last = self._turned = _Turned(key, of_bins, of_bands.reshape(-1, *of_bins.shape[1:]))
-        return last
+    def _turned(self, orientation: Floats) -> Float32:
+        """(bin or band, product, k) the products of the turned head: of each bin, then averaged over each octave
+        band."""
+        turned = np.empty(self.turning.level.size + TURNED_SCRATCH, np.float32)
+        turn_products(self.turning, orientation, turned)
+        harmonics = harmonic_count(self.heard_order)
+        return turned[:-TURNED_SCRATCH].reshape(-1, PRODUCTS, harmonics)
+
+    @cached_property
+    def turning(self) -> Turning:
+        """What turns the head: its products of each bin, then averaged over each octave band."""
+        of_bins = self._products.matrix.astype(np.float32)
+        of_bands = (self._mean_over_band @ of_bins.reshape(len(of_bins), -1)).reshape(-1, *of_bins.shape[1:])
+        level = np.concatenate([of_bins, of_bands]).reshape(-1, of_bins.shape[-1])
+        directions, inverse, _ = sampled(self.heard_order)
+        return Turning(np.ascontiguousarray(level), directions, inverse)
 
     @cached_property
     def _products(self) -> EarProducts:

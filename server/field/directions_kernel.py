@@ -3,9 +3,13 @@
 Axes: bands (7), bins, columns of frames, harmonics k; products as in `server.rendering.ear_products`.
 """
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.spherical_harmonics import harmonics_after_first
 from server.kernels.compiled import compiled
 from server.kernels.simd import (
     LANES,
@@ -26,9 +30,75 @@ from server.kernels.simd import (
 )
 
 Float32 = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
 
 _SILENT = np.float32(-80.0)
 """A log magnitude below every floor."""
+
+PRODUCTS = 4
+"""Products of two ears at each bin."""
+_PADDED = 2 * LANES
+"""Numbers in a row of a rotation: at least as many as harmonics up to the third order."""
+TURNED_SCRATCH = _PADDED
+"""Numbers after the products that `turn_products` overwrites."""
+_harmonics = compiled(harmonics_after_first)
+
+
+class Turning(NamedTuple):
+    """The products of a head that looks ahead, and what turns them. `level` (row, k) are rows of products of any kind.
+    `directions` (direction, 3) and `inverse` (k, direction) are as in
+    `server.acoustics.spherical_harmonics.sampled`."""
+
+    level: Float32
+    directions: Floats
+    inverse: Floats
+
+
+@compiled
+def turn_products(turning: Turning, orientation: Floats, turned: Float32) -> None:
+    """Write the products (row * k,) for harmonics in world axes, of a head with this orientation, and TURNED_SCRATCH
+    numbers after them."""
+    level = turning.level
+    harmonics = level.shape[1]
+    matrix = np.zeros((harmonics, _PADDED), np.float32)
+    _rotate(turning, orientation, matrix)
+    source, rows = matrix.ctypes.data, level.ctypes.data
+    to = turned.ctypes.data
+    # Rows are written one after the other, so that each overwrites what the one before it wrote too much.
+    for row in range(level.shape[0]):
+        first, rest = broadcast(np.float32(0.0)), broadcast(np.float32(0.0))
+        for k in range(harmonics):
+            factor = load_broadcast(rows, row * harmonics + k)
+            first = multiply_add(factor, load(source, k * _PADDED), first)
+            rest = multiply_add(factor, load(source, k * _PADDED + LANES), rest)
+        store(to, row * harmonics, first)
+        store(to, row * harmonics + LANES, rest)
+
+
+@compiled
+def _rotate(turning: Turning, orientation: Floats, matrix: Float32) -> None:
+    """Write the matrix of `server.acoustics.spherical_harmonics.rotation`."""
+    x, y, z, w = orientation
+    harmonics = turning.inverse.shape[0]
+    total = np.zeros((harmonics, harmonics))
+    total[0, 0] = 1.0
+    for number in range(turning.directions.shape[0]):
+        east, north, up = turning.directions[number]
+        turned = _harmonics(
+            (1 - 2 * (y * y + z * z)) * east + 2 * (x * y + z * w) * north + 2 * (x * z - y * w) * up,
+            2 * (x * y - z * w) * east + (1 - 2 * (x * x + z * z)) * north + 2 * (y * z + x * w) * up,
+            2 * (x * z + y * w) * east + 2 * (y * z - x * w) * north + (1 - 2 * (x * x + y * y)) * up,
+        )
+        begin = 1
+        while begin < harmonics:
+            size = 2 * int(math.sqrt(begin)) + 1
+            for row in range(begin, begin + size):
+                for column in range(begin, begin + size):
+                    total[row, column] += turned[row - 1] * turning.inverse[column, number]
+            begin += size
+    for row in range(harmonics):
+        for column in range(harmonics):
+            matrix[row, column] = total[row, column]
 
 
 @compiled

@@ -9,13 +9,15 @@ orientations (B, 4) as quaternions x, y, z, w, or yaws (B,) of level heads; a fi
 """
 
 import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.fast_length import next_fast_length
-from server.acoustics.geometry import Vector3, yaws_of
+from server.acoustics.geometry import Vector3, orientations_of, yaws_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
 from server.acoustics.sound_path import SoundPathFinder
@@ -25,7 +27,7 @@ from server.core.errors import BundleError, FieldError
 from server.field.any_size_decoder import add_from, resized
 from server.field.band_tail import BandTail
 from server.field.decoder import Decoder
-from server.field.directional_graph import DirectionalGraph
+from server.field.directional_graph import Arrivals, DirectionalGraph
 from server.field.gate import RISE_S, Gate
 from server.field.graph import RESPONSE, FieldGraph, Spectrograms, open_graph
 from server.field.graphs import graph_of
@@ -50,12 +52,54 @@ _HEAD_BYTES = 256 * 1024
 """What a head takes besides its tail, roughly."""
 _NEVER = 2.0**31
 """Samples: larger than any index of a response."""
+_TOLD_BYTES = 8 * 1024 * 1024
+"""Size of what a field of directions keeps of recent poses: some hundred of them."""
 _EAR_AHEAD_S = 0.00026
 """Seconds: the nearer ear is 87.5 mm from the middle of the head, so sound reaches it at most this much earlier."""
 _RISE_AFTER_FIRST_S = 0.003
 """Length of the gate's rise from the onset, where geometry computes the first reflections: the predicted sound after
 them is faded in gradually. A shorter rise gives larger errors of the interaural time difference, a longer one of the
 direct-to-reverberant ratio."""
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What poses of listener and emitter say, whatever the head: what arrives, where the first coded sample lies (B,),
+    and the samples from which sound arrives and is reflected (B,). Read-only."""
+
+    arrivals: Arrivals
+    aligned: Floats
+    onsets: npt.NDArray[np.int64]
+    echoes: npt.NDArray[np.int64] | None
+
+    @property
+    def nbytes(self) -> int:
+        return self.arrivals.log_magnitude.nbytes + self.arrivals.directions.nbytes
+
+    def row(self, number: int) -> "_Told":
+        """One of them, in arrays of its own."""
+        part = slice(number, number + 1)
+        return _Told(
+            Arrivals(self.arrivals.log_magnitude[part].copy(), self.arrivals.directions[part].copy()),
+            self.aligned[part],
+            self.onsets[part],
+            None if self.echoes is None else self.echoes[part],
+        )
+
+    @classmethod
+    def joined(cls, parts: "Sequence[_Told]") -> "_Told":
+        if len(parts) == 1:
+            return parts[0]
+        echoes = [part.echoes for part in parts if part.echoes is not None]
+        return cls(
+            Arrivals(
+                np.concatenate([part.arrivals.log_magnitude for part in parts]),
+                np.concatenate([part.arrivals.directions for part in parts]),
+            ),
+            np.concatenate([part.aligned for part in parts]),
+            np.concatenate([part.onsets for part in parts]),
+            np.concatenate(echoes) if echoes else None,
+        )
 
 
 class AcousticField:
@@ -65,6 +109,8 @@ class AcousticField:
     them in `node_cache`, which it shares with the other levels of the scene.
     """
 
+    _order: int | None = None
+    """The order of the ambisonic channels that responses have in place of ears."""
     source: ResponseSource
     """Where this level gets responses: computed for every pose, or taken from nodes that each represent many poses."""
 
@@ -110,6 +156,7 @@ class AcousticField:
                 frames=level.frames if self._tail is None else self._tail.early_frames,
             )
         self._cache = PhaseCache() if level.phase.warm else None
+        self._told: BoundedCache[bytes, _Told] = BoundedCache(_TOLD_BYTES)
         node_cache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
         self.source = self.kind.open(bundle, self._paths, self._compute_all, node_cache)
 
@@ -138,6 +185,26 @@ class AcousticField:
             self._heard.put(filters, heard, _HEAD_BYTES + tail_bytes)
         return heard
 
+    def encoded(self, order: int) -> "AcousticField":
+        """The same field as ambisonic channels of an order: its responses (B, (order + 1)**2, ir_samples) are those of
+        `ambisonics`, whatever the heads.
+
+        Raises ValueError for a field that knows no directions.
+        """
+        if not self.knows_directions:
+            raise ValueError(f"field {self.graph.name} knows no directions")
+        other = self._encoded.get(order)
+        if other is None:
+            other = copy.copy(self)
+            other._order = order
+            other._bind(BoundedCache(NODE_CACHE_BYTES))
+            self._encoded[order] = other
+        return other
+
+    def _bind(self, cache: NodeCache) -> None:
+        """Open a source of responses of this object's own, for a copy."""
+        self.source = self.kind.open(self.bundle, self._paths, self._compute_all, cache)
+
     def _with(self, graph: FieldGraph) -> "AcousticField":
         """A copy whose graph gives the spectrograms of another head."""
         other = copy.copy(self)
@@ -146,13 +213,17 @@ class AcousticField:
         other._tail = other._open_tail()
         if other._cache is not None:
             other._cache = PhaseCache()
-        other.source = other.kind.open(self.bundle, self._paths, other._compute_all, BoundedCache(NODE_CACHE_BYTES))
+        other._bind(BoundedCache(NODE_CACHE_BYTES))
         return other
 
     def _open_tail(self) -> BandTail | None:
         if self.level.tail == "stft" or not isinstance(self.graph, DirectionalGraph):
             return None
         return BandTail(self.graph, self.bundle.frozen_noise)
+
+    @cached_property
+    def _encoded(self) -> dict[int, "AcousticField"]:
+        return {}
 
     @cached_property
     def _heard(self) -> BoundedCache[HeadFilters, "AcousticField"]:
@@ -165,7 +236,7 @@ class AcousticField:
 
     @property
     def channels(self) -> int:
-        return len(self.bundle.manifest.channels)
+        return len(self.bundle.manifest.channels) if self._order is None else harmonic_count(self._order)
 
     @property
     def sample_rate(self) -> int:
@@ -183,7 +254,8 @@ class AcousticField:
 
         Equal poses always give equal responses, except with `remember`: a level with warm phase then starts from the
         phase that it last found near each pose, and stores its own phase for later calls. This suits streams, in which
-        each pose is near the one before it.
+        each pose is near the one before it. A field of directions with a tail of bands then remembers what arrives at
+        recent poses, so that a head that only turns needs no network.
 
         Raises ValueError for poses that are not finite, and FieldError if a response would not be finite.
         """
@@ -241,13 +313,12 @@ class AcousticField:
         return self.source.find(listener, emitter, yaw)
 
     def _compute_all(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool = False) -> Float32:
-        cache = self._cache if remember else None
         if 0 < len(heads) <= _CHUNK:
-            return self._compute(listeners, emitters, heads, cache)
+            return self._compute(listeners, emitters, heads, remember=remember)
         responses = np.empty((len(heads), self.channels, self.ir_samples), dtype=np.float32)
         for start in range(0, len(heads), _CHUNK):
             part = slice(start, start + _CHUNK)
-            responses[part] = self._compute(listeners[part], emitters[part], heads[part], cache)
+            responses[part] = self._compute(listeners[part], emitters[part], heads[part], remember=remember)
         return responses
 
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
@@ -275,15 +346,39 @@ class AcousticField:
         length_m = [self._paths.find(*pair).length_m for pair in pairs]
         return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
 
-    def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, cache: PhaseCache | None) -> Float32:
+    def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool) -> Float32:
+        if self._order is not None:
+            return self.ambisonics(listeners, emitters, self._order)
+        if self._tail is not None and self._decoder is not None:
+            told = self._remembered(listeners, emitters) if remember else self._tell(listeners, emitters)
+            responses = self._tail.responses(self._decoder, told.arrivals, orientations_of(heads), told.aligned)
+            self._gate.open(self._finite(responses, listeners, emitters), told.onsets, told.echoes)
+            return responses
         aligned = self._aligned(listeners, emitters)
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, heads)
             responses = self._finite(self._placed(coded, aligned), listeners, emitters)
         else:
+            cache = self._cache if remember else None
             responses = self._decoded(self._decoder, listeners, emitters, heads, aligned, cache)
         self._gate.open(responses, *self._opening(listeners, emitters, aligned))
         return responses
+
+    def _tell(self, listeners: Floats, emitters: Floats) -> _Told:
+        assert isinstance(self.graph, DirectionalGraph)
+        aligned = self._aligned(listeners, emitters)
+        return _Told(self.graph.arrivals(listeners, emitters), aligned, *self._opening(listeners, emitters, aligned))
+
+    def _remembered(self, listeners: Floats, emitters: Floats) -> _Told:
+        keys = [row.tobytes() for row in np.concatenate([listeners, emitters], axis=-1)]
+        known = [self._told.get(key) for key in keys]
+        missing = [row for row, told in enumerate(known) if told is None]
+        if missing:
+            told = self._tell(listeners[missing], emitters[missing])
+            for number, row in enumerate(missing):
+                known[row] = one = told.row(number)
+                self._told.put(keys[row], one, one.nbytes)
+        return _Told.joined([told for told in known if told is not None])
 
     def _aligned(self, listeners: Floats, emitters: Floats) -> Floats:
         """(B,) the sample of each response on which the first coded sample lies, with its fraction."""
@@ -314,9 +409,6 @@ class AcousticField:
         cache: PhaseCache | None,
     ) -> Float32:
         """Decoded responses (B, channel, ir_samples), including the energy that windows smear to before the onset."""
-        if self._tail is not None:
-            responses = self._tail.responses(decoder, listeners, emitters, heads, aligned)
-            return self._finite(responses, listeners, emitters)
         predicted = self.graph.predictions(listeners, emitters, heads)
         if self.channels == 1:
             # Decoders expect two ears; a single microphone is stored as the left one.
@@ -394,6 +486,9 @@ class Silence(AcousticField):
     @property
     def knows_directions(self) -> bool:
         return True
+
+    def _bind(self, cache: NodeCache) -> None:  # noqa: ARG002  nothing is kept
+        self.source = ComputedResponses(self.impulse_responses)
 
     def _ambisonics(self, listeners: Floats, emitters: Floats, order: int) -> Float32:  # noqa: ARG002
         return np.zeros((len(listeners), harmonic_count(order), self.ir_samples), dtype=np.float32)

@@ -15,9 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 
-from server.acoustics.geometry import axes_of
+from server.acoustics.geometry import axes_of, orientations_of
 from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
+from server.acoustics.spherical_harmonics import harmonic_count, rotation
+from server.field.band_tail import BandTail
+from server.field.band_tail_kernel import MOST_IN_A_BAND
 from server.field.decoder import Decoder
+from server.field.directional_graph import LEAST_POWER, Arrivals, DirectionalGraph
 from server.field.field import AcousticField, Silence
 from server.field.gate import MOST_GIVEN, Gate, Indices
 from server.field.graph import Spectrograms
@@ -47,6 +51,11 @@ class DoubleDecoder(Decoder):
         self._known = min(parameters.known_frames, self._used)
         signal = _fitted(field.bundle.frozen_noise, self._codec.samples)
         self._white = self._codec.transform(signal) / np.sqrt(self._codec.window_energy)
+
+    @property
+    def constants(self) -> None:
+        """NumPy decodes them."""
+        return None
 
     def decode(
         self, predicted: Spectrograms, aligned: _Floats, near: Sequence[_Float32 | None] | None = None
@@ -134,9 +143,119 @@ class DoubleGate(Gate):
             response *= gain * np.sqrt(1 + share[:, None] * given)
 
 
+class DoubleDirectionalGraph(DirectionalGraph):
+    """A field's graph whose predictions are heard by two ears in float64."""
+
+    def __init__(self, graph: DirectionalGraph) -> None:
+        vars(self).update(vars(graph))
+        self._single = graph
+
+    def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> list[_Float32]:
+        return self._single.run(listeners, emitters, heads)
+
+    def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike, *, columns: int | None = None) -> Spectrograms:  # noqa: ARG002  all are computed
+        rows = [
+            self._at_ears(_double(log_magnitude), _double(directions), orientation)
+            for log_magnitude, directions, orientation in zip(
+                arrivals.log_magnitude, arrivals.directions, orientations_of(heads), strict=True
+            )
+        ]
+        levels, coherence = (np.stack(parts) for parts in zip(*rows, strict=True))
+        no_phase = np.zeros((*levels.shape[:3], self.parameters.known_frames))
+        return Spectrograms(levels, no_phase, no_phase, coherence)
+
+    def _at_ears(self, log_magnitude: _Floats, directions: _Floats, orientation: _Floats) -> tuple[_Floats, _Floats]:
+        floor = self.parameters.log_floor
+        products = self._products.matrix @ rotation(orientation, self.heard_order)
+        by_band = np.square(np.maximum(np.exp(log_magnitude) - floor, 0)) * self.relative(directions)
+        band, share = self.between_bands
+        upper = _double(share)[:, None]
+        power = (1 - upper) * by_band[:, band] + upper * by_band[:, band + 1]
+        heard = np.einsum("bpk,kbc->pbc", products, power)
+        least = LEAST_POWER * products[:, :2, 0].T[..., None] * power[0]
+        amplitude = np.sqrt(np.maximum(heard[:2], least))
+        both = amplitude[0] * amplitude[1]
+        coherence = np.divide(heard[2:], both, out=np.zeros_like(heard[2:]), where=both > 0)
+        coherence /= np.maximum(1, np.hypot(*coherence))
+        return np.log(amplitude + floor), coherence
+
+    def relative(self, directions: _Floats) -> _Floats:
+        """(k, band, column) the harmonics of the power that are heard, relative to the first."""
+        one = np.ones((1, *directions.shape[1:]))
+        return np.concatenate([one, directions])[: harmonic_count(self.heard_order)]
+
+
+class DoubleBandTail(BandTail):
+    """A tail of band noises in NumPy: gains and sums in float64, of the noises as they are kept."""
+
+    def __init__(self, tail: BandTail, graph: DoubleDirectionalGraph) -> None:
+        vars(self).update(vars(tail))
+        self._graph: DoubleDirectionalGraph = graph
+
+    def _add(self, arrivals: Arrivals, orientations: _Floats, aligned: _Floats, responses: _Float32) -> None:
+        codec, parts = self._codec, self.parts
+        noises = parts.noises.astype(np.float64) * _double(parts.steps)[..., None]
+        for row, (orientation, start) in enumerate(zip(orientations, aligned.tolist(), strict=True)):
+            gains = self._gains(
+                _double(arrivals.log_magnitude[row, :, parts.first :]),
+                _double(arrivals.directions[row, ..., parts.first :]),
+                orientation,
+            )
+            whole = int(np.floor(start / codec.hop))
+            share = start / codec.hop - whole
+            fade_at = (whole + self.early_frames) * codec.hop - codec.frame_lead_samples
+            amount = _at(
+                share * parts.missing[0] + (1 - share) * parts.missing[1], np.arange(self._length) - fade_at, 1
+            )
+            amount[: max(0, fade_at)] = 0
+            places = parts.places + start
+            at = np.arange(self._length)
+            left, other, own = ([np.interp(at, places, band) for band in ear] for ear in gains)
+            tail = np.stack(
+                [np.sum(left * noises[:, 0], axis=0), np.sum(other * noises[:, 0] + own * noises[:, 1], axis=0)]
+            )
+            count = min(self._length, responses.shape[-1])
+            responses[row, :, :count] += (amount * tail)[:, :count]
+
+    @property
+    def _length(self) -> int:
+        return int(self.parts.noises.shape[-1])
+
+    def _gains(self, log_magnitude: _Floats, directions: _Floats, orientation: _Floats) -> _Floats:
+        """(3, band, column) gains as `server.field.band_tail_kernel.find_band_gains` describes them."""
+        graph, diffuse = self._graph, _double(self.parts.diffuse)
+        mean = _double(graph._mean_over_band)
+        of_bins = graph._products.matrix @ rotation(orientation, graph.heard_order)
+        products = np.einsum("bf,fpk->bpk", mean, of_bins)
+        left, right, real, _ = np.einsum("bpk,kbc->pbc", products, graph.relative(directions))
+        left, right = (np.maximum(power, LEAST_POWER * diffuse[:, ear, None]) for ear, power in ((0, left), (1, right)))
+        coherence = np.clip(real / np.sqrt(left * right), -MOST_IN_A_BAND, MOST_IN_A_BAND)
+        magnitude = np.maximum(np.exp(log_magnitude) - self._codec.log_floor, 0)
+        amplitudes = [
+            _balanced(magnitude * np.sqrt(power / diffuse[:, ear, None])) for ear, power in ((0, left), (1, right))
+        ]
+        of_diffuse = diffuse[:, 2, None]
+        own = np.sqrt((1 - coherence**2) / (1 - of_diffuse**2))
+        return np.stack([amplitudes[0], amplitudes[1] * (coherence - own * of_diffuse), amplitudes[1] * own])
+
+
+def _balanced(gain: _Floats) -> _Floats:
+    """Gains (band, column) that make up for what is lacking where bands' amplitudes add up."""
+    squares = gain[:-1] ** 2 + gain[1:] ** 2
+    between = np.divide(1.5 * squares, squares + gain[:-1] * gain[1:], out=np.ones_like(squares), where=squares > 0)
+    padded = np.pad(between, ((1, 1), (0, 0)), constant_values=1.0)
+    return np.asarray(gain * np.sqrt((padded[:-1] + padded[1:]) / 2))
+
+
 class _DoubleField(AcousticField):
     def __init__(self, field: AcousticField) -> None:
-        super().__init__(field.bundle, field.level, field.graph)
+        graph = field.graph
+        if isinstance(graph, DirectionalGraph):
+            graph = DoubleDirectionalGraph(graph)
+        super().__init__(field.bundle, field.level, graph)
+        if self._tail is not None:
+            assert isinstance(self.graph, DoubleDirectionalGraph)
+            self._tail = DoubleBandTail(self._tail, self.graph)
         if self._decoder is not None:
             self._decoder = DoubleDecoder(field, None if self._tail is None else self._tail.early_frames)
         self._gate = DoubleGate(self._gate)

@@ -173,6 +173,18 @@ def pointer(_context: Any, _address: Any) -> Any:
 
 
 @intrinsic
+def load_shorts(_context: Any, _address: Any, _index: Any) -> Any:
+    """Load LANES int16 as floats; `index` counts int16."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        shorts = ir.VectorType(ir.IntType(16), LANES)
+        values = builder.load(_pointer(builder, *args, shorts, 2), align=2)
+        return builder.sitofp(values, _floats(LANES))
+
+    return Vector(LANES)(types.int64, types.int64), generate
+
+
+@intrinsic
 def prefetch(_context: Any, _address: Any) -> Any:
     """Prefetch the cache line at an address."""
 

@@ -10,15 +10,13 @@ spherical_harmonics`). Axes: bins from 0 to half the sample rate; products left 
 part of left times conjugate right.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.spherical_harmonics import even_directions, mean_squares, real_harmonics, rotation
+from server.acoustics.spherical_harmonics import even_directions, mean_squares, real_harmonics
 from server.rendering.hrtf import HeadFilters
 from server.rendering.sphere import find_triangle
 
@@ -47,16 +45,6 @@ class EarProducts:
             kept[bins, order] = cls(order, _project(filters, bins, order))
         return kept[bins, order]
 
-    def turned(self, orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-        """(bin, product, k) the products for harmonics in world axes, of a head with this orientation (x, y, z, w)."""
-        # As one product of two matrices: of many small ones, NumPy computes one after the other.
-        turned = self._flat @ rotation(orientation, self.order).astype(np.float32)
-        return turned.reshape(self.matrix.shape)
-
-    @cached_property
-    def _flat(self) -> npt.NDArray[np.float32]:
-        return self.matrix.reshape(-1, self.matrix.shape[-1]).astype(np.float32)
-
 
 _KEPT: "WeakKeyDictionary[HeadFilters, dict[tuple[int, int], EarProducts]]" = WeakKeyDictionary()
 
@@ -69,14 +57,14 @@ def _project(filters: HeadFilters, bins: int, order: int) -> _Floats:
     total = np.zeros((bins, PRODUCTS, harmonics.shape[-1]))
     for start in range(0, len(directions), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        left, right = np.moveaxis(_spectra(filters, directions[part], bins), 1, 0)
+        left, right = np.moveaxis(wave_spectra(filters, directions[part], bins), 1, 0)
         cross = left * np.conj(right)
         products = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag])
         total += np.einsum("pdf,dk->fpk", products, harmonics[part], optimize=True)
     return total / len(directions)
 
 
-def _spectra(filters: HeadFilters, directions: _Floats, bins: int) -> npt.NDArray[np.complex128]:
+def wave_spectra(filters: HeadFilters, directions: _Floats, bins: int) -> npt.NDArray[np.complex128]:
     """(direction, ear, bin) spectra of waves from these directions: interpolated minimum phase and delay."""
     mesh = filters.triangulation
     weights = np.empty((len(directions), 3))

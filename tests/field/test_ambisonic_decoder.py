@@ -196,7 +196,7 @@ def against_ears(moments, order, head, filters):
     same field gives its ears directly."""
     to_ears = ear_filters(head, order)
     heard = np.einsum("kef,kl,lef->ef", to_ears, covariance(decoded(moments, order)), to_ears.conj()).real
-    direct = EarProducts.of(filters, bins=BINS, order=2).turned((0, 0, 0, 1))[:, :2] @ moments
+    direct = EarProducts.of(filters, bins=BINS, order=2).matrix[:, :2] @ moments
     ears, expected = in_octaves(heard), in_octaves(direct.T)
     level = 10 * np.log10(ears.sum(axis=0) / expected.sum(axis=0))
     ild = 10 * np.log10(ears[0] / ears[1]) - 10 * np.log10(expected[0] / expected[1])

@@ -10,7 +10,9 @@ from server.acoustics.spherical_harmonics import real_harmonics
 from server.field.band_tail import early_frames
 from server.field.directional_graph import DirectionalGraph
 from server.field.field import AcousticField
+from server.health.double_precision import DoubleFullResponse
 from server.rendering.hrtf import kemar
+from server.responses.full_response import FullResponse
 from server.scene.bundle import BUNDLED, Bundle
 from server.scene.manifest import QualityLevel
 from tests.directional_flat import with_ears_exchanged
@@ -30,7 +32,6 @@ class _Predicted(DirectionalGraph):
         self.name, self.channels, self.gives_responses = "predicted", 2, False
         self.order = self.heard_order = 2
         self.parameters = PARAMETERS
-        self._turned = None
         self.said = log_magnitude, relative
 
     def run(self, listeners, emitters, heads):  # noqa: ARG002  the same everywhere
@@ -136,3 +137,15 @@ def test_equal_poses_have_equal_responses_in_any_batch():
     together = bands.impulse_responses([LISTENER] * 3, [EMITTER] * 3, heads)
     for row, head in enumerate(heads):
         assert_allclose(together[row], bands.impulse_responses([LISTENER], [EMITTER], [head])[0], atol=1e-7)
+
+
+@pytest.mark.parametrize("towards", [None, (0.0, 1.0, 0.0), (0.6, 0.0, 0.8)])
+def test_it_is_that_of_double_precision(towards):
+    head = Quaternion.from_angles(0.3, 0.4, -0.2)
+    poses = [LISTENER], [EMITTER], [head]
+    for field in fields((60.0, 60.0, 70.0, 80.0, 100.0, 120.0, 150.0), towards):
+        found = FullResponse(field, kemar(RATE)).impulse_responses(*poses)[0].astype(float)
+        exact = DoubleFullResponse(field, kemar(RATE)).impulse_responses(*poses)[0].astype(float)
+        for part in (slice(None, 1600), slice(1600, None)):
+            error = np.sum((found - exact)[:, part] ** 2) / np.sum(exact[:, part] ** 2)
+            assert 10 * np.log10(error) < -120

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import Quaternion
-from server.acoustics.spherical_harmonics import real_harmonics
+from server.acoustics.spherical_harmonics import real_harmonics, rotation
 from server.core.errors import BundleError
 from server.field.directional_graph import LEAST_POWER, Arrivals, DirectionalGraph
 from server.field.field import AcousticField
@@ -33,6 +33,9 @@ from tests.directional_flat import (
 
 LISTENER, EMITTER = (2.0, 2.5, 1.5), (6.0, 3.0, 1.4)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+units = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: math.hypot(*v) > 0.1)
+quaternions = st.builds(Quaternion, *[st.floats(0.05, 1)] * 4)
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +101,42 @@ def test_energies_are_those_of_the_responses(diffuse, from_the_north):
         assert_allclose(10 * np.log10(heard / predicted), 0, atol=1.5)  # the noise is one draw of a short response
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+@given(head=quaternions)
+def test_products_turn_with_the_head(graphs, order, head):
+    graph = graphs[order]
+    level = graph.turning.level.reshape(-1, 4, (order + 1) ** 2)
+    assert_allclose(graph._turned(np.array(head)), level @ rotation(head, order), atol=1e-5 * np.abs(level).max())
+
+
+def test_remembered_arrivals_are_those_of_the_network(tmp_path, monkeypatch):
+    """In a stream, a head that only turns hears to the bit what it would hear anew."""
+    field = AcousticField.load(write_directional(tmp_path / "flat", 2, (0.0, 0.6, 0.8), "bands"))
+    heads = [Quaternion.from_angles(0.5 * step, 0.2, -0.1) for step in range(4)]
+    anew = [field.impulse_responses([LISTENER], [EMITTER], [head]) for head in heads]
+    field.impulse_responses([LISTENER], [EMITTER], [LEVEL], remember=True)
+    ran = []
+    run = field.graph.run
+    monkeypatch.setattr(field.graph, "run", lambda *poses: ran.append(poses) or run(*poses))
+    for head, expected in zip(heads, anew, strict=True):
+        assert_array_equal(field.impulse_responses([LISTENER], [EMITTER], [head], remember=True), expected)
+    assert not ran
+    # Of several poses, only the new ones are told by the network.
+    both = field.impulse_responses([LISTENER] * 2, [EMITTER, (5.0, 1.0, 1.0)], [heads[0]] * 2, remember=True)
+    assert [len(poses[0]) for poses in ran] == [1]
+    assert_array_equal(both[0], anew[0][0])
+    assert_array_equal(both[1], field.impulse_responses([LISTENER], [(5.0, 1.0, 1.0)], heads[:1])[0])
+
+
+def test_what_is_remembered_is_heard_through_every_head(tmp_path):
+    field = AcousticField.load(write_directional(tmp_path / "flat", 2, (0.0, 1.0, 0.0), "bands"))
+    other = field.through(with_ears_exchanged(kemar(24_000)))
+    poses = [LISTENER], [EMITTER], [LEVEL]
+    expected = [heard.impulse_responses(*poses) for heard in (field, other)]
+    for heard, response in zip((field, other), expected, strict=True):
+        assert_array_equal(heard.impulse_responses(*poses, remember=True), response)
+
+
 def test_another_head_hears_another_room(from_the_north):
     own = kemar(24_000)
     mirrored = with_ears_exchanged(own)
@@ -127,10 +166,6 @@ def arrivals_from(directions, powers, order):
     log = np.full((1, BANDS, COLUMNS), np.log(np.sqrt(total) + 1e-5), np.float32)
     rest = np.ones((1, len(relative) - 1, BANDS, COLUMNS), np.float32) * relative[None, 1:, None, None]
     return Arrivals(log, rest.astype(np.float32))
-
-
-units = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: math.hypot(*v) > 0.1)
-quaternions = st.builds(Quaternion, *[st.floats(0.05, 1)] * 4)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])

@@ -240,6 +240,18 @@ def test_load_int_reads_sixty_four_bits():
     assert read(values[2:], -1) == -1
 
 
+def test_load_shorts_reads_integers_of_sixteen_bits_as_floats():
+    @numba.njit
+    def read(values, index, found):
+        simd.store(found.ctypes.data, 0, simd.load_shorts(values.ctypes.data, index))
+
+    values = np.array([0, -1, 2**15 - 1, -(2**15), 256, -256, 77, 3, 5], np.int16)
+    found = np.zeros(8, np.float32)
+    for index in (0, 1):
+        read(values, index, found)
+        assert found.tolist() == values[index : index + 8].tolist()
+
+
 def test_load_short_int_reads_thirty_two_bits_with_their_sign():
     @numba.njit
     def read(values, index):

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from server.core.errors import NafirError
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
 from training.models.encoders import FieldShape
 from training.models.naf import NafShape
+from training.simulation.responses import SimulatedResponses
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "log.csv"

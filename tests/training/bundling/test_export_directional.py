@@ -8,10 +8,10 @@ from rich.progress import Progress
 from server.field.fields_by_level import FieldsByLevel
 from server.field.runtime import open_session
 from training.bundling.export import ExportError, export
-from training.data.responses import SimulatedResponses
 from training.learning.runs import Configuration, DirectionalRecipe
 from training.learning.train import load_learner, train
 from training.models.directional import ExportedDirections
+from training.simulation.responses import SimulatedResponses
 
 SILENT = Progress(disable=True)
 

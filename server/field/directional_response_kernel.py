@@ -1,0 +1,140 @@
+"""Responses of two ears from what arrives by direction, in one call of compiled code.
+
+Axes: B poses; bands (7), columns of a prediction, harmonics k; responses (B, ear, sample).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.columns_kernel import Columns
+from server.acoustics.decoding_kernel import WHOLE, Shape, Workspace, decode
+from server.acoustics.stft_kernel import Windows
+from server.field.band_tail_kernel import add_band_tail, find_band_gains
+from server.field.directions_kernel import PRODUCTS, Turning, ears_of_directions, turn_products
+from server.kernels.compiled import compiled
+
+Float32 = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+Int16 = npt.NDArray[np.int16]
+
+
+class Early(NamedTuple):
+    """How the first frames are decoded. Bins lie between `band` (bin,) and the next, at a `share` (bin,) of the way.
+    The first `columns` of a prediction are needed."""
+
+    band: npt.NDArray[np.int64]
+    share: Float32
+    columns: int
+    of_frames: Columns
+    shape: Shape
+    windows: Windows
+    noise: Float32
+
+
+class Tail(NamedTuple):
+    """The tail after the first frames, from column `first` on; the rest is as in `server.field.band_tail_kernel`."""
+
+    first: int
+    diffuse: Float32
+    steps: Float32
+    noises: Int16
+    places: Floats
+    missing: Float32
+
+
+class Buffers(NamedTuple):
+    """Buffers of `respond`, reused between calls: `turned` products; `levels` and `coherence` (1, 2, bin, column) of
+    the ears, zeros beyond the first columns; `no_phase` (2, bin, 0); `work`, `gains` and `scratch` as their users need
+    them."""
+
+    turned: Float32
+    levels: Float32
+    coherence: Float32
+    no_phase: Float32
+    work: Float32
+    gains: Float32
+    scratch: Float32
+
+
+@compiled
+def respond(
+    log_magnitude: Float32,
+    directions: Float32,
+    orientations: Floats,
+    aligned: Floats,
+    turning: Turning,
+    early: Early,
+    tail: Tail,
+    least: float,
+    buffers: Buffers,
+    decoding: Workspace,
+    responses: Float32,
+) -> None:
+    """Write responses to poses with these predictions, (B, band, column) and (B, k - 1, band, column), and heads with
+    these `orientations` (B, 4). The first coded sample lies at sample `aligned` (B,). Where directions cancel, an ear's
+    power is `least` times the diffuse one."""
+    shape, hop = early.shape, early.windows.n_fft // 4
+    harmonics = turning.level.shape[1]
+    rows = turning.level.shape[0] // PRODUCTS
+    products = buffers.turned[: rows * PRODUCTS * harmonics].reshape(rows, PRODUCTS, harmonics)
+    of_bins, of_bands = products[: shape.bins], products[shape.bins :]
+    for row in range(responses.shape[0]):
+        if row == 0 or _differ(orientations[row], orientations[row - 1]):
+            turn_products(turning, orientations[row], buffers.turned)
+        heard = directions[row, : harmonics - 1]
+        ears_of_directions(
+            log_magnitude[row],
+            heard,
+            of_bins,
+            early.band,
+            early.share,
+            shape.log_floor,
+            least,
+            early.columns,
+            buffers.work,
+            buffers.levels[0],
+            buffers.coherence[0],
+        )
+        decode(
+            buffers.levels,
+            buffers.no_phase,
+            buffers.no_phase,
+            buffers.coherence,
+            aligned[row : row + 1],
+            early.of_frames,
+            shape,
+            early.windows,
+            early.noise,
+            WHOLE,
+            decoding,
+            responses[row : row + 1],
+        )
+        find_band_gains(
+            log_magnitude[row],
+            heard,
+            of_bands,
+            tail.diffuse,
+            tail.steps,
+            tail.first,
+            shape.log_floor,
+            least,
+            buffers.gains,
+        )
+        delay = aligned[row] / hop
+        whole = math.floor(delay)
+        fade_at = (whole + shape.used) * hop - shape.frame_lead
+        places = tail.places + aligned[row]
+        add_band_tail(
+            buffers.gains, places, tail.noises, fade_at, delay - whole, tail.missing, buffers.scratch, responses[row]
+        )
+
+
+@compiled
+def _differ(one: Floats, other: Floats) -> bool:
+    is_other = False
+    for number in range(one.size):
+        is_other |= one[number] != other[number]
+    return is_other
