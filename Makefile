@@ -13,10 +13,12 @@ PAIRS ?= 120
 # Of how many simulations of each pair the medians are what its parameters are compared with.
 DRAWS ?= 9
 # How long the paper's network is trained for the table.
-NAF ?= --as-long-as $(RUNS)/run
-RANKS ?= 32,16,8,4,2
-# How the field is trained, where not as usual: "--epochs 24", say; of a run that is finished, remove $(RUNS)/trained.
+NAF ?= --as-long-as $(RUNS)/ears
+RANKS ?= 32,16
+# How the field of directions and that of ears are trained, where not as usual: "--epochs 24", say; of runs that are
+# finished, remove $(RUNS)/trained.
 TRAINING ?=
+EARS ?=
 # How much of the frontier is measured: all ranks with frozen phase, and one of them with responses reused.
 SWEEP ?= --phases-of none --reuse-of factorised-r16
 # Which of the held-out pairs a bundle's own errors are of: by default all.
@@ -34,6 +36,10 @@ UV := $(BIN)/python -m uv pip install --quiet --python $(BIN)/python
 # compile.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 BYTECODE := $(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null || true
+
+# Where the environment forbids bytecode, each of the some hundred processes that tests start would compile the server's
+# and the tests' sources again, half a second to fifteen.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -145,11 +151,12 @@ $(RUNS)/simulated: | $(VENV)/installed-training
 	@touch $@
 
 $(RUNS)/trained: $(RUNS)/simulated
-	$(STEP) train $(TRAIN) train $(RUNS)/data -o $(RUNS)/run $(TRAINING)
+	$(STEP) train $(TRAIN) train $(RUNS)/data -o $(RUNS)/run --field directional $(TRAINING)
+	$(STEP) train-ears $(TRAIN) train $(RUNS)/data -o $(RUNS)/ears --field factorised $(EARS)
 	@touch $@
 
 $(RUNS)/measured: $(RUNS)/trained
-	$(STEP) export $(TRAIN) export $(RUNS)/run -o $(RUNS)/bundle --ranks $(RANKS)
+	$(STEP) export $(TRAIN) export $(RUNS)/run $(RUNS)/ears -o $(RUNS)/bundle --ranks $(RANKS)
 	$(STEP) frontier $(TRAIN) frontier $(RUNS)/bundle $(RUNS)/data -o $(RUNS)/frontier $(SWEEP) --record
 	$(STEP) evaluate $(TRAIN) evaluate $(RUNS)/bundle $(RUNS)/data $(MEASURE) --record \
 		--figure $(RUNS)/errors.png

@@ -39,6 +39,7 @@ MODULES = {
     "numba.core.compiler": "server/kernels/dispatchers.py",
     "numba.core.compiler_lock": "server/kernels/dispatchers.py",
     "numba.core.registry": "server/kernels/dispatchers.py",
+    "numba.core.environment": "server/kernels/compiled.py",
     "numba.core.imputils": "server/kernels/by_reference.py",
     "numba.core.typing.templates": "server/kernels/by_reference.py",
     "numba.core.typing.typeof": "server/kernels/by_reference.py",

@@ -125,16 +125,30 @@ def open_page(context, url: str):
     return page
 
 
-@pytest.fixture
-def page(browser, server):
-    """The page, loaded; fails a test that leaves an error in the console."""
+@contextlib.contextmanager
+def visit(browser, url: str) -> Iterator:
+    """The page, loaded; fails if an error was left in the console."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     complaints: list[str] = []
     context.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
     context.on("weberror", lambda error: complaints.append(str(error.error)))
-    yield open_page(context, server)
+    yield open_page(context, url)
     context.close()
     assert complaints == []
+
+
+@pytest.fixture
+def page(browser, server):
+    """The page, loaded for one test, which fails if it leaves an error in the console."""
+    with visit(browser, server) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def one_page(browser, server):
+    """The page, loaded once for tests that only use its modules."""
+    with visit(browser, server) as page:
+        yield page
 
 
 def start(page) -> None:

@@ -4,7 +4,7 @@ import asyncio
 import dataclasses
 import logging
 from collections.abc import AsyncIterator, Mapping
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from functools import partial
 from importlib.metadata import version
@@ -175,16 +175,20 @@ def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
     """Decode clips, compute responses and render once, so that the first stream does not have to wait for it. Also
     measure how long this host takes for a response of each level."""
     compiler.begin((levels.bundle for levels in host.scenes.values()), cores=usable_cores())
-    compile_rendering()
-    compiler.wait()  # all else is on disk then
-    warm_up(get_args(BlockSize))
+    with ThreadPoolExecutor(1, "nafir-clips") as decoding:
+        playable = decoding.map(playable_clips, host.clips.values())
+        compile_rendering()
+        compiler.wait()  # all else is on disk then
+        warm_up(get_args(BlockSize))
+        for scene, levels in host.scenes.items():
+            host.places[scene] = place_of_field(levels.default)
+        clips_of = dict(zip(host.clips, playable, strict=True))  # before times are measured
     for scene, levels in host.scenes.items():
-        host.places[scene] = place_of_field(levels.default)
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
         offer = host.offers[scene] = Offer(
             tuple(levels[name].level for name in levels.names), calibrate(levels, filters, _CALIBRATION_POSES)
         )
-        clips = playable_clips(host.clips[scene])
+        clips = clips_of[scene]
         hello = Hello(protocol=PROTOCOL, scene=scene)
         (best, *_) = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)
         session = Session(hello, levels, filters, host.clips[scene].load, quality=best, window=100)

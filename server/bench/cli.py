@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from server.bench.report import (
     Judgement,
@@ -116,7 +115,7 @@ def convolver(
         print_json(measured)
     else:
         if measured["peer"] is None:
-            Console().print("pedalboard is not installed: there is nothing to compare with (pip install pedalboard)")
+            typer.echo("pedalboard is not installed: there is nothing to compare with (pip install pedalboard)")
         _print_convolver(measured, judgements)
     return Outcome.judged("convolver", judgements)
 
@@ -224,6 +223,8 @@ def listen(
 
 def _steps_told() -> Callable[[str], None]:
     """A callback that prints a line for each step, for runs whose number of steps is unknown."""
+    from rich.console import Console
+
     console, began_s = Console(stderr=True), time.monotonic()
     return lambda step: console.print(f"{time.monotonic() - began_s:6.0f} s  {step}", highlight=False)
 
@@ -231,6 +232,7 @@ def _steps_told() -> Callable[[str], None]:
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[str], None]]:
     """A progress bar that is redrawn only between measurements, since a thread that redraws would affect them."""
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()

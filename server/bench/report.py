@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 Reached = Literal["stretch", "goal"]
 
@@ -83,6 +81,9 @@ def print_json(measured: dict[str, Any]) -> None:
 
 def print_measures(title: str, measured: dict[str, Any]) -> None:
     """Print a table with one row per measure."""
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table("measure", "value", title=title)
     for name, value in measured.items():
         table.add_row(name.replace("_", " "), show(value))
@@ -91,6 +92,9 @@ def print_measures(title: str, measured: dict[str, Any]) -> None:
 
 def print_rows(title: str, rows: Iterable[dict[str, Any]]) -> None:
     """Print a table with one column per key. All rows have the same keys."""
+    from rich.console import Console
+    from rich.table import Table
+
     rows = list(rows)
     table = Table(*(name.replace("_", " ") for name in rows[0]), title=title)
     for row in rows:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from server.core.command_line import figure_file
 
@@ -24,6 +23,7 @@ def check(
     The exit code is 1 if a law is broken, unless the scene was exported with a reason to accept that. Slow fields are
     checked at fewer poses, for about 15 seconds each.
     """
+    from rich.console import Console
     from rich.progress import track
 
     from server.health.check import check as check_bundle

@@ -9,6 +9,7 @@ unless it is told that it may.
 
 import contextlib
 import gc
+import inspect
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
@@ -70,13 +71,22 @@ def _no_collections() -> Iterator[None]:
 class CompiledFunction(CPUDispatcher):  # type: ignore[misc]
     """A function as Python calls it, compiled on its first call for each combination of types.
 
-    `on_compiled` is called for each function compiled in order to be called by compiled code.
+    `cache` opens where its machine code is stored, when it is first called. `on_compiled` is called for each function
+    compiled in order to be called by compiled code.
     """
 
     def __init__(
-        self, py_func: Callable[..., Any], targetoptions: dict[str, Any], on_compiled: Callable[[], None]
+        self,
+        py_func: Callable[..., Any],
+        targetoptions: dict[str, Any],
+        *,
+        cache: Callable[[], Any],
+        on_compiled: Callable[[], None],
     ) -> None:
+        self._open_cache = cache
+        py_func.__signature__ = inspect.signature(py_func)  # type: ignore[attr-defined]  # numba asks for it twice
         super().__init__(py_func, targetoptions={**targetoptions, "no_cfunc_wrapper": True})
+        del self._cache  # which stores nothing
         self._targetoptions = targetoptions
         self._on_compiled = on_compiled
 
@@ -84,6 +94,10 @@ class CompiledFunction(CPUDispatcher):  # type: ignore[misc]
     def _called(self) -> _CalledFunction:
         """Made only where something is compiled: a start makes a hundred functions, and mostly loads them from disk."""
         return _CalledFunction(self.py_func, self._targetoptions, self._on_compiled)
+
+    @cached_property
+    def _cache(self) -> Any:
+        return self._open_cache()
 
     def compile(self, sig: Any) -> Any:
         with _no_collections():

@@ -57,14 +57,14 @@ def _project(filters: HeadFilters, bins: int, order: int) -> _Floats:
     total = np.zeros((bins, PRODUCTS, harmonics.shape[-1]))
     for start in range(0, len(directions), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        left, right = np.moveaxis(_spectra(filters, directions[part], bins), 1, 0)
+        left, right = np.moveaxis(wave_spectra(filters, directions[part], bins), 1, 0)
         cross = left * np.conj(right)
         products = np.stack([np.abs(left) ** 2, np.abs(right) ** 2, cross.real, cross.imag])
         total += np.einsum("pdf,dk->fpk", products, harmonics[part], optimize=True)
     return total / len(directions)
 
 
-def _spectra(filters: HeadFilters, directions: _Floats, bins: int) -> npt.NDArray[np.complex128]:
+def wave_spectra(filters: HeadFilters, directions: _Floats, bins: int) -> npt.NDArray[np.complex128]:
     """(direction, ear, bin) spectra of waves from these directions: interpolated minimum phase and delay."""
     mesh = filters.triangulation
     weights = np.empty((len(directions), 3))

@@ -173,6 +173,7 @@ class HeadFilters:
             directions=self.directions,
             cepstra=self.cepstra,
             delays_s=self.delays_s,
+            solid_angles=self.solid_angles,
             **self.triangulation._asdict(),
         )
 
@@ -181,7 +182,16 @@ class HeadFilters:
         """Load filters exactly as `save` wrote them."""
         with np.load(path, allow_pickle=False) as file:
             triangulation = Triangulation(*(file[name] for name in Triangulation._fields))
-            return cls(int(file["sample_rate"]), file["directions"], file["cepstra"], file["delays_s"], triangulation)
+            filters = cls(
+                int(file["sample_rate"]), file["directions"], file["cepstra"], file["delays_s"], triangulation
+            )
+            filters.__dict__["solid_angles"] = file["solid_angles"]
+        return filters
+
+    @cached_property
+    def solid_angles(self) -> _Floats:
+        """(d,) share of the sphere that is nearest to each direction."""
+        return solid_angles(self.directions)
 
     @property
     def taps(self) -> int:

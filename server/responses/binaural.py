@@ -18,7 +18,6 @@ from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.geometry import COINCIDENT_M, Pose, Vector3
 from server.acoustics.minimum_phase import folded_cepstrum
 from server.rendering.hrtf import HeadFilters
-from server.rendering.sphere import solid_angles
 from server.rendering.still_paths import StillPaths
 from server.scene.bundle import Bundle
 
@@ -84,6 +83,6 @@ class Binauralization:
 def mean_over_directions(filters: HeadFilters) -> _Float32:
     """Return a minimum-phase filter (tap,) with the mean power of both ears over all directions."""
     power = np.abs(np.exp(np.fft.rfft(filters.cepstra, _N_FFT))) ** 2
-    everywhere = np.einsum("d,def->f", solid_angles(filters.directions), power) / 2
+    everywhere = np.einsum("d,def->f", filters.solid_angles, power) / 2
     cepstrum = folded_cepstrum(0.5 * np.log(everywhere))
     return np.fft.irfft(np.exp(np.fft.rfft(cepstrum, _N_FFT)), _N_FFT)[: filters.taps].astype(np.float32)

@@ -16,7 +16,6 @@ from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.hrtf import HeadFilters, kemar
-from server.rendering.sphere import solid_angles
 from server.rendering.still_paths import StillPaths
 from server.responses.early_reflections import EarlyReflections
 from server.responses.emitter_state import EmitterState
@@ -92,7 +91,7 @@ class FullResponse:
 def diffuse_energy(filters: HeadFilters) -> npt.NDArray[np.float64]:
     """Return the energy per ear (band,) of a unit impulse from all directions, by octave band."""
     spectra = np.abs(np.exp(np.fft.rfft(filters.cepstra, _N_FFT))) ** 2
-    everywhere = np.einsum("d,def->f", solid_angles(filters.directions), spectra) / 2
+    everywhere = np.einsum("d,def->f", filters.solid_angles, spectra) / 2
     frequency = np.maximum(np.fft.rfftfreq(_N_FFT, 1 / filters.sample_rate), 1.0)
     band = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
     # Bins between DC and Nyquist also stand for negative frequencies.

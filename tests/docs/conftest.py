@@ -10,13 +10,18 @@ from pathlib import Path
 
 import pytest
 
+from tests.once_a_run import once
+
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fails with what mkdocs says where a link leads nowhere or a page is in no menu."""
-    folder = tmp_path_factory.mktemp("site")
+    return once("site", build, tmp_path_factory)
+
+
+def build(folder: Path) -> None:
     # Without --quiet, with which --strict counts no warnings.
     built = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder],
@@ -28,7 +33,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         check=False,
     )
     assert built.returncode == 0, built.stdout + built.stderr
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -32,7 +32,7 @@ def package(tmp_path):
     for name, source in MODULES.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(source)
-    for name in ("compiled.py", "dispatchers.py"):
+    for name in ("compiled.py", "dispatchers.py", "lean_numba.py"):
         shutil.copy(KERNELS / name, tmp_path / "server" / "kernels")
     return tmp_path
 
@@ -68,6 +68,38 @@ def test_what_is_kept_runs_without_what_only_compiling_needs(package):
         text=True,
     )
     assert output.stdout.split() == ["20", "1", "False"]
+
+
+def test_what_is_kept_of_numbas_own_functions_is_read_without_their_modules(package):
+    """Code that allocates arrays may raise what `numba.np.arrayobj` raises, which takes long to import."""
+    outer = package / "server" / "outer.py"
+    outer.write_text(
+        "import numpy as np\nfrom server.kernels.compiled import compiled\n\n"
+        "@compiled\ndef outer(x):\n    return np.empty(x).size\n"
+    )
+    check = (
+        "from server.outer import outer; import sys; print(outer(3), sum(outer.stats.cache_hits.values()), "
+        "'numba.np.arrayobj' in sys.modules)\ntry:\n    outer(-1)\nexcept ValueError as exc:\n    print(exc)"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(package)
+    command = [sys.executable, "-c", check]
+    for told in ("3 0 True", "3 1 False"):
+        output = subprocess.run(command, cwd=package, env=environment, check=True, capture_output=True, text=True)
+        assert output.stdout.splitlines() == [told, "negative dimensions not allowed"]
+
+
+def test_numba_is_imported_without_scipy_and_yaml_which_can_be_imported_afterwards(tmp_path):
+    check = (
+        "import server.kernels.compiled, sys; print('scipy' in sys.modules, 'yaml' in sys.modules); "
+        "import scipy, yaml; print(scipy.__name__, yaml.__name__)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(KERNELS.parents[1])}
+    command = [sys.executable, "-c", check]
+    for told in ("False False", "False True"):
+        output = subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True)
+        assert output.stdout.splitlines() == [told, "scipy yaml"]
+        (tmp_path / ".numba_config.yaml").write_text("opt: 3\n")  # numba asks yaml for it
 
 
 def test_what_is_on_disk_for_this_processor_is_known(package):

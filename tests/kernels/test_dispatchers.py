@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from numba.core.caching import NullCache
 from numba.core.errors import NumbaError
 
 from server.kernels.compiled import compiled, compiled_in_place
@@ -83,8 +84,8 @@ def test_the_garbage_collector_rests_while_code_is_compiled_and_then_goes_on():
         return square_root(x)
 
     seen = []
-    function = CompiledFunction(fails, {"nopython": True}, lambda: None)
-    caller = CompiledFunction(calls, {"nopython": True}, lambda: None)
+    function = CompiledFunction(fails, {"nopython": True}, cache=NullCache, on_compiled=lambda: None)
+    caller = CompiledFunction(calls, {"nopython": True}, cache=NullCache, on_compiled=lambda: None)
     square_root._called._on_compiled, told = lambda: seen.append(gc.isenabled()), square_root._called._on_compiled
     try:
         assert caller(np.float32(4)) == 2

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from server.acoustics.geometry import Quaternion, axes_of
 from server.acoustics.spherical_harmonics import even_directions, real_harmonics, rotation
-from server.rendering.ear_products import EarProducts, _spectra
+from server.rendering.ear_products import EarProducts, wave_spectra
 from server.rendering.hrtf import kemar
 
 BINS = 129
@@ -15,7 +15,7 @@ HEAD = kemar(24_000)
 
 def of_waves(directions, powers, orientation=(0.0, 0.0, 0.0, 1.0)):
     """(bin, product) of waves from directions in world axes."""
-    spectra = _spectra(HEAD, np.ascontiguousarray(directions @ axes_of(orientation).T), BINS)
+    spectra = wave_spectra(HEAD, np.ascontiguousarray(directions @ axes_of(orientation).T), BINS)
     left, right = spectra[:, 0], spectra[:, 1]
     cross = left * np.conj(right)
     return np.einsum("pdf,d->fp", np.stack([abs(left) ** 2, abs(right) ** 2, cross.real, cross.imag]), powers)

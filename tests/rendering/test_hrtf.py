@@ -334,7 +334,7 @@ def test_the_prepared_head_is_what_its_measurements_make(rate):
     which way four directions on a circle are cut into two triangles."""
     prepared, made = hrtf_module.kemar(rate), HeadFilters.from_hrtf(Hrtf.read(KEMAR, rate))
     assert prepared.sample_rate == rate
-    for name in ("directions", "cepstra", "delays_s"):
+    for name in ("directions", "cepstra", "delays_s", "solid_angles"):
         np.testing.assert_allclose(getattr(prepared, name), getattr(made, name), rtol=1e-6, atol=1e-6)
     triangles, across, inverses = prepared.triangulation
     corners = np.swapaxes(prepared.directions[triangles], 1, 2)

@@ -8,7 +8,7 @@ import weakref
 
 import pytest
 
-from server.runtime.memory import collect_as_usual, collect_rarely
+from server.runtime.memory import collect_as_usual, collect_rarely, collect_rarely_at_start
 
 CHURN = """
 import sys, threading
@@ -83,6 +83,17 @@ def test_thousands_of_objects_call_for_no_collection_on_a_server(collections):
     collect_as_usual()
     kept += [Ring() for _ in range(5_000)]
     assert len(collections) > 3
+
+
+def test_a_start_makes_a_hundred_thousand_objects_without_a_collection(collections):
+    collect_rarely_at_start()
+    try:
+        kept = [Ring() for _ in range(100_000)]
+        assert collections == []
+    finally:
+        collect_as_usual()
+    kept += [Ring() for _ in range(5_000)]
+    assert collections
 
 
 @pytest.mark.usefixtures("rarely")

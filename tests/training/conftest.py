@@ -16,11 +16,11 @@ from tests.training.held_out import make_held_out  # noqa: F401  a fixture
 from training.bundling import noise
 from training.bundling.export import export
 from training.data.dataset import Dataset
-from training.data.responses import SimulatedResponses
 from training.data.scene_file import SceneFile
 from training.learning.runs import Configuration
 from training.learning.train import train
 from training.models.encoders import FieldShape
+from training.simulation.responses import SimulatedResponses
 from training.simulation.run import simulate
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -21,8 +20,9 @@ from server.scene.bundle import Bundle
 from training.baselines.baselines import PairResponses, TrainingPairs
 from training.data.dataset import TAKES, Dataset
 from training.data.dataset_check import DatasetError
-from training.data.responses import ImportedDataset, SimulatedResponses, open_responses
-from training.simulation.references import References, ReheardReferences
+from training.data.responses import ImportedDataset
+from training.simulation.references import References
+from training.simulation.responses import SimulatedResponses, open_responses
 
 Responses = npt.NDArray[np.floating]
 _Floats = npt.NDArray[np.float64]
@@ -84,7 +84,7 @@ class HeldOut:
 
     def reheard(self, hrtf: Path | None, *, tilt_deg: float = 0.0) -> "HeldOut":
         """The same pairs heard through another head (a SOFA file), or with the head tilted up, down, to the left and to
-        the right in turn. Responses are simulated anew. Their repeats differ in noise only, and not in rays.
+        the right in turn.
 
         Raises EvaluationError for measured responses, which know one head, and HrtfError for a file that is no head.
         """
@@ -97,7 +97,7 @@ class HeldOut:
             heads[self.yaw_indices] = tilted(self.yaws[self.yaw_indices], math.radians(tilt_deg))
         rate = self.sample_rate
         filters = kemar(rate) if hrtf is None else HeadFilters.from_hrtf(Hrtf.read(hrtf, rate))
-        first, second = (ReheardReferences(self.simulated, filters, heads, take) for take in TAKES)
+        first, second = (References(self.simulated, take, filters=filters, heads=heads) for take in TAKES)
         told = [f"through {hrtf.stem}"] if hrtf is not None else []
         told += [f"tilted by {tilt_deg:g} degrees"] if tilt_deg else []
         return replace(
@@ -128,14 +128,14 @@ def tilted(yaws: _Floats, angle_rad: float) -> _Floats:
 
 @contextmanager
 def open_held_out(folder: Path) -> Iterator[HeldOut]:
-    """The held-out pairs of a simulated or measured dataset folder. Responses are read from disk when they are needed.
+    """The held-out pairs of a simulated or measured dataset folder. Responses are drawn, or read from disk, when they
+    are needed.
 
     Raises DatasetError or ResponsesError if the folder holds no dataset, and EvaluationError if no pair is held out.
     """
     responses = open_responses(folder)
     if isinstance(responses, SimulatedResponses):
-        with h5py.File(folder / "pairs.h5", "r") as file:
-            yield _of_simulation(responses.dataset, file)
+        yield _of_simulation(responses.dataset)
     else:
         yield _of_measurement(responses)
 
@@ -148,7 +148,7 @@ def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
         raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
 
 
-def _of_simulation(dataset: Dataset, file: h5py.File) -> HeldOut:
+def _of_simulation(dataset: Dataset) -> HeldOut:
     probes = dataset.probes
     emitter, listener = np.divmod(np.arange(len(probes) ** 2), len(probes))
     held_out = np.flatnonzero(dataset.held_out.ravel())
@@ -159,9 +159,9 @@ def _of_simulation(dataset: Dataset, file: h5py.File) -> HeldOut:
         sample_rate=dataset.sample_rate,
         samples=dataset.samples,
         channels=2,
-        pairs=TrainingPairs(References(dataset, file), listener, emitter, probes, probes, training),
+        pairs=TrainingPairs(References(dataset), listener, emitter, probes, probes, training),
         held_out=held_out,
-        repeats=References(dataset, file, "repeats"),
+        repeats=References(dataset, TAKES[1]),
         delays_s=dataset.onset_s.ravel(),
         yaws=dataset.yaws,
         yaw_indices=np.arange(len(dataset.yaws)),

@@ -10,9 +10,12 @@ from server.health import laws
 from server.health.energies import Windows
 from server.health.findings import DECAY
 from server.scene.manifest import DataReference, Manifest
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.dataset import TAKES
+from training.data.responses import ResponseSet
 from training.models.targets import LEAD_SAMPLES, codec_of
 from training.models.whole_transform import transform_at_once
+from training.simulation.references import References
+from training.simulation.responses import SimulatedResponses
 
 _MOST_ROWS = 192
 _REPEATED_PAIRS = 24
@@ -122,10 +125,11 @@ def _uncertain_from(responses: SimulatedResponses, windows: Windows) -> int | No
     pairs = dataset.pairs(held_out=True)[:_REPEATED_PAIRS]
     codec = codec_of(responses)
     levels = []
-    for take in ("reflected", "repeats"):
-        heard = dataset.read(pairs, take)[:, 0]
+    for take in TAKES:
+        references = References(dataset, take, heads=dataset.yaws[:1])
         energies = []
-        for (emitter, listener), response in zip(pairs, heard, strict=True):
+        for emitter, listener in pairs.tolist():
+            (response,) = references.reflected(emitter, listener)
             later = round(float(dataset.onset_s[emitter, listener]) * dataset.sample_rate) - LEAD_SAMPLES
             energies.append(windows.energies(np.abs(transform_at_once(codec, advance(response, later)))))
         levels.append(laws.window_levels_db(np.array(energies)))

@@ -32,7 +32,7 @@ from training.bundling.graphs import halve_weights, pose_by_pose, to_int8, to_on
 from training.bundling.manifests import Fields, measured_manifest, simulated_manifest
 from training.bundling.noise import choose_noise
 from training.bundling.shaped_graph import ShapedNearestGraph
-from training.data.responses import FILE, ImportedDataset, ResponseSet, SimulatedResponses
+from training.data.responses import FILE, ImportedDataset, ResponseSet
 from training.learning.basis import BasisLearner
 from training.learning.directional import DirectionalLearner
 from training.learning.factorised import FactorisedLearner
@@ -47,6 +47,7 @@ from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
 from training.models.targets import LEAD_SAMPLES, codec_of
+from training.simulation.responses import SimulatedResponses
 
 Precision = Literal["float32", "int8"]
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
@@ -108,9 +109,10 @@ def export(
     progress: Progress | None = None,
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision. The first field is the
-    default. Factorised and directional fields are also written at each lower one of `ranks`, with the least loss. With
-    `exact_tables`, a `naf` is also written with less arithmetic for the same numbers. In place of a run, the folder of
-    measured responses stands for the field that needs no training, `ShapedNearest`, in one precision.
+    default. Levels of directional fields make the tail in octave bands. Factorised and directional fields are also
+    written at each lower one of `ranks`, with the least loss. With `exact_tables`, a `naf` is also written with less
+    arithmetic for the same numbers. In place of a run, the folder of measured responses stands for the field that needs
+    no training, `ShapedNearest`, in one precision.
 
     Fields of a simulated scene leave direct sound and first reflections to the server. Fields of measured responses
     include them, and so does `naf-whole`. If the first field of a simulated scene is factorised or directional, the
@@ -200,7 +202,10 @@ def _contents(exported: Sequence[_Exported], precision: Precision, seed: int) ->
         for title, each in zip(titles, exported, strict=True)
     }
     levels = tuple(
-        QualityLevel(name=title if number else DEFAULT_LEVEL, field=title) for number, title in enumerate(titles)
+        QualityLevel(
+            name=title if number else DEFAULT_LEVEL, field=title, tail="stft" if each.order is None else "bands"
+        )
+        for number, (title, each) in enumerate(zip(titles, exported, strict=True))
     )
     files[ARRAYS_FILE] = _arrays(even_noise(codec.codec, np.random.default_rng([seed, 6])))
     return files, Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))

@@ -21,7 +21,8 @@ from server.scene.manifest import (
     Start,
 )
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
-from training.data.responses import ImportedDataset, ResponsesError, SimulatedResponses
+from training.data.responses import ImportedDataset, ResponsesError
+from training.simulation.responses import SimulatedResponses
 
 _MARGIN_M = 0.1
 _LEVELLED_ROWS = 500

@@ -9,7 +9,9 @@ Draws are compared on the same pairs, a few pairs at a time. A draw that is behi
 is dropped, so most draws need only a part of the pairs.
 """
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -61,12 +63,14 @@ def race(
     compute the scores of the pairs of one round after the other, until they are dropped."""
     running = list(range(len(contestants)))
     scores: list[list[Scores]] = [[] for _ in contestants]
-    for pairs in progress.track(rounds, description="choosing the noise"):
-        for number in running:
-            scores[number].append(contestants[number](pairs))
-        running = _still_running({number: Scores.joined(scores[number]) for number in running})
-        if len(running) == 1:
-            break
+    with ThreadPoolExecutor(os.cpu_count(), "noise") as pool:
+        for pairs in progress.track(rounds, description="choosing the noise"):
+            found = pool.map(lambda number, pairs=pairs: contestants[number](pairs), running)
+            for number, each in zip(running, found, strict=True):
+                scores[number].append(each)
+            running = _still_running({number: Scores.joined(scores[number]) for number in running})
+            if len(running) == 1:
+                break
     return running[0]
 
 

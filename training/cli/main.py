@@ -61,7 +61,7 @@ def simulate(
     processes = workers or os.cpu_count() or 1
     with _progress() as progress:
         dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, simulation=ready)
-    from training.data.responses import SimulatedResponses
+    from training.simulation.responses import SimulatedResponses
 
     _print_findings(SimulatedResponses(dataset))
     trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
@@ -110,9 +110,9 @@ def train(
     """Train a field on a dataset. Run again after an interruption to go on; with torchrun, in several processes."""
     # Targets need many small matrix products, where threads of OpenBLAS wait for each other. Torch has its own threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from training.data.responses import open_responses
     from training.learning.runs import configure, minutes_of
     from training.learning.train import train as train_field
+    from training.simulation.responses import open_responses
 
     lengths = {"--epochs": epochs, "--minutes": minutes, "--as-long-as": as_long_as}
     require_at_most_one({option: value is not None for option, value in lengths.items()})
@@ -151,10 +151,10 @@ def ablate(
     """Train the factorised field once per factor and compare errors on the held-out pairs. Run again to go on."""
     from dataclasses import asdict
 
-    from training.data.responses import open_responses
     from training.evaluation.ablation import ablate as ablate_factors
     from training.evaluation.ablation import table, variants
     from training.learning.runs import configure
+    from training.simulation.responses import open_responses
 
     responses = open_responses(data)
     configurations = variants(configure("factorised", rank=rank, epochs=epochs, seed=seed), responses, teacher)
@@ -195,8 +195,9 @@ def export(
     """Write finished runs as the fields of a scene bundle. Every graph is checked against torch, and by nafir check."""
     from training.bundling.export import PRECISIONS
     from training.bundling.export import export as export_bundle
-    from training.data.responses import FILE, open_responses
+    from training.data.responses import FILE
     from training.learning.runs import dataset_folder
+    from training.simulation.responses import open_responses
 
     chosen = [known for name in precision.split(",") for known in PRECISIONS if known == name.strip()]
     if len(chosen) != len(precision.split(",")):
@@ -254,7 +255,7 @@ def _law_and_reason(entry: str) -> tuple[str, str]:
 def _print_findings(responses: "ResponseSet") -> None:
     """Prints what training may want to know about a dataset."""
     from training.bundling.data_reference import health_of
-    from training.data.responses import SimulatedResponses
+    from training.simulation.responses import SimulatedResponses
 
     rays = responses.dataset.effects.rays if isinstance(responses, SimulatedResponses) else None
     for line in health_of(responses).lines(rays):

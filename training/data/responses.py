@@ -1,4 +1,5 @@
-"""Impulse responses with their poses: one interface to simulated and measured ones.
+"""Impulse responses with their poses: one interface to simulated ones (`training.simulation.responses`) and measured
+ones.
 
 A row is one response with its pose in metres and radians; yaw is counter-clockwise, 0 along +x. `ImportedDataset` is
 the folder that importers write. Its `responses.h5` has one row per measured response: float32, whole, with the direct
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.core.errors import NafirError
-from training.data.dataset import SPEED_OF_SOUND, Dataset
+from training.data.dataset import SPEED_OF_SOUND
 from training.data.dataset_check import DatasetError
 from training.data.importers.report import ImportReport
 
@@ -94,47 +95,6 @@ class ResponseSet(Protocol):
     def read(self, rows: npt.ArrayLike) -> _Responses:
         """(n, channel, sample)"""
         ...
-
-
-class SimulatedResponses:
-    """The rows of a simulated dataset, ordered by emitter, listener and yaw. They hold late reverberation only."""
-
-    channels = 2
-
-    def __init__(self, dataset: Dataset) -> None:
-        self.dataset = dataset
-        probes = len(dataset.probes)
-        self._pairs = np.argwhere(~np.eye(probes, dtype=bool))
-        yaws = len(dataset.yaws)
-        emitter, listener = np.repeat(self._pairs, yaws, axis=0).T
-        self.emitter, self.listener = dataset.probes[emitter], dataset.probes[listener]
-        self.yaw = np.tile(dataset.yaws, len(self._pairs))
-        self.pair = np.repeat(np.arange(len(self._pairs)), yaws)
-        self.held_out = dataset.held_out[emitter, listener]
-        self.onset_s = dataset.onset_s[emitter, listener]
-
-    @property
-    def sample_rate(self) -> int:
-        return self.dataset.sample_rate
-
-    @property
-    def samples(self) -> int:
-        return self.dataset.samples
-
-    @property
-    def file(self) -> Path:
-        return self.dataset.folder / "pairs.h5"
-
-    def ends(self, row: int) -> tuple[int, int]:
-        """Probe numbers of the emitter and the listener of a row."""
-        emitter, listener = self._pairs[self.pair[row]]
-        return int(emitter), int(listener)
-
-    def read(self, rows: npt.ArrayLike) -> _Responses:
-        rows = np.asarray(rows, dtype=np.int64)
-        pairs, which = np.unique(self.pair[rows], return_inverse=True)
-        of_pairs = self.dataset.read(self._pairs[pairs])
-        return _require_finite_samples(of_pairs[which, rows % len(self.dataset.yaws)], self.file)
 
 
 @dataclass(frozen=True)
@@ -321,16 +281,6 @@ def _write_rows(
             source=source,
             report=json.dumps(report.to_json()),
         )
-
-
-def open_responses(folder: Path) -> SimulatedResponses | ImportedDataset:
-    """Opens a simulated dataset or a folder of imported responses.
-
-    Raises DatasetError or ResponsesError if the folder holds neither, or a damaged one.
-    """
-    if (folder / "pairs.h5").exists():
-        return SimulatedResponses(Dataset.open(folder))
-    return ImportedDataset.open(folder)
 
 
 def choose_held_out(emitter: _Floats, listener: _Floats, share: float, seed: int) -> _Booleans:

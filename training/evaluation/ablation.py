@@ -14,12 +14,13 @@ import torch
 from rich.progress import Progress
 
 from server.core.errors import NafirError
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
 from training.learning.factorised import FactorisedLearner
 from training.learning.runs import Configuration, FactorisedRecipe
 from training.learning.train import load_learner, train
 from training.models.factorised import ExportedField
 from training.models.targets import align, delay_samples
+from training.simulation.responses import SimulatedResponses
 
 _MOST_ROWS = 600
 _BATCH = 32

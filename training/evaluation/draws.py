@@ -33,7 +33,7 @@ from training.simulation.pairs import PairSimulation
 from training.simulation.references import GeometricSound
 
 _FOLDER = "draws"
-_FORMAT = 2
+_FORMAT = 3
 """This number must change whenever simulations, or the parameters measured in them, change."""
 _WORKERS = 2
 # With 20,000 rays, the reverberation time of a small room has an error of 0.9 %, the same for all pairs.
@@ -118,8 +118,8 @@ class _Draws:
         number, take = divmod(draw, len(TAKES))
         simulation = self._simulations[number]
         measured = []
-        for listener, _, own in simulation.own(emitter, np.array(self._listeners(emitter)), take):
-            response = self._geometric.complete(emitter, listener, simulation.whole(take, own))
+        for listener, _, late in simulation.take(emitter, np.array(self._listeners(emitter)), take):
+            response = self._geometric.complete(emitter, listener, late)
             measured.append(vars(measure(response, self._dataset.sample_rate, decay_db=self._decay_db)))
         path = self._file(draw, emitter)
         partial = path.with_suffix(f".{os.getpid()}.partial")  # another process may write the same file

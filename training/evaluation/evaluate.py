@@ -4,6 +4,7 @@ Axes: the responses of one held-out pair are `(yaw, channel, sample)`. Errors ar
 for each `(pair, yaw)`.
 """
 
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -208,7 +209,7 @@ def evaluate(
     truth: Sequence[RoomParameters] = (),
     draws: int = 1,
     decay_db: float = 30.0,
-    threads: int = 2,
+    threads: int | None = None,
     stored: StoredErrors | None = None,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
@@ -219,14 +220,14 @@ def evaluate(
 
     of: the number of held-out pairs from which these were drawn. truth: reference parameters by pair, which are medians
     over `draws` simulations; by default, those of the reference response. Spectra are always compared with the
-    reference response. Sources are called from several `threads` for errors, and one at a time for timing. Pairs in
-    `stored` are not measured again. `track` may wrap the loop over pairs in a progress bar.
+    reference response. Sources are called from several `threads` (one per core) for errors, and one at a time for
+    timing. Pairs in `stored` are not measured again. `track` may wrap the loop over pairs in a progress bar.
     """
     names = [column.name for column in columns]
     if len(set(names)) < len(names):
         raise EvaluationError(f"two columns have the same name among {', '.join(names)}")
     measurement = _PairErrors(held_out, columns, truth, decay_db, stored)
-    pool = ThreadPoolExecutor(threads)
+    pool = ThreadPoolExecutor(threads or os.cpu_count())
     try:
         pairs = range(len(held_out))
         by_pair = [errors for _, errors in zip(track(pairs), pool.map(measurement.of_pair, pairs), strict=True)]

@@ -17,7 +17,7 @@ import torch
 from server.acoustics.codec import Codec
 from server.acoustics.phase import FrozenNoise, correlated_noise, separate
 from training.baselines.held_out import EvaluationError, HeldOut, Responses
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
 from training.evaluation.evaluate import Column
 from training.learning.factorised import FactorisedLearner
 from training.learning.naf import NafLearner
@@ -27,6 +27,7 @@ from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
 from training.models.targets import LEAD_SAMPLES, align
+from training.simulation.responses import SimulatedResponses
 
 Outputs = tuple[npt.NDArray[np.float32], ...]
 _BYTES_PER_PARAMETER = 4

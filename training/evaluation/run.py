@@ -8,7 +8,6 @@ import numpy as np
 from server.scene.bundle import Bundle
 from training.baselines.coded import Track
 from training.baselines.held_out import EvaluationError, HeldOut, open_held_out
-from training.data.responses import open_responses
 from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import Column, Evaluation, Kind, evaluate
 from training.evaluation.fields import field_columns
@@ -16,6 +15,7 @@ from training.evaluation.figure import draw_figure
 from training.evaluation.methods import DEFAULT_METHODS, floor_columns, method_columns, simulation_column
 from training.evaluation.published import PublishedTable, published_table
 from training.evaluation.stored_errors import StoredErrors, signature
+from training.simulation.responses import open_responses
 
 
 def evaluate_bundles(

@@ -6,10 +6,8 @@ Axes: entries are (pair, yaw); responses (yaw, ear, sample).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Self
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -19,7 +17,7 @@ from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_l
 from server.acoustics.room_parameters import RoomParameters, measure
 from server.field.field import AcousticField
 from server.responses.full_response import FullResponse
-from training.data.dataset import Dataset, StoredResponses
+from training.data.dataset import TAKES, Dataset
 from training.simulation.references import References
 
 _STEP_M = 0.05
@@ -142,24 +140,22 @@ class SampledPairs:
         all_pairs = dataset.pairs(held_out=held_out)
         chosen = all_pairs[np.sort(rng.choice(len(all_pairs), min(pairs, len(all_pairs)), replace=False))]
         yaw_indices = np.unique(np.linspace(0, len(dataset.yaws), yaws, endpoint=False).astype(int))
-        with h5py.File(Path(dataset.folder) / "pairs.h5", "r") as file:
-            first, second = References(dataset, file), References(dataset, file, "repeats")
-            reflected = StoredResponses(dataset, file)
-            self.entries = []
-            for emitter, listener in chosen:
-                pair = int(emitter) * len(dataset.probes) + int(listener)
-                ends = dataset.probes[emitter], dataset.probes[listener]
-                reference = first[pair][yaw_indices]
-                entry = Entry(
-                    *ends,
-                    yaws=dataset.yaws[yaw_indices],
-                    visible=bool(dataset.plan.is_visible(*ends)),
-                    reference=reference,
-                    reflected=reflected[emitter, listener][yaw_indices],
-                    repeat=second[pair][yaw_indices] if held_out else None,
-                    parameters=measure(reference, self._sample_rate),
-                )
-                self.entries.append(entry)
+        heads = dataset.yaws[yaw_indices]
+        first, second = (References(dataset, take, heads=heads) for take in TAKES)
+        self.entries = []
+        for emitter, listener in chosen.tolist():
+            ends = dataset.probes[emitter], dataset.probes[listener]
+            reference = first.complete(emitter, listener)
+            entry = Entry(
+                *ends,
+                yaws=heads,
+                visible=bool(dataset.plan.is_visible(*ends)),
+                reference=reference,
+                reflected=first.reflected(emitter, listener),
+                repeat=second.complete(emitter, listener) if held_out else None,
+                parameters=measure(reference, self._sample_rate),
+            )
+            self.entries.append(entry)
 
     @property
     def size(self) -> tuple[int, int]:

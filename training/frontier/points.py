@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +24,9 @@ class Point:
     """A level with its measured `accuracy` and `cost`. `audible` are its mean errors in JND by metric, `by_pair`
     (pair,) their mean for each held-out pair.
 
-    A `bound`, such as the true phase, is a level that no server can offer; it is drawn for comparison only. `missing`
-    is the share of errors that cannot be measured: a level must not win because its hardest responses cannot be
-    measured.
+    `predicts` says what the level's field predicts. A `bound`, such as the true phase, is a level that no server can
+    offer; it is drawn for comparison only. `missing` is the share of errors that cannot be measured: a level must not
+    win because its hardest responses cannot be measured.
     """
 
     level: QualityLevel
@@ -33,6 +34,7 @@ class Point:
     by_pair: _Floats
     missing: float = 0.0
     bound: bool = False
+    predicts: Literal["ears", "directions"] = "ears"
 
     @property
     def accuracy(self) -> Accuracy:
@@ -57,11 +59,15 @@ def pareto(points: Sequence[Point], *, missing: float = 0.0) -> list[Point]:
     pairs, so that chance does not decide.
     """
     best: list[Point] = []
-    eligible = [point for point in points if not point.bound and point.missing <= missing + _MISSING_ALLOWANCE]
-    for point in sorted(eligible, key=lambda point: point.cost.ms_mean):
+    for point in sorted(eligible(points, missing=missing), key=lambda point: point.cost.ms_mean):
         if not best or _is_better(point.by_pair, best[-1].by_pair):
             best.append(point)
     return best
+
+
+def eligible(points: Sequence[Point], *, missing: float) -> list[Point]:
+    """The points that a server can offer and that have hardly more missing than `missing`."""
+    return [point for point in points if not point.bound and point.missing <= missing + _MISSING_ALLOWANCE]
 
 
 def _is_better(ours: _Floats, theirs: _Floats) -> bool:
@@ -88,9 +94,20 @@ def default_point(best: Sequence[Point], *, ms: float) -> Point:
     )
 
 
-def offered_points(best: Sequence[Point], default: Point) -> list[Point]:
+def default_among(points: Sequence[Point], *, ms: float) -> Point:
+    """The default level of a bundle with all these points. Where a field predicts directions it is one of these,
+    because they are heard through any head that is turned in any way."""
+    directional = [point for point in points if point.predicts == "directions"]
+    return default_point(pareto(directional or points), ms=ms)
+
+
+def offered_points(points: Sequence[Point], best: Sequence[Point], default: Point, *, ms: float) -> list[Point]:
     """A few of the Pareto-optimal points, the default first. From it on down and up, each is the most accurate of those
-    that cost a third of the one before or less, or three times as much or more."""
+    that cost a third of the one before or less, or three times as much or more.
+
+    If no such point is of a field of ears, or of directions, and there are `points` of one, what would be the default
+    among these with this `ms` follows: both ways to predict a response can be heard side by side.
+    """
     offered = [default]
     for point in reversed(best):
         if point.cost.ms_mean * LEAST_COST_RATIO <= offered[-1].cost.ms_mean:
@@ -100,4 +117,6 @@ def offered_points(best: Sequence[Point], default: Point) -> list[Point]:
         if point.cost.ms_mean >= LEAST_COST_RATIO * dearest.cost.ms_mean:
             dearest = point
             offered.append(point)
-    return offered
+    others = sorted({point.predicts for point in points} - {point.predicts for point in offered})
+    of_others = [pareto([point for point in points if point.predicts == kind]) for kind in others]
+    return [*offered, *(default_point(of_kind, ms=ms) for of_kind in of_others)]

@@ -1,13 +1,15 @@
 """The sweep: measures every candidate level, and writes the Pareto-optimal ones into the bundle.
 
-Errors are measured level by level and stored in a file, so that an interrupted sweep can be resumed. Times are measured
-at the end, for all levels in one run.
+Errors are measured level by level, several at a time, and stored in a file, so that an interrupted sweep can be
+resumed. Times are measured at the end, for all levels in one run.
 """
 
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,7 @@ from training.data.dataset import Dataset
 from training.frontier.accuracy import Errors, Estimate, SampledPairs
 from training.frontier.bound import TruePhase
 from training.frontier.cost import SEGMENT_S, cost_of, measure, memory_mb, one_core
-from training.frontier.points import Point, default_point, offered_points, pareto
+from training.frontier.points import Point, default_among, eligible, offered_points, pareto
 from training.frontier.steps import largest_steps
 
 _FORMAT = 4
@@ -36,7 +38,7 @@ _STEPS = 60
 
 @dataclass(frozen=True)
 class Frontier:
-    """All measured points, the Pareto-optimal ones (quickest first), the default among them, and the floor."""
+    """All measured points, the Pareto-optimal ones (quickest first), the default, and the floor."""
 
     scene: str
     pairs: int
@@ -46,11 +48,8 @@ class Frontier:
     default: Point
     floor: Errors
     block_ms: float
-
-    @property
-    def offered(self) -> tuple[Point, ...]:
-        """The points that a bundle should offer as quality levels, the default first."""
-        return tuple(offered_points(self.best, self.default))
+    offered: tuple[Point, ...]
+    """The points that a bundle should offer as quality levels, the default first."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for `json.dumps`."""
@@ -85,7 +84,7 @@ class Frontier:
 class Effort:
     """How much is measured: held-out `pairs` at `yaws` orientations each, and a walk of `walk_s`, of which a level that
     computes every response anew uses `budget_s`. The default level is the quickest that is about as accurate as the
-    most accurate, among those whose response takes at most `default_ms`."""
+    most accurate, among those whose response takes at most `default_ms`; a level of directions if there is one."""
 
     pairs: int = 40
     yaws: int = 3
@@ -122,18 +121,22 @@ def sweep(
     points = []
     for level in levels:
         cost = cost_of(trial, level, times[level.name], memory[first_of_field[level.field]])
-        points.append(_point(level, cost, errors[level.name], floor, sample))
+        predicts = trial.manifest.fields[level.field].predicts
+        points.append(dataclasses.replace(_point(level, cost, errors[level.name], floor, sample), predicts=predicts))
     points.append(_true_phase(trial, points[0], sample, floor))
     best = pareto(points, missing=floor.missing)
+    measurable = eligible(points, missing=floor.missing)
+    default = default_among(measurable, ms=effort.default_ms)
     codec = trial.manifest.codec
     return Frontier(
         bundle.id,
         *sample.size,
         tuple(points),
         tuple(best),
-        default_point(best, ms=effort.default_ms),
+        default,
         floor,
         block_ms=256 / codec.sample_rate * 1000,
+        offered=tuple(offered_points(measurable, best, default, ms=effort.default_ms)),
     )
 
 
@@ -187,17 +190,23 @@ def _accuracies(
     """Errors by level. Those that `path` has for the same graph, noise and sample are not measured again."""
     kept: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     task = progress.add_task("accuracy", total=len(levels))
-    errors = {}
-    for level in levels:
-        progress.update(task, description=f"accuracy  {level.name}")
-        key = _key(trial, level, effort)
-        if key not in kept:
-            kept[key] = asdict(_errors(AcousticField.load(trial, level=level.name), sample, effort.seed))
-            kept[key]["by_pair"] = kept[key]["by_pair"].tolist()
+    keys = {level.name: _key(trial, level, effort) for level in levels}
+    missing = [name for name, key in keys.items() if key not in kept]
+    progress.advance(task, len(levels) - len(missing))
+
+    def measured(name: str) -> dict[str, Any]:
+        found = asdict(_errors(AcousticField.load(trial, level=name), sample, effort.seed))
+        return {**found, "by_pair": found["by_pair"].tolist()}
+
+    pool = ThreadPoolExecutor(os.cpu_count(), "accuracy")
+    try:
+        for name, found in zip(missing, pool.map(measured, missing), strict=True):
+            kept[keys[name]] = found
             path.write_text(json.dumps(kept))
-        errors[level.name] = Errors(**{**kept[key], "by_pair": np.array(kept[key]["by_pair"])})
-        progress.advance(task)
-    return errors
+            progress.update(task, advance=1, description=f"accuracy  {name}")
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return {name: Errors(**{**kept[key], "by_pair": np.array(kept[key]["by_pair"])}) for name, key in keys.items()}
 
 
 def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:

@@ -9,7 +9,7 @@ from rich.progress import Progress
 from torch import Tensor
 
 from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
 from training.learning.basis import TARGETS, BasisLearner
 from training.learning.energies import BandEnergyError
 from training.learning.learner import Losses, Rows
@@ -22,6 +22,7 @@ from training.models.level_correction import InterpolatedBands
 from training.models.site import Reach, Site
 from training.models.stored_targets import load_directional_targets
 from training.models.targets import codec_of
+from training.simulation.responses import SimulatedResponses
 
 # In nepers, and in shares of the power: about what no field can predict from the places alone.
 _SPREADS = {LOG_MAGNITUDE: 0.35, DIRECTIONS: 0.5}

@@ -8,7 +8,7 @@ import torch
 from rich.progress import Progress
 from torch import Tensor
 
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
 from training.learning.basis import TARGETS, BasisLearner
 from training.learning.distillation import DistillationTargets, distillation_targets
 from training.learning.energies import RAYLEIGH_DEFICIT, EnergyError
@@ -22,6 +22,7 @@ from training.models.level_correction import InterpolatedLevels
 from training.models.site import Reach, Site
 from training.models.stored_targets import Targets, load_targets
 from training.models.targets import codec_of
+from training.simulation.responses import SimulatedResponses
 
 # Errors are measured in units of how far targets scatter about the best possible prediction: in ln magnitude for one
 # noisy bin and for a pooled cell, and in unit phasors. The losses of all heads then have the same floor.

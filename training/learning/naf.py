@@ -9,14 +9,16 @@ from rich.progress import Progress
 from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
+from training.learning.basis import TARGETS
 from training.learning.learner import Losses, Rows
 from training.learning.runs import Configuration, NafRecipe, RecipeError
 from training.learning.schedule import decay_to_a_tenth
 from training.models.naf import Naf, NafShape
 from training.models.site import Site
+from training.models.stored_targets import Targets, load_aligned
 from training.models.targets import align, codec_of, delay_samples
-from training.simulation.references import WholeResponses
+from training.simulation.responses import SimulatedResponses
 
 N_FFT = 512
 _GRID_DECAY = 1e-2
@@ -28,7 +30,8 @@ _ENVELOPE_SAMPLES = 65
 
 
 class NafLearner:
-    """Computes targets as they are needed, which takes milliseconds; a step takes seconds."""
+    """Computes targets as they are needed, from responses that are drawn once, or measured. That takes milliseconds; a
+    step takes seconds."""
 
     def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
         shape, recipe = configuration.shape, configuration.recipe
@@ -41,13 +44,16 @@ class NafLearner:
         sizes = (self.codec.bins, self.codec.frames) if shape.domain == "spectrogram" else (responses.samples,)
         self.field = Naf(self.site, sizes, responses.channels, shape)
         self._trainable = np.flatnonzero(~responses.held_out)
+        self._drawn: Targets | None = None
 
     def prepare(self, progress: Progress) -> None:
-        """Do nothing: there are no stored targets."""
+        """Draw the responses of a simulation; measured ones are read as they are needed."""
+        if isinstance(self.responses, SimulatedResponses):
+            self._drawn = load_aligned(self.responses, self.responses.file.parent / TARGETS, progress)
 
     @property
     def prepared_s(self) -> float:
-        return 0.0
+        return 0.0 if self._drawn is None else self._drawn.seconds
 
     @torch.no_grad()
     def initialise(self, rows: Rows, seed: int) -> None:
@@ -138,7 +144,10 @@ class NafLearner:
 
     def _aligned(self, row: int) -> npt.NDArray[np.float64]:
         """Return the response of a row (ear, sample), shifted so that its sound arrives at the beginning."""
-        return align(self.responses.read([row])[0], delay_samples(self.responses, row))
+        if self._drawn is None:
+            return align(self.responses.read([row])[0], delay_samples(self.responses, row))
+        flat = self._drawn.flat[np.searchsorted(self._trainable, row)]
+        return np.asarray(flat.reshape(self.responses.channels, -1), np.float64)
 
     def _values(self, aligned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the values that the network learns, for an aligned response: (ear, *axes, outputs)."""
@@ -155,9 +164,9 @@ class NafLearner:
         return max(1, int(np.sum(self.codec.frame_times_s * self.responses.sample_rate < left)))
 
 
-def _whole(responses: ResponseSet) -> WholeResponses:
+def _whole(responses: ResponseSet) -> SimulatedResponses:
     """The responses with direct sound and first reflections. Raises RecipeError for measured responses, which have them
     already."""
     if not isinstance(responses, SimulatedResponses):
         raise RecipeError("field: measured responses are whole as they are; train naf in place of naf-whole")
-    return WholeResponses(responses.dataset)
+    return SimulatedResponses(responses.dataset, whole=True)

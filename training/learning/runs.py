@@ -12,12 +12,15 @@ import numpy as np
 import torch
 
 from server.core.errors import NafirError
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
 from training.models.encoders import FieldShape
 from training.models.naf import NafShape
+from training.simulation.responses import SimulatedResponses
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "log.csv"
+GRID_FEATURES = 64
+"""Learned features of a place, of a directional field: with half of them, levels and clarity are less accurate."""
 _FIELD_NAMES = {"lessons": "distilled_poses"}
 """Fields of a recipe that have another name in `run.json`."""
 
@@ -113,7 +116,9 @@ class Configuration:
     ) -> "Configuration":
         """An epoch visits each pair once and not at every yaw, so there are more of them."""
         settings = {"epochs": 100, "batch": 32, **changes}
-        return cls(shape=shape or FieldShape(), recipe=recipe or DirectionalRecipe(), **settings)
+        return cls(
+            shape=shape or FieldShape(grid_features=GRID_FEATURES), recipe=recipe or DirectionalRecipe(), **settings
+        )
 
     @property
     def kind(self) -> Literal["factorised", "directional", "naf"]:
@@ -191,6 +196,8 @@ def configure(
         if points is not None:
             raise RunError(f"points: a {field} field is trained on whole responses; leave it out")
         chosen = {"rank": rank, "width": width}
+        if field == "directional":
+            chosen["grid_features"] = GRID_FEATURES
         shape = FieldShape(**{option: value for option, value in chosen.items() if value is not None})
         if field == "directional":
             recipe = DirectionalRecipe() if order is None else DirectionalRecipe(order=order)

@@ -37,8 +37,7 @@ class DirectionalTargets:
         self._pool = cells.all_frames.pool()
 
     def of_pair(self, emitter: int, listener: int) -> npt.NDArray[np.float16]:
-        """(size of the heads,) flat target, aligned like those of ears. Raises DatasetError if the dataset has no
-        energies."""
+        """(size of the heads,) flat target, aligned like those of ears."""
         advance = self._dataset.onset_s[emitter, listener] * self._dataset.sample_rate - LEAD_SAMPLES
         arrivals = self._spectrograms.arrivals(emitter, listener, self._pool, advance)
         power, *others = harmonic_powers(*arrivals)

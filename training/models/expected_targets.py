@@ -45,7 +45,7 @@ class ExpectedTargets:
         self._bands = cells.bands.pool().T
 
     def of_pair(self, emitter: int, listener: int) -> npt.NDArray[np.float16]:
-        """(yaw, heads.size) flat targets. Raises DatasetError if the dataset has no energies."""
+        """(yaw, heads.size) flat targets."""
         cells, fine = self._cells, self._cells.fine_frames
         advance = self._dataset.onset_s[emitter, listener] * self._dataset.sample_rate - LEAD_SAMPLES
         diffuse = self._spectrograms.diffuse_products(emitter, listener, self._pool, advance)

@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import FloorPlan
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
+from training.simulation.responses import SimulatedResponses
 
 _MARGIN_M = 0.5
 _MOVES_M = 0.01

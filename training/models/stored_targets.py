@@ -1,12 +1,15 @@
-"""Computes the targets of all responses that may be trained on, once, and stores them in a file.
+"""Computes the targets of all responses that may be trained on, once, and stores them in a file. Pairs are computed in
+threads.
 
 HDF5 lets one process at a time write the file. The rows lie in one piece, and are then read through a memory map.
 """
 
 import hashlib
 import json
+import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,14 +20,17 @@ import numpy.typing as npt
 from rich.progress import Progress
 
 from training.data.dataset_check import DatasetError
-from training.data.responses import ResponseSet, SimulatedResponses
+from training.data.responses import ResponseSet
 from training.models.cells import Cells
 from training.models.directional_targets import DirectionalTargets
 from training.models.expected_targets import ExpectedTargets
 from training.models.targets import align, delay_samples, flat_targets
+from training.simulation.half_precision import to_half
+from training.simulation.responses import SimulatedResponses
 
 _FORMAT = 1
 _FLUSH_S = 10.0
+_PAIRS_AT_A_TIME = 64
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,7 @@ def load_targets(
     the responses have been rewritten.
 
     With `expected`, for simulated responses only, targets are expected values over all draws of a response's noise.
-    Raises DatasetError if the dataset has no energies, if another process is computing the same, or if the file is
+    Raises DatasetError if another process is computing the same, or if the file is
     damaged.
     """
     choice = {"format": _FORMAT, "cells": asdict(cells), "expected": expected}
@@ -71,6 +77,14 @@ def load_directional_targets(responses: ResponseSet, cells: Cells, folder: Path,
     first = rows[np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))]
     choice = {"format": _FORMAT, "cells": asdict(cells), "predicts": "directions"}
     return _load(responses, first, choice, lambda: _Directional(_simulated(responses), cells), folder, progress)
+
+
+def load_aligned(responses: ResponseSet, folder: Path, progress: Progress) -> Targets:
+    """The aligned responses that are not held out, one after the other (channel, sample), for fields that learn other
+    points of them in every step. They are stored and raise errors like targets."""
+    whole = isinstance(responses, SimulatedResponses) and responses.whole
+    choice = {"format": _FORMAT, "aligned": True, "whole": whole}
+    return _load(responses, np.flatnonzero(~responses.held_out), choice, lambda: _Aligned(responses), folder, progress)
 
 
 def _load(
@@ -119,19 +133,27 @@ def _complete(
     targets = computation()
     task = progress.add_task("targets", total=len(starts), completed=done)
     flushed_s = time.monotonic()
-    for number in range(done, len(starts)):
-        stop = starts[number + 1] if number + 1 < len(starts) else len(rows)
-        of_pair = targets.of_rows(rows[starts[number] : stop])
-        if "flat" not in file:
-            file.create_dataset("flat", (len(rows), of_pair.shape[-1]), np.float16)
-        file["flat"][starts[number] : stop] = of_pair
-        progress.advance(task)
-        if time.monotonic() - flushed_s > _FLUSH_S or number + 1 == len(starts):
-            file.flush()
-            now_s = time.monotonic()
-            file.attrs["pairs"] = number + 1
-            file.attrs["seconds"] += now_s - flushed_s
-            flushed_s = now_s
+    bounds = np.append(starts, len(rows))
+    workers = os.cpu_count() or 1
+
+    def of_pair(number: int) -> npt.NDArray[np.float16]:
+        return targets.of_rows(rows[bounds[number] : bounds[number + 1]])
+
+    # Pairs come in the order of emitters, whose images are found once for all of them: threads take pairs in order.
+    with ThreadPoolExecutor(workers, "targets") as pool:
+        for first in range(done, len(starts), _PAIRS_AT_A_TIME):
+            numbers = range(first, min(first + _PAIRS_AT_A_TIME, len(starts)))
+            for number, flat in zip(numbers, pool.map(of_pair, numbers), strict=True):
+                if "flat" not in file:
+                    file.create_dataset("flat", (len(rows), flat.shape[-1]), np.float16)
+                file["flat"][bounds[number] : bounds[number + 1]] = flat
+                progress.advance(task)
+            if time.monotonic() - flushed_s > _FLUSH_S or numbers.stop == len(starts):
+                file.flush()
+                now_s = time.monotonic()
+                file.attrs["pairs"] = numbers.stop
+                file.attrs["seconds"] += now_s - flushed_s
+                flushed_s = now_s
 
 
 def _simulated(responses: ResponseSet) -> SimulatedResponses:
@@ -148,6 +170,16 @@ class _Drawn:
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
         responses = self.responses
         return flat_targets(align(responses.read(rows), delay_samples(responses, rows[0])), self.cells)
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    responses: ResponseSet
+
+    def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
+        responses = self.responses
+        aligned = align(responses.read(rows), delay_samples(responses, rows[0]))
+        return to_half(aligned.astype(np.float32)).reshape(len(rows), -1)
 
 
 class _Expected:

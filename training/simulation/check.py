@@ -35,8 +35,8 @@ _YAWS_HEARD = 4
 class PlanCheck:
     """The result of a check. `errors` compares the plan with every effect on; `floor` compares every effect on with a
     second random draw. Both are means by metric, in its unit. Plan and reference use the same random numbers until the
-    plan's shared tail sets in. Until then, errors are caused by what the plan leaves out; later, the random numbers
-    differ too. `everything_s` and `plan_s` are seconds of one core for the emitters that were simulated. `once_s` is
+    plan's shared tail sets in. Until then, errors are caused by what the plan leaves out; later, the rays differ too.
+    `everything_s` and `plan_s` are seconds of one core for the emitters that were simulated. `once_s` is
     the time of the plan's preparations, which are done once for all `probes` of a whole simulation."""
 
     scene: str
@@ -77,8 +77,6 @@ def check_plan(
     for name, (of, drawn) in settings.items():  # the plan comes last, because the first simulation also loads code
         began = process_time()
         simulations[name] = PairSimulation.prepare(scene, probes, yaws, seed=drawn, plan=of)
-        for _ in simulations[name].own(0, np.array([1]), 0):  # computes everything that all emitters share
-            pass
         once_s = process_time() - began
     seconds = dict.fromkeys(simulations, 0.0)
     measured: dict[str, list[RoomParameters]] = {name: [] for name in simulations}
@@ -89,12 +87,15 @@ def check_plan(
         repeated = listeners[:: round(1 / scene.simulation.held_out_share)]
         for name, simulation in simulations.items():
             began = process_time()
-            own = [response for _, _, response in simulation.own(emitter, listeners, 0)]
-            for _ in simulation.own(emitter, repeated, 1):
-                pass
+            energies = simulation.energies(emitter, listeners, 0)
+            simulation.energies(emitter, repeated, 1)
             seconds[name] += process_time() - began
-            whole = np.stack([simulation.whole(0, each)[:: max(1, len(yaws) // _YAWS_HEARD)] for each in own]) + known
-            measured[name].append(measure(whole, scene.simulation.sample_rate))
+            late_sound = simulation.late_sound.turned(_compared(yaws))
+            late = [
+                late_sound.response(emitter, int(listener), 0, simulation.joined(own, 0))
+                for listener, own in zip(listeners, energies, strict=True)
+            ]
+            measured[name].append(measure(np.stack(late) + known, scene.simulation.sample_rate))
     return PlanCheck(
         scene=scene.id,
         emitters=len(measured["plan"]),
@@ -114,10 +115,9 @@ class GeometricResponses:
 
     def __init__(self, scene: SceneFile, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
         settings = scene.simulation
-        compared = yaws[:: max(1, len(yaws) // _YAWS_HEARD)]
         samples = round(settings.duration_s * settings.sample_rate)
         directions = sphere_directions(settings.arrival_directions)
-        self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, compared, samples)
+        self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, _compared(yaws), samples)
         self._probes = probes
         self._direct = DirectPaths.of(scene, plan)
         self._tracer = RoomTracer.of(scene, plan, probes, image_order=GEOMETRIC_ORDER)
@@ -137,6 +137,11 @@ class GeometricResponses:
                 for listener in listeners
             ]
         )
+
+
+def _compared(yaws: _Floats) -> _Floats:
+    """The yaws at which responses are compared."""
+    return yaws[:: max(1, len(yaws) // _YAWS_HEARD)]
 
 
 def _mean_errors(reference: list[RoomParameters], estimate: list[RoomParameters]) -> dict[str, float]:

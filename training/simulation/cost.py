@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from time import thread_time
 
 import numpy as np
 
-from training.data.dataset import GEOMETRIC_ORDER
 from training.data.scene_file import SceneFile
 from training.data.simulation_plan import SimulatedEffect, SimulationPlan
 from training.simulation.pairs import PairSimulation
@@ -25,33 +25,27 @@ def predicted_s(simulation: PairSimulation) -> float:
     plan, probes = simulation.plan, len(simulation.probes)
     brief = replace(simulation, plan=replace(plan, rays=min(plan.rays, _RAYS_TRIED)))
     many, few = (np.arange(1, 1 + min(count, probes - 1)) for count in (_LISTENERS_TRACED, _LISTENERS_TRIED))
-    for _ in brief.own(0, few[:1], 0):  # the first pair also computes what all pairs share
-        pass
-    many_traced_s = _seconds(lambda: brief.energies(0, many, np.random.default_rng(0)))
-    few_traced_s = _seconds(lambda: brief.energies(0, few, np.random.default_rng(0)))
-    taking_s = _seconds(lambda: list(brief.own(0, few, 0)))
+    brief.energies(0, few, 0)  # the first run also compiles code
+    many_traced_s, few_traced_s = (_seconds(partial(brief.energies, 0, some, 0)) for some in (many, few))
     # Every listener takes the same time.
     per_listener_s = (many_traced_s - few_traced_s) / max(1, len(many) - len(few))
     tracing_s = many_traced_s + per_listener_s * (probes - 1 - len(many))
-    pairs = probes * (probes - 1) * (1 + simulation.scene.simulation.held_out_share)
     # The second take has only the held-out listeners.
-    traced_s = probes * (tracing_s + few_traced_s) * plan.rays / max(brief.plan.rays, 1)
-    return simulation.prepared_s + traced_s + pairs * max(0.0, taking_s - few_traced_s) / len(few)
+    return simulation.prepared_s + probes * (tracing_s + few_traced_s) * plan.rays / max(brief.plan.rays, 1)
 
 
 def is_brief(scene: SceneFile) -> bool:
     """Whether the short runs that predict the cost of this scene take little time."""
     size = SimulationSize(scene)
     rays = min(1.0, _RAYS_TRIED / scene.simulation.rays)
-    return size.tracing_s * rays + size.images_s + _LISTENERS_TRIED * size.synthesis_s < _LONGEST_TRIAL_S
+    return size.tracing_s * rays < _LONGEST_TRIAL_S
 
 
 def with_costs(simulation: PairSimulation) -> SimulationPlan:
     """The simulation's plan, with the seconds that each effect costs, or saves if it is off."""
     plan, settings = simulation.plan, simulation.scene.simulation
     takes_s = predicted_s(simulation)
-    images = settings.image_order if plan.image_order == GEOMETRIC_ORDER else GEOMETRIC_ORDER
-    changed = {SimulatedEffect.EARLY_REFLECTIONS: replace(simulation, plan=replace(plan, image_order=images))}
+    changed = {}
     tailless = replace(simulation, tail=None, prepared_s=0.0)
     if plan.rays:
         silent = replace(plan, rays=0, tail_start_s=None, tail_rays=0)

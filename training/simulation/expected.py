@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from server.acoustics.codec import Codec
 from server.rendering.hrtf import kemar
-from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND, Dataset
+from training.data.dataset import SPEED_OF_SOUND, Dataset
+from training.simulation.late_sound import MirroredReflections
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
-from training.simulation.tracing import RoomTracer
 
 _Floats = npt.NDArray[np.float64]
 _Singles = npt.NDArray[np.float32]
@@ -37,12 +37,7 @@ class ExpectedSpectrograms:
         self._codec = codec
         directions = sphere_directions(dataset.scene.simulation.arrival_directions)
         self._synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
-        self._images: tuple[int, list[tuple[_Floats, _Floats]]] | None = None
-
-    @cached_property
-    def _tracer(self) -> RoomTracer:
-        dataset = self._dataset
-        return RoomTracer.of(dataset.scene, dataset.effects, dataset.probes, least_order=GEOMETRIC_ORDER + 1)
+        self._mirrored = MirroredReflections(dataset.scene, dataset.effects, dataset.probes)
 
     @cached_property
     def _arrival_products(self) -> _Singles:
@@ -64,18 +59,15 @@ class ExpectedSpectrograms:
         return np.asarray(self._codec.window_energy * window / window.sum(), dtype=np.float32)
 
     def specular(self, emitter: int, listener: int) -> _Singles:
-        """(yaw, ear, sample) the specular part of the stored response, which is the same in every draw."""
-        positions, amplitudes = self._images_at(emitter, listener)
+        """(yaw, ear, sample) the specular part of the late reverberation, which is the same in every draw."""
+        positions, amplitudes = self._mirrored.of_pair(emitter, listener)
         return self._synthesis.specular(positions, amplitudes, self._dataset.probes[listener])
 
     def diffuse_products(self, emitter: int, listener: int, pool: _Singles, advance_samples: float = 0.0) -> _Singles:
-        """(frequency, product, yaw, cell) expected products of the ears' spectra, for the diffuse part of the stored
-        response: squared magnitudes of left and right, then real and imaginary parts of left times conjugate right.
-        Frames are summed to cells with `pool` (frame, cell). An aligned response begins `advance_samples` after the
-        emission.
-
-        Raises DatasetError if the dataset has no energies.
-        """
+        """(frequency, product, yaw, cell) expected products of the ears' spectra, for the diffuse part of the late
+        reverberation: squared magnitudes of left and right, then real and imaginary parts of left times conjugate
+        right. Frames are summed to cells with `pool` (frame, cell). An aligned response begins `advance_samples` after
+        the emission."""
         energy, onset_s, times_s, weights = self._diffuse(emitter, listener, pool, advance_samples)
         return self._synthesis.late_covariance(energy, onset_s, times_s, weights, self._arrival_products)
 
@@ -84,13 +76,10 @@ class ExpectedSpectrograms:
     ) -> tuple[_Floats, _Floats]:
         """What arrives at the listener's place, diffuse and specular, without a head: (arrival, xyz) directions towards
         the sound, in world axes, and (arrival, band, cell) expected squared magnitudes of the codec's transform.
-        `pool` and `advance_samples` are as in `diffuse_products`.
-
-        Raises DatasetError if the dataset has no energies.
-        """
+        `pool` and `advance_samples` are as in `diffuse_products`."""
         codec = self._codec
         diffuse = self._synthesis.late_power(*self._diffuse(emitter, listener, pool, advance_samples))
-        positions, amplitudes = self._images_at(emitter, listener)
+        positions, amplitudes = self._mirrored.of_pair(emitter, listener)
         offset = positions - self._dataset.probes[listener]
         distance_m = np.linalg.norm(offset, axis=-1)
         arrival_samples = distance_m / SPEED_OF_SOUND * codec.sample_rate - advance_samples
@@ -109,10 +98,3 @@ class ExpectedSpectrograms:
         times_s = (self._times_s + advance_samples / self._codec.sample_rate).ravel()
         weights = (pool[:, None, :] * self._window[:, None]).reshape(len(times_s), -1)
         return energy, float(self._dataset.onset_s[emitter, listener]), times_s, weights
-
-    def _images_at(self, emitter: int, listener: int) -> tuple[_Floats, _Floats]:
-        """Positions (image, xyz) of the images of an emitter, and their pressures (image, band) at the listener."""
-        if self._images is None or self._images[0] != emitter:
-            # Images for all listeners take as long as images for one, and pairs come in the order of emitters.
-            self._images = emitter, self._tracer.images(self._dataset.probes[emitter])
-        return self._images[1][listener]

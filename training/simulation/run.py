@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
-from training.data.dataset import Dataset, OwnResponse
+from training.data.dataset import Dataset
 from training.data.scene_file import SceneFile
 from training.data.simulation_plan import SimulationPlan, overrides_among
 from training.simulation.half_precision import to_half
@@ -73,21 +73,15 @@ def simulate(
 
 def _simulate_emitter(
     simulation: PairSimulation, emitter: int, repeated: npt.NDArray[np.int64], is_over: threading.Event
-) -> tuple[int, list[dict[int, OwnResponse]], npt.NDArray[np.float16]]:
-    """Return the emitter, its responses by take and listener (the second take has only the `repeated` listeners), and
-    the log energies from which the first take was drawn. Raises CancelledError once `is_over` is set."""
+) -> tuple[int, list[dict[int, npt.NDArray[np.float16]]]]:
+    """Return the emitter, and its log energies by take and listener; the second take has only the `repeated` listeners.
+    Raises CancelledError once `is_over` is set."""
     listeners = np.flatnonzero(np.arange(len(simulation.probes)) != emitter)
-    takes: list[dict[int, OwnResponse]] = []
-    logarithms = {}
+    takes = []
     for number, wanted in enumerate((listeners, repeated)):
-        takes.append({})
-        for listener, energy, response in simulation.own(emitter, wanted, number):
-            if is_over.is_set():
-                raise CancelledError
-            takes[number][listener] = response
-            if number == 0:
-                with np.errstate(divide="ignore"):  # the logarithm is -inf where no ray arrived
-                    logarithms[listener] = to_half(np.log(energy))
-    log_energy = np.full((len(simulation.probes), *next(iter(logarithms.values())).shape), -np.inf, np.float16)
-    log_energy[list(logarithms)] = list(logarithms.values())
-    return emitter, takes, log_energy
+        energies = simulation.energies(emitter, wanted, number)
+        if is_over.is_set():
+            raise CancelledError
+        with np.errstate(divide="ignore"):  # the logarithm is -inf where no ray arrived
+            takes.append(dict(zip(map(int, wanted), to_half(np.log(energies)), strict=True)))
+    return emitter, takes

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import SceneFile, SceneFileError
 
 MOST_PROBES = 2_000
@@ -22,8 +22,6 @@ MOST_WALL_SEQUENCES = 3_000_000
 
 # Measured on a core of 2.5 GHz. They are right to a factor of three, which is enough to refuse a scene.
 _HIT_S, _WALL_S, _RECEIVER_S = 60e-9, 3e-9, 5e-9
-_SEQUENCE_S = 40e-9
-_SAMPLE_S, _HEADING_S = 12e-9, 2.5e-9
 # Larger values are probably in another unit.
 _LARGE_M = 100.0
 _LONG_S = 20.0
@@ -47,10 +45,6 @@ class SimulationSize:
         return self.probes * (self.probes - 1)
 
     @property
-    def samples(self) -> int:
-        return self.scene.simulation.samples
-
-    @property
     def _histogram(self) -> int:
         """The number of energies of one pair."""
         settings = self.scene.simulation
@@ -58,19 +52,12 @@ class SimulationSize:
 
     @property
     def dataset_gb(self) -> float:
-        settings = self.scene.simulation
-        response = 2 * settings.yaws * self.samples * (1 + settings.held_out_share)
-        return 2 * self.pairs * (response + self._histogram) / 1e9
+        return 2 * self.pairs * self._histogram * (1 + self.scene.simulation.held_out_share) / 1e9
 
     @property
     def memory_gb(self) -> float:
-        """Memory for one emitter: energies twice in single precision, responses in half precision, and the synthesis of
-        one response."""
-        settings = self.scene.simulation
-        ears = 2 * settings.yaws * self.samples
-        of_pair = 10 * self._histogram + 2 * ears
-        synthesis = 32 * settings.arrival_directions * self.samples + 24 * ears
-        return (self.probes * of_pair + synthesis + 24 * settings.rays) / 1e9
+        """Memory for one emitter: energies three times in single precision and once in half precision."""
+        return (14 * self.probes * self._histogram + 24 * self.scene.simulation.rays) / 1e9
 
     def sequences_of(self, order: int) -> float:
         """The number of sequences of up to `order` walls that may mirror a path. On average an image is in front of
@@ -85,25 +72,15 @@ class SimulationSize:
 
     @property
     def core_minutes(self) -> float:
-        return self.probes * (self.tracing_s + self.images_s + (self.probes - 1) * self.synthesis_s) / 60
+        return self.probes * self.tracing_s / 60
 
     @property
     def tracing_s(self) -> float:
-        """Seconds of one core to trace the rays of one emitter."""
+        """Seconds of one core to trace the rays of one emitter, in both takes."""
         settings, geometry = self.scene.simulation, self.scene.geometry
         hits = settings.rays * settings.duration_s * SPEED_OF_SOUND / self.mean_free_path_m
-        return hits * (_HIT_S + _WALL_S * len(geometry.corners) + _RECEIVER_S * self.probes)
-
-    @property
-    def images_s(self) -> float:
-        """Seconds of one core to find the images of one emitter."""
-        return self.wall_sequences * self.probes * _SEQUENCE_S * (self.scene.simulation.image_order > GEOMETRIC_ORDER)
-
-    @property
-    def synthesis_s(self) -> float:
-        """Seconds of one core to synthesise the response of one pair."""
-        settings = self.scene.simulation
-        return settings.arrival_directions * self.samples * (_SAMPLE_S + _HEADING_S * settings.yaws)
+        heard = self.probes * (1 + settings.held_out_share)
+        return hits * (2 * (_HIT_S + _WALL_S * len(geometry.corners)) + _RECEIVER_S * heard)
 
     @property
     def mean_free_path_m(self) -> float:
@@ -149,7 +126,6 @@ class SimulationSize:
         settings = self.scene.simulation
         relative_sizes = {
             "probes.spacing_m": self.probes / 100,
-            "simulation.yaws": settings.yaws / 12,
             "simulation.arrival_directions": settings.arrival_directions / 24,
             "simulation.duration_s": settings.duration_s,
         }
@@ -158,9 +134,13 @@ class SimulationSize:
     @property
     def _longest(self) -> str:
         """The field that contributes most to the time."""
-        parts = {"simulation.rays": self.tracing_s, "simulation.image_order": self.images_s}
-        longest = max(parts, key=lambda name: parts[name])
-        return longest if parts[longest] > self.probes * self.synthesis_s else self._largest
+        settings = self.scene.simulation
+        relative_sizes = {
+            "simulation.rays": settings.rays / 20_000,
+            "probes.spacing_m": self.probes / 100,
+            "simulation.duration_s": settings.duration_s,
+        }
+        return max(relative_sizes, key=lambda name: relative_sizes[name])
 
     @property
     def _hint(self) -> str:

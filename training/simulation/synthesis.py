@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, rfft
 from scipy.sparse import coo_array
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
+from server.acoustics.bands import band_weights
 from server.acoustics.geometry import axes_of
 from server.rendering.hrtf import HeadFilters
 from server.scene.manifest import Air
@@ -164,34 +164,6 @@ class BinauralSynthesis:
         share = (position - below)[:, None, None, None]
         products = products[below] * (1 - share) + products[below + 1] * share
         return np.ascontiguousarray(products.transpose(0, 1, 3, 2), dtype=np.float32)
-
-    def diffuse_noise(self, directional: _Floats, samples: int, rng: np.random.Generator) -> _Singles:
-        """(band, yaw, ear, sample) circular noise, whose length is rounded down to whole windows. In each octave band
-        it has unit power per sample, divided between directions of arrival by the shares `directional` (direction,
-        band). Overlapping bands are independent, so that their powers add up for any gains of the bands."""
-        step = self._n_fft // 2
-        frames = samples // step
-        at_ears = np.zeros((len(OCTAVE_BANDS_HZ), 2 * len(self.heads), frames * step), dtype=np.float32)
-        for neighbours in (0, 1):  # only neighbouring bands overlap
-            noise = _unit_noise((len(directional), frames, step), rng)
-            sections = np.concatenate([noise, np.roll(noise, -1, axis=1)], axis=-1)
-            sections *= self._window
-            spectra = np.ascontiguousarray(rfft(sections).transpose(2, 1, 0))
-            for band in range(neighbours, len(OCTAVE_BANDS_HZ), 2):
-                inside = np.flatnonzero(self._band_weights[band])
-                if not len(inside):
-                    continue  # the whole band lies above half the sample rate
-                within = slice(inside[0], inside[-1] + 1)
-                amplitudes = np.sqrt(directional[:, band]).astype(np.float32)
-                shape = np.sqrt(self._band_weights[band, within])[:, None, None]
-                shaped = np.zeros((2 * len(self.heads), frames, len(spectra)), dtype=np.complex64)
-                arriving = np.matmul(spectra[within] * (amplitudes * shape), self._arrival_spectra[within])
-                shaped[..., within] = arriving.transpose(2, 1, 0)
-                sections = irfft(shaped, self._n_fft)
-                sections *= self._window
-                later = np.roll(sections[..., step:], 1, axis=1)
-                at_ears[band] = (sections[..., :step] + later).reshape(len(sections), -1)
-        return at_ears.reshape(len(at_ears), len(self.heads), 2, -1)
 
     @property
     def _sample_rate(self) -> int:

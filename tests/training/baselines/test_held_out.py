@@ -2,7 +2,6 @@ import dataclasses
 import shutil
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from PIL import Image
@@ -27,8 +26,7 @@ from training.simulation.references import References
 
 @pytest.fixture(scope="module")
 def references(dataset):
-    with h5py.File(dataset.folder / "pairs.h5", "r") as file:
-        yield References(dataset, file)
+    return References(dataset)
 
 
 @pytest.fixture(scope="module")

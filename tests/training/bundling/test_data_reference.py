@@ -7,8 +7,10 @@ from server.health import laws
 from server.health.energies import Windows
 from tests.conftest import MANIFEST
 from training.bundling.data_reference import DataHealth, advance, health_of, reference_of, window_energies
-from training.data.responses import SimulatedResponses
+from training.data.dataset import TAKES
 from training.models.targets import LEAD_SAMPLES, codec_of
+from training.simulation.references import References
+from training.simulation.responses import SimulatedResponses
 
 RATE, SAMPLES = 16_000, 8000
 ARRIVES = 160
@@ -98,29 +100,21 @@ def test_late_sound_that_hangs_on_few_rays_is_told_with_what_to_do():
     assert "simulation.rays = 32000" in line
 
 
-def test_two_takes_that_differ_are_found(dataset):
+def test_two_takes_that_differ_are_found(dataset, monkeypatch):
     """Those of the tiny room, one of them made louder by 12 dB from 0.12 s on."""
-    responses = SimulatedResponses(dataset)
     late = round(0.12 * dataset.sample_rate)
+    reflected = References.reflected
 
-    def read(pairs, take="reflected"):
-        found = dataset.read(pairs, take).copy()
-        if take == "repeats":
+    def louder(references, emitter, listener):
+        found = reflected(references, emitter, listener)
+        if references.take == TAKES[1]:
             found[..., late:] *= 4
         return found
 
-    responses.dataset = _Reading(dataset, read)
-    found = health_of(responses).uncertain_from_s
+    monkeypatch.setattr(References, "reflected", louder)
+    found = health_of(SimulatedResponses(dataset)).uncertain_from_s
     assert found is not None
     assert 0.05 < found < 0.16
-
-
-class _Reading:
-    def __init__(self, dataset, read):
-        self._dataset, self.read = dataset, read
-
-    def __getattr__(self, name):
-        return getattr(self._dataset, name)
 
 
 def test_a_manifest_reads_its_reference_back(manifest):

@@ -15,12 +15,12 @@ from server.field.runtime import open_session
 from training.bundling import export as export_module
 from training.bundling.export import INPUTS, MODEL_FILE, OUTPUTS, ExportError, export
 from training.bundling.graphs import halve_weights, to_int8
-from training.data.responses import SimulatedResponses
 from training.learning.runs import Configuration, NafRecipe
 from training.learning.train import load_learner, train
 from training.models.factorised import ExportedField
 from training.models.naf import NafShape
 from training.models.naf_graph import NafGraph
+from training.simulation.responses import SimulatedResponses
 
 
 @pytest.fixture(scope="module")

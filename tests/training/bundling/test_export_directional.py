@@ -1,17 +1,21 @@
 """A directional field in a bundle, alone and beside one of ears."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
 from rich.progress import Progress
 
+from server.acoustics.geometry import Quaternion
 from server.field.fields_by_level import FieldsByLevel
 from server.field.runtime import open_session
+from server.responses.full_response import FullResponse
 from training.bundling.export import ExportError, export
-from training.data.responses import SimulatedResponses
 from training.learning.runs import Configuration, DirectionalRecipe
 from training.learning.train import load_learner, train
 from training.models.directional import ExportedDirections
+from training.simulation.responses import SimulatedResponses
 
 SILENT = Progress(disable=True)
 
@@ -52,6 +56,7 @@ def test_the_manifest_says_what_it_predicts(alone, dataset):
     assert manifest.codec.known_frames == 0
     assert manifest.codec.samples == dataset.samples
     assert manifest.levels[0].name == "standard"
+    assert all(level.tail == "bands" for level in manifest.levels)
 
 
 def test_the_graph_computes_what_torch_does(alone, dataset, directional_run):
@@ -66,6 +71,21 @@ def test_the_graph_computes_what_torch_does(alone, dataset, directional_run):
         for values, true in zip(found, expected, strict=True):
             assert values.shape == tuple(true.shape)
             np.testing.assert_allclose(values, true, atol=tolerance)
+
+
+@pytest.mark.parametrize("level", ["standard", "directional-r8"])
+def test_a_degree_of_pitch_or_roll_is_no_more_of_a_step_than_one_of_yaw(alone, level):
+    whole = FullResponse.through_kemar(FieldsByLevel.load(alone)[level])
+    ends = [(1.0, 1.0, 1.5)], [(3.0, 2.0, 1.5)]
+    degrees = np.radians(np.arange(-30, 31))
+
+    def largest_step(turned):
+        heads = [Quaternion.from_angles(0.5 + yaw, pitch, roll) for yaw, pitch, roll in turned]
+        heard = [whole.impulse_responses(*ends, np.array([head]))[0] for head in heads]
+        return max(np.linalg.norm(b - a) / np.linalg.norm(a) for a, b in itertools.pairwise(heard))
+
+    yaw, pitch, roll = (largest_step([np.eye(3)[axis] * angle for angle in degrees]) for axis in range(3))
+    assert 0 < max(pitch, roll) < 1.2 * yaw < 0.15
 
 
 def test_every_form_is_heard(alone):

@@ -12,8 +12,8 @@ from server.scene.bundle import Bundle
 from training.bundling import export as export_module
 from training.bundling.data_reference import reference_of
 from training.bundling.export import ExportError, export
-from training.data.responses import SimulatedResponses
 from training.learning.train import load_learner
+from training.simulation.responses import SimulatedResponses
 
 
 @pytest.mark.parametrize(

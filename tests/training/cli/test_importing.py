@@ -6,7 +6,7 @@ import soundfile
 
 from tests.training.data.importers.conftest import wave
 from training.cli.main import main
-from training.data.responses import open_responses
+from training.simulation.responses import open_responses
 
 RATE = 16_000
 MICROPHONES = np.array([[x, 0.0, 0.0] for x in np.linspace(0.0, 1.0, 6)])

@@ -18,9 +18,10 @@ from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.responses.full_response import FullResponse
 from training.bundling.export import export
-from training.data.responses import SimulatedResponses
 from training.evaluation.run import evaluate_bundles
 from training.learning.train import train
+from training.simulation.references import References
+from training.simulation.responses import SimulatedResponses
 from training.simulation.run import simulate
 
 
@@ -67,7 +68,7 @@ def test_levels_are_those_of_the_simulation(tiny_field, dataset):
     pairs = dataset.pairs(held_out=True)
     differences = []
     for emitter, listener in pairs:
-        reference = dataset.read(np.array([[emitter, listener]]))[0]
+        reference = References(dataset).reflected(emitter, listener)
         shape = (len(dataset.yaws), 3)
         predicted = tiny_field.impulse_responses(
             np.broadcast_to(dataset.probes[listener], shape),

@@ -5,12 +5,12 @@ import pytest
 import torch
 from rich.progress import Progress
 
-from training.data.responses import SimulatedResponses
 from training.evaluation import ablation
 from training.evaluation.ablation import AblationError, ablate, table, variants
 from training.learning.factorised import FactorisedLearner
 from training.learning.runs import Configuration, FactorisedRecipe, configure
 from training.models.targets import LEAD_SAMPLES, align
+from training.simulation.responses import SimulatedResponses
 
 SILENT = Progress(disable=True)
 

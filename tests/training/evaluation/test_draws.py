@@ -11,6 +11,7 @@ from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import ONE_SIMULATION
 from training.evaluation.run import evaluate_bundles
 from training.simulation.pairs import PairSimulation
+from training.simulation.references import References
 
 DRAWS = 4
 
@@ -47,7 +48,7 @@ def simulated(held_out) -> list[list[RoomParameters]]:
     ends = [divmod(int(pair), len(dataset.probes)) for pair in held_out.held_out]
     of_pairs = []
     for index, (emitter, listener) in enumerate(ends):
-        known = held_out.reference(index) - dataset.read(np.array([[emitter, listener]]))[0]
+        known = held_out.reference(index) - References(dataset).reflected(emitter, listener)
         listeners = np.flatnonzero(dataset.held_out[emitter])
         of_pairs.append([])
         for draw in range(DRAWS):
@@ -79,7 +80,7 @@ def test_what_was_drawn_is_kept_and_what_was_cut_off_goes_on(folder, held_out, m
     for one, other in zip(medians, again, strict=True):
         for name, values in vars(one).items():
             np.testing.assert_array_equal(values, getattr(other, name))
-    monkeypatch.setattr(PairSimulation, "own", None)  # nothing is left to draw
+    monkeypatch.setattr(PairSimulation, "energies", None)  # nothing is left to draw
     few = held_out.sample(pairs=1, yaws=1, seed=0)
     (of_one,) = median_parameters(few, DRAWS)
     index = held_out.held_out.tolist().index(few.held_out[0])

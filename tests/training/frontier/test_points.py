@@ -1,8 +1,10 @@
+from typing import Literal
+
 import numpy as np
 import pytest
 
 from server.scene.manifest import Accuracy, Cost, QualityLevel
-from training.frontier.points import LEAST_COST_RATIO, Point, default_point, offered_points, pareto
+from training.frontier.points import LEAST_COST_RATIO, Point, default_among, default_point, offered_points, pareto
 
 PAIRS = 50
 
@@ -16,6 +18,7 @@ def point(
     missing: float = 0.0,
     bound: bool = False,
     miss_ms: float | None = None,
+    predicts: Literal["ears", "directions"] = "ears",
 ) -> Point:
     """On a walk most poses take no time: the mean is what counts."""
     spread = np.random.default_rng(seed).normal(0, 0.05, PAIRS)
@@ -28,7 +31,7 @@ def point(
             ms_p50=0.001, ms_p99=2 * ms, ms_mean=ms, ms_miss=miss_ms or ms, storage_mb=1, memory_mb=1, host="here"
         ),
     )
-    return Point(level, {"t60": error}, error + spread, missing, bound)
+    return Point(level, {"t60": error}, error + spread, missing, bound, predicts)
 
 
 def names(points: list[Point]) -> list[str]:
@@ -92,7 +95,7 @@ def test_where_nothing_is_in_time_the_default_is_what_a_deadline_bears_best() ->
 def test_a_few_are_offered_from_the_default_on_down_and_up_each_much_cheaper_or_dearer(default) -> None:
     times = np.geomspace(0.003, 30, 30)
     best = [point(f"p{number:02}", ms, 1 - 0.02 * number) for number, ms in enumerate(times)]
-    first, *others = offered = offered_points(best, best[default])
+    first, *others = offered = offered_points(best, best, best[default], ms=100)
     assert first is best[default]
     costs = sorted(each.cost.ms_mean for each in offered)
     assert len(set(costs)) == len(offered)
@@ -102,3 +105,21 @@ def test_a_few_are_offered_from_the_default_on_down_and_up_each_much_cheaper_or_
     assert costs[0] < LEAST_COST_RATIO * times[0]
     assert costs[-1] > times[-1] / LEAST_COST_RATIO
     assert others or len(best) == 1
+
+
+def test_the_default_knows_directions_where_there_are_any_however_quick_others_are() -> None:
+    kept, whole = point("kept", 0.01, 0.4), point("whole", 2, 0.3)
+    rough, fine = (point(name, ms, error, predicts="directions") for name, ms, error in (("o", 1, 0.6), ("p", 2, 0.5)))
+    assert default_among([kept, whole, rough, fine], ms=2.5) is fine
+    assert default_among([kept, whole, rough, fine], ms=1.5) is rough
+    assert default_among([kept, whole], ms=2.5) is whole
+
+
+def test_each_way_to_predict_a_response_is_offered() -> None:
+    """Also where another is quicker and more accurate."""
+    ears = [point("slow", 9, 0.9), point("quick", 3, 0.95)]
+    directions = [point("a", 1, 0.5, predicts="directions")]
+    points = [*ears, *directions]
+    offered = offered_points(points, pareto(points), directions[0], ms=5)
+    assert names(offered) == ["a", "quick"]
+    assert names(offered_points(ears, pareto(ears), ears[1], ms=5)) == ["quick", "slow"]

@@ -22,7 +22,7 @@ from training.frontier.figure import draw_frontier
 from training.frontier.sweep import Effort, record, sweep, with_levels
 from training.frontier.walk import POSES_PER_S, SPEED_M_PER_S, walk
 
-EFFORT = Effort(pairs=3, yaws=2, walk_s=12.0)
+EFFORT = Effort(pairs=4, yaws=4, walk_s=12.0)
 
 
 @pytest.fixture(scope="module")

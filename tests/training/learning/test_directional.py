@@ -6,12 +6,13 @@ import torch
 from rich.progress import Progress
 
 from training.data.importers.report import ImportReport
-from training.data.responses import ImportedDataset, Measurement, SimulatedResponses
+from training.data.responses import ImportedDataset, Measurement
 from training.learning.directional import DirectionalLearner
 from training.learning.pairs import split
 from training.learning.runs import CHECKPOINT, Configuration, DirectionalRecipe, RecipeError, RunError, configure
 from training.learning.train import load_learner, train
 from training.models.directional import ExportedDirections
+from training.simulation.responses import SimulatedResponses
 
 SILENT = Progress(disable=True)
 

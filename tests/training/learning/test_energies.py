@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from training.data.responses import SimulatedResponses
 from training.learning.energies import RAYLEIGH_DEFICIT, EnergyError
 from training.learning.factorised import FactorisedLearner
 from training.learning.runs import FactorisedRecipe
 from training.models.targets import flat_targets
+from training.simulation.responses import SimulatedResponses
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import torch
 from rich.progress import Progress
 
 from training.data.importers.report import ImportReport
-from training.data.responses import ImportedDataset, Measurement, SimulatedResponses
+from training.data.responses import ImportedDataset, Measurement
 from training.learning.distillation import distillation_targets
 from training.learning.factorised import FactorisedLearner
 from training.learning.pairs import split
@@ -16,6 +16,7 @@ from training.models.encoders import FieldShape
 from training.models.factorised import ExportedField
 from training.models.naf import NafShape
 from training.models.targets import LEAD_SAMPLES, align, delay_samples, flat_targets
+from training.simulation.responses import SimulatedResponses
 
 SILENT = Progress(disable=True)
 RATE, SAMPLES = 16_000, 2_000

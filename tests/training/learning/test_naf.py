@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 
-from training.data.responses import SimulatedResponses
 from training.learning.naf import NafLearner
 from training.learning.runs import Configuration, NafRecipe
 from training.models.naf import NafShape
 from training.models.targets import LEAD_SAMPLES, align
+from training.simulation.responses import SimulatedResponses
 
 SHAPE = NafShape(width=8, grid_features=4)
 

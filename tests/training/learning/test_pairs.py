@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from training.data.responses import SimulatedResponses
 from training.learning.pairs import split
+from training.simulation.responses import SimulatedResponses
 
 
 def couples(responses, rows):

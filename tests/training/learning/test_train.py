@@ -14,7 +14,6 @@ import torch
 from rich.progress import Progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from training.data.responses import SimulatedResponses
 from training.learning import train as train_module
 from training.learning.factorised import FactorisedLearner
 from training.learning.kinds import learner_of
@@ -38,6 +37,7 @@ from training.models.level_correction import InterpolatedLevels, PowerBalance
 from training.models.naf import NafShape
 from training.models.stored_targets import load_targets
 from training.models.targets import codec_of
+from training.simulation.responses import SimulatedResponses
 
 
 class Impatient(Progress):
@@ -351,7 +351,7 @@ def test_two_processes_learn_what_one_does(dataset, configuration, tmp_path):
         "import sys, torch\n"
         "from pathlib import Path\n"
         "from rich.progress import Progress\n"
-        "from training.data.responses import open_responses\n"
+        "from training.simulation.responses import open_responses\n"
         "from training.learning.runs import Configuration\n"
         "from training.learning.train import train\n"
         "torch.set_num_threads(1)\n"

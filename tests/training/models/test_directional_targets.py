@@ -4,14 +4,17 @@ from rich.progress import Progress
 
 from server.acoustics.spherical_harmonics import even_directions, real_harmonics
 from training.data.dataset_check import DatasetError
-from training.data.responses import ImportedDataset, SimulatedResponses
+from training.data.responses import ImportedDataset
 from training.models.cells import Cells
 from training.models.directional import DirectionHeads
 from training.models.directional_targets import DirectionalTargets, harmonic_powers
 from training.models.stored_targets import load_directional_targets
 from training.models.targets import LEAD_SAMPLES, align, codec_of
 from training.simulation.expected import ExpectedSpectrograms
+from training.simulation.late_sound import MirroredReflections
 from training.simulation.rays import sphere_directions
+from training.simulation.references import References
+from training.simulation.responses import SimulatedResponses
 
 SILENT = Progress(disable=True)
 
@@ -84,7 +87,7 @@ def test_an_image_arrives_in_the_frames_whose_window_it_falls_into(dataset, cell
     towards = np.array([0.6, 0.0, 0.8])
     samples = 300
     position = dataset.probes[3] + towards * samples / dataset.sample_rate * 343.0
-    monkeypatch.setattr(spectrograms, "_images", (0, [(position[None], np.full((1, 7), 0.3))] * len(dataset.probes)))
+    monkeypatch.setattr(MirroredReflections, "of_pair", lambda *_: (position[None], np.full((1, 7), 0.3)))
     frames = np.eye(cells.codec.frames, dtype=np.float32)
     directions, powers = spectrograms.arrivals(0, 3, frames, 40.0)
     np.testing.assert_allclose(directions[-1], towards, atol=1e-9)
@@ -96,7 +99,7 @@ def test_an_image_arrives_in_the_frames_whose_window_it_falls_into(dataset, cell
 def test_an_image_at_the_listeners_place_has_a_finite_direction(dataset, cells, monkeypatch):
     spectrograms = ExpectedSpectrograms(dataset, cells.codec)
     image = dataset.probes[3][None], np.full((1, 7), 0.3)
-    monkeypatch.setattr(spectrograms, "_images", (0, [image] * len(dataset.probes)))
+    monkeypatch.setattr(MirroredReflections, "of_pair", lambda *_: image)
     directions, powers = spectrograms.arrivals(0, 3, np.eye(cells.codec.frames, dtype=np.float32), 0.0)
     assert np.isfinite(directions).all()
     assert np.isfinite(powers).all()
@@ -104,7 +107,7 @@ def test_an_image_at_the_listeners_place_has_a_finite_direction(dataset, cells, 
 
 def test_levels_are_those_of_drawn_responses(dataset, cells):
     """Those of the ears of drawn responses, without the mean gain of the head."""
-    (drawn,) = dataset.read(np.array([[0, 3]]))
+    drawn = References(dataset).reflected(0, 3)
     advance = dataset.onset_s[0, 3] * dataset.sample_rate - LEAD_SAMPLES
     power = (np.abs(cells.codec.transform(align(drawn, advance))) ** 2).mean(axis=(0, 1)) @ cells.all_frames.pool()
     found = unfolded(DirectionalTargets(dataset, cells).of_pair(0, 3).astype(float), cells)["log_magnitude"]

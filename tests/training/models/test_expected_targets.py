@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from training.data.responses import SimulatedResponses
 from training.models.cells import Cells
 from training.models.expected_targets import expected_phasor
 from training.models.factorised import Heads
 from training.models.stored_targets import load_targets
 from training.models.targets import codec_of
+from training.simulation.responses import SimulatedResponses
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1e-6, 0.3, 1.0, 4.0, 30.0, 1e6])

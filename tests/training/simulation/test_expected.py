@@ -1,11 +1,8 @@
-import h5py
 import numpy as np
 import pytest
 
 from server.acoustics.codec import Codec
 from server.rendering.hrtf import kemar
-from training.data.dataset import Dataset, DatasetError
-from training.data.simulation_plan import SimulationPlan
 from training.simulation.expected import ExpectedSpectrograms
 from training.simulation.rays import sphere_directions
 from training.simulation.synthesis import BinauralSynthesis
@@ -76,13 +73,3 @@ def test_an_aligned_response_has_its_frames_earlier(codec, expected):
     at_emission = expected.diffuse_products(0, 3, every_frame(codec))
     aligned = expected.diffuse_products(0, 3, every_frame(codec), 3 * codec.hop)
     np.testing.assert_allclose(aligned[..., :-8], at_emission[..., 3:-5], rtol=1e-3, atol=1e-9)
-
-
-def test_a_dataset_without_energies_says_so(tiny_scene, tmp_path, codec):
-    dataset = Dataset.create(tmp_path, tiny_scene, 0, SimulationPlan.everything(2, 500))
-    with h5py.File(tmp_path / "pairs.h5", "r+") as file:
-        del file["log_energy"]
-    with pytest.raises(DatasetError, match="has no energies"):
-        ExpectedSpectrograms(dataset, codec).diffuse_products(0, 1, every_frame(codec))
-    with pytest.raises(DatasetError, match="without energies"):
-        Dataset.create(tmp_path, tiny_scene, 0, SimulationPlan.everything(2, 500))

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from training.data.dataset import TAKES
+from training.data.dataset import GEOMETRIC_ORDER, TAKES
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.data.simulation_plan import SimulatedEffect, SimulationPlan
-from training.simulation import pairs
 from training.simulation.pairs import PairSimulation
 from training.simulation.planner import planner_of
 from training.simulation.rays import RayTracer
 from training.simulation.synthesis import BinauralSynthesis
+from training.simulation.tracing import RoomTracer
 from training.trials.field_decay import MOST_FROM_DATA
 from training.trials.own_scenes import OWN
 from training.trials.reverberation import reverberation_time_s
@@ -49,11 +49,12 @@ def test_a_plan_of_everything_draws_whole_responses_of_each_pair(box):
     simulation = simulation_of(box, EVERYTHING)
     _, responses = taken(simulation)
     probes = simulation.probes
-    tracer = simulation._tracer(probes[1:])
+    tracer = RoomTracer.of(box, EVERYTHING, probes[1:], least_order=GEOMETRIC_ORDER + 1)
     arrivals = tracer.trace(probes[0], rays=EVERYTHING.rays, rng=np.random.default_rng([0, 2, 0, 0]))
+    synthesis = simulation.late_sound.synthesis
     for listener, (place, arrival, response) in enumerate(zip(probes[1:], arrivals, responses, strict=True), start=1):
         onset_s = np.linalg.norm(place - probes[0]) / 343
-        expected = simulation._synthesis.render(arrival, place, onset_s, np.random.default_rng([0, 5, 0, 0, listener]))
+        expected = synthesis.render(arrival, place, onset_s, np.random.default_rng([0, 5, 0, 0, listener]))
         np.testing.assert_allclose(response, expected, atol=1e-3 * np.abs(expected).max())
 
 
@@ -71,9 +72,10 @@ def test_a_listener_hears_the_same_whoever_else_is_asked_for(box):
     energies, responses = taken(simulation)
     rng = np.random.default_rng([0, 5, 0, 0, 2])
     onset_s = np.linalg.norm(simulation.probes[2] - simulation.probes[0]) / 343
-    late = simulation._synthesis.late(energies[1].astype(np.float32), onset_s, rng)
-    images = simulation._tracer(simulation.probes[2:3]).images(simulation.probes[0])[0]
-    expected = late + simulation._synthesis.specular(*images, simulation.probes[2])
+    synthesis = simulation.late_sound.synthesis
+    late = synthesis.late(energies[1].astype(np.float32), onset_s, rng)
+    tracer = RoomTracer.of(box, EVERYTHING, simulation.probes[2:3], least_order=GEOMETRIC_ORDER + 1)
+    expected = late + synthesis.specular(*tracer.images(simulation.probes[0])[0], simulation.probes[2])
     np.testing.assert_allclose(responses[1], expected, atol=1e-3 * np.abs(expected).max())
 
 
@@ -81,7 +83,6 @@ def test_without_rays_nothing_is_traced_and_no_noise_drawn(box, monkeypatch):
     plan = planner_of(box, 0).plan({SimulatedEffect.LATE_REVERBERATION: False, SimulatedEffect.EARLY_REFLECTIONS: True})
     monkeypatch.setattr(RayTracer, "trace", None)
     monkeypatch.setattr(BinauralSynthesis, "late", None)
-    monkeypatch.setattr(pairs, "draw_tail", None)
     energies, responses = taken(simulation_of(box, plan))
     assert not energies.any()
     assert responses.any()

@@ -14,7 +14,7 @@ import soundfile
 from server.scene.limits import MOST_SAMPLES
 from tests.training.data.importers.conftest import RATE, wave
 from training.cli.main import main
-from training.data.responses import open_responses
+from training.simulation.responses import open_responses
 
 POINTS = [(0.0, 0.0, 1.5), (1.0, 0.0, 1.5), (2.0, 0.0, 1.5), (0.0, 1.0, 1.5), (1.0, 1.0, 1.5), (2.0, 1.2, 1.5)]
 MICROPHONES = [(x, y, 0.3) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.6)]
