@@ -75,6 +75,13 @@ start of the stream, sent or skipped. A message with a `sample_clock` takes effe
 0 is where the listener starts. Later poses, of the listener and of emitters, have rising ids. Each block names the
 newest pose of its direct sound and that of its reflected field, so that a client can measure both latencies.
 
+**Ambisonics.** With `"output": "ambisonics"` in the `hello`, blocks have the channels of AmbiX (ACN order, SN3D norm)
+of the `order` in the `hello`: 4, 9 or 16, as `welcome` says. They are in the axes of the scene, at the place of the
+listener's head: W is what an omnidirectional microphone hears there. The client turns them by the inverse of its
+listener's orientation and decodes them. So a turn is heard as soon as the client likes, changes nothing in the blocks
+and asks for no response; positions count as ever. Only scenes and levels whose fields predict directions can do it, and
+scenes without a field: others refuse the `hello` (`no_directions`).
+
 **Flow control by acknowledgement.** At most `window` blocks (see `welcome`) are sent without an `acknowledge`. One
 `acknowledge` stands for all earlier blocks, so every fourth block or so is enough. While the window is full, blocks are
 rendered but not sent: `sequence` has no gap then, and `sample_clock` jumps. Once the window has been full for
@@ -107,8 +114,9 @@ class _Draft7(GenerateJsonSchema):
         return generated
 
     def field_is_required(self, field: Any, total: bool) -> bool:
-        # The server sends every field of a message.
-        return self.mode == "serialization" or super().field_is_required(field, total)
+        # The server sends every field of a message, but for those that a condition leaves out.
+        is_sent = self.mode == "serialization" and "serialization_exclude_if" not in field
+        return is_sent or super().field_is_required(field, total)
 
     def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ARG002  no titles that repeat a field's name
         return False

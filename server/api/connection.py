@@ -47,6 +47,7 @@ from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.readiness import Readiness
 from server.streaming.audio_engine import AudioEngine
+from server.streaming.calibration import calibrate
 from server.streaming.load_policy import Ladder
 from server.streaming.quality_steps import Offer, QualityStep
 from server.streaming.session import Session
@@ -105,6 +106,8 @@ class StreamHost:
     responses: ResponseCache
     readiness: Readiness
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
+    ambisonic_offers: dict[tuple[str, int], Offer] = dataclasses.field(default_factory=dict)
+    """The same for streams of ambisonics, by scene and order, once one was asked for."""
     places: dict[str, SceneAcoustics] = dataclasses.field(default_factory=dict)
     """Acoustics of each scene, for the planner of effects."""
     effect_costs: dict[str, Costs] = dataclasses.field(default_factory=dict)
@@ -120,6 +123,17 @@ class StreamHost:
 
     def is_full(self) -> bool:
         return self.streams >= self.settings.max_streams
+
+    def measure_ambisonics(self, scene: str, levels: FieldsByLevel, order: int) -> Offer:
+        """Measure what ambisonic responses of a scene's levels cost on this host, and keep the result: work for another
+        thread."""
+        offer = self.ambisonic_offers.get((scene, order))
+        if offer is None:
+            filters = self.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
+            offered = tuple(levels[name].level for name in levels.names)
+            offer = Offer(offered, calibrate(levels, filters, order=order))
+            self.ambisonic_offers[scene, order] = offer
+        return offer
 
     def await_hello(self, patience: asyncio.Timeout) -> None:
         """Note a connection that has not sent its hello yet. If there are too many, end the oldest."""
@@ -226,9 +240,13 @@ class Connection:
         try:
             if levels is None:
                 raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
+            if hello.ambisonic_order is not None:
+                levels = levels.with_directions(hello.level)
             field = levels.default
             block_s = hello.block_size / field.sample_rate
-            offer = self._host.offers[hello.scene]
+            offer = await self._offer(hello, levels)
+            if offer is None:
+                return None
             ladder = Ladder(offer.steps(hello.level, block_s=block_s))
             session = await self._host.openings.run(
                 partial(self._open_session, hello, levels, hrtf, ladder.step, window), is_wanted=self._is_there
@@ -251,6 +269,7 @@ class Connection:
                 hrtf=hrtf,
                 level=ladder.step.level,
                 max_emitters=self._host.settings.max_emitters,
+                order=hello.ambisonic_order,
             )
         )
         return Stream(
@@ -262,6 +281,19 @@ class Connection:
             lead=hello.buffer_blocks,
             deliver=self._deliver,
         )
+
+    async def _offer(self, hello: Hello, levels: FieldsByLevel) -> Offer | None:
+        """The levels for a hello, with their costs. Those of an ambisonic order are measured when a stream first asks
+        for it. Returns None if the client has gone meanwhile."""
+        host, order = self._host, hello.ambisonic_order
+        if order is None:
+            return host.offers[hello.scene]
+        measured = host.ambisonic_offers.get((hello.scene, order))
+        if measured is None:
+            measured = await host.openings.run(
+                partial(host.measure_ambisonics, hello.scene, levels, order), is_wanted=self._is_there
+            )
+        return measured
 
     def _is_there(self) -> bool:
         return self._fast_path is None or self._fast_path.is_open()

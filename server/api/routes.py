@@ -244,7 +244,7 @@ async def plan(
     walks: Annotated[bool, Query(description="the listener walks and turns the head")] = True,
     move: Annotated[bool, Query(description="the emitters move")] = False,
     output: Annotated[
-        str, Query(description="headphones or mono", json_schema_extra={"enum": [*OUTPUTS]})
+        str, Query(description="headphones, mono or ambisonics", json_schema_extra={"enum": [*OUTPUTS]})
     ] = "headphones",
     effect: Annotated[list[EffectText] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
 ) -> Response:

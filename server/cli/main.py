@@ -24,6 +24,7 @@ from server.soak.cli import soak
 if TYPE_CHECKING:
     from server.field.field import AcousticField
     from server.offline.render import RenderedEmitter
+    from server.planning.scene_acoustics import Output
 
 app = StrictTyper(
     name="nafir",
@@ -41,6 +42,9 @@ Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [de
 Hrtf = Annotated[Path | None, typer.Option(help="SOFA file with the head to use instead of KEMAR.")]
 Ambisonics = Annotated[
     bool, typer.Option("--ambisonics", help="AmbiX channels (ACN, SN3D) in place of two ears, in the head's axes.")
+]
+WorldAmbisonics = Annotated[
+    bool, typer.Option("--ambisonics", help="AmbiX channels (ACN, SN3D) in place of two ears, in the scene's axes.")
 ]
 Order = Annotated[int | None, typer.Option(help="Order of the ambisonics, 1 to 3. [default: 1]", metavar="N")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, for programs.")]
@@ -232,6 +236,8 @@ def render(
     mono: Annotated[
         bool, typer.Option("--mono", help="Render one channel for one loudspeaker, without a head.")
     ] = False,
+    ambisonics: WorldAmbisonics = False,
+    order: Order = None,
     duration_s: Annotated[
         float | None, typer.Option(help="Length to render; by default until the reverberation has decayed.")
     ] = None,
@@ -243,26 +249,30 @@ def render(
     from rich.progress import Progress
 
     from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
-    from server.field.fields_by_level import FieldsByLevel
+    from server.field.fields_by_level import FieldsByLevel, require_level
     from server.offline.render import MAX_RENDER_S, planned_effects, read_path
     from server.offline.render import render as render_path
     from server.responses.direct_sound import DirectSound
+    from server.responses.impulse_response import parse_order
     from server.scene.bundle import Bundle, find_bundle
 
     if not is_block_size(block_size):
         raise NafirError(f"--block-size: {block_size} is not {BLOCK_SIZES}")
     if output.suffix != ".wav":
         raise RequestError("unknown_format", f"{output}: only .wav can be written", field="output")
-    require_at_most_one({"--mono": mono, "--hrtf": hrtf is not None})
+    require_at_most_one({"--mono": mono, "--ambisonics": ambisonics, "--hrtf": hrtf is not None})
     names = {name.strip() for name in effects.split(",")}
-    require_at_most_one({"--mono": mono, f"--effects {effects}": "hrtf" in names})
+    require_at_most_one({"--mono": mono, "--ambisonics": ambisonics, f"--effects {effects}": "hrtf" in names})
+    order = parse_order("ambisonics" if ambisonics else None, order)
     if hrtf is not None and not names & {"all", "plan", "hrtf"}:
         raise NafirError(
             f"--hrtf and --effects {effects} contradict each other: add hrtf to the effects, or leave one out"
         )
     bundle = Bundle.load(find_bundle(scene))
     levels = FieldsByLevel.load(bundle)
-    field = levels.choose(level)
+    if ambisonics:
+        levels = levels.with_directions(level)
+    field = levels.default if level is None else levels[require_level(bundle, level)]
     if duration_s is not None and not 1 / field.sample_rate <= duration_s <= MAX_RENDER_S:
         raise RequestError(
             "malformed_duration",
@@ -281,13 +291,14 @@ def render(
     length = None if duration_s is None else round(duration_s * field.sample_rate)
     heads = HrtfLibrary([] if hrtf is None else [hrtf], [field.sample_rate])
     filters = heads.filters(DEFAULT_HRTF if hrtf is None else hrtf.stem, field.sample_rate)
-    planned = planned_effects(effects, field, points[0].pose, output="mono" if mono else "headphones")
+    heard: Output = "ambisonics" if ambisonics else "mono" if mono else "headphones"
+    planned = planned_effects(effects, field, points[0].pose, output=heard)
     started_s = time.perf_counter()
     with Progress(transient=True, disable=as_json, console=Console(stderr=True)) as progress:
         task = progress.add_task("rendering", total=1.0)
         samples = render_path(
             field,
-            DirectSound.of(field.bundle, filters),
+            DirectSound.of(field.bundle, filters, order=order),
             emitters,
             points,
             block_size=block_size,
@@ -330,6 +341,9 @@ def plan(
     still: Annotated[bool, typer.Option("--still", help="The listener neither walks nor turns the head.")] = False,
     moving: Annotated[bool, typer.Option("--moving", help="The emitters move.")] = False,
     mono: Annotated[bool, typer.Option("--mono", help="Plan for one loudspeaker instead of headphones.")] = False,
+    ambisonics: Annotated[
+        bool, typer.Option("--ambisonics", help="Plan for ambisonic channels instead of headphones.")
+    ] = False,
     effect: Annotated[
         list[str] | None, typer.Option(help="Switch an effect on or off; repeatable.", metavar="NAME=on|off")
     ] = None,
@@ -346,13 +360,14 @@ def plan(
     from server.responses.impulse_response import parse_position
     from server.scene.bundle import Bundle, find_bundle
 
+    require_at_most_one({"--mono": mono, "--ambisonics": ambisonics})
     query = PlanQuery(
         listener=None if listener is None else parse_position(listener, "listener"),
         yaw_deg=yaw_deg,
         emitters=tuple(parse_position(text, "emitter") for text in emitter or ()),
         walks=not still,
         move=moving,
-        output="mono" if mono else "headphones",
+        output="ambisonics" if ambisonics else "mono" if mono else "headphones",
         effects=parse_effects(effect or ()),
     )
     field = AcousticField.load(Bundle.load(find_bundle(scene)))

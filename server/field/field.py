@@ -65,6 +65,8 @@ class AcousticField:
     them in `node_cache`, which it shares with the other levels of the scene.
     """
 
+    _order: int | None = None
+    """The order of the ambisonic channels that responses have in place of ears."""
     source: ResponseSource
     """Where this level gets responses: computed for every pose, or taken from nodes that each represent many poses."""
 
@@ -138,6 +140,26 @@ class AcousticField:
             self._heard.put(filters, heard, _HEAD_BYTES + tail_bytes)
         return heard
 
+    def encoded(self, order: int) -> "AcousticField":
+        """The same field as ambisonic channels of an order: its responses (B, (order + 1)**2, ir_samples) are those of
+        `ambisonics`, whatever the heads.
+
+        Raises ValueError for a field that knows no directions.
+        """
+        if not self.knows_directions:
+            raise ValueError(f"field {self.graph.name} knows no directions")
+        other = self._encoded.get(order)
+        if other is None:
+            other = copy.copy(self)
+            other._order = order
+            other._bind(BoundedCache(NODE_CACHE_BYTES))
+            self._encoded[order] = other
+        return other
+
+    def _bind(self, cache: NodeCache) -> None:
+        """Open a source of responses of this object's own, for a copy."""
+        self.source = self.kind.open(self.bundle, self._paths, self._compute_all, cache)
+
     def _with(self, graph: FieldGraph) -> "AcousticField":
         """A copy whose graph gives the spectrograms of another head."""
         other = copy.copy(self)
@@ -146,13 +168,17 @@ class AcousticField:
         other._tail = other._open_tail()
         if other._cache is not None:
             other._cache = PhaseCache()
-        other.source = other.kind.open(self.bundle, self._paths, other._compute_all, BoundedCache(NODE_CACHE_BYTES))
+        other._bind(BoundedCache(NODE_CACHE_BYTES))
         return other
 
     def _open_tail(self) -> BandTail | None:
         if self.level.tail == "stft" or not isinstance(self.graph, DirectionalGraph):
             return None
         return BandTail(self.graph, self.bundle.frozen_noise)
+
+    @cached_property
+    def _encoded(self) -> dict[int, "AcousticField"]:
+        return {}
 
     @cached_property
     def _heard(self) -> BoundedCache[HeadFilters, "AcousticField"]:
@@ -165,7 +191,7 @@ class AcousticField:
 
     @property
     def channels(self) -> int:
-        return len(self.bundle.manifest.channels)
+        return len(self.bundle.manifest.channels) if self._order is None else harmonic_count(self._order)
 
     @property
     def sample_rate(self) -> int:
@@ -276,6 +302,8 @@ class AcousticField:
         return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
 
     def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, cache: PhaseCache | None) -> Float32:
+        if self._order is not None:
+            return self.ambisonics(listeners, emitters, self._order)
         aligned = self._aligned(listeners, emitters)
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, heads)
@@ -394,6 +422,9 @@ class Silence(AcousticField):
     @property
     def knows_directions(self) -> bool:
         return True
+
+    def _bind(self, cache: NodeCache) -> None:  # noqa: ARG002  nothing is kept
+        self.source = ComputedResponses(self.impulse_responses)
 
     def _ambisonics(self, listeners: Floats, emitters: Floats, order: int) -> Float32:  # noqa: ARG002
         return np.zeros((len(listeners), harmonic_count(order), self.ir_samples), dtype=np.float32)

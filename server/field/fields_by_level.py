@@ -71,6 +71,25 @@ class FieldsByLevel(Mapping[str, AcousticField]):
             return tuple(reversed(costs))
         return tuple(sorted(measured, key=measured.__getitem__))
 
+    def with_directions(self, chosen: str | None = None) -> "FieldsByLevel":
+        """Those levels whose fields know from where sound arrives. Raises RequestError `no_directions` if there are
+        none, or if the `chosen` level is not among them."""
+        fields = [field for field in self._fields.values() if field.knows_directions]
+        if not fields:
+            knower = "head" if self.default.channels == 2 else "microphone"
+            raise RequestError(
+                "no_directions",
+                f"output: scene {self.bundle.id} knows what one {knower} hears, and not from where sound arrives; ask "
+                "for headphones, or for a scene whose field predicts directions",
+                field="output",
+                status=409,
+            )
+        if chosen in self._fields and not self._fields[chosen].knows_directions:
+            names = ", ".join(field.level.name for field in fields)
+            problem = f"level: {chosen!r} does not know from where sound arrives; ask for auto, or for one of {names}"
+            raise RequestError("no_directions", problem, field="level", status=409)
+        return FieldsByLevel(fields, self.node_cache)
+
     def choose(self, name: str | None) -> AcousticField:
         """The field of the level that a client named, or the default. Raises RequestError `unknown_level`, which lists
         the names."""

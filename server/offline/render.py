@@ -207,7 +207,7 @@ def render(
     levels: Mapping[str, AcousticField] | None = None,
 ) -> FloatArray:
     """Render at least one emitter for a listener on `path`, which has at least one point. Returns (channel, length):
-    two ears, or one channel for a mono loudspeaker.
+    two ears, one channel for a mono loudspeaker, or the ambisonic channels of `direct_sound`.
 
     A point takes effect with the first block that begins at its sample or later, unless a later point does too. The
     emitters start at the beginning of the path. `length`, in samples, defaults to the end of the path or of the longest
@@ -258,7 +258,7 @@ def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output
 
     Raises RequestError unknown_effect.
     """
-    if choice == "all" and output == "headphones":
+    if choice == "all" and output != "mono":
         return None
     own: dict[EffectName, bool] = {}
     if choice == "all":

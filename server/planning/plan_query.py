@@ -25,7 +25,7 @@ from server.scene.effects import EffectName, read_overrides
 
 EFFECT_PATTERN = f"^({'|'.join(EffectName)})=(on|off)$"
 """The texts that `parse_effects` accepts, as a regular expression of JSON Schema."""
-OUTPUTS: tuple[Output, ...] = ("headphones", "mono")
+OUTPUTS: tuple[Output, ...] = ("headphones", "mono", "ambisonics")
 
 
 class Decided(BaseModel):

@@ -30,9 +30,15 @@ def nothing_in_the_way(place: SceneAcoustics) -> str:
     return "the room is convex: nothing can stand in the way" if place.paths is None else ""
 
 
-def one_loudspeaker(listener: Listener) -> str:
-    """Return why a mono output has no head; empty for headphones."""
-    return "one loudspeaker plays what one microphone would hear" if listener.output == "mono" else ""
+def no_head(listener: Listener) -> str:
+    """Return why an output has no head; empty for headphones."""
+    match listener.output:
+        case "mono":
+            return "one loudspeaker plays what one microphone would hear"
+        case "ambisonics":
+            return "the client turns ambisonic channels and decodes them for its ears"
+        case _:
+            return ""
 
 
 def reason(

@@ -21,7 +21,8 @@ from server.acoustics.transmission import PathFinder, TransmittedPaths, transmis
 from server.responses.emitter_state import EmitterState
 from server.scene.geometry import Materials
 
-Output = Literal["headphones", "mono"]
+Output = Literal["headphones", "mono", "ambisonics"]
+"""Where the sound goes: to two ears, to one loudspeaker, or to a client that decodes ambisonic channels."""
 Bands = npt.NDArray[np.float64]
 
 WALKING_M_S = 1.4

@@ -43,13 +43,13 @@ class AudioBlock:
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
         ("flags", "B", "sum of " + ", ".join(f"{bit} {name}" for name, bit in FLAGS.items())),
-        ("channels", "H", "2, or 1 for a mono output"),
+        ("channels", "H", "2 for headphones, 1 for a mono output, 4, 9 or 16 for ambisonics"),
         ("sequence", "I", "number of the block among those sent, from 0, without gaps, modulo 2^32"),
         ("sample_clock", "Q", "samples from the start of the stream to the first frame"),
         ("pose_id", "I", "newest pose of the direct sound"),
         ("reverberation_pose_id", "I", "newest pose of the reflected field"),
         ("frames", "I", "samples of each channel"),
-        then="the frames, channels interleaved (left, right), in the encoding of the hello",
+        then="the frames, channels interleaved (left, right, or in ACN order), in the encoding of the hello",
     )
     HEADER_BYTES: ClassVar[int] = LAYOUT.size
 

@@ -14,12 +14,21 @@ from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, get_args
 
-from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
+from pydantic import (
+    Field,
+    FiniteFloat,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from server.acoustics import directivity
 from server.acoustics.directivity import Directivity
 from server.acoustics.geometry import Pose, Quaternion
+from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.core.errors import RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.near_names import suggestion
@@ -85,8 +94,10 @@ class Hello(Message):
     has to be the scene's. `buffer_blocks` is how many blocks ahead of real time the server sends: a higher number copes
     with a worse network, a lower one has less latency. `hrtf` names a head, one of GET /v1/hrtfs. `level` names a
     quality level of the scene; with `auto` the server takes the best one that its host computes in time, and a cheaper
-    one under load. `output` says what plays the sound: for a mono loudspeaker, blocks have one channel. `effects`
-    switches effects on or off, whatever the plan would decide."""
+    one under load. `output` says what plays the sound: for a mono loudspeaker, blocks have one channel. With
+    `ambisonics` blocks have the channels of `order` 1 (the default), 2 or 3 in the axes of the scene: ACN order, SN3D
+    norm (AmbiX). The client turns them by its listener's orientation and decodes them; a turn then changes nothing in
+    the blocks. `effects` switches effects on or off, whatever the plan would decide."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer
@@ -98,9 +109,24 @@ class Hello(Message):
     hrtf: Annotated[str, Field(max_length=256)] | None = None
     level: LevelName = AUTO
     output: Output = "headphones"
+    order: Annotated[int, Field(ge=1, le=HIGHEST_ORDER), WHOLE] | None = None
     effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
     # guard: a buffer has blocks, and not too many
     buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
+
+    @field_validator("order")
+    @classmethod
+    def _is_of_ambisonics(cls, order: int | None, info: ValidationInfo) -> int | None:
+        if order is not None and info.data.get("output", "ambisonics") != "ambisonics":
+            raise PydanticCustomError("malformed_message", "belongs to the output ambisonics")
+        return order
+
+    @property
+    def ambisonic_order(self) -> int | None:
+        """The order of the channels to render; None for another output."""
+        if self.output != "ambisonics":
+            return None
+        return 1 if self.order is None else self.order
 
 
 class DirectivityPattern(Message):
@@ -182,7 +208,7 @@ class SetLevel(Message):
 
 class SetEffects(Message):
     """Switches effects on or off, whatever the plan would decide; null leaves an effect to the plan. Also sets what
-    plays the sound. A `plan_changed` says which effects are on then."""
+    plays the sound, but neither to nor from ambisonics. A `plan_changed` says which effects are on then."""
 
     type: Literal["set_effects"] = "set_effects"
     effects: dict[str, bool | None] = Field(default_factory=dict, max_length=32)

@@ -52,7 +52,7 @@ class SceneDescription(Message):
 class Welcome(Message):
     """The answer to a valid hello. `window` is how many blocks may be unacknowledged before the server skips blocks.
     `level` is the first quality level. `max_emitters` is how many emitters the stream may have at once; servers up to
-    0.1 do not send it."""
+    0.1 do not send it. `order` is that of ambisonic channels; streams of other outputs do not have it."""
 
     type: Literal["welcome"] = "welcome"
     protocol: Literal[2] = PROTOCOL
@@ -68,6 +68,7 @@ class Welcome(Message):
     hrtf: str
     level: str
     max_emitters: int | None = None
+    order: Annotated[int | None, Field(exclude_if=lambda order: order is None)] = None
 
 
 class EmitterAdded(Message):

@@ -27,6 +27,8 @@ from server.rendering.ingest import LOUDEST
 from server.rendering.partitions import TURNS, Partitioning
 
 FloatArray = npt.NDArray[np.float32]
+CHANNELS = (1, 2, 4, 9, 16)
+"""Numbers of channels that can be convolved: one, two ears, and ambisonics of order 1 to 3."""
 
 if TYPE_CHECKING:
     from server.rendering.compiled_convolver import CompiledConvolver
@@ -40,7 +42,7 @@ class PartitionedIr:
     """The partitioning, and the number of channels."""
     filters: Any
     tail_energy: float
-    """The sum of squares, over both channels, of the samples that a shared tail can replace."""
+    """The sum of squares, over all channels, of the samples that a shared tail can replace."""
 
     @property
     def channels(self) -> int:
@@ -64,8 +66,8 @@ _NO_TAIL = _Tail(None, None)
 
 
 class Convolver:
-    """Convolves `sources` mono inputs, each with its own IR of `channels` channels (1 or 2), and mixes them into one
-    output.
+    """Convolves `sources` mono inputs, each with its own IR of `channels` channels (one of CHANNELS), and mixes them
+    into one output.
 
     `block_size` is a power of two from 64 up. With `any_size` it may be any size that a renderer accepts, and NumPy
     does the work. With `shared_tail` the last stage convolves one mix of all sources with one tail. This tail comes
@@ -89,8 +91,8 @@ class Convolver:
         switches_tail: bool = False,
         any_size: bool = False,
     ) -> None:
-        if sources < 1 or channels not in {1, 2}:
-            raise ValueError("a convolver has at least 1 source, and 1 or 2 channels")
+        if sources < 1 or channels not in CHANNELS:
+            raise ValueError(f"a convolver has at least 1 source, and {CHANNELS} channels")
         self._partitioning = Partitioning(block_size, ir_samples, any_size)
         stages = self._partitioning.stages
         # With one stage the tail would be the whole IR, which cannot be shared.

@@ -215,7 +215,8 @@ def _begin(convolver, stage, window) -> None:
             job_source[jobs], job_new[jobs] = source, new
             job_old[jobs] = old if is_fading else 0
             stage.fades += is_fading
-            stage.cost += _transform_ns(stage.size) + _product_ns(stage, source, is_fading) * (stage.size // 8)
+            stage.cost += _transform_ns(stage.size)
+            stage.cost += _product_ns(convolver, stage, source, is_fading) * (stage.size // 8)
             jobs += 1
     stage.jobs = jobs
     stage.cursor, stage.step, stage.cost_done = 0, 0, 0
@@ -240,11 +241,12 @@ def _transform_ns(size) -> int:
 
 
 @compiled
-def _product_ns(stage, source, is_fading) -> int:
+def _product_ns(convolver, stage, source, is_fading) -> int:
     """Estimated cost of the products of one tile."""
     since = _since_turn(stage, source)
-    ns = 10 * (stage.partitions if since == 0 else TURNS - since)
-    return ns + 20 * stage.partitions if is_fading else ns
+    pairs = (convolver.channels + 1) // 2
+    ns = 10 * pairs * (stage.partitions if since == 0 else TURNS - since)
+    return ns + 20 * pairs * stage.partitions if is_fading else ns
 
 
 @compiled
@@ -265,7 +267,7 @@ def _work(convolver, stage, until) -> None:
                 continue
             weight = 0
             for member in range(job, end):
-                weight += _product_ns(stage, job_source[member], job_old[member] != 0)
+                weight += _product_ns(convolver, stage, job_source[member], job_old[member] != 0)
             first = stage.step - (end - job)
             last = min(tiles, first + max(1, _CHUNK_NS // weight))
             _multiply(convolver, stage, job, end, first, last)

@@ -1,4 +1,5 @@
-"""The direct sound of many emitters at one listener's ears; it follows the poses in every block.
+"""The direct sound of many emitters at one listener's ears, or as ambisonic channels; it follows the poses in every
+block.
 
 Pressure falls as 1 / r with distance r in metres; nearer than the near limit it no longer rises. The air and the
 listener's head filter it. Everything else on the path (screens, directivity) is given as one gain per octave band.
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.kernels.cache_lines import zeros_on_lines
 from server.rendering.direct_path_kernel import TILE, ask, render_direct_paths, transform_tables
 from server.rendering.direct_path_records import SLOT, DirectPathState, FloatArray
@@ -56,16 +58,24 @@ class DirectPath:
         speed_of_sound: float,
         air_db_per_m: npt.NDArray[np.floating],
         max_distance_m: float = 200.0,
+        order: int | None = None,
     ) -> None:
-        """`filters` describe a head; None means one ear without a head."""
+        """`filters` describe a head; None means one ear without a head or, with an `order`, ambisonic channels in world
+        axes: ACN order, SN3D norm, with unit gain in the first."""
+        if order is not None and filters is not None:
+            raise ValueError("ambisonic channels are heard through no head")
         if min(slots, block_size) < 1 or (filters is not None and filters.sample_rate != sample_rate):
             raise ValueError("slots and block_size are at least 1, and filters are of the same sample rate")
         self.slots = slots
         self.block_size = block_size
         self.sample_rate = sample_rate
-        self.channels = 1 if filters is None else 2
+        self._has_head = filters is not None
+        self.channels = 2 if filters is not None else harmonic_count(order or 0)
         ears = NoHead(sample_rate) if filters is None else filters
-        self.state = _state(slots, block_size, ears, speed_of_sound, air_db_per_m, max_distance_m)
+        harmonics = 0 if order is None else self.channels
+        self.state = _state(
+            slots, block_size, ears, speed_of_sound, air_db_per_m, max_distance_m, self.channels, harmonics
+        )
         self._blocks = np.zeros((slots, block_size), np.float32)
         self._heard = np.zeros((self.channels, block_size), np.float32)
         # Compile here, where it may take long, and not on the audio thread at the first pose.
@@ -109,8 +119,9 @@ class DirectPath:
             self.state.slots[slot][name] = other.state.slots[from_slot][name]
 
     def set_orientation(self, quaternion: Sequence[float] | npt.NDArray[np.floating]) -> None:
-        """Set the unit quaternion (x, y, z, w) that rotates head axes to world axes, from the next block on."""
-        if self.channels == 2:
+        """Set the unit quaternion (x, y, z, w) that rotates head axes to world axes, from the next block on. Without a
+        head it changes nothing."""
+        if self._has_head:
             self.state.to_head[:] = axes_of(quaternion)
 
     def process(self, blocks: FloatArray, out: FloatArray) -> None:
@@ -142,7 +153,7 @@ class DirectPath:
         for slot in range(self.slots):
             self.clear(slot)
         self.state.position[0] = 0
-        self.set_orientation(_LEVEL)
+        self.state.to_head[:] = axes_of(_LEVEL)
 
     def is_quiet(self, slot: int) -> bool:
         """Whether this slot has rung out: it adds exactly nothing until its input has a nonzero sample."""
@@ -157,6 +168,8 @@ def _state(
     speed_of_sound: float,
     air_db_per_m: npt.NDArray[np.floating],
     max_distance_m: float,
+    channels: int,
+    harmonics: int,
 ) -> DirectPathState:
     ears, taps, sample_rate = filters.cepstra.shape[1], filters.taps, filters.sample_rate
     wide = -(-block_size // TILE) * TILE
@@ -189,7 +202,7 @@ def _state(
         line=floats(slots, ring + again),
         heard=floats(slots, ears, 2 * bins + TILE),
         plain=floats(wide),
-        spectra=floats(slots, ears, 2, bins),
+        spectra=floats(slots, channels, 2, bins),
         cepstra=filters.cepstra,
         head_delays_s=filters.delays_s,
         triangles=filters.triangulation.triangles,
@@ -210,10 +223,11 @@ def _state(
         sums=floats(2, taps + 8),
         next_taps=floats(2, taps),
         padded=floats(2 * bins),
-        next_spectra=floats(ears, 2, bins),
+        next_spectra=floats(channels, 2, bins),
+        harmonics=doubles(harmonics),
         bins=floats(2, bins),
         is_mixed=integers(4),
-        mix=floats(3, ears, 2, bins),
+        mix=floats(3, channels, 2, bins),
         first=np.zeros(wide, np.int32),
         row=np.zeros(wide, np.int32),
         share=floats(wide),

@@ -3,6 +3,7 @@
 An emitter's block is written to its delay line. Each ear reads the line with its own delay, the path's plus the head's,
 and applies one minimum-phase filter that combines the magnitudes of head, air and path as a sum of cepstra. Without a
 head there is one ear, which has no delay of its own, and needs a filter only if something on the path has a gain.
+Ambisonic channels are this one ear with a filter for each channel: the common one times the harmonic of the direction.
 
 A muted emitter still writes its delay line but costs nothing else, so it can be heard again at once.
 
@@ -16,9 +17,9 @@ motion could is crossfaded too, from the old delay to the new.
 Filters work on the spectra of `server.kernels.odd_fft`, and all slots are summed before the single inverse transform:
 there is one spectrum of the delayed input per ear, and one per filter whenever the filter changes.
 
-Letters: s slots, e ears (2, or 1 without a head), n taps, f bins, b block size, w block size rounded up to whole tiles
-of the loops (values beyond b mean nothing), r length of the delay line's ring. Lengths are in metres, delays in samples
-unless their name says seconds.
+Letters: s slots, e ears (2, or 1 without a head), c channels of the output, n taps, f bins, b block size, w block size
+rounded up to whole tiles of the loops (values beyond b mean nothing), r length of the delay line's ring. Lengths are in
+metres, delays in samples unless their name says seconds.
 """
 
 from typing import Any
@@ -39,6 +40,7 @@ from server.rendering.direct_path_records import (
     FloatArray,
 )
 from server.rendering.fractional_delay import BEFORE
+from server.rendering.harmonics_kernel import write_harmonics
 from server.rendering.sphere import find_triangle
 
 _LENGTH_TIME_S = 0.015
@@ -81,7 +83,7 @@ def ask(
 
 @compiled_in_place
 def render_direct_paths(state: DirectPathState, blocks: FloatArray, out: FloatArray) -> None:
-    """Render the blocks (s, b) of all slots and add the result to the ears (e, b) in `out`."""
+    """Render the blocks (s, b) of all slots and add the result to the channels (c, b) in `out`."""
     position = state.position[0]
     size = out.shape[1]
     state.is_mixed[:] = 0
@@ -112,7 +114,8 @@ def _fetch(state: DirectPathState, index: int, position: int, size: int) -> None
     loops.fetch(line, begin, min(begin + size + 2 * BEFORE, line.size))
     for ear in range(state.heard.shape[1]):
         loops.fetch(state.heard[index, ear], 0, state.heard.shape[2])
-        loops.fetch(state.spectra[index, ear, 0], 0, 2 * state.spectra.shape[3])  # the imaginary parts follow
+    for channel in range(state.spectra.shape[1]):
+        loops.fetch(state.spectra[index, channel, 0], 0, 2 * state.spectra.shape[3])  # the imaginary parts follow
 
 
 @compiled_in_place
@@ -128,15 +131,15 @@ def _synthesise(state: DirectPathState, kind: int, out: FloatArray) -> None:
     """Transform one of the mixes back and add it to `out`: the mix of the filters in effect, or a mix that fades out
     from the previous filters."""
     block = state.filtered
-    for ear in range(out.shape[0]):
-        loops.synthesise(state.mix[kind, ear], state.twist, state.passes, state.lanes, block)
+    for channel in range(out.shape[0]):
+        loops.synthesise(state.mix[kind, channel], state.twist, state.passes, state.lanes, block)
         newest = block[block.size - out.shape[1] :]
         if kind == 0:
-            loops.add_block(newest, out[ear])
+            loops.add_block(newest, out[channel])
         elif kind == _STEP:
-            loops.add_fading(newest, state.ramp, out[ear])
+            loops.add_fading(newest, state.ramp, out[channel])
         else:
-            loops.add_fading(newest, state.fade, out[ear])
+            loops.add_fading(newest, state.fade, out[channel])
 
 
 @compiled_in_place
@@ -182,7 +185,8 @@ def _render_slot(state: DirectPathState, slot: Any, index: int, size: int) -> No
     gain_before = gain if at_once else slot.gain
     slot.gain = gain
     change = _change(slot, state.to_head, state.air_db_per_m)
-    now = MUTED if slot.muted else FILTERED if ears == 2 or _colours(slot) else UNFILTERED
+    is_filtered = ears == 2 or state.harmonics.size > 0 or _colours(slot)
+    now = MUTED if slot.muted else FILTERED if is_filtered else UNFILTERED
     slot.mode = now
     if jumps or (now == FILTERED) != (before == FILTERED):
         change = _LEAP
@@ -220,23 +224,27 @@ def _read_past(state: DirectPathState, slot: Any, index: int, ear: int, back: in
 
 @compiled_in_place
 def _add_filtered(state: DirectPathState, index: int, ear: int, before: int, now: int, change: int) -> None:
-    """Filter what an ear receives and add it to the mix, with a crossfade from the previous filter if the two
-    differ."""
+    """Filter what an ear receives and add it to the mix of its channels, with a crossfade from the previous filter if
+    the two differ."""
     loops.transform(state.heard[index, ear], state.twist, state.passes, state.lanes, state.bins)
-    in_effect, after = state.spectra[index, ear], state.next_spectra[ear]
-    if before != FILTERED:
-        in_effect[:] = 0
-    if now != FILTERED:
-        after[:] = 0
-    if before == NOT_STARTED:
-        loops.copy_spectrum(after, in_effect)
-    elif change != _NONE:
+    channels = state.spectra.shape[1] // state.heard.shape[1]
+    if before != NOT_STARTED and change != _NONE:
         _open(state, change)
-        loops.accumulate_change(state.bins, in_effect, after, state.mix[change, ear])
-        loops.copy_spectrum(after, in_effect)
     if now == FILTERED:
         _open(state, 0)
-        loops.accumulate(state.bins, in_effect, state.mix[0, ear])
+    for channel in range(ear * channels, (ear + 1) * channels):
+        in_effect, after = state.spectra[index, channel], state.next_spectra[channel]
+        if before != FILTERED:
+            in_effect[:] = 0
+        if now != FILTERED:
+            after[:] = 0
+        if before == NOT_STARTED:
+            loops.copy_spectrum(after, in_effect)
+        elif change != _NONE:
+            loops.accumulate_change(state.bins, in_effect, after, state.mix[change, channel])
+            loops.copy_spectrum(after, in_effect)
+        if now == FILTERED:
+            loops.accumulate(state.bins, in_effect, state.mix[0, channel])
 
 
 @compiled_in_place
@@ -349,6 +357,12 @@ def _find_filters(state: DirectPathState, slot: Any) -> None:
     for ear in range(ears):
         loops.copy(state.next_taps[ear], state.padded[:count])
         loops.transform(state.padded, state.twist, state.passes, state.lanes, state.next_spectra[ear])
+    if state.harmonics.size > 0:
+        write_harmonics(slot.direction, state.harmonics)
+        for channel in range(1, state.harmonics.size):
+            loops.copy_spectrum(state.next_spectra[0], state.next_spectra[channel])
+            for part in range(2):
+                loops.multiply_by(state.next_spectra[channel, part], state.harmonics[channel])
 
 
 @compiled_in_place

@@ -63,7 +63,7 @@ class DirectPathState(NamedTuple):
     line: FloatArray  # (s, r + a copy of its beginning)
     heard: FloatArray  # (s, e, 2 f + padding to whole tiles) delayed input, the newest 2 f samples
     plain: FloatArray  # (w,) sum of the sound that needs no filter
-    spectra: FloatArray  # (s, e, part, f) of the filters in effect
+    spectra: FloatArray  # (s, c, part, f) of the filters in effect
 
     # Tables.
     cepstra: FloatArray  # (direction, e, n)
@@ -88,10 +88,11 @@ class DirectPathState(NamedTuple):
     sums: FloatArray  # (e, n + 8)
     next_taps: FloatArray  # (e, n)
     padded: FloatArray  # (2 f,)
-    next_spectra: FloatArray  # (e, part, f)
+    next_spectra: FloatArray  # (c, part, f)
+    harmonics: DoubleArray  # (c,) of the direction, for ambisonic channels; else empty
     bins: FloatArray  # (part, f)
     is_mixed: IntArray  # (4,) whether this block used each of the three mixes, and `plain`
-    mix: FloatArray  # (3, e, part, f) output of the filters in effect, and of the previous ones in a step and in a leap
+    mix: FloatArray  # (3, c, part, f) output of the filters in effect, and of the previous ones in a step and in a leap
     first: npt.NDArray[np.int32]  # (w,)
     row: npt.NDArray[np.int32]  # (w,)
     share: FloatArray  # (w,)

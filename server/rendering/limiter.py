@@ -1,7 +1,7 @@
 """The peak limiter, the last step before output. It changes a block only if the block would be too loud for a
 converter.
 
-Both ears get the same gain, so that nothing seems to move. Peaks are true peaks: they include the signal between
+All channels get the same gain, so that nothing seems to move. Peaks are true peaks: they include the signal between
 samples, which a converter reconstructs, estimated at four times the sample rate as in ITU-R BS.1770-4, Annex 2. A block
 below the ceiling passes unchanged to the last bit.
 
@@ -210,7 +210,7 @@ def _silence_what_is_not_finite(block: FloatArray) -> int:
 
 @compiled
 def _find_peaks(signal: FloatArray, table: FloatArray, peak: FloatArray) -> None:
-    """Write to `peak` (sample,) the largest magnitude over both channels, at each sample and between it and its
+    """Write to `peak` (sample,) the largest magnitude over all channels, at each sample and between it and its
     neighbours, as far as these are known."""
     size = peak.size
     ahead = _TAPS // 2

@@ -1,5 +1,6 @@
-"""The mixers of one renderer: one for a head with two ears, one for a single ear without a head. Each mixer is made
-when it is needed and dropped when all sound in it has rung out; the same goes for its convolver.
+"""The mixers of one renderer: one for a head with two ears, one for a single ear without a head, or one alone for
+ambisonic channels. Each mixer is made when it is needed and dropped when all sound in it has rung out; the same goes
+for its convolver.
 
 Making one takes milliseconds, so `prepare` and `prepare_hearing` do it on another thread before the rendering thread
 needs it. All other methods are for the rendering thread.
@@ -19,19 +20,21 @@ Slot = tuple[Mixer, int]
 
 
 class MixerSet:
-    """The mixers of a renderer; `new_direct` and `new_convolver` take a number of channels and make the parts of a
-    mixer."""
+    """The mixers of a renderer, by number of channels, each of which is one of `hearings`; the last is the usual one.
+    `new_direct` and `new_convolver` take a number of channels and make the parts of a mixer."""
 
     def __init__(
         self,
         *,
         slots: int,
         block_size: int,
+        hearings: tuple[int, ...],
         new_direct: Callable[[int], DirectPath | None],
         new_convolver: Callable[[int], Convolver],
     ) -> None:
         self._slots = slots
         self._block_size = block_size
+        self._hearings = hearings
         self._new_direct = new_direct
         self._new_convolver = new_convolver
         self._spare_mixers: dict[int, Mixer] = {}
@@ -51,16 +54,18 @@ class MixerSet:
         return iter(self._mixers.values())
 
     def prepare(self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None, same_from: int) -> PartitionedIr:
-        """Prepare an IR (1 or 2, samples) for the mixer with the same number of channels, as `Convolver.prepare` does.
+        """Prepare an IR (channel, samples) for the mixer with the same number of channels, as `Convolver.prepare` does.
 
         Raises ValueError for another shape or a sample that is not finite.
         """
-        channels = 1 if ir.ndim == 2 and ir.shape[0] == 1 else 2
+        channels = ir.shape[0] if ir.ndim == 2 and ir.shape[0] in self._hearings else self._hearings[-1]
         self.prepare_hearing(channels)
         return self.preparer(channels).prepare(ir, like=like, same_from=same_from)
 
-    def preparer(self, channels: int) -> Convolver:
-        """The convolver of the mixer with this number of channels; made now if there is none yet."""
+    def preparer(self, channels: int | None = None) -> Convolver:
+        """The convolver of the mixer with this number of channels, by default the usual one; made now if there is none
+        yet."""
+        channels = self._hearings[-1] if channels is None else channels
         known = self._mixers.get(channels)
         convolver = None if known is None else known.convolver
         if convolver is None:

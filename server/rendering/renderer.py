@@ -10,6 +10,9 @@ Every change is free of clicks: an IR changes by a crossfade, a path by Doppler 
 A removed emitter's input is ramped to zero, after which its reverberation rings out. An added emitter begins at the
 first sample of its source.
 
+Instead of ears there may be ambisonic channels in world axes, to be turned where they are decoded. Then paths are
+encoded with their directions, IRs have as many channels, and the listener's orientation changes nothing.
+
 Parts that are not needed do not exist. The convolver is made with the first IR and dropped when the last has rung out;
 without a head, paths and IRs have one channel. When an emitter moves between hearing with and without a head, its input
 fades from one mixer to the other, and what it played before rings out in the old one.
@@ -25,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import Quaternion
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.errors import NafirError
 from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
 from server.rendering.direct_path import DirectPath, PathTarget
@@ -67,7 +71,7 @@ class _Emitter:
 
 class Renderer:
     """Renders one listener with at most `max_emitters` emitters and `outputs` channels: two ears (0 is the left one),
-    or one.
+    or one; with an `order`, its ambisonic channels: ACN order, SN3D norm.
 
     `filters` are the head for direct paths, at `sample_rate`; without them there are only IRs, which must then include
     the direct sound. `air_db_per_m` (7,) is the absorption of air per octave band. With a `ceiling`, no sample of the
@@ -93,13 +97,16 @@ class Renderer:
         ceiling: float | None = None,
         outputs: int = 2,
         has_head: bool = True,
+        order: int | None = None,
     ) -> None:
         if not is_block_size(block_size):
             raise ValueError(f"block_size is {BLOCK_SIZES}, not {block_size}")
         self.block_size = block_size
         self.ir_samples = ir_samples
         self.max_emitters = max_emitters
-        self.outputs = outputs
+        self.order = order
+        """The order of ambisonic channels; None for ears."""
+        self.outputs = outputs if order is None else harmonic_count(order)
         # Twice the number of emitters: a removed emitter keeps its slot until its reverberation has rung out.
         slots = 2 * max_emitters
 
@@ -113,6 +120,7 @@ class Renderer:
                 filters=filters if channels == 2 else None,
                 speed_of_sound=speed_of_sound,
                 air_db_per_m=air_db_per_m,
+                order=order,
             )
 
         def convolver_of(channels: int) -> Convolver:
@@ -126,10 +134,16 @@ class Renderer:
                 any_size=not is_power_of_two(block_size),
             )
 
-        self._mixers = MixerSet(slots=slots, block_size=block_size, new_direct=direct_of, new_convolver=convolver_of)
-        self._mixer = self._mixers.of(2 if has_head else 1)
+        self._mixers = MixerSet(
+            slots=slots,
+            block_size=block_size,
+            hearings=(1, 2) if order is None else (self.outputs,),
+            new_direct=direct_of,
+            new_convolver=convolver_of,
+        )
+        self._mixer = self._mixers.of(self.outputs if order is not None else 2 if has_head else 1)
         """The mixer for new emitters."""
-        self._output = Output(channels=outputs, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
+        self._output = Output(channels=self.outputs, block_size=block_size, sample_rate=sample_rate, ceiling=ceiling)
         self._emitters: dict[str, _Emitter] = {}
         self._changed: list[_Emitter] = []  # since the last block
         self.exchanged = False
@@ -164,7 +178,8 @@ class Renderer:
 
     @property
     def channels(self) -> int:
-        """The number of channels for new emitters: 2 for a head, 1 for a single ear without one."""
+        """The number of channels for new emitters: 2 for a head, 1 for a single ear without one, or those of
+        ambisonics."""
         return self._mixer.channels
 
     def applied(self, emitter_id: str) -> int | None:
@@ -175,9 +190,9 @@ class Renderer:
     def prepare(
         self, ir: npt.NDArray[np.floating], *, like: PartitionedIr | None = None, same_from: int = 0
     ) -> PartitionedIr:
-        """Prepare an IR (1 or 2, 1..ir_samples) for `set_ir`. This is most of its cost, and any thread may do it. It
-        costs less if the IR equals, from sample `same_from` on, the IR from which `like` was made. One channel is for
-        hearing without a head.
+        """Prepare an IR (1 or 2 or all ambisonic channels, 1..ir_samples) for `set_ir`. This is most of its cost, and
+        any thread may do it. It costs less if the IR equals, from sample `same_from` on, the IR from which `like` was
+        made. One channel is for hearing without a head.
 
         Raises ValueError for another shape or a sample that is not finite.
         """
@@ -185,8 +200,9 @@ class Renderer:
 
     @property
     def preparation(self) -> Hashable:
-        """A key that is equal for renderers which prepare IRs of two channels in the same way and may share them."""
-        return self._mixers.preparer(2).preparation
+        """A key that is equal for renderers which prepare IRs with a head, or of ambisonics, in the same way and may
+        share them."""
+        return self._mixers.preparer().preparation
 
     def prepare_hearing(self, channels: int) -> None:
         """Prepare for `set_channels`, on any thread."""

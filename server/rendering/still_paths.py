@@ -1,4 +1,4 @@
-"""Impulse responses of many static paths, filtered by one head and summed.
+"""Impulse responses of many static paths, filtered by one head and summed, or encoded as ambisonic channels.
 
 `DirectPath` follows motion block by block; this module is for paths that are exchanged as a whole: reflections inside
 impulse responses, and single responses.
@@ -28,7 +28,8 @@ class StillPaths:
     """Adds responses of static paths for one head and the air around it; threads may share it. `air_db_per_m` (band,)
     >= 0.
 
-    Without a head there is one ear, and responses have one channel.
+    Without a head there is one ear, and responses have one channel, or 4, 9 or 16 ambisonic ones in ACN order and SN3D
+    norm.
     """
 
     def __init__(
@@ -59,10 +60,10 @@ class StillPaths:
         orientation: Sequence[float],
         out: FloatArray,
     ) -> None:
-        """Add the responses of paths to `out` (ear, sample), where sample 0 is emission. The unit quaternion
-        `orientation` turns the head. Paths have lengths (n,), unit vectors (n, 3) in world axes towards the direction
-        of arrival, and gains (n, band) without distance and air. Samples before 0 or after the end of `out` are left
-        out."""
+        """Add the responses of paths to `out` (channel, sample), where sample 0 is emission. The unit quaternion
+        `orientation` turns the head, or the axes of ambisonic channels. Paths have lengths (n,), unit vectors (n, 3) in
+        world axes towards the direction of arrival, and gains (n, band) without distance and air. Samples before 0 or
+        after the end of `out` are left out."""
         # One memory layout for each array, so that only one version is compiled.
         add_still_paths(
             self._tables,

@@ -13,6 +13,7 @@ import server.rendering.path_loops as loops
 from server.kernels.compiled import compiled
 from server.kernels.copying import copy
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
+from server.rendering.harmonics_kernel import write_harmonics
 from server.rendering.sphere import find_triangle
 
 FloatArray = npt.NDArray[np.float32]
@@ -47,14 +48,16 @@ def add_still_paths(
     gains_db: DoubleArray,
     out: FloatArray,
 ) -> None:
-    """Add to `out` (e, sample) the responses of paths to a unit impulse at sample 0: lengths (path,), arrivals (path,
-    3), gains (path, band)."""
+    """Add to `out` (channel, sample) the responses of paths to a unit impulse at sample 0: lengths (path,), arrivals
+    (path, 3), gains (path, band). Channels are the ears or, for one ear, also 4, 9 or 16 ambisonic ones."""
     ears, count, bands = tables.cepstra.shape[1], tables.cepstra.shape[2], tables.band_cepstra.shape[0]
     wide = -(-(count + TAPS - 1) // loops.TILE) * loops.TILE
     cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)
     taps, padded = np.zeros((2, count), np.float32), np.zeros(wide + TAPS - 1, np.float32)
     still_taps, heard = np.zeros(TAPS, np.float32), np.zeros(wide, np.float32)
     direction, weights = np.zeros(3), np.zeros(3)
+    of_each = out.shape[0] // ears
+    harmonics = np.ones(of_each)
     triangle = 0
     for path in range(lengths_m.size):
         length = lengths_m[path]
@@ -77,7 +80,9 @@ def add_still_paths(
             for n in range(count):
                 of_ear[n] *= tables.orders[n]
         loops.series_exponential(cepstrum, tables.reciprocals, sums, taps)
-        gain = np.float32(1.0 / max(length, tables.nearest_m))
+        if ears == 1:
+            write_harmonics(direction, harmonics)
+        gain = 1.0 / max(length, tables.nearest_m)
         for ear in range(ears):
             delay_s = length / tables.speed_of_sound
             if ears == 2:
@@ -92,5 +97,7 @@ def add_still_paths(
             loops.filter_block(padded, still_taps, heard)
             begin = whole + BEFORE - (TAPS - 1)
             # Outside the reach of filter and sinc there are only zeros.
-            for i in range(max(0, -begin), min(count + TAPS - 1, out.shape[1] - begin)):
-                out[ear, begin + i] += gain * heard[i]
+            for number in range(of_each):
+                scale = np.float32(gain * harmonics[number])
+                for i in range(max(0, -begin), min(count + TAPS - 1, out.shape[1] - begin)):
+                    out[ear * of_each + number, begin + i] += scale * heard[i]

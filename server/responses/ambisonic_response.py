@@ -13,15 +13,13 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import LEVEL, Pose, orientations_of
 from server.acoustics.sound_path import SoundPathFinder
-from server.acoustics.spherical_harmonics import harmonic_count, real_harmonics, rotation
+from server.acoustics.spherical_harmonics import harmonic_count, rotation
 from server.core.errors import RequestError
 from server.field.field import AcousticField
 from server.rendering.hrtf import NoHead
 from server.rendering.still_paths import StillPaths
 from server.responses.early_reflections import EarlyReflections
 from server.responses.emitter_state import EmitterState
-
-_Floats = npt.NDArray[np.float64]
 
 
 class AmbisonicResponse:
@@ -69,18 +67,8 @@ class AmbisonicResponse:
             responses, listeners, emitters, orientations_of(heads), strict=True
         ):
             paths = self._finder.find(listener, emitter[None])
-            self._add(paths.length_m, paths.arrival, paths.screen_db, response)
+            self._waves.add(paths.length_m, paths.arrival, paths.screen_db, LEVEL, response)
             if self._early is not None:
-                state = EmitterState(Pose(tuple(emitter)))
-                self._add(*self._early.paths(Pose(tuple(listener)), [state])[0], response)
+                self._early.add(response[None], Pose(tuple(listener)), [EmitterState(Pose(tuple(emitter)))])
             response[:] = rotation(orientation, order) @ response
         return responses
-
-    def _add(self, lengths_m: _Floats, arrivals: _Floats, gains_db: _Floats, response: npt.NDArray[np.float32]) -> None:
-        """Add paths (n,) as plane waves to a response (k, sample) in world axes."""
-        order = round(len(response) ** 0.5) - 1
-        for path, harmonics in enumerate(real_harmonics(arrivals, order).astype(np.float32)):
-            part = slice(path, path + 1)
-            wave = np.zeros((1, response.shape[-1]), np.float32)
-            self._waves.add(lengths_m[part], arrivals[part], gains_db[part], LEVEL, wave)
-            response += harmonics[:, None] * wave

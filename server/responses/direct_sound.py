@@ -78,7 +78,8 @@ class PathBatch(Generic[Key]):
 
 
 class DirectSound:
-    """The direct sound in one scene, through one head; `air_db_per_m` (7,) is per octave band.
+    """The direct sound in one scene, through one head or, with an `order`, as ambisonic channels in world axes;
+    `air_db_per_m` (7,) is per octave band.
 
     `early_reflections` are computed here if the responses of the scene's fields leave them out; otherwise None. If the
     fields include the direct sound, a renderer has none to add and there are no `filters`; if those fields are also
@@ -97,11 +98,13 @@ class DirectSound:
         early_without_head: EarlyReflections | None = None,
         binauralization: Binauralization | None = None,
         field_gain: float = 1.0,
+        order: int | None = None,
     ) -> None:
         self.early_reflections = early_reflections
         self.early_without_head = early_without_head
         self.binauralization = binauralization
         self.field_gain = field_gain
+        self.order = order
         self._finder = SoundPathFinder(plan, speed_of_sound)
         self._straight = SoundPathFinder(_IN_THE_OPEN, speed_of_sound)
         self._speed_of_sound = speed_of_sound
@@ -109,17 +112,19 @@ class DirectSound:
         self._filters = filters
 
     @classmethod
-    def of(cls, bundle: Bundle, filters: HeadFilters) -> "DirectSound":
+    def of(cls, bundle: Bundle, filters: HeadFilters, *, order: int | None = None) -> "DirectSound":
         manifest = bundle.manifest
+        without_head = EarlyReflections.of(bundle, NoHead(filters.sample_rate))
         return cls(
             bundle.floor_plan,
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
             filters=filters if manifest.direct_sound == "geometry" else None,
-            early_reflections=EarlyReflections.of(bundle, filters),
-            early_without_head=EarlyReflections.of(bundle, NoHead(filters.sample_rate)),
+            early_reflections=EarlyReflections.of(bundle, filters) if order is None else without_head,
+            early_without_head=without_head,
             binauralization=Binauralization.of(bundle, filters),
             field_gain=float(db_to_amplitude(-manifest.reference_level_db)),
+            order=order,
         )
 
     def renderer(
@@ -148,24 +153,28 @@ class DirectSound:
             ceiling=CEILING,
             outputs=outputs,
             has_head=has_head,
+            order=self.order,
         )
 
-    def through_head(self, field: AcousticField) -> AcousticField:
-        """The field heard through the head of this direct sound."""
+    def heard(self, field: AcousticField) -> AcousticField:
+        """The field heard through the head of this direct sound, or as its ambisonic channels."""
+        if self.order is not None:
+            return field.encoded(self.order)
         return field if self._filters is None else field.through(self._filters)
 
     def early(self, channels: int) -> EarlyReflections | None:
-        """The first reflections for two ears, or for one channel without a head."""
+        """The first reflections for two ears, for one channel without a head, or for ambisonic channels."""
         return self.early_reflections if channels == 2 else self.early_without_head
 
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
-        """Add the direct sound of each emitter at `listener` to its response (B, ear, sample), for emitters whose
+        """Add the direct sound of each emitter at `listener` to its response (B, channel, sample), for emitters whose
         direct sound is baked into the response; sample 0 is emission.
 
         A renderer multiplies these responses by the emitter's `reverberation_gain`, which is divided out here.
         """
         if self._filters is None:
             return
+        listener = self.axes_for(listener)
         for ways in self.ways_from(enumerate(emitters)):
             for row, length_m, arrival, gain_db in zip(ways.keys, *ways.find(listener), strict=True):
                 emitter = emitters[row]
@@ -177,6 +186,10 @@ class DirectSound:
                 still.add(
                     np.array([length_m]), arrival[np.newaxis], gain[np.newaxis], listener.orientation, responses[row]
                 )
+
+    def axes_for(self, listener: Pose) -> Pose:
+        """The pose whose axes responses have: the listener's, or for ambisonic channels those of the world."""
+        return listener if self.order is None else Pose(listener.position)
 
     @property
     def is_heard_apart(self) -> bool:
@@ -193,11 +206,11 @@ class DirectSound:
         return [PathBatch(finder, some) for finder, some in ((self._finder, hidden), (self._straight, open_)) if some]
 
     def _still(self, channels: int, *, has_air: bool) -> StillPaths:
-        return self._still_paths[channels - 1][has_air]
+        return self._still_paths[channels == 2][has_air]
 
     @cached_property
     def _still_paths(self) -> tuple[tuple[StillPaths, StillPaths], tuple[StillPaths, StillPaths]]:
-        """Renderers of resting paths for one ear and for two, each without air absorption and with it."""
+        """Renderers of resting paths without a head and for two ears, each without air absorption and with it."""
         assert self._filters is not None
         airless = np.zeros_like(self._air_db_per_m)
         one, two = (

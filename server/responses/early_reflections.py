@@ -36,7 +36,10 @@ _Floats = npt.NDArray[np.float64]
 
 
 class EarlyReflections:
-    """First reflections in one scene, through one head; `air_db_per_m` (band,). Safe to share between threads."""
+    """First reflections in one scene, through one head; `air_db_per_m` (band,). Safe to share between threads.
+
+    Without a head, responses have one channel, or several ambisonic ones in the axes of the listener.
+    """
 
     def __init__(
         self,
@@ -81,7 +84,7 @@ class EarlyReflections:
         )
 
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
-        """Add the first reflections of each emitter at `listener` to its response (B, ear, sample); sample 0 is
+        """Add the first reflections of each emitter at `listener` to its response (B, channel, sample); sample 0 is
         emission.
 
         A renderer multiplies these responses by the emitter's `reverberation_gain`, which is right for diffuse sound.

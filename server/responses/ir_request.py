@@ -31,7 +31,7 @@ class AskedIr:
 @dataclass(frozen=True)
 class IrRequest:
     """A request for IRs of one quality level, for the poses at the time when `pose_id` was the newest, with two
-    channels through a head or one without."""
+    channels through a head, one without, or ambisonic ones."""
 
     pose_id: int
     level: str
@@ -39,7 +39,7 @@ class IrRequest:
     asked: tuple[AskedIr, ...]
     """The responses of emitters whose IR is out of date."""
     direct_sound: DirectSound
-    """The direct sound and first reflections that the field's IRs leave out, through this session's head."""
+    """The direct sound and first reflections that the field's IRs leave out, as this session hears them."""
     channels: int = 2
     is_first: bool = False
     """Whether an emitter in the request waits for its first IR to become audible."""
@@ -80,7 +80,7 @@ def composed_irs(
     """Return responses (B, channel, sample) with the parts that the emitters' effects call for. The field computes only
     those of emitters with `late` on. `remember` is as in `AcousticField.impulse_responses`."""
     count = len(emitters)
-    field = direct.through_head(field)
+    field, listener = direct.heard(field), direct.axes_for(listener)
     held = _held(field, direct, listener, emitters, remember=remember)
     if direct.binauralization is not None:
         places = [emitter.pose.position for emitter in emitters]
@@ -108,7 +108,7 @@ def _held(
     """Return the field's responses (B, channel, sample) in an array of their own; zeros for emitters with `late`
     off."""
     late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
-    channels = 2 if direct.binauralization is None else 1
+    channels = field.channels
     if not late:
         return np.zeros((len(emitters), channels, field.ir_samples), np.float32)
     ears = np.tile(np.asarray(listener.position), (len(late), 1))

@@ -28,8 +28,8 @@ class ActiveEffects:
         self, renderer: Renderer, planned: PlannedEffects | None, *, sample_rate: int, has_early: bool, has_late: bool
     ) -> None:
         self.planned = planned
-        self.shared = SharedEffects() if planned is None else planned.shared
         self._renderer = renderer
+        self.shared = self._called_for()
         self._sample_rate = sample_rate
         has = {EffectName.EARLY_REFLECTIONS: has_early, EffectName.LATE_REVERBERATION: has_late}
         self._lacking = frozenset(name for name, is_there in has.items() if not is_there)
@@ -42,7 +42,7 @@ class ActiveEffects:
     @property
     def wants_other_ears(self) -> bool:
         """Whether the effects call for another number of channels than the renderer has."""
-        return self.shared.channels != self._renderer.channels
+        return self._renderer.order is None and self.shared.channels != self._renderer.channels
 
     @property
     def awaits_ears(self) -> bool:
@@ -58,7 +58,7 @@ class ActiveEffects:
         """Put the plan into effect. Return the emitters that it includes for the first time and that need no IR."""
         assert self.planned is not None
         ears = self.shared.channels
-        self.shared = self.planned.shared
+        self.shared = self._called_for()
         begin = []
         for name, emitter in emitters.items():
             effects = self.planned.of_emitter(name, self.clock_s, lacking=self._lacking)
@@ -71,6 +71,11 @@ class ActiveEffects:
             if ears != self.shared.channels:
                 emitter.discard_response()
         return begin
+
+    def _called_for(self) -> SharedEffects:
+        """The shared effects that the plan calls for; ambisonic channels have no head, whatever a client wishes."""
+        shared = SharedEffects() if self.planned is None else self.planned.shared
+        return shared if self._renderer.order is None else dataclasses.replace(shared, head=False)
 
     def whole(self) -> tuple[EmitterEffects, bool]:
         """Return the flags with every effect on but those switched off by hand, and whether there is a head then."""

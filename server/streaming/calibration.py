@@ -25,7 +25,8 @@ _MOST_MS = 50.0
 
 
 class Listener:
-    """A listener to one emitter with all effects on, at the level of `field`, served as a stream is.
+    """A listener to one emitter with all effects on, at the level of `field`, served as a stream is; with an `order`,
+    as a stream of ambisonics.
 
     `node_cache` has the responses kept from before; `time_s` is the clock.
     """
@@ -37,12 +38,13 @@ class Listener:
         *,
         node_cache: NodeCache | None = None,
         time_s: Callable[[], float] = time.perf_counter,
+        order: int | None = None,
     ) -> None:
         self._field = field
         self._node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
         self._levels = FieldsByLevel([field], self._node_cache)
         self._time_s = time_s
-        self._direct_sound = DirectSound.of(field.bundle, filters)
+        self._direct_sound = DirectSound.of(field.bundle, filters, order=order)
         self._renderer = self._direct_sound.renderer(
             block_size=_BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
         )
@@ -59,9 +61,8 @@ class Listener:
         if self._heard is None or not self._heard.around.holds(listener):
             shared = shared_response(self._field, self._direct_sound.early_reflections, listener, self._emitter)
             if shared is None or self._heard is None or shared.identity != self._heard.identity:
-                request = IrRequest(
-                    0, self._field.level.name, listener, (AskedIr(0, self._emitter),), self._direct_sound
-                )
+                asked, channels = (AskedIr(0, self._emitter),), self._renderer.channels
+                request = IrRequest(0, self._field.level.name, listener, asked, self._direct_sound, channels)
                 compute_irs(self._levels, request, self._renderer)
             self._heard = shared
         return 1000 * (self._time_s() - started_s)
@@ -72,9 +73,11 @@ class Listener:
         self._heard = None
 
 
-def calibrate(levels: FieldsByLevel, filters: HeadFilters, poses: int = POSES) -> dict[str, float]:
+def calibrate(
+    levels: FieldsByLevel, filters: HeadFilters, poses: int = POSES, order: int | None = None
+) -> dict[str, float]:
     """Return the milliseconds that a new response takes on this host now, by level: the median of `poses`, or of fewer
-    for a slow level.
+    for a slow level. With an `order`, responses are ambisonic.
 
     Times are CPU time of this thread, so that other load has little influence; levels take turns, so that it affects
     all of them alike. The caches of `levels` are cleared.
@@ -82,7 +85,7 @@ def calibrate(levels: FieldsByLevel, filters: HeadFilters, poses: int = POSES) -
     start = levels.bundle.manifest.start
     places = [(float(x), float(y), float(z)) for x, y, z in np.linspace(start.listener, start.emitter, poses)]
     listeners = {
-        name: Listener(field, filters, node_cache=levels.node_cache, time_s=time.thread_time)
+        name: Listener(field, filters, node_cache=levels.node_cache, time_s=time.thread_time, order=order)
         for name, field in levels.items()
     }
     times_ms: dict[str, list[float]] = {name: [] for name in levels}

@@ -108,12 +108,18 @@ class PlanAudit:
         return audible_difference(reference, heard, field.sample_rate, onset_s=onset_s)
 
     def _heard(self, field: AcousticField, effects: EmitterEffects, channels: int) -> npt.NDArray[np.float32]:
-        """Return the full response (2, sample); a mono one is repeated."""
+        """Return the full response (2, sample); a mono one is repeated, and ambisonic channels are heard by two
+        cardioid microphones, back to back."""
         emitter = dataclasses.replace(self.emitter, effects=dataclasses.replace(effects, propagation_delay=True))
-        responses = composed_irs(field, self.direct_sound, self.listener, [emitter], channels)
+        responses: npt.NDArray[np.float32] = composed_irs(field, self.direct_sound, self.listener, [emitter], channels)
         if effects.direct_path:
             self.direct_sound.add(responses, self.listener, [emitter])
-        return np.repeat(responses[0], 2, axis=0) if channels == 1 else responses[0]
+        if channels == 1:
+            return np.repeat(responses[0], 2, axis=0)
+        if channels == 2:
+            return np.asarray(responses[0])
+        pressure, to_the_left = responses[0, :2]
+        return np.array([pressure + to_the_left, pressure - to_the_left], np.float32) / np.float32(2)
 
 
 @dataclass

@@ -75,7 +75,7 @@ class Session:
 
     `levels` are the scene's, and `quality` is the first one to render. `filters` are those of the listener's head.
     `load_clip` returns audio at the scene's rate; it has to be fast, since it is called on the rendering thread. Raises
-    RequestError for a hello that cannot be served.
+    RequestError for a hello that cannot be served, such as no_directions.
     """
 
     def __init__(
@@ -101,7 +101,11 @@ class Session:
         self._bundle = levels.bundle
         self._sample_rate = field.sample_rate
         self._load_clip = load_clip
-        self._direct_sound = DirectSound.of(self._bundle, filters)
+        order = hello.ambisonic_order
+        if order is not None:
+            levels = levels.with_directions()
+        self._output = hello.output
+        self._direct_sound = DirectSound.of(self._bundle, filters, order=order)
         self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
         self._bundle.require_inside(self._listener.position, "listener.position")
         planned = None
@@ -312,9 +316,14 @@ class Session:
             self._effects.planned.follow_emitter(identifier, emitter.state.pose, self._effects.clock_s)
 
     def _wish(self, message: SetEffects) -> None:
+        output = message.output or self._output
+        if output != self._output and "ambisonics" in (output, self._output):
+            problem = f"output: a stream for {self._output} cannot become one for {output}; open another stream"
+            raise RequestError("fixed_output", problem, field="output", status=409)
         if self._effects.planned is not None:
             wishes = {require_effect(name): is_on for name, is_on in message.effects.items()}
             self._effects.planned.wish(wishes, message.output)
+        self._output = output
 
     def _move_listener(self, message: ListenerPose) -> None:
         pose = message.pose

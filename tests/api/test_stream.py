@@ -24,6 +24,7 @@ from server.protocol.server_messages import (
     Welcome,
     parse_server_message,
 )
+from tests.directional_flat import write_directional
 
 pytestmark = pytest.mark.timed
 
@@ -43,7 +44,8 @@ def clip_files(tmp_path_factory):
 
 @contextmanager
 def serving(settings, bundle, hrtfs):
-    with TestClient(create_app(settings, scenes={"flat": FieldsByLevel.load(bundle)}, hrtfs=hrtfs)) as client:
+    scenes = {bundle.folder.name: FieldsByLevel.load(bundle)}
+    with TestClient(create_app(settings, scenes=scenes, hrtfs=hrtfs)) as client:
         for _ in range(3_600):  # the first time ever, everything is compiled
             if client.get("/readyz").status_code == 200:
                 break
@@ -54,6 +56,14 @@ def serving(settings, bundle, hrtfs):
 @pytest.fixture(scope="module")
 def client(bundle, hrtfs, clip_files):
     with serving(Settings(clips=clip_files, hello_timeout_s=0.5), bundle, hrtfs) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def client_of_directions(tmp_path_factory, hrtfs, clip_files):
+    """Of a server of a scene whose field predicts directions."""
+    directional = write_directional(tmp_path_factory.mktemp("scenes") / "flat", towards=(0.0, 0.0, 1.0))
+    with serving(Settings(clips=clip_files[:1]), directional, hrtfs) as client:
         yield client
 
 
@@ -137,6 +147,37 @@ def test_integer_samples_and_other_block_sizes_are_negotiated(client):
         assert ears.until(AudioBlock).samples.shape == (2, 512)
         ears.send(TALKER)
         assert 0.001 < np.abs(ears.until_sound().samples).max() <= 1
+
+
+def test_a_stream_of_ambisonics_from_hello_to_sound(client_of_directions):
+    hello = Hello(protocol=PROTOCOL, scene="flat", output="ambisonics", order=2, encoding="s16")
+    with client_of_directions.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, hello)
+        assert (ears.welcome.channels, ears.welcome.order) == (9, 2)
+        ears.send(TALKER)
+        assert ears.until_sound().samples.shape == (9, 256)
+        ears.send(ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5), yaw=1.0))
+        ears.until(AudioBlock, lambda block: block.reverberation_pose_id == 1)
+        turned = ears.until(AudioBlock)
+        ears.send(ListenerPose(pose_id=2, position=(2.0, 2.0, 1.5), yaw=2.0))
+        block = ears.until(AudioBlock, lambda block: block.pose_id == 2)
+        assert (block.reverberation_pose_id, block.is_exchange) == (2, False)
+        assert turned.samples.any()
+
+
+def test_a_stream_of_two_ears_has_no_order(client):
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_text(HELLO.serialize())
+        assert "order" not in json.loads(socket.receive_text())
+
+
+def test_a_scene_of_ears_refuses_a_hello_for_ambisonics(client):
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_text(Hello(protocol=PROTOCOL, scene="flat", output="ambisonics").serialize())
+        error = parse_server_message(socket.receive_text())
+        assert (error.code, error.field) == ("no_directions", "output")
+        with pytest.raises(WebSocketDisconnect):
+            socket.receive_text()
 
 
 def test_binary_poses_are_heard(ears):

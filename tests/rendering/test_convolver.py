@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.rendering.convolver import Convolver
+from server.rendering.convolver import CHANNELS, Convolver
 from server.rendering.partitions import Partitioning
 from tests.rendering.streams import BLOCK_SIZES, BOTH_KINDS, convolve, decaying_ir, stream
 from tests.signals import error_db, noise
@@ -57,7 +57,7 @@ def test_many_sources_are_added_up_as_exactly_as_few(any_size):
 @given(
     seed=st.integers(0, 2**32 - 1),
     sources=st.integers(1, 4),
-    channels=st.integers(1, 2),
+    channels=st.sampled_from(CHANNELS),
     block_size=st.sampled_from(BLOCK_SIZES),
     ir_samples=st.integers(1, 6_000),
     blocks=st.integers(1, 80),
@@ -73,6 +73,17 @@ def test_any_layout_equals_convolution(any_size, seed, sources, channels, block_
         convolver.set_ir(source, ir)
     expected = sum(convolve(dry[source], ir) for source, ir in enumerate(irs))
     assert error_db(stream(convolver, dry), expected) < -120
+
+
+@pytest.mark.parametrize("channels", [4, 9, 16])
+def test_ambisonic_channels_are_those_of_convolvers_with_one(any_size, channels):
+    dry, ir = noise(5, 1, 120 * 64), decaying_ir(6, 3_000, channels)
+    together = Convolver(sources=1, channels=channels, block_size=64, ir_samples=3_000, any_size=any_size)
+    heard = stream(together, dry, [(0, 0, ir), (40, 0, ir[::-1])])
+    for channel in (0, 1, channels - 1):
+        alone = Convolver(sources=1, channels=1, block_size=64, ir_samples=3_000, any_size=any_size)
+        changes = [(0, 0, ir[channel, None]), (40, 0, ir[::-1][channel, None])]
+        np.testing.assert_allclose(heard[channel], stream(alone, dry, changes)[0], rtol=0, atol=1e-5)
 
 
 def test_an_impulse_in_every_partition_comes_out_where_it_is(any_size):

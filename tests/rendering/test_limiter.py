@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import resample_poly
 
+from server.acoustics.spherical_harmonics import real_harmonics
 from server.rendering.limiter import CEILING, Limiter
 from tests.signals import noise
 
@@ -182,3 +183,13 @@ def test_with_nothing_compiled_it_is_the_same(tmp_path):
         subprocess.run(command, check=True, cwd=Path(__file__).parents[2])
         outputs.append(np.load(tmp_path / f"{how}.npy"))
     np.testing.assert_allclose(*outputs, atol=1e-6)
+
+
+def test_ambisonic_channels_keep_their_direction():
+    """A wave that is too loud comes from where it came from: one gain for all sixteen channels."""
+    harmonics = real_harmonics((0.6, -0.48, 0.64), 3)
+    signal = (8 * harmonics[:, None] * tone(700, 60 * SIZE)[0]).astype(np.float32)
+    out, acted = limit(signal)
+    assert acted.any()
+    assert true_peak_db(out[:, 2 * SIZE :]) < -0.9
+    np.testing.assert_allclose(out, harmonics[:, None] * out[0], atol=1e-5)

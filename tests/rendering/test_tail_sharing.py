@@ -15,14 +15,14 @@ SETTLED = SAMPLES + 4 * 16 * SIZE
 pytestmark = BOTH_KINDS
 
 
-def make(any_size, **kind):
-    return Convolver(sources=SOURCES, channels=2, block_size=SIZE, ir_samples=SAMPLES, any_size=any_size, **kind)
+def make(any_size, channels=2, **kind):
+    return Convolver(sources=SOURCES, channels=channels, block_size=SIZE, ir_samples=SAMPLES, any_size=any_size, **kind)
 
 
-def rooms(seed):
+def rooms(seed, channels=2):
     rng = np.random.default_rng(seed)
     decay = np.exp(-np.arange(SAMPLES) / 900)
-    return [(0.1 * decay * rng.standard_normal((2, SAMPLES))).astype(np.float32) for _ in range(SOURCES)]
+    return [(0.1 * decay * rng.standard_normal((channels, SAMPLES))).astype(np.float32) for _ in range(SOURCES)]
 
 
 def stream(convolver, dry, switches=(), irs=()):
@@ -37,15 +37,16 @@ def stream(convolver, dry, switches=(), irs=()):
     return np.concatenate(output, axis=1).astype(float)
 
 
-def test_before_and_after_a_switch_it_is_as_if_it_had_always_been_so(any_size):
+@pytest.mark.parametrize("channels", [2, 4, 9])
+def test_before_and_after_a_switch_it_is_as_if_it_had_always_been_so(any_size, channels):
     dry = np.random.default_rng(1).standard_normal((SOURCES, 400 * SIZE)).astype(np.float32)
     own, shared, switched = (
-        make(any_size),
-        make(any_size, shared_tail=True),
-        make(any_size, switches_tail=True),
+        make(any_size, channels),
+        make(any_size, channels, shared_tail=True),
+        make(any_size, channels, switches_tail=True),
     )
     for convolver in (own, shared, switched):
-        for source, ir in enumerate(rooms(2)):
+        for source, ir in enumerate(rooms(2, channels)):
             convolver.set_ir(source, ir)
     alone, together = stream(own, dry), stream(shared, dry)
     heard = stream(switched, dry, [(100, True), (250, False)])

@@ -7,7 +7,7 @@ from server.planning.change import UNCHANGED, Change, in_jnd, most
 from server.planning.cost import Cost, Measured
 from server.planning.effect import RESPONSES, SharedEffect
 from server.planning.prediction import ALL_ON, Prediction
-from server.planning.reasons import one_loudspeaker
+from server.planning.reasons import no_head
 from server.planning.scene_acoustics import Emitter, Situation
 from server.scene.effects import EffectName
 
@@ -19,7 +19,7 @@ _EAR_GAIN = 3.0
 def _change(prediction: Prediction) -> Change:
     """Return the change if responses keep one orientation while the head turns."""
     listener = prediction.listener
-    if not listener.turns or listener.output == "mono":
+    if not listener.turns or listener.output != "headphones":
         return UNCHANGED
     if prediction.place.holds_direct_sound:
         between_s = delay_s(1.0, prediction.place.speed_of_sound)
@@ -40,7 +40,7 @@ def _change(prediction: Prediction) -> Change:
 
 
 def _absence(situation: Situation, _: Emitter | None) -> str:
-    return one_loudspeaker(situation.listener) or ("" if situation.listener.turns else "the head keeps still")
+    return no_head(situation.listener) or ("" if situation.listener.turns else "the head keeps still")
 
 
 def _responses(measured: Measured) -> Cost:

@@ -6,7 +6,7 @@ from server.planning.change import UNCHANGED, Change, in_jnd, most
 from server.planning.cost import STILL, Variant
 from server.planning.effect import SharedEffect
 from server.planning.prediction import Prediction
-from server.planning.reasons import one_loudspeaker
+from server.planning.reasons import no_head
 from server.responses.effect_flags import SharedEffects
 from server.scene.effects import EffectName
 
@@ -17,7 +17,7 @@ _LEAST_COLOURING_DB = 3.0
 def _change(prediction: Prediction) -> Change:
     """Return the change if both ears hear the same."""
     listener = prediction.listener
-    if listener.output == "mono":
+    if listener.output != "headphones":
         return UNCHANGED
     energies, shares = prediction.whole, prediction.shares
     after = (energies.mirrored[0] + energies.held[0]) @ shares
@@ -52,6 +52,6 @@ EFFECT = SharedEffect(
     ),
     flag="head",
     change=_change,
-    absence=lambda situation, _: one_loudspeaker(situation.listener),
+    absence=lambda situation, _: no_head(situation.listener),
     costs_in=(STILL, Variant(shared=SharedEffects(head=False))),
 )
