@@ -79,5 +79,6 @@ def describe_scene(levels: FieldsByLevel) -> SceneDescription:
         emitter=Place(position=start.emitter),
         level=field.level.name,
         levels=manifest.levels,
+        directional_levels=tuple(name for name in levels if levels[name].knows_directions),
         accepted_laws=manifest.accepted,
     )

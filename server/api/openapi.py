@@ -23,6 +23,7 @@ _REFUSED: Final[dict[str, str]] = {
 }
 """Refusals that every route has."""
 _OF_A_SCENE: Final = {"404": "There is no such scene, or the scene has no such place or level; `code` says which."}
+_OF_A_HEAD: Final = {"404": "There is no such head, or no scene has this sample rate; `code` says which."}
 _OF_A_COMPUTATION: Final = {
     "409": "The request asks for more than this scene allows, or its settings contradict each other."
 }
@@ -42,7 +43,8 @@ _PROBLEM: Final[Object] = {
         "field": {"anyOf": [{"type": "string"}, {"type": "null"}]},
     },
 }
-_TAGGED: Final = ("/impulse-response", "/loudness", "/plan")
+_COMPUTED: Final = ("/impulse-response", "/loudness", "/plan")
+_TAGGED: Final = (*_COMPUTED, "/decoder")
 
 
 def install_openapi(app: FastAPI) -> None:
@@ -76,7 +78,9 @@ def _refusals(path: str) -> Object:
     refused = dict(_REFUSED)
     if "{scene}" in path:
         refused |= _OF_A_SCENE
-    if path.endswith(_TAGGED):
+    if "{hrtf}" in path:
+        refused |= _OF_A_HEAD
+    if path.endswith(_COMPUTED):
         refused |= _OF_A_COMPUTATION
     content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     responses: Object = {status: {"description": text, "content": content} for status, text in sorted(refused.items())}

@@ -18,11 +18,13 @@ from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
 from server.api.web_socket import fast_path
 from server.assets.hrtfs import DEFAULT_HRTF
-from server.core.entity_tags import content_tag
+from server.core.entity_tags import computed_tag, content_tag
 from server.core.errors import RequestError
 from server.core.numerals import parse_decimal, parse_integer
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.plan_query import EFFECT_PATTERN, OUTPUTS, PlanDocument, PlanQuery, parse_effects, rounded
+from server.rendering.head_decoder import ORDERS, HeadDecoder
+from server.responses.decoder_file import DECODER_FORMATS, DECODER_MEDIA_TYPES, DecoderFile, parse_decoder_format
 from server.responses.full_response import FullResponse
 from server.responses.impulse_response import (
     IR_FORMATS,
@@ -69,6 +71,7 @@ YawDeg = Annotated[Number, Query(**_TURNS, description="of the head, counter-clo
 EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
 _IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
 _IR_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
+_DECODER_TYPES = {"content": {each: _IR_TYPES["content"][each] for each in DECODER_MEDIA_TYPES.values()}}
 _MAP_TYPES = {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
 _MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 
@@ -292,6 +295,34 @@ async def clips(request: Request) -> dict[str, Any]:
 async def hrtfs(request: Request) -> dict[str, Any]:
     """Heads that a stream can be rendered for."""
     return {"default": DEFAULT_HRTF, "hrtfs": _host(request).hrtfs.names}
+
+
+@api.get("/hrtfs/{hrtf}/decoder", response_class=Response, responses={200: _DECODER_TYPES})
+async def decoder(
+    request: Request,
+    hrtf: str,
+    sample_rate: Annotated[WholeNumber, Query(description="in Hz, one that a scene has", examples=[24_000])],
+    order: Annotated[
+        WholeNumber, Query(**_between(ORDERS[0], ORDERS[-1]), description="of the ambisonic channels")
+    ] = ORDERS[0],
+    format: Annotated[  # noqa: A002  the parameter's name
+        str, Query(description="json, npy or wav", json_schema_extra={"enum": [*DECODER_FORMATS]})
+    ] = "json",
+) -> Response:
+    """Filters by which a head's two ears hear ambisonic channels."""
+    heads, name = _host(request).hrtfs, parse_decoder_format(format)
+    heads.require(hrtf)
+    if sample_rate not in heads.sample_rates:
+        known = ", ".join(map(str, heads.sample_rates))
+        problem = f"no scene is rendered at {sample_rate} Hz, only at {known}"
+        raise RequestError("unsupported_sample_rate", problem, field="sample_rate", status=404)
+    filters = heads.filters(hrtf, sample_rate)
+    return await _cached(
+        request,
+        computed_tag("decoder", hrtf, filters.digest, order, name),
+        DECODER_MEDIA_TYPES[name],
+        lambda _: DecoderFile(hrtf, HeadDecoder.of(filters, order)).encode(name),
+    )
 
 
 @api.websocket("/stream")

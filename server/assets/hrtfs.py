@@ -26,14 +26,19 @@ class HrtfLibrary:
         if DEFAULT_HRTF in named:
             _logger.warning("warning: %s takes the place of the bundled head %r", named[DEFAULT_HRTF], DEFAULT_HRTF)
         rates = set(sample_rates)
+        self.sample_rates = tuple(sorted(rates))
         self._filters = {(DEFAULT_HRTF, rate): kemar(rate) for rate in rates if DEFAULT_HRTF not in named}
         for name, path in named.items():
             self._filters |= {(name, rate): HeadFilters.from_hrtf(Hrtf.read(path, rate)) for rate in rates}
         self.names = tuple(sorted({DEFAULT_HRTF, *named}))
 
-    def filters(self, name: str, sample_rate: int) -> HeadFilters:
-        """Raises RequestError unknown_hrtf."""
+    def require(self, name: str) -> None:
+        """Raises RequestError unknown_hrtf for a name that is not among `names`."""
         if name not in self.names:
             known = ", ".join(self.names)
             raise RequestError("unknown_hrtf", f"there is no HRTF {name!r}, only {known}", field="hrtf", status=404)
+
+    def filters(self, name: str, sample_rate: int) -> HeadFilters:
+        """Raises RequestError unknown_hrtf."""
+        self.require(name)
         return self._filters[name, sample_rate]

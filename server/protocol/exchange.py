@@ -87,6 +87,7 @@ _STUDIO: Final = SceneDescription(
     emitter=Place(position=(6.0, 2.5, 1.5)),
     level="fine",
     levels=(QualityLevel(name="fine", field="rank16"), QualityLevel(name="fast", field="rank4", ir_rate_hz=20.0)),
+    directional_levels=("fine",),
     accepted_laws=(AcceptedLaw(law="decay", reason="the booth has a flutter echo"),),
 )
 _TWO_FRAMES: Final = np.array([[0.5, 0.25], [-0.25, 0.0]], np.float32)

@@ -24,7 +24,9 @@ class Place(Message):
 
 class SceneDescription(Message):
     """Description of a scene. `corners` is the floor plan, counter-clockwise, or the outline of the bounds if the walls
-    are unknown. `channels` are those of the scene's responses: two ears or one microphone.
+    are unknown. `channels` are those of the scene's responses: two ears or one microphone. `directional_levels` are the
+    quality levels that know from where sound arrives, so that a stream of them may be ambisonic; servers up to 0.1 do
+    not send them.
 
     `listener` and `emitter` are the places where a visit begins. `accepted_laws` are the laws of `nafir check` that the
     scene's fields break, each with the reason why the scene is offered all the same.
@@ -46,6 +48,7 @@ class SceneDescription(Message):
     emitter: Place
     level: str
     levels: tuple[QualityLevel, ...]
+    directional_levels: tuple[str, ...] = ()
     accepted_laws: tuple[AcceptedLaw, ...]
 
 

@@ -8,7 +8,6 @@ the left ear and the right one; or the harmonics of an ambisonic response (ACN, 
 import io
 import json
 import math
-import struct
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
@@ -21,6 +20,7 @@ from server.assets.hrtfs import DEFAULT_HRTF
 from server.core.entity_tags import computed_tag
 from server.core.errors import RequestError
 from server.core.numerals import DECIMAL, parse_decimal
+from server.core.wav import wav_bytes
 from server.field.field import AcousticField
 from server.rendering.hrtf import HeadFilters, kemar
 from server.responses.full_response import FullResponse
@@ -31,7 +31,6 @@ IR_FORMATS: tuple[IrFormat, ...] = get_args(IrFormat)
 IrOutput = Literal["binaural", "ambisonics", "mono"]
 IR_OUTPUTS: tuple[IrOutput, ...] = get_args(IrOutput)
 USUAL_ORDER = 1
-_IEEE_FLOAT = 3
 MEDIA_TYPES: dict[IrFormat, str] = {
     "wav": "audio/wav",
     "npy": "application/octet-stream",
@@ -298,7 +297,7 @@ class ImpulseResponse:
         buffer = io.BytesIO()
         match name:
             case "wav":
-                buffer.write(self._wav())
+                buffer.write(wav_bytes(self.samples, self.sample_rate))
             case "npy":
                 np.save(buffer, self.samples, allow_pickle=False)
             case "json":
@@ -323,19 +322,6 @@ class ImpulseResponse:
             head=query.hrtf if self.bundle.manifest.direct_sound == "geometry" or query.output == "binaural" else None,
             order=query.order,
         )
-
-    def _wav(self) -> bytes:
-        """Write a WAV file byte for byte as `scipy.io.wavfile.write` does, whose import takes a third of a second.
-        libsndfile would put the time of day into WAV files of floats (PEAK chunk)."""
-        channels, frames = self.samples.shape
-        samples = self.samples.T.astype("<f4").tobytes()
-        frame_bytes = 4 * channels
-        described = struct.pack(
-            "<HHIIHHH", _IEEE_FLOAT, channels, self.sample_rate, self.sample_rate * frame_bytes, frame_bytes, 32, 0
-        )
-        chunks = ((b"fmt ", described), (b"fact", struct.pack("<I", frames)), (b"data", samples))
-        content = b"WAVE" + b"".join(name + struct.pack("<I", len(chunk)) + chunk for name, chunk in chunks)
-        return b"RIFF" + struct.pack("<I", len(content)) + content
 
     def _document(self) -> dict[str, object]:
         return {

@@ -1,7 +1,8 @@
 // window.nafir: an interface to the page for tests and for the browser's console.
 //
 //   await nafir.ready                         the scene is on the page and play can be pressed
-//   nafir.state()                             {connection, playing, level, head, effects, listener, emitters, latency, reverberationLatency, poses}
+//   nafir.state()                             {connection, playing, output, level, head, effects, listener, emitters, latency, reverberationLatency,
+//                                              turnLatency, poses}
 //   await nafir.setListener({x, y, z, yaw})   metres and radians, each optional; resolves when it is heard (at once while paused)
 //   await nafir.setEmitter("A", {x, y, z})    likewise
 //   await nafir.capture(seconds)              {sampleRate, left, right}: the last seconds played (12 at most), before the volume
@@ -34,6 +35,7 @@ export function exposeHook(page) {
     state: () => ({
       connection: page.connection,
       playing: page.playing,
+      output: page.output,
       level: page.level,
       head: page.head,
       effects: structuredClone(page.rendered),
@@ -41,6 +43,7 @@ export function exposeHook(page) {
       emitters: structuredClone([...page.world.emitters.values()]),
       latency: page.ledger.summary(),
       reverberationLatency: page.reverberationLedger.summary(),
+      turnLatency: page.turnLedger.summary(),
       poses: { posed: page.ledger.newestPosed, heard: page.ledger.newestHeard, answered: page.reverberationLedger.newestHeard },
     }),
     setListener(pose) {

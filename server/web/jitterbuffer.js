@@ -1,5 +1,5 @@
 // An adaptive playout buffer between a bursty network and the sound card. It does no I/O, so that the worklet and tests can drive it.
-// Positions count samples since the first one pushed, the same for both ears.
+// Positions count samples since the first one pushed, the same for all channels: two ears, or those of ambisonics.
 //
 // Samples are played bit for bit. Splices compensate clock drift and changing jitter: one quantum crossfades to the same signal a few
 // milliseconds later (to shorten the buffer) or earlier (to lengthen it), at the lag where the two match best.
@@ -21,18 +21,17 @@ const SLACK_S = 0.012; // the buffer is shortened only if the fill is this far a
 const GROWTH_S = 0.015; // each dropout increases the headroom by this much
 const SHORTEST_LAG = 48;
 const LONGEST_LAG = 288;
-const INAUDIBLE = 1e-4; // sum of squares over a quantum of both ears, 60 dB below full scale
+const INAUDIBLE = 1e-4; // sum of squares over a quantum of the first two channels, 60 dB below full scale
 
 const raisedCosine = (length) => Float32Array.from({ length }, (_, i) => 0.5 - 0.5 * Math.cos((Math.PI * (i + 0.5)) / length));
 const CROSSFADE = raisedCosine(QUANTUM);
 const FADE = raisedCosine(RESERVE);
 
 export class JitterBuffer {
-  constructor({ sampleRate, capacityS = 4 }) {
+  constructor({ sampleRate, channels = 2, capacityS = 4 }) {
     this.sampleRate = sampleRate;
     this.capacity = Math.round(sampleRate * capacityS);
-    this.left = new Float32Array(this.capacity);
-    this.right = new Float32Array(this.capacity);
+    this.rings = Array.from({ length: channels }, () => new Float32Array(this.capacity));
     this.counters = { underruns: 0, splices: 0, gaps: 0, overflows: 0, late: 0, blocks: 0 };
     this.reset();
   }
@@ -57,10 +56,10 @@ export class JitterBuffer {
 
   /** The next samples with a fade-out, so that a stream that ends does not end in a click. */
   #faded() {
-    const ears = [new Float32Array(RESERVE), new Float32Array(RESERVE)];
-    this.#copy(...ears, RESERVE);
-    this.#ramp(...ears, FADE, 0, true);
-    return ears;
+    const rest = this.rings.map(() => new Float32Array(RESERVE));
+    this.#copy(rest, RESERVE);
+    this.#ramp(rest, FADE, 0, true);
+    return rest;
   }
 
   #openWindow(seconds = WINDOW_S) {
@@ -79,8 +78,8 @@ export class JitterBuffer {
     return Math.round((this.headroomS + RIPPLE_S) * this.sampleRate);
   }
 
-  push({ left, right, sampleClock, poseId, reverberationPoseId = poseId, late }) {
-    const frames = left.length;
+  push({ channels, sampleClock, poseId, reverberationPoseId = poseId, late }) {
+    const frames = channels[0].length;
     this.counters.blocks += 1;
     if (late) this.counters.late += 1;
     const joined = this.nextClock === null || sampleClock === this.nextClock;
@@ -92,17 +91,13 @@ export class JitterBuffer {
     }
     if (!joined) this.counters.gaps += 1;
     const soften = !joined && this.fill >= RESERVE;
-    for (let i = 0; soften && i < RESERVE; i++) {
-      const at = (this.written - RESERVE + i) % this.capacity;
-      this.left[at] *= 1 - FADE[i];
-      this.right[at] *= 1 - FADE[i];
-    }
-    for (let i = 0; i < frames; i++) {
-      const at = (this.written + i) % this.capacity;
-      const gain = !joined && i < RESERVE ? FADE[i] : 1;
-      this.left[at] = gain * left[i];
-      this.right[at] = gain * right[i];
-    }
+    this.rings.forEach((ring, index) => {
+      for (let i = 0; soften && i < RESERVE; i++) ring[(this.written - RESERVE + i) % this.capacity] *= 1 - FADE[i];
+      for (let i = 0; i < frames; i++) {
+        const gain = !joined && i < RESERVE ? FADE[i] : 1;
+        ring[(this.written + i) % this.capacity] = gain * channels[index][i];
+      }
+    });
     if (poseId > this.newestPose || reverberationPoseId > this.newestReverberationPose) {
       this.newestPose = poseId;
       this.newestReverberationPose = reverberationPoseId;
@@ -112,63 +107,59 @@ export class JitterBuffer {
   }
 
   /**
-   * Fills both outputs (QUANTUM samples each). Returns the poses that become audible in them, as
+   * Fills the outputs, one for each channel (QUANTUM samples each). Returns the poses that become audible in them, as
    * [{poseId, reverberationPoseId, offset, fill}] with `offset` in samples from the start of the outputs.
    */
-  pull(left, right) {
-    const frames = left.length;
+  pull(outputs) {
+    const frames = outputs[0].length;
     if (!this.playing && this.fill >= this.target) {
       this.playing = true;
       this.started = true;
       this.read = this.written - this.target; // older samples of the same burst would only add delay
       this.dips = [];
       this.#openWindow();
-      this.#copy(left, right, frames);
-      this.#ramp(left, right, FADE, 0, false);
+      this.#copy(outputs, frames);
+      this.#ramp(outputs, FADE, 0, false);
       return this.#heard(frames);
     }
     if (!this.playing) {
-      left.fill(0);
-      right.fill(0);
-      this.ending?.forEach((ear, index) => [left, right][index].set(ear));
+      outputs.forEach((samples, index) => {
+        samples.fill(0);
+        if (this.ending) samples.set(this.ending[index]);
+      });
       this.ending = null;
       return [];
     }
-    if (this.fill < frames + RESERVE) return this.#runDry(left, right, frames);
+    if (this.fill < frames + RESERVE) return this.#runDry(outputs, frames);
     this.lowest = Math.min(this.lowest, this.fill);
     this.windowLeft -= frames;
     const lag = this.windowLeft <= 0 ? this.#correction() : 0;
-    if (lag !== 0 && frames === QUANTUM) this.#splice(left, right, lag);
-    else this.#copy(left, right, frames);
+    if (lag !== 0 && frames === QUANTUM) this.#splice(outputs, lag);
+    else this.#copy(outputs, frames);
     return this.#heard(frames);
   }
 
-  #copy(left, right, frames) {
-    for (let i = 0; i < frames; i++) {
-      const at = (this.read + i) % this.capacity;
-      left[i] = this.left[at];
-      right[i] = this.right[at];
-    }
+  #copy(outputs, frames) {
+    outputs.forEach((samples, index) => {
+      const ring = this.rings[index];
+      for (let i = 0; i < frames; i++) samples[i] = ring[(this.read + i) % this.capacity];
+    });
     this.read += frames;
   }
 
-  #ramp(left, right, shape, start, falling) {
-    for (let i = 0; i < shape.length && start + i < left.length; i++) {
-      const gain = falling ? 1 - shape[i] : shape[i];
-      left[start + i] *= gain;
-      right[start + i] *= gain;
+  #ramp(outputs, shape, start, falling) {
+    for (const samples of outputs) {
+      for (let i = 0; i < shape.length && start + i < samples.length; i++) samples[start + i] *= falling ? 1 - shape[i] : shape[i];
     }
   }
 
-  #runDry(left, right, frames) {
+  #runDry(outputs, frames) {
     const rest = Math.min(this.fill, frames);
-    left.fill(0);
-    right.fill(0);
-    this.#copy(left.subarray(0, rest), right.subarray(0, rest), rest);
+    for (const samples of outputs) samples.fill(0);
+    const last = outputs.map((samples) => samples.subarray(0, rest));
+    this.#copy(last, rest);
     const start = Math.max(0, rest - RESERVE);
-    this.#ramp(left.subarray(0, rest), right.subarray(0, rest), FADE.subarray(0, rest - start), start, true);
-    left.fill(0, rest);
-    right.fill(0, rest);
+    this.#ramp(last, FADE.subarray(0, rest - start), start, true);
     this.playing = false;
     this.counters.underruns += 1;
     this.headroomS = Math.min(MAX_HEADROOM_S, this.headroomS + GROWTH_S);
@@ -214,6 +205,7 @@ export class JitterBuffer {
 
   /** The lag at which the signal matches best; the longest if several do. */
   #bestLag(sign, limit) {
+    const [first, second] = this.rings; // of ambisonics, the sound from everywhere and that from the side
     const differences = [];
     for (let lag = SHORTEST_LAG; lag <= Math.min(LONGEST_LAG, limit); lag++) {
       const shift = sign * lag;
@@ -223,7 +215,7 @@ export class JitterBuffer {
       for (let i = 0; i < QUANTUM; i += 2) {
         const here = (this.read + i) % this.capacity;
         const there = (this.read + i + shift) % this.capacity;
-        difference += (this.left[here] - this.left[there]) ** 2 + (this.right[here] - this.right[there]) ** 2;
+        difference += (first[here] - first[there]) ** 2 + (second[here] - second[there]) ** 2;
       }
       differences.push(difference);
     }
@@ -232,13 +224,15 @@ export class JitterBuffer {
     return at < 0 ? 0 : sign * (SHORTEST_LAG + at);
   }
 
-  #splice(left, right, lag) {
-    for (let i = 0; i < QUANTUM; i++) {
-      const here = (this.read + i) % this.capacity;
-      const there = (this.read + i + lag) % this.capacity;
-      left[i] = this.left[here] + CROSSFADE[i] * (this.left[there] - this.left[here]);
-      right[i] = this.right[here] + CROSSFADE[i] * (this.right[there] - this.right[here]);
-    }
+  #splice(outputs, lag) {
+    outputs.forEach((samples, index) => {
+      const ring = this.rings[index];
+      for (let i = 0; i < QUANTUM; i++) {
+        const here = (this.read + i) % this.capacity;
+        const there = (this.read + i + lag) % this.capacity;
+        samples[i] = ring[here] + CROSSFADE[i] * (ring[there] - ring[here]);
+      }
+    });
     this.read += QUANTUM + lag;
     this.counters.splices += 1;
     this.dips = this.dips.map(({ lowest, seconds }) => ({ lowest: lowest - lag, seconds }));

@@ -3,11 +3,34 @@
 
 const WINDOW_MS = 4000;
 const MOST_PENDING = 2000;
+const MOST_TURNS = 60;
 
 export function quantile(values, q) {
   if (values.length === 0) return null;
   const sorted = [...values].sort((a, b) => a - b);
   return sorted[Math.min(sorted.length - 1, Math.floor(q * sorted.length))];
+}
+
+/** The time from a turn of the head until its sound, where the browser turns the sound. */
+export class TurnLedger {
+  #samples = []; // {totalMs, heldMs}
+
+  /** `turns` are those that are heard first `at` that time: {at, heldMs}, the time set and the time until the worklet turned the sound. */
+  turned({ at, turns }) {
+    this.#samples.push(...turns.map((turn) => ({ totalMs: at - turn.at, heldMs: turn.heldMs })));
+    this.#samples.splice(0, this.#samples.length - MOST_TURNS);
+  }
+
+  restart() {
+    this.#samples = [];
+  }
+
+  /** Medians over the last turns, in milliseconds: {totalMs, heldMs}; null if there are none yet. */
+  summary() {
+    if (this.#samples.length === 0) return null;
+    const median = (key) => quantile(this.#samples.map((sample) => sample[key]), 0.5);
+    return { totalMs: median("totalMs"), heldMs: median("heldMs") };
+  }
 }
 
 export class PoseLedger {

@@ -4,7 +4,7 @@
 import { FloorPlan } from "./floorplan.js";
 import { Effects } from "./effects.js";
 import { Frontier } from "./frontier.js";
-import { PoseLedger } from "./latency.js";
+import { PoseLedger, TurnLedger } from "./latency.js";
 import { Heads } from "./heads.js";
 import { Legend } from "./legend.js";
 import { LoudnessField, combine, parseGrid, raised, scaleOf } from "./loudness.js";
@@ -14,11 +14,14 @@ import { onThemeChange } from "./palette.js";
 import { Panel } from "./panel.js";
 import { Paper } from "./paper.js";
 import { Player } from "./player.js";
-import { fetchClips, fetchFrontier, fetchHeads, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
+import { fetchClips, fetchDecoder, fetchFrontier, fetchHeads, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
 import { Sources } from "./sources.js";
+import { Turning } from "./turning.js";
 import { Walking } from "./walking.js";
 import { World } from "./world.js";
 
+const ORDER = 1; // of ambisonic streams
+const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
 const LONGEST_RETRY_MS = 30_000;
 
@@ -35,11 +38,16 @@ class Page {
     this.frontier = new Frontier(find("quality"));
     this.effects = new Effects(find("rendered"));
     this.heads = new Heads(find("head"));
+    this.turning = new Turning(find("turning"));
+    this.output = null; // of the present stream; null while there is none
     this.rendered = null; // the server's plan of effects; null while there is no stream
     this.level = this.head = null; // the present level and head; null while there is no stream
+    this.decoded = null; // the head whose filters the worklet has
     this.player = new Player();
     this.ledger = new PoseLedger();
     this.reverberationLedger = new PoseLedger();
+    this.turnLedger = new TurnLedger();
+    this.turnedAt = 0;
     this.worker = new Worker(new URL("stream_worker.js", import.meta.url), { type: "module" });
     this.connection = "idle";
     this.playing = false;
@@ -67,7 +75,10 @@ class Page {
     this.#describe(scene);
     const clips = (await fetchClips().catch(() => null)) ?? [];
     this.#setUp(scene, { clips, mostEmitters });
-    this.#fill("heads", fetchHeads, (heads) => this.heads.show(heads));
+    this.#fill("heads", fetchHeads, (heads) => {
+      this.heads.show(heads);
+      if (this.turning.isHere) this.#listenWithHead(); // a server may take a second to make the filters
+    });
     if (clips.length === 0) this.#fill("clips", fetchClips, (found) => this.#gotClips(found));
     this.#fill("frontier", () => fetchFrontier(scene.id), (frontier) => this.frontier.show(frontier));
     this.#setConnection("idle", "Ready");
@@ -131,6 +142,9 @@ class Page {
     this.scene = scene;
     this.clips = clips;
     this.world = new World(scene, { mostEmitters });
+    this.turning.directionalLevels = scene.directional_levels ?? [];
+    this.panel.turnsHere = this.turning.isHere;
+    this.#turnHead();
     if (clips.length > 0) this.world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });
     else this.notices.show("clips", "The server has no clip to play.", { lasting: true });
     this.paper = new Paper(find("paper"), scene);
@@ -149,6 +163,7 @@ class Page {
     const { world, plan } = this;
     let known = new Map();
     world.addEventListener("listener", () => {
+      this.#turnHead();
       this.#tell("listener", this.#listenerNow());
       this.#pointNeedle();
     });
@@ -175,7 +190,11 @@ class Page {
     this.player.addEventListener("report", ({ detail }) => {
       if (!this.playing || this.connection !== "live") return;
       this.steady = detail.playing;
-      this.plan.glow(...this.panel.report(detail, this.ledger.summary(), this.reverberationLedger.summary()));
+      this.plan.glow(...this.panel.report(detail, this.ledger.summary(), this.reverberationLedger.summary(), this.turnLedger.summary()));
+      if (this.output === "ambisonics" && epochNow() - this.turnedAt >= REST_MS) this.#turnHead();
+    });
+    this.player.addEventListener("turned", ({ detail }) => {
+      if (this.steady) this.turnLedger.turned(detail);
     });
     this.player.addEventListener("heard", ({ detail }) => {
       this.ledger.heard(detail, this.steady);
@@ -210,12 +229,22 @@ class Page {
 
   #listenToControls() {
     find("play").addEventListener("click", () => (this.playing ? this.pause() : this.play()));
-    this.frontier.addEventListener("chosen", ({ detail }) => this.#tell("level", { name: detail }));
-    this.effects.addEventListener("wished", ({ detail }) => {
-      this.heads.used = this.effects.wishes.output !== "mono";
-      this.#tell("effects", detail);
+    this.frontier.addEventListener("chosen", ({ detail }) => {
+      this.turning.level = detail;
+      if (!this.#renewed({ level: detail })) this.#tell("level", { name: detail });
     });
-    this.heads.addEventListener("chosen", ({ detail }) => this.#tell("head", { name: detail }));
+    this.effects.addEventListener("wished", ({ detail }) => {
+      this.heads.used = this.turning.used = this.effects.wishes.output !== "mono";
+      if (!this.#renewed()) {
+        this.#tell("effects", detail);
+        if (this.output !== null) this.output = this.#wantedOutput;
+      }
+    });
+    this.turning.addEventListener("chosen", () => this.#renewed());
+    this.heads.addEventListener("chosen", ({ detail }) => {
+      if (this.output === "ambisonics") this.#listenWithHead();
+      else this.#tell("renew", { head: detail });
+    });
     find("volume").addEventListener("input", ({ target }) => this.#setVolume(target.valueAsNumber));
     this.#setVolume(find("volume").valueAsNumber);
     onThemeChange(() => {
@@ -243,6 +272,52 @@ class Page {
     this.worker.postMessage({ type, detail }, transfer);
   }
 
+  get #wantedOutput() {
+    return this.turning.isHere ? "ambisonics" : this.effects.wishes.output;
+  }
+
+  /** What a hello says of the output. Ambisonic sound is decoded here, whatever head the server has. */
+  #outputNow() {
+    this.output = this.#wantedOutput;
+    const isHere = this.output === "ambisonics";
+    return { output: this.output, order: isHere ? ORDER : undefined, head: isHere ? undefined : this.heads.chosen };
+  }
+
+  /** Begins another stream if only that can have the output that is wanted now. Returns whether it does. */
+  #renewed(changes = {}) {
+    const crosses = this.output !== this.#wantedOutput && [this.output, this.#wantedOutput].includes("ambisonics");
+    if (!this.playing || this.output === null || !crosses) return false;
+    this.#tell("renew", { ...changes, effects: this.effects.wishes.effects, ...this.#outputNow() });
+    if (this.output === "ambisonics") this.#listenWithHead();
+    return true;
+  }
+
+  /** Tells the worklet how the head turns. */
+  #turnHead() {
+    const { yaw } = this.world.listener;
+    this.turnedAt = epochNow();
+    this.player.turn([0, 0, Math.sin(yaw / 2), Math.cos(yaw / 2)], this.turnedAt);
+  }
+
+  /** Gives the worklet the filters of the chosen head. If there are none to be had, the server renders two ears. */
+  async #listenWithHead() {
+    try {
+      const head = this.heads.chosen ?? (await fetchHeads()).default;
+      if (head !== this.decoded) {
+        const decoder = await fetchDecoder(head, { order: ORDER, sampleRate: this.scene.sample_rate });
+        if ((this.heads.chosen ?? head) !== head) return; // another was chosen meanwhile
+        this.player.listenWith({ filters: decoder.filters, delaySamples: decoder.delay_samples });
+        this.decoded = head;
+      }
+      if (this.output === "ambisonics") this.head = head;
+    } catch (error) {
+      if (this.output !== "ambisonics") return; // it is tried again when it is needed
+      this.notices.show(error.code ?? "decoder", `The sound is turned on the server: ${error.message}`);
+      this.turning.giveUp();
+      this.#renewed();
+    }
+  }
+
   async play() {
     if (this.playing) return;
     this.#setPlaying(true);
@@ -258,13 +333,15 @@ class Page {
     }
     if (!this.playing) return;
     this.notices.clear("audio");
+    this.turning.level = this.frontier.chosen;
     const hello = {
       scene: this.scene.id,
       sampleRate: this.scene.sample_rate,
       level: this.frontier.chosen,
-      head: this.heads.chosen,
-      ...this.effects.wishes,
+      effects: this.effects.wishes.effects,
+      ...this.#outputNow(),
     };
+    if (this.output === "ambisonics") this.#listenWithHead();
     const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
     this.#tell("open", { url: streamUrl(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
   }
@@ -275,6 +352,7 @@ class Page {
     await this.player.pause();
     if (this.playing) return;
     this.#tell("close");
+    this.output = null;
     this.#blank();
     this.#setConnection("idle", "Paused");
   }
@@ -282,6 +360,8 @@ class Page {
   /** Clears the figures of a stream that has ended. */
   #blank() {
     this.panel.rest();
+    this.panel.turnsHere = this.turning.isHere;
+    this.turnLedger.restart();
     this.frontier.heard = this.level = this.head = null;
     this.rendered = null;
     this.effects.rest();
@@ -312,7 +392,8 @@ class Page {
       this.#setConnection("live", "Live");
       const { welcome } = detail;
       this.frontier.heard = this.level = welcome.level;
-      this.head = welcome.hrtf;
+      this.head = this.output === "ambisonics" ? this.decoded : welcome.hrtf;
+      this.panel.turnsHere = this.output === "ambisonics";
       this.world.mostEmitters = welcome.max_emitters;
       // If the page was opened while the server warmed up, it does not have the levels' costs yet.
       fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
@@ -326,6 +407,7 @@ class Page {
       this.notices.show("connection", reason, { lasting: true });
       this.#setPlaying(false);
       this.player.pause();
+      this.output = null;
       this.#blank();
       this.#setConnection("refused", "Refused");
     }

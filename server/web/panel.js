@@ -50,6 +50,7 @@ export class Panel {
   #drawn = 0;
   #dropouts = 0;
   #fillMs = null;
+  #turnsHere = false;
   #server = { late: 0, dropped: 0 };
 
   constructor(document) {
@@ -64,8 +65,14 @@ export class Panel {
     this.#spark.draw();
   }
 
-  /** Shows a worklet report and the latencies of direct sound and reflected field. Returns the meters' lengths for both ears. */
-  report(report, latency, reverberation) {
+  /** Whether turns of the head are heard sooner than steps, and so have a figure of their own. */
+  set turnsHere(isHere) {
+    this.#turnsHere = isHere;
+    this.#find("turn").hidden = this.#find("turn-part").hidden = !isHere;
+  }
+
+  /** Shows a worklet report and the latencies of direct sound, reflected field and turns. Returns the meters' lengths for both ears. */
+  report(report, latency, reverberation, turn) {
     const at = performance.now();
     const fillMs = 1000 * report.fillS;
     this.#fillMs = this.#fillMs === null ? fillMs : this.#fillMs + 0.1 * (fillMs - this.#fillMs);
@@ -75,12 +82,12 @@ export class Panel {
     const lengths = [this.#left.show(report.rms[0], report.peak[0]), this.#right.show(report.rms[1], report.peak[1])];
     if (at - this.#drawn >= DRAW_MS) {
       this.#drawn = at;
-      this.#print(report, latency, reverberation);
+      this.#print(report, latency, reverberation, turn);
     }
     return lengths;
   }
 
-  #print({ targetS, counters, started }, latency, reverberation) {
+  #print({ targetS, counters, started }, latency, reverberation, turn) {
     this.#left.print();
     this.#right.print();
     this.#spark.draw();
@@ -93,12 +100,16 @@ export class Panel {
       this.#find(id).classList.toggle("alarm", this.#find(id).textContent !== "0");
     }
     if (latency) this.#printLatency(latency);
+    if (turn) {
+      this.#find("latency-turn").textContent = Math.round(turn.totalMs);
+      this.#find("latency-turn-held").textContent = milliseconds(turn.heldMs);
+    }
     if (reverberation) this.#find("latency-reverberation").textContent = milliseconds(reverberation.totalMs);
   }
 
   #printLatency({ totalMs, worstMs, serverMs, bufferMs, outputMs }) {
     this.#find("latency").textContent = Math.round(totalMs);
-    this.#find("latency-note").textContent = `95% within ${Math.round(worstMs)} ms`;
+    this.#find("latency-note").textContent = `${this.#turnsHere ? "a step, " : ""}95% within ${Math.round(worstMs)} ms`;
     this.#find("part-server").textContent = milliseconds(serverMs);
     this.#find("part-buffer").textContent = milliseconds(bufferMs);
     this.#find("part-device").textContent = milliseconds(outputMs);
@@ -121,7 +132,7 @@ export class Panel {
     this.#spark.clear();
     this.#find("buffer").textContent = "–";
     this.#find("buffer-note").textContent = "";
-    for (const id of ["latency", "part-server", "part-buffer", "part-device", "latency-reverberation", "field-cost"]) {
+    for (const id of ["latency", "part-server", "part-buffer", "part-device", "latency-reverberation", "latency-turn", "latency-turn-held", "field-cost"]) {
       this.#find(id).textContent = "–";
     }
     this.#find("latency-note").textContent = "measured while playing";

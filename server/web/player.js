@@ -1,6 +1,7 @@
 // Audio output: an AudioContext at the stream's sample rate, the worklet and a volume control.
-// Events: "report" and "heard" from the worklet, and "interrupted" when the system stops the sound (a call, another tab). "heard" has in
-// addition `at`, the epoch millisecond when it leaves the sound card, and `outputS`, the time from the worklet until then.
+// Events: "report", "heard" and "turned" from the worklet, and "interrupted" when the system stops the sound (a call, another tab).
+// "heard" and "turned" have in addition `at`, the epoch millisecond when it leaves the sound card, and `outputS`, the time from the worklet
+// until then.
 
 export class Player extends EventTarget {
   #context = null;
@@ -11,6 +12,7 @@ export class Player extends EventTarget {
   #nextCapture = 0;
   #ready = null;
   #started = false;
+  #toSend = new Map(); // the newest message of each type for a worklet that is not there yet
   #wanted = false; // whether sound should be running, so that a pause followed by a start does nothing
 
   /** Starts audio. Browsers allow that only in a user gesture. Resolves with a port that takes audio blocks. */
@@ -40,6 +42,7 @@ export class Player extends EventTarget {
     this.#gain = new GainNode(this.#context, { gain: 0 });
     this.#node.connect(this.#gain).connect(this.#context.destination);
     this.#node.port.onmessage = ({ data }) => this.#receive(data);
+    for (const message of this.#toSend.values()) this.#node.port.postMessage(message);
   }
 
   #receive(data) {
@@ -48,7 +51,7 @@ export class Player extends EventTarget {
       this.#captures.delete(data.id);
       return;
     }
-    this.dispatchEvent(new CustomEvent(data.type, { detail: data.type === "heard" ? this.#timed(data) : data }));
+    this.dispatchEvent(new CustomEvent(data.type, { detail: data.type === "report" ? data : this.#timed(data) }));
   }
 
   #timed(heard) {
@@ -64,6 +67,21 @@ export class Player extends EventTarget {
     }
     const latencyS = this.#context.outputLatency || this.#context.baseLatency;
     return performance.timeOrigin + performance.now() + 1000 * (time - this.#context.currentTime + latencyS);
+  }
+
+  /** Decodes ambisonic streams with these filters[ear][channel] of a head, which hears sound `delaySamples` later. */
+  listenWith({ filters, delaySamples }) {
+    this.#tell({ type: "head", filters, delaySamples });
+  }
+
+  /** Turns the head of ambisonic streams. `at` is the epoch millisecond of the turn. */
+  turn(orientation, at) {
+    this.#tell({ type: "turn", orientation, at, saidAt: Date.now() });
+  }
+
+  #tell(message) {
+    if (this.#node) this.#node.port.postMessage(message);
+    else this.#toSend.set(message.type, message);
   }
 
   #fade(target) {

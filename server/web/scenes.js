@@ -32,6 +32,13 @@ export const fetchFrontier = (id) => getJson(endpoint(`scenes/${encodeURICompone
 export const fetchClips = async () => (await getJson(endpoint("clips"))).clips;
 export const fetchHeads = () => getJson(endpoint("hrtfs"));
 
+/** The filters by which a head hears ambisonic channels: {hrtf, order, sample_rate, delay_samples, filters[ear][channel]}. */
+export function fetchDecoder(head, { order, sampleRate }) {
+  const url = endpoint(`hrtfs/${encodeURIComponent(head)}/decoder`);
+  for (const [key, value] of Object.entries({ order, sample_rate: sampleRate })) url.searchParams.set(key, value);
+  return getJson(url);
+}
+
 export function fetchLoudness(scene, { position, heightM, signal }) {
   const url = endpoint(`scenes/${encodeURIComponent(scene)}/loudness`);
   const query = { emitter: position.map((value) => value.toFixed(3)).join(","), height_m: heightM, format: "json" };

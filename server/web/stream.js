@@ -32,7 +32,7 @@ export class Stream {
   #heartbeat = 0;
 
   /**
-   * `hello` is {scene, sampleRate, level, effects, output, head}; `listeners` are callbacks: block(block), state({state, ...}),
+   * `hello` is {scene, sampleRate, level, effects, output, order, head}; `listeners` are callbacks: block(block), state({state, ...}),
    * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field}).
    */
   constructor({ url, hello, listener, emitters, listeners }) {
@@ -85,9 +85,9 @@ export class Stream {
     if (this.#welcomed) this.#send(message.setEffects({ effects, output }));
   }
 
-  /** Changes the head. That takes a new stream, since only a hello names the head. */
-  setHead(head) {
-    this.#hello = { ...this.#hello, head };
+  /** Begins a new stream, since only a hello says what `changes` say: the head, or the channels of the output. */
+  renew(changes) {
+    this.#hello = { ...this.#hello, ...changes };
     clearTimeout(this.#retry);
     this.#detach();
     this.#attempt = 0;

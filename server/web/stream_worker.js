@@ -15,10 +15,10 @@ function open({ url, hello, listener, emitters, port }) {
     listener,
     emitters,
     listeners: {
-      block: (block) => playerPort.postMessage(block, [block.left.buffer, block.right.buffer]),
+      block: (block) => playerPort.postMessage(block, block.channels.map((samples) => samples.buffer)),
       state(detail) {
         // A new stream counts its samples and poses from zero.
-        if (detail.state === "live") playerPort.postMessage("restart");
+        if (detail.state === "live") playerPort.postMessage({ restart: true, order: detail.welcome.order ?? null });
         self.postMessage({ type: "state", detail });
       },
       posed: tell("posed"),
@@ -36,7 +36,7 @@ const commands = {
   emitter: (detail) => stream?.setEmitter(detail),
   remove: ({ id }) => stream?.removeEmitter(id),
   level: ({ name }) => stream?.setLevel(name),
-  head: ({ name }) => stream?.setHead(name),
+  renew: (changes) => stream?.renew(changes),
   effects: (wishes) => stream?.setEffects(wishes),
   close() {
     stream?.close();

@@ -7,6 +7,7 @@ const AUDIO_BLOCK = 1;
 const LISTENER_POSE = 2;
 const BLOCK_HEADER_BYTES = 28;
 const POSE_BYTES = 36;
+const CHANNELS = [1, 2, 4, 9, 16];
 
 export const FLAG_LATE = 2;
 
@@ -25,25 +26,25 @@ export function serializePose({ poseId, position, yaw }) {
 export const isBlock = (buffer) => buffer.byteLength > 0 && new DataView(buffer).getUint8(0) === AUDIO_BLOCK;
 
 /**
- * An audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, left, right}. `left` and `right` are
- * Float32Array(frames), equal if there is one channel. The poses are the newest of the direct sound and of the reflected field.
+ * An audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, channels}. `channels` are Float32Array(frames):
+ * both ears, equal if the block has one channel, or 4, 9 or 16 of ambisonics. The poses are the newest of the direct sound and of the
+ * reflected field.
  */
 export function parseBlock(buffer) {
   const view = new DataView(buffer);
   if (buffer.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) {
     throw new TypeError("not an audio block");
   }
-  const channels = view.getUint16(2, true);
+  const count = view.getUint16(2, true);
   const frames = view.getUint32(24, true);
-  if ((channels !== 1 && channels !== 2) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * channels * 4) {
-    throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${channels} channels`);
+  if (!CHANNELS.includes(count) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * count * 4) {
+    throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${count} channels`);
   }
-  const left = new Float32Array(frames);
-  const right = new Float32Array(frames);
-  for (let frame = 0, offset = BLOCK_HEADER_BYTES; frame < frames; frame++, offset += 4 * channels) {
-    left[frame] = view.getFloat32(offset, true);
-    right[frame] = view.getFloat32(offset + 4 * (channels - 1), true);
-  }
+  const channels = Array.from({ length: Math.max(2, count) }, () => new Float32Array(frames));
+  channels.forEach((samples, index) => {
+    const first = BLOCK_HEADER_BYTES + 4 * Math.min(index, count - 1);
+    for (let frame = 0; frame < frames; frame++) samples[frame] = view.getFloat32(first + 4 * count * frame, true);
+  });
   return {
     flags: view.getUint8(1),
     sequence: view.getUint32(4, true),
@@ -51,15 +52,14 @@ export function parseBlock(buffer) {
     poseId: view.getUint32(16, true),
     reverberationPoseId: view.getUint32(20, true),
     frames,
-    left,
-    right,
+    channels,
   };
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, level, effects, output, head, listener }) =>
+  hello: ({ scene, sampleRate, level, effects, output, order, head, listener }) =>
     JSON.stringify({
-      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, hrtf: head, listener,
+      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, order, hrtf: head, listener,
     }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),

@@ -1,8 +1,11 @@
-// The AudioWorklet. It plays the blocks from the stream worker and reports levels and buffer statistics. It uses messages and no shared
-// memory, so that the page needs no cross-origin isolation.
+// The AudioWorklet. It plays the blocks from the stream worker and reports levels and buffer statistics. Ambisonic blocks are turned and
+// decoded after the buffer, so that a turn of the head is heard with the next quantum. It uses messages and no shared memory, so that the
+// page needs no cross-origin isolation.
 
+import { HeadDecoder } from "./ambisonics.js";
 import { JitterBuffer } from "./jitterbuffer.js";
 
+const QUANTUM = 128; // samples that the Web Audio API processes at once
 const REPORT_QUANTA = 5; // about 27 ms at 24 kHz
 const TAP_S = 12;
 
@@ -10,6 +13,12 @@ class NafirPlayer extends AudioWorkletProcessor {
   constructor() {
     super();
     this.buffer = new JitterBuffer({ sampleRate });
+    this.channels = null; // what the buffer gave last, of an ambisonic stream
+    this.decoder = null; // of an ambisonic stream
+    this.filters = null; // of the head; {filters, delaySamples}
+    this.orientation = [0, 0, 0, 1];
+    this.turns = []; // {id, at, saidAt}: turns that the next quantum is the first to have
+    this.ending = null; // last quantum of a stream that had other channels
     this.tap = [new Float32Array(TAP_S * sampleRate), new Float32Array(TAP_S * sampleRate)];
     this.tapped = 0; // samples written to the tap since the start
     this.feed = null; // port of the stream worker
@@ -23,10 +32,45 @@ class NafirPlayer extends AudioWorkletProcessor {
     if (data.type === "connect") {
       this.feed?.close();
       this.feed = data.port;
-      this.feed.onmessage = ({ data: block }) => (block === "restart" ? this.buffer.reset() : this.buffer.push(block));
+      this.feed.onmessage = ({ data: block }) => (block.restart ? this.#restart(block.order) : this.buffer.push(block));
     } else if (data.type === "capture") {
       this.#capture(data);
+    } else if (data.type === "head") {
+      this.filters = data;
+      this.decoder?.use(data.filters);
+    } else if (data.type === "turn") {
+      this.orientation = data.orientation;
+      this.decoder?.turn(data.orientation);
+      this.turns.push(data);
     }
+  }
+
+  /** Makes ready for a stream of ambisonics of this order, or of two ears if it is null. */
+  #restart(order) {
+    if (order === (this.decoder?.order ?? null)) {
+      this.buffer.reset();
+      return;
+    }
+    const { counters } = this.buffer;
+    this.buffer.reset();
+    this.ending = [new Float32Array(QUANTUM), new Float32Array(QUANTUM)];
+    this.#pull(...this.ending);
+    this.decoder = order === null ? null : new HeadDecoder({ order, frames: QUANTUM });
+    const channels = this.decoder?.channels ?? 2;
+    this.channels = Array.from({ length: channels }, () => new Float32Array(QUANTUM));
+    this.buffer = new JitterBuffer({ sampleRate, channels });
+    Object.assign(this.buffer.counters, counters);
+    if (!this.decoder) return;
+    this.decoder.turn(this.orientation);
+    if (this.filters) this.decoder.use(this.filters.filters);
+  }
+
+  /** Fills both ears. Returns the poses that become audible. */
+  #pull(left, right) {
+    if (!this.decoder) return this.buffer.pull([left, right]);
+    const heard = this.buffer.pull(this.channels);
+    this.decoder.decode(this.channels, left, right);
+    return heard;
   }
 
   /** The last `seconds` that were played, before the volume control. */
@@ -42,7 +86,10 @@ class NafirPlayer extends AudioWorkletProcessor {
   }
 
   process(_inputs, [output]) {
-    const heard = this.buffer.pull(output[0], output[1]);
+    const heard = this.#pull(output[0], output[1]);
+    if (this.ending) output.forEach((samples, ear) => samples.forEach((_, i) => (samples[i] += this.ending[ear][i])));
+    this.ending = null;
+    this.#tellTurns();
     for (const { offset, fill, ...poses } of heard) {
       this.port.postMessage({ type: "heard", ...poses, time: currentTime + offset / sampleRate, bufferedS: fill / sampleRate });
     }
@@ -51,6 +98,17 @@ class NafirPlayer extends AudioWorkletProcessor {
     this.quanta += 1;
     if (this.quanta === REPORT_QUANTA) this.#report(output[0].length);
     return true;
+  }
+
+  /** Says which turns of the head this quantum is the first to have. */
+  #tellTurns() {
+    if (this.turns.length === 0) return;
+    const turns = this.turns;
+    this.turns = [];
+    if (!this.decoder || !this.buffer.playing) return;
+    const time = currentTime + (this.filters?.delaySamples ?? 0) / sampleRate;
+    const now = Date.now();
+    this.port.postMessage({ type: "turned", time, turns: turns.map(({ at, saidAt }) => ({ at, heldMs: Math.max(0, now - saidAt) })) });
   }
 
   #measure(samples, ear) {

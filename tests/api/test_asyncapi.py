@@ -274,6 +274,7 @@ def test_a_dry_block_is_read_by_the_document():
 # Where requests are refused that are no messages of a stream; what `errors` names is a field_failure in one.
 ELSEWHERE = {
     "ambisonic_response.py",
+    "decoder_file.py",
     "errors.py",
     "impulse_response.py",
     "main.py",

@@ -19,12 +19,14 @@ from server.api.settings import Settings
 from server.assets.hrtfs import HrtfLibrary
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
+from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 from server.responses.impulse_response import MEDIA_TYPES, ImpulseResponse, IrQuery
 from tests.directional_flat import write_directional
 from tests.killing import kill, threads_may_die
 
 IR = "/v1/scenes/flat/impulse-response"
+DECODER = "/v1/hrtfs/kemar/decoder"
 PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
 HEADINGS_DEG = count(1)
 
@@ -238,6 +240,54 @@ def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_a
     assert len({tag(), tag(yaw_deg=1), tag(format="npy"), tag(listener="1,2,1.6")}) == 4
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_decoder_of_a_head_is_that_of_the_server_in_every_format(shared_client, filters, order):
+    decoder = HeadDecoder.of(filters, order)
+    asked = {"order": order, "sample_rate": 24_000}
+    as_json, as_npy, as_wav = (
+        shared_client.get(DECODER, params={**asked, "format": name}) for name in ("json", "npy", "wav")
+    )
+    assert [each.headers["content-type"] for each in (as_json, as_npy, as_wav)] == [
+        "application/json",
+        "application/octet-stream",
+        "audio/wav",
+    ]
+    told = as_json.json()
+    np.testing.assert_array_equal(np.float32(told.pop("filters")), decoder.filters)
+    assert told == {"hrtf": "kemar", "order": order, "sample_rate": 24_000, "delay_samples": decoder.delay}
+    np.testing.assert_array_equal(np.load(io.BytesIO(as_npy.content)), decoder.filters)
+    samples, rate = soundfile.read(io.BytesIO(as_wav.content), dtype="float32")
+    assert rate == 24_000
+    np.testing.assert_array_equal(samples.T.reshape(decoder.filters.shape), decoder.filters)
+
+
+def test_the_decoder_is_of_first_order_and_json_unless_asked_otherwise(shared_client):
+    usual = shared_client.get(DECODER, params={"sample_rate": 24_000})
+    asked = shared_client.get(DECODER, params={"sample_rate": 24_000, "order": 1, "format": "json"})
+    assert usual.content == asked.content
+    assert np.shape(usual.json()["filters"])[:2] == (2, 4)
+
+
+def test_each_decoder_has_its_tag_and_is_sent_once(directional_client):
+    asked = [
+        ("kemar", {}),
+        ("kemar", {"order": 2}),
+        ("kemar", {"format": "npy"}),
+        ("small", {}),
+    ]
+    answers = [
+        directional_client.get(f"/v1/hrtfs/{head}/decoder", params={"sample_rate": 24_000, **each})
+        for head, each in asked
+    ]
+    tags = [answer.headers["etag"] for answer in answers]
+    assert len(set(tags)) == len(tags)
+    assert answers[0].headers["cache-control"].startswith("public, max-age=")
+    again = directional_client.get(DECODER, params={"sample_rate": 24_000}, headers={"If-None-Match": tags[0]})
+    assert (again.status_code, again.content) == (304, b"")
+    kemar, small = (np.array(answers[number].json()["filters"]) for number in (0, 3))
+    np.testing.assert_allclose(np.sum(small**2), np.sum(kemar**2) / 4, rtol=0.01)
+
+
 @pytest.mark.parametrize(
     ("path", "params", "status", "code", "at_fault"),
     [
@@ -280,6 +330,15 @@ def test_other_spellings_of_the_same_query_have_the_same_tag_and_other_queries_a
         ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "spacing_m": 0.01}, 422, "malformed_request", "spacing_m"),
         ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "spacing_m": 0.1}, 409, "map_too_fine", "spacing_m"),
         ("/v1/scenes/flat/loudness", {"emitter": "6,3,1.5", "format": "gif"}, 422, "unknown_format", "format"),
+        ("/v1/hrtfs/moomin/decoder", {"sample_rate": 24_000}, 404, "unknown_hrtf", "hrtf"),
+        (DECODER, {"sample_rate": 44_100}, 404, "unsupported_sample_rate", "sample_rate"),
+        (DECODER, {}, 422, "malformed_request", "sample_rate"),
+        (DECODER, {"sample_rate": "fast"}, 422, "malformed_request", "sample_rate"),
+        (DECODER, {"sample_rate": 24_000, "order": 0}, 422, "malformed_request", "order"),
+        (DECODER, {"sample_rate": 24_000, "order": 4}, 422, "malformed_request", "order"),
+        (DECODER, {"sample_rate": 24_000, "order": "first"}, 422, "malformed_request", "order"),
+        (DECODER, {"sample_rate": 24_000, "format": "sofa"}, 422, "unknown_format", "format"),
+        (DECODER, {"sample_rate": 24_000, "taps": 8}, 422, "unknown_parameter", "taps"),
         ("/v1/nothing", {}, 404, "not_found", None),
         ("/nothing", {}, 404, "not_found", None),
     ],

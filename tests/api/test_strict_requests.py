@@ -22,6 +22,7 @@ GETS = [
     (f"{SCENE}/plan", {"emitter": ["6,3,1.5", "1,2,1.5"]}),
     ("/v1/clips", {}),
     ("/v1/hrtfs", {}),
+    ("/v1/hrtfs/kemar/decoder", {"sample_rate": "24000"}),
     ("/", {}),
     ("/stream.js", {}),
 ]

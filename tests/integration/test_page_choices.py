@@ -95,6 +95,7 @@ def test_another_head_is_chosen_while_listening_and_stays_chosen(browser, server
     page = open_page(context, f"{server}/?scene=open-field")
     page.wait_for_function("!document.getElementById('head').disabled")
     assert page.locator("#head option").all_inner_texts() == ["KEMAR", "lopsided"]
+    page.select_option("#turning", "server")
     page.evaluate("nafir.setListener({ x: 0, y: 0, yaw: 0 })")
     page.evaluate("nafir.setEmitter('A', { x: 0, y: 3 })")
     start(page)

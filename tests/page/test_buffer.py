@@ -35,12 +35,13 @@ SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0 }) => {
       if (arrival > now) break;
       last = arrival;
       const left = Float32Array.from({ length: 256 }, (_, i) => tone(sent + i));
-      buffer.push({ left, right: left.map((value) => -value), sampleClock: sent, poseId: sent / 256, late: false });
+      const channels = [left, left.map((value) => -value)];
+      buffer.push({ channels, sampleClock: sent, poseId: sent / 256, late: false });
       sent += 256;
     }
     const left = new Float32Array(128);
     const right = new Float32Array(128);
-    for (const { poseId, offset } of buffer.pull(left, right)) heard.push([poseId, played.length + offset]);
+    for (const { poseId, offset } of buffer.pull([left, right])) heard.push([poseId, played.length + offset]);
     played.push(...left);
     fills.push(buffer.fill / rate);
     targets.push(buffer.target / rate);
@@ -141,11 +142,11 @@ RESTART = """async () => {
   const pull = (quanta) => {
     for (let i = 0; i < quanta; i++) {
       const ears = [new Float32Array(128), new Float32Array(128)];
-      buffer.pull(...ears);
+      buffer.pull(ears);
       played.push(ears.map((ear) => Array.from(ear)));
     }
   };
-  buffer.push({ left: samples(0.5), right: samples(-0.5), sampleClock: 0, poseId: 0, late: false });
+  buffer.push({ channels: [samples(0.5), samples(-0.5)], sampleClock: 0, poseId: 0, late: false });
   pull(20);
   buffer.reset();
   pull(5);

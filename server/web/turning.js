@@ -1,0 +1,62 @@
+// The menu of where sound is turned when the head turns: in the browser, which then gets ambisonic sound, or on the server, which then
+// sends the sound of two ears. Emits "chosen".
+
+const NO_DIRECTIONS = "This scene knows what two ears hear, and not from where sound arrives.";
+const LEVEL_WITHOUT = "This quality level knows what two ears hear, and not from where sound arrives.";
+const NO_HEAD = "One loudspeaker is the same wherever the head looks.";
+
+export class Turning extends EventTarget {
+  #choice;
+  #wish = "browser";
+  #levels = []; // of the scene, those that know directions
+  #level = "auto";
+  #isUsed = true;
+
+  /** `choice` is the menu. */
+  constructor(choice) {
+    super();
+    this.#choice = choice;
+    this.#wish = choice.value;
+    choice.addEventListener("change", () => {
+      this.#wish = choice.value;
+      this.dispatchEvent(new Event("chosen"));
+    });
+  }
+
+  /** Whether the browser is to turn the sound. */
+  get isHere() {
+    return this.#choice.value === "browser" && this.#isUsed;
+  }
+
+  /** Takes the names of the levels that know from where sound arrives. */
+  set directionalLevels(names) {
+    this.#levels = names;
+    this.#show();
+  }
+
+  /** The chosen quality level. */
+  set level(name) {
+    this.#level = name;
+    this.#show();
+  }
+
+  /** Whether the output is headphones. */
+  set used(isUsed) {
+    this.#isUsed = isUsed;
+    this.#show();
+  }
+
+  /** Leaves it to the server, because the browser cannot. */
+  giveUp() {
+    this.#wish = "server";
+    this.#show();
+  }
+
+  #show() {
+    const isPossible = this.#levels.length > 0;
+    const isOfLevel = this.#level === "auto" || this.#levels.includes(this.#level);
+    this.#choice.disabled = !isPossible || !isOfLevel || !this.#isUsed;
+    this.#choice.value = isPossible && isOfLevel ? this.#wish : "server";
+    this.#choice.title = !isPossible ? NO_DIRECTIONS : !isOfLevel ? LEVEL_WITHOUT : !this.#isUsed ? NO_HEAD : "";
+  }
+}
