@@ -53,13 +53,18 @@ class Point:
 
 
 def pareto(points: Sequence[Point], *, missing: float = 0.0) -> list[Point]:
-    """The Pareto-optimal points by mean cost, cheapest first, among those with hardly more missing than `missing`.
+    """The Pareto-optimal points by mean cost, cheapest first, among those with hardly more missing than `missing`."""
+    return _optimal(eligible(points, missing=missing))
+
+
+def _optimal(points: Sequence[Point]) -> list[Point]:
+    """The Pareto-optimal ones of points that are all eligible.
 
     Each is more accurate than the one before by more than one standard error of their difference over the held-out
     pairs, so that chance does not decide.
     """
     best: list[Point] = []
-    for point in sorted(eligible(points, missing=missing), key=lambda point: point.cost.ms_mean):
+    for point in sorted(points, key=lambda point: point.cost.ms_mean):
         if not best or _is_better(point.by_pair, best[-1].by_pair):
             best.append(point)
     return best
@@ -95,17 +100,17 @@ def default_point(best: Sequence[Point], *, ms: float) -> Point:
 
 
 def default_among(points: Sequence[Point], *, ms: float) -> Point:
-    """The default level of a bundle with all these points. Where a field predicts directions it is one of these,
+    """The default level of a bundle with all these eligible points. Where a field predicts directions it is one of these,
     because they are heard through any head that is turned in any way."""
     directional = [point for point in points if point.predicts == "directions"]
-    return default_point(pareto(directional or points), ms=ms)
+    return default_point(_optimal(directional or points), ms=ms)
 
 
 def offered_points(points: Sequence[Point], best: Sequence[Point], default: Point, *, ms: float) -> list[Point]:
     """A few of the Pareto-optimal points, the default first. From it on down and up, each is the most accurate of those
     that cost a third of the one before or less, or three times as much or more.
 
-    If no such point is of a field of ears, or of directions, and there are `points` of one, what would be the default
+    If no such point is of a field of ears, or of directions, and there are eligible `points` of one, what would be the default
     among these with this `ms` follows: both ways to predict a response can be heard side by side.
     """
     offered = [default]
@@ -118,5 +123,5 @@ def offered_points(points: Sequence[Point], best: Sequence[Point], default: Poin
             dearest = point
             offered.append(point)
     others = sorted({point.predicts for point in points} - {point.predicts for point in offered})
-    of_others = [pareto([point for point in points if point.predicts == kind]) for kind in others]
+    of_others = [_optimal([point for point in points if point.predicts == kind]) for kind in others]
     return [*offered, *(default_point(of_kind, ms=ms) for of_kind in of_others)]

@@ -123,3 +123,9 @@ def test_each_way_to_predict_a_response_is_offered() -> None:
     offered = offered_points(points, pareto(points), directions[0], ms=5)
     assert names(offered) == ["a", "quick"]
     assert names(offered_points(ears, pareto(ears), ears[1], ms=5)) == ["quick", "slow"]
+
+
+def test_where_the_reference_lacks_values_too_there_is_a_default() -> None:
+    points = [point("ears", 3, 0.5, missing=0.05), point("rough", 1, 0.6, missing=0.05, predicts="directions")]
+    assert default_among(points, ms=2).level.name == "rough"
+    assert names(offered_points(points, pareto(points, missing=0.05), points[1], ms=2)) == ["rough", "ears"]
