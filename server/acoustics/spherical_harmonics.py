@@ -17,6 +17,8 @@ _Floats = npt.NDArray[np.float64]
 
 HIGHEST_ORDER = 3
 _SAMPLED = 24
+_COORDINATES = (1, 2, 0)
+"""Of the harmonics of the first degree: y, z, x."""
 
 
 def harmonic_count(order: int) -> int:
@@ -71,9 +73,14 @@ def rotation(orientation: Sequence[float] | npt.NDArray[np.floating], order: int
     """(k, k) the matrix from harmonics of directions in world axes to harmonics of the same directions in the axes of a
     head with this orientation (x, y, z, w).
 
-    A rotation turns harmonics of one degree into each other. So their values at a few directions, before and after the
-    rotation, determine the matrix.
+    The harmonics of the first degree are coordinates, and turn as they do. A rotation turns harmonics of one degree
+    into each other: so for higher orders their values at a few directions, before and after the rotation, determine the
+    matrix.
     """
+    if order == 1:  # a stream turns a head so many times a second
+        turned = np.eye(4)
+        turned[1:, 1:] = axes_of(orientation)[np.ix_(_COORDINATES, _COORDINATES)]
+        return turned
     directions, inverse, is_apart = _sampled(order)
     matrix = (inverse @ real_harmonics(directions @ axes_of(orientation).T, order)).T
     matrix[is_apart] = 0

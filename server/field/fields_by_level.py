@@ -71,6 +71,11 @@ class FieldsByLevel(Mapping[str, AcousticField]):
             return tuple(reversed(costs))
         return tuple(sorted(measured, key=measured.__getitem__))
 
+    @property
+    def buses(self) -> list[int]:
+        """The orders of the levels whose reflected sound is heard by a bus."""
+        return sorted({field.level.bus for field in self._fields.values() if field.level.bus is not None})
+
     def with_directions(self, chosen: str | None = None) -> "FieldsByLevel":
         """Those levels whose fields know from where sound arrives. Raises RequestError `no_directions` if there are
         none, or if the `chosen` level is not among them."""

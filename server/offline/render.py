@@ -7,7 +7,7 @@ the sample clocks of the blocks that first applied them, renders the same sample
 
 import csv
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from server.acoustics.geometry import Pose, Quaternion
 from server.core.errors import NafirError
 from server.core.numerals import parse_decimal
 from server.field.field import AcousticField, Silence
+from server.field.fields_by_level import FieldsByLevel
 from server.planning.places import place_of_field
 from server.planning.planned_effects import PlannedEffects
 from server.planning.scene_acoustics import Output
@@ -30,7 +31,7 @@ from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs
 from server.responses.radiation import reverberation_gain
 from server.scene.effects import EffectName, require_effect
-from server.streaming.active_effects import ActiveEffects, as_asked
+from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
 from server.streaming.emitters import Stage, StreamedEmitter
 
@@ -230,7 +231,8 @@ def render(
         if point.reverberation_sample is not None
     }
     shares_tail = any(each.kind.shares_tail for each in (field, *(levels or {}).values()))
-    walk = _Walk(fields[0], direct_sound, emitters, path[0].pose, block_size, planned, ir_samples, shares_tail)
+    buses = FieldsByLevel([*(levels or {}).values(), *fields]).buses
+    walk = _Walk(fields[0], direct_sound, emitters, path[0].pose, block_size, planned, ir_samples, shares_tail, buses)
     blocks = -(-length // block_size)
     output = np.empty((walk.renderer.outputs, blocks, block_size), np.float32)
     for block in range(blocks):
@@ -282,9 +284,10 @@ class _Walk:
         planned: PlannedEffects | None,
         ir_samples: int,
         shares_tail: bool,
+        buses: Iterable[int],
     ) -> None:
         """`ir_samples` is the length of the longest response. `shares_tail` says whether any level has a shared
-        tail."""
+        tail, `buses` are the orders of the levels that are heard by a bus."""
         self.renderer = direct_sound.renderer(
             block_size=block_size,
             ir_samples=ir_samples,
@@ -293,6 +296,7 @@ class _Walk:
             switches_tail=planned is not None or shares_tail,
             outputs=1 if planned is not None and planned.output == "mono" else 2,
             has_head=planned is None or planned.shared.head,
+            buses=buses,
         )
         self._field = field
         self.renderer.share_tail(field.kind.shares_tail)
@@ -304,6 +308,7 @@ class _Walk:
             has_early=direct_sound.early_reflections is not None,
             has_late=not isinstance(field, Silence),
         )
+        self._effects.bus = field.level.bus
         self._listener = start
         self._has_begun = False
         self._emitters: dict[str, StreamedEmitter] = {}
@@ -333,6 +338,7 @@ class _Walk:
                 emitter.is_outdated = True
             pose, field = reverberation
             is_other, self._field = field is not self._field, field
+            self._effects.bus = field.level.bus
             self._respond(pose)
             if is_other:
                 self._effects.share_tail(field.kind.shares_tail, self._emitters)
@@ -365,13 +371,13 @@ class _Walk:
         named = {
             name: emitter
             for name, emitter in self._emitters.items()
-            if emitter.effects.has_response and (emitter.is_outdated or emitter.wants_baking)
+            if emitter.effects.has_response and (emitter.is_outdated or self._effects.wants_baking(emitter))
         }
         if self._effects.awaits_ears:
             self.renderer.set_channels(self._effects.channels)
         if not named:
             return
-        asked = [as_asked(emitter) for emitter in named.values()]
+        asked = [self._effects.as_asked(emitter) for emitter in named.values()]
         irs = composed_irs(self._field, self._direct_sound, listener, asked, self._effects.channels)
         for (name, emitter), state, ir in zip(named.items(), asked, irs, strict=True):
             emitter.is_outdated = False

@@ -1,6 +1,7 @@
 """The mixers of one renderer: one for a head with two ears, one for a single ear without a head, or one alone for
-ambisonic channels. Each mixer is made when it is needed and dropped when all sound in it has rung out; the same goes
-for its convolver.
+ambisonic channels. A head may also have mixers with a bus (`server.rendering.bus`), which are those with the number of
+its ambisonic channels. Each mixer is made when it is needed and dropped when all sound in it has rung out; the same
+goes for its convolver. There are at most two at a time.
 
 Making one takes milliseconds, so `prepare` and `prepare_hearing` do it on another thread before the rendering thread
 needs it. All other methods are for the rendering thread.
@@ -12,16 +13,20 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import Quaternion
+from server.rendering.bus import Bus
 from server.rendering.convolver import Convolver, PartitionedIr
 from server.rendering.direct_path import DirectPath
 from server.rendering.mixing import Mixer
 
 Slot = tuple[Mixer, int]
 
+_MOST = 2
+"""Mixers that compiled code mixes for one listener."""
+
 
 class MixerSet:
-    """The mixers of a renderer, by number of channels, each of which is one of `hearings`; the last is the usual one.
-    `new_direct` and `new_convolver` take a number of channels and make the parts of a mixer."""
+    """The mixers of a renderer, by the number of channels of their responses, each of which is one of `hearings`.
+    `new_direct`, `new_convolver` and `new_bus` take that number and make the parts of a mixer."""
 
     def __init__(
         self,
@@ -31,12 +36,15 @@ class MixerSet:
         hearings: tuple[int, ...],
         new_direct: Callable[[int], DirectPath | None],
         new_convolver: Callable[[int], Convolver],
+        new_bus: Callable[[int], Bus | None],
     ) -> None:
         self._slots = slots
         self._block_size = block_size
         self._hearings = hearings
+        self._usual = 2 if 2 in hearings else hearings[0]
         self._new_direct = new_direct
         self._new_convolver = new_convolver
+        self._new_bus = new_bus
         self._spare_mixers: dict[int, Mixer] = {}
         self._spare_convolvers: dict[int, Convolver] = {}
         self.clear()
@@ -58,14 +66,12 @@ class MixerSet:
 
         Raises ValueError for another shape or a sample that is not finite.
         """
-        channels = ir.shape[0] if ir.ndim == 2 and ir.shape[0] in self._hearings else self._hearings[-1]
+        channels = ir.shape[0] if ir.ndim == 2 and ir.shape[0] in self._hearings else self._usual
         self.prepare_hearing(channels)
         return self.preparer(channels).prepare(ir, like=like, same_from=same_from)
 
-    def preparer(self, channels: int | None = None) -> Convolver:
-        """The convolver of the mixer with this number of channels, by default the usual one; made now if there is none
-        yet."""
-        channels = self._hearings[-1] if channels is None else channels
+    def preparer(self, channels: int) -> Convolver:
+        """The convolver of the mixer with this number of channels; made now if there is none yet."""
         known = self._mixers.get(channels)
         convolver = None if known is None else known.convolver
         if convolver is None:
@@ -83,15 +89,15 @@ class MixerSet:
         """The mixer with this number of channels; made now if there is none yet."""
         if channels not in self._mixers:
             mixer = self._spare_mixers.pop(channels, None) or self._new_mixer(channels)
-            if mixer.direct is not None and self._orientation is not None:
-                mixer.direct.set_orientation(self._orientation)
+            if self._orientation is not None:
+                mixer.set_orientation(self._orientation)
             self._mixers[channels] = mixer
         return self._mixers[channels]
 
     def is_free(self, channels: int) -> bool:
-        """Whether the mixer with this number of channels is free of sound."""
+        """Whether the mixer with this number of channels is free of sound, and may exist beside the others."""
         mixer = self._mixers.get(channels)
-        return mixer is None or len(mixer.free_slots) == self._slots
+        return len(self._mixers) < _MOST if mixer is None else len(mixer.free_slots) == self._slots
 
     def convolver_of(self, mixer: Mixer) -> Convolver:
         """The convolver of a mixer; made and connected now if there is none yet."""
@@ -112,8 +118,7 @@ class MixerSet:
         if orientation != self._orientation:
             self._orientation = orientation
             for mixer in self:
-                if mixer.direct is not None:
-                    mixer.direct.set_orientation(orientation)
+                mixer.set_orientation(orientation)
 
     @property
     def rests(self) -> bool:
@@ -163,11 +168,12 @@ class MixerSet:
                 mixer.convolver.clear(slot)
         ringing = {mixer for mixer, _ in (*self._ringing, *self._hushed)}
         for channels, mixer in tuple(self._mixers.items()):
-            if mixer not in ringing and mixer not in heard:
+            if mixer not in ringing and mixer not in heard and mixer.has_rung_out:
                 del self._mixers[channels]
             elif mixer.convolver is not None and mixer not in ringing and mixer not in sending:
                 mixer.connect(None)
 
     def _new_mixer(self, channels: int) -> Mixer:
         direct = self._new_direct(channels)
-        return Mixer(channels=channels, slots=self._slots, block_size=self._block_size, direct=direct)
+        bus = self._new_bus(channels)
+        return Mixer(channels=channels, slots=self._slots, block_size=self._block_size, direct=direct, bus=bus)

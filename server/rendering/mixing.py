@@ -4,14 +4,17 @@
 Each emitter has a slot, which is a row of `dry` (slot, block). Its samples are scaled by its gain for the direct path,
 and by gain and send for the convolver. Both reach their wanted values by the end of a block, along a raised cosine.
 
-A mixer has a convolver only while something is sent to it, and otherwise costs nothing for it.
+A mixer has a convolver only while something is sent to it, and otherwise costs nothing for it. Where there is a bus,
+the convolver's channels are decoded by it to the two ears of the direct paths.
 """
 
 from typing import TypeGuard
 
 import numpy as np
 
+from server.acoustics.geometry import Quaternion
 from server.kernels.by_reference import Reference
+from server.rendering.bus import Bus
 from server.rendering.convolver import Convolver, FloatArray
 from server.rendering.direct_path import DirectPath
 from server.rendering.fade import raised_cosine
@@ -26,15 +29,19 @@ def is_read_by_compiled_code(source: Source) -> TypeGuard[ClipPlayer]:
 
 
 class Mixer:
-    """Mixes the sound of its slots. `gain` and `send` (2, slot): the values in effect, and the wanted values. A slot
+    """Mixes the sound of its slots. `channels` are those of responses, and of the output too unless there is a `bus`.
+    `gain` and `send` (2, slot): the values in effect, and the wanted values. A slot
     that does not play adds nothing new. `is_compiled` says whether compiled code does the mixing; it requires blocks of
     a power of two."""
 
-    def __init__(self, *, channels: int, slots: int, block_size: int, direct: DirectPath | None) -> None:
+    def __init__(
+        self, *, channels: int, slots: int, block_size: int, direct: DirectPath | None, bus: Bus | None = None
+    ) -> None:
         self.is_compiled = is_power_of_two(block_size)
         self.channels = channels
         self.slots = slots
         self.direct = direct
+        self.bus = bus
         self.convolver: Convolver | None = None
         self.free_slots = list(range(slots))
         self.dry = np.zeros((slots, block_size), np.float32)
@@ -45,7 +52,7 @@ class Mixer:
         self._sources: dict[int, Source] = {}
         self._clips: dict[int, FloatArray] = {}
         self._followed: dict[int, FloatArray] = {}
-        self.output = np.zeros((channels, block_size), np.float32)
+        self.output = np.zeros((channels if bus is None else 2, block_size), np.float32)
         self.fade_in = raised_cosine(block_size)
         if self.is_compiled:
             self.direct_state = Reference(direct.state) if direct is not None else None
@@ -57,6 +64,13 @@ class Mixer:
         self.convolver = convolver
         if self.is_compiled:
             enter_convolver(self.record, None if convolver is None else convolver.compiled)
+
+    def set_orientation(self, orientation: Quaternion) -> None:
+        """Turn the head of direct paths and bus."""
+        if self.direct is not None:
+            self.direct.set_orientation(orientation)
+        if self.bus is not None:
+            self.bus.set_orientation(orientation)
 
     def take_slot(self) -> int | None:
         """Reserve a slot that has rung out; None if there is none."""
@@ -123,6 +137,11 @@ class Mixer:
         self._followed.pop(slot, None)
 
     @property
+    def has_rung_out(self) -> bool:
+        """Whether the bus, if there is one, adds nothing any more to what slots and responses do."""
+        return self.bus is None or self.bus.is_quiet
+
+    @property
     def plays_by_itself(self) -> bool:
         """Whether compiled code reads all of its sources, so that Python fetches none."""
         return not self._sources
@@ -147,12 +166,15 @@ def mix(mixer: Mixer) -> None:
     mixer.dry[~plays] = 0
     mixer.dry *= _ramp(mixer.gain, mixer.fade_in)
     mixer.gain[0, plays] = mixer.gain[1, plays]
+    convolved = None
     if mixer.convolver is not None:
         sent = mixer.dry * _ramp(mixer.send, mixer.fade_in)
         mixer.send[0] = mixer.send[1]
-        mixer.convolver.process(sent, mixer.output)
-    else:
+        convolved = mixer.convolver.process(sent, mixer.output if mixer.bus is None else None)
+    if convolved is None or mixer.bus is not None:
         mixer.output.fill(0)
+    if mixer.bus is not None:
+        mixer.bus.process(convolved, mixer.output)
     if mixer.direct is not None:
         mixer.direct.process(mixer.dry, mixer.output)
 

@@ -10,6 +10,7 @@ from server.kernels.by_reference import Reference, reference_at
 from server.kernels.compiled import compiled
 from server.kernels.copying import copy
 from server.kernels.simd import broadcast, load, multiply, multiply_add, pointer, store
+from server.rendering.bus_kernel import BUS, decode_bus
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
 
@@ -18,7 +19,7 @@ MIXER = np.dtype(
         (name, np.int64)
         for name in (
             "slots",
-            "channels",
+            "channels",  # of the output
             "block_size",
             "plays",  # (slot,) int64
             "clip",  # (slot,) int64: address of the float32 samples that a slot plays; 0 if Python fills its row
@@ -33,6 +34,7 @@ MIXER = np.dtype(
             "output",  # (channel, block_size) float32
             "convolver",  # 0 for none
             "convolver_output",
+            "bus",  # address of a BUS record, 0 for none
             "direct",  # address of a reference to a DirectPathState, 0 for none
         )
     ]
@@ -47,11 +49,14 @@ def mix(mixer, like: Reference | None) -> None:
     _scale(mixer)
     if mixer.convolver != 0:
         process_convolver(mixer.convolver)
+    if mixer.convolver != 0 and mixer.bus == 0:
         for n in range(0, mixer.channels * mixer.block_size, 8):
             store(mixer.output, n, load(mixer.convolver_output, n))
     else:
         for n in range(0, mixer.channels * mixer.block_size, 8):
             store(mixer.output, n, broadcast(np.float32(0)))
+    if mixer.bus != 0:
+        decode_bus(carray(pointer(mixer.bus), (1,), BUS)[0], mixer.convolver_output, mixer.output)
     if like is not None and mixer.direct != 0:
         blocks = carray(pointer(mixer.dry), (mixer.slots, mixer.block_size), np.float32)
         output = carray(pointer(mixer.output), (mixer.channels, mixer.block_size), np.float32)
@@ -117,6 +122,7 @@ def record_of(mixer: Any) -> npt.NDArray[np.void]:
     record["channels"] = mixer.output.shape[0]
     for name in ("plays", "clip", "clip_samples", "clip_at", "clip_loops", "dry", "gain", "send", "fade_in", "output"):
         record[name] = getattr(mixer, name).ctypes.data
+    record["bus"] = 0 if mixer.bus is None else mixer.bus.address
     record["direct"] = 0 if mixer.direct_state is None else mixer.direct_state.address
     return record
 

@@ -116,11 +116,11 @@ def add_newest(stage, channels, members, newest, ahead, first, last) -> None:
     filters. The product with partition p is added to the mix of the window p after the current one."""
     mix, tiles, start = stage.mix, stage.size // 8, spectrum_stride(stage.size) * newest
     zero = broadcast(np.float32(0))
-    for tile in range(first, last):
-        x = start + 16 * tile
-        for partition in range(ahead):
-            for channel in range(0, channels, 2):
-                is_pair = channel + 1 < channels
+    for channel in range(0, channels, 2):
+        is_pair = channel + 1 < channels
+        for tile in range(first, last):
+            x = start + 16 * tile
+            for partition in range(ahead):
                 h = 16 * (channels * (tiles * partition + tile) + channel)
                 left = mix_offset(channels, tile, channel, (stage.window + partition) % TURNS)
                 left_sum, right_sum = zero, zero
@@ -145,9 +145,9 @@ def add_range(stage, channels, filters, count, ring, newest, begin, end, ahead, 
     zero = broadcast(np.float32(0))
     near = min(NEAR, count)
     start = (newest + begin - ahead) % slots
-    for tile in range(first, last):
-        for channel in range(0, channels, 2):
-            is_pair = channel + 1 < channels
+    for channel in range(0, channels, 2):
+        is_pair = channel + 1 < channels
+        for tile in range(first, last):
             left = mix_offset(channels, tile, channel, column)
             left_sum, right_sum = zero, zero
             slot = start
@@ -169,56 +169,56 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
     """Multiply all partitions of a group's filters by the spectra in their rings, from slot `newest` on, and add the
     products to the mix of the current window. Also add the products that are known by now to the mixes of the next
     three windows: from the first, second and third partition on."""
-    for tile in range(first, last):
-        for channel in range(0, channels, 2):
-            _add_turn_of_pair(stage, channels, channel, members, newest, tile)
+    for channel in range(0, channels, 2):
+        _add_turn_of_pair(stage, channels, channel, members, newest, first, last)
 
 
 @compiled
-def _add_turn_of_pair(stage, channels, channel, members, newest, tile) -> None:
-    """Do the work of `add_turn` for one tile of a channel and the next, if there is one."""
+def _add_turn_of_pair(stage, channels, channel, members, newest, first, last) -> None:
+    """Do the work of `add_turn` for a channel and the next, if there is one."""
     mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
     spectrum = spectrum_stride(stage.size)
     is_pair = channel + 1 < channels
     other = 16 * COLUMNS  # distance from one channel of the mix to the other
     zero = broadcast(np.float32(0))
-    a = mix_offset(channels, tile, channel, stage.window % TURNS)
-    b = mix_offset(channels, tile, channel, (stage.window + 1) % TURNS)
-    c = mix_offset(channels, tile, channel, (stage.window + 2) % TURNS)
-    d = mix_offset(channels, tile, channel, (stage.window + 3) % TURNS)
-    l_a, l_b, l_c, l_d = zero, zero, zero, zero
-    r_a, r_b, r_c, r_d = zero, zero, zero, zero
-    for member in range(members):
-        filters, count, ring = member_of(stage, member)
-        near = min(NEAR, count)
-        real_b, real_c, real_d = zero, zero, zero
-        opposed_b, opposed_c, opposed_d = zero, zero, zero
-        slot = newest
-        h = 16 * (channels * tile + channel)
-        for partition in range(count):
-            x = spectrum * slot + 16 * tile
-            real_a, opposed_a = load_twice(ring, x), load_opposed(ring, x + 8)
-            prefetch(ring + 4 * x + _SPECTRUM_AHEAD)
-            _fetch_filter(filters, h)
-            l_a = _multiply_add(l_a, real_a, opposed_a, filters, h)
-            l_b = _multiply_add(l_b, real_b, opposed_b, filters, h)
-            l_c = _multiply_add(l_c, real_c, opposed_c, filters, h)
-            l_d = _multiply_add(l_d, real_d, opposed_d, filters, h)
-            if is_pair:
-                r_a = _multiply_add(r_a, real_a, opposed_a, filters, h + 16)
-                r_b = _multiply_add(r_b, real_b, opposed_b, filters, h + 16)
-                r_c = _multiply_add(r_c, real_c, opposed_c, filters, h + 16)
-                r_d = _multiply_add(r_d, real_d, opposed_d, filters, h + 16)
-            real_b, real_c, real_d = real_a, real_b, real_c
-            opposed_b, opposed_c, opposed_d = opposed_a, opposed_b, opposed_c
-            h += _step(near, tiles, channels, count, tile, partition)
-            slot = slot + 1 if slot + 1 < slots else 0
-    if is_pair:
-        _add_to(mix, a + other, r_a)
-        _add_to(mix, b + other, r_b)
-        _add_to(mix, c + other, r_c)
-        _add_to(mix, d + other, r_d)
-    _add_to(mix, a, l_a)
-    _add_to(mix, b, l_b)
-    _add_to(mix, c, l_c)
-    _add_to(mix, d, l_d)
+    for tile in range(first, last):
+        a = mix_offset(channels, tile, channel, stage.window % TURNS)
+        b = mix_offset(channels, tile, channel, (stage.window + 1) % TURNS)
+        c = mix_offset(channels, tile, channel, (stage.window + 2) % TURNS)
+        d = mix_offset(channels, tile, channel, (stage.window + 3) % TURNS)
+        l_a, l_b, l_c, l_d = zero, zero, zero, zero
+        r_a, r_b, r_c, r_d = zero, zero, zero, zero
+        for member in range(members):
+            filters, count, ring = member_of(stage, member)
+            near = min(NEAR, count)
+            real_b, real_c, real_d = zero, zero, zero
+            opposed_b, opposed_c, opposed_d = zero, zero, zero
+            slot = newest
+            h = 16 * (channels * tile + channel)
+            for partition in range(count):
+                x = spectrum * slot + 16 * tile
+                real_a, opposed_a = load_twice(ring, x), load_opposed(ring, x + 8)
+                prefetch(ring + 4 * x + _SPECTRUM_AHEAD)
+                _fetch_filter(filters, h)
+                l_a = _multiply_add(l_a, real_a, opposed_a, filters, h)
+                l_b = _multiply_add(l_b, real_b, opposed_b, filters, h)
+                l_c = _multiply_add(l_c, real_c, opposed_c, filters, h)
+                l_d = _multiply_add(l_d, real_d, opposed_d, filters, h)
+                if is_pair:
+                    r_a = _multiply_add(r_a, real_a, opposed_a, filters, h + 16)
+                    r_b = _multiply_add(r_b, real_b, opposed_b, filters, h + 16)
+                    r_c = _multiply_add(r_c, real_c, opposed_c, filters, h + 16)
+                    r_d = _multiply_add(r_d, real_d, opposed_d, filters, h + 16)
+                real_b, real_c, real_d = real_a, real_b, real_c
+                opposed_b, opposed_c, opposed_d = opposed_a, opposed_b, opposed_c
+                h += _step(near, tiles, channels, count, tile, partition)
+                slot = slot + 1 if slot + 1 < slots else 0
+        if is_pair:
+            _add_to(mix, a + other, r_a)
+            _add_to(mix, b + other, r_b)
+            _add_to(mix, c + other, r_c)
+            _add_to(mix, d + other, r_d)
+        _add_to(mix, a, l_a)
+        _add_to(mix, b, l_b)
+        _add_to(mix, c, l_c)
+        _add_to(mix, d, l_d)

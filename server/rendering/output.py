@@ -78,7 +78,7 @@ def _mix(output: Output, mixers: Sequence[Mixer]) -> Rendered:
     for mixer in mixers:
         mix(mixer)
         # One channel without a head is copied to both outputs; the two ears of a head are averaged to one output.
-        output.sum += mixer.output if mixer.channels <= output.channels else mixer.output.mean(axis=0)
+        output.sum += mixer.output if len(mixer.output) <= output.channels else mixer.output.mean(axis=0)
     if output.limiter is not None:
         output.limiter.process(output.sum)
     is_exchange = any(mixer.convolver is not None and mixer.convolver.exchanged for mixer in mixers)

@@ -13,6 +13,9 @@ first sample of its source.
 Instead of ears there may be ambisonic channels in world axes, to be turned where they are decoded. Then paths are
 encoded with their directions, IRs have as many channels, and the listener's orientation changes nothing.
 
+A head may also hear IRs that are ambisonic: they go to a bus (`server.rendering.bus`), which turns and decodes the sum
+of all emitters. Then a turn of the head needs no other IRs.
+
 Parts that are not needed do not exist. The convolver is made with the first IR and dropped when the last has rung out;
 without a head, paths and IRs have one channel. When an emitter moves between hearing with and without a head, its input
 fades from one mixer to the other, and what it played before rings out in the old one.
@@ -30,8 +33,10 @@ import numpy.typing as npt
 from server.acoustics.geometry import Quaternion
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.errors import NafirError
+from server.rendering.bus import Bus
 from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
 from server.rendering.direct_path import DirectPath, PathTarget
+from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import require_gain
 from server.rendering.mixer_set import MixerSet
@@ -71,7 +76,8 @@ class _Emitter:
 
 class Renderer:
     """Renders one listener with at most `max_emitters` emitters and `outputs` channels: two ears (0 is the left one),
-    or one; with an `order`, its ambisonic channels: ACN order, SN3D norm.
+    or one; with an `order`, its ambisonic channels: ACN order, SN3D norm. `decoders` are those of the head by which it
+    can hear IRs of as many channels as they have.
 
     `filters` are the head for direct paths, at `sample_rate`; without them there are only IRs, which must then include
     the direct sound. `air_db_per_m` (7,) is the absorption of air per octave band. With a `ceiling`, no sample of the
@@ -98,6 +104,7 @@ class Renderer:
         outputs: int = 2,
         has_head: bool = True,
         order: int | None = None,
+        decoders: Sequence[HeadDecoder] = (),
     ) -> None:
         if not is_block_size(block_size):
             raise ValueError(f"block_size is {BLOCK_SIZES}, not {block_size}")
@@ -107,6 +114,7 @@ class Renderer:
         self.order = order
         """The order of ambisonic channels; None for ears."""
         self.outputs = outputs if order is None else harmonic_count(order)
+        self._decoders = {harmonic_count(decoder.order): decoder for decoder in decoders}
         # Twice the number of emitters: a removed emitter keeps its slot until its reverberation has rung out.
         slots = 2 * max_emitters
 
@@ -117,7 +125,7 @@ class Renderer:
                 slots=slots,
                 block_size=block_size,
                 sample_rate=sample_rate,
-                filters=filters if channels == 2 else None,
+                filters=filters if channels == 2 or channels in self._decoders else None,
                 speed_of_sound=speed_of_sound,
                 air_db_per_m=air_db_per_m,
                 order=order,
@@ -134,12 +142,17 @@ class Renderer:
                 any_size=not is_power_of_two(block_size),
             )
 
+        def bus_of(channels: int) -> Bus | None:
+            decoder = self._decoders.get(channels)
+            return None if decoder is None else Bus(decoder, block_size=block_size)
+
         self._mixers = MixerSet(
             slots=slots,
             block_size=block_size,
-            hearings=(1, 2) if order is None else (self.outputs,),
+            hearings=(1, 2, *self._decoders) if order is None else (self.outputs,),
             new_direct=direct_of,
             new_convolver=convolver_of,
+            new_bus=bus_of,
         )
         self._mixer = self._mixers.of(self.outputs if order is not None else 2 if has_head else 1)
         """The mixer for new emitters."""
@@ -178,8 +191,8 @@ class Renderer:
 
     @property
     def channels(self) -> int:
-        """The number of channels for new emitters: 2 for a head, 1 for a single ear without one, or those of
-        ambisonics."""
+        """The number of channels of IRs for new emitters: 2 for a head, 1 for a single ear without one, or those of a
+        bus or of ambisonics."""
         return self._mixer.channels
 
     def applied(self, emitter_id: str) -> int | None:
@@ -192,25 +205,28 @@ class Renderer:
     ) -> PartitionedIr:
         """Prepare an IR (1 or 2 or all ambisonic channels, 1..ir_samples) for `set_ir`. This is most of its cost, and
         any thread may do it. It costs less if the IR equals, from sample `same_from` on, the IR from which `like` was
-        made. One channel is for hearing without a head.
+        made. One channel is for hearing without a head. An IR for a bus is advanced by as much as its decoder is late.
 
         Raises ValueError for another shape or a sample that is not finite.
         """
+        decoder = self._decoders.get(len(ir)) if ir.ndim == 2 else None
+        if decoder is not None and ir.shape[1] > 0:
+            ir = ir[:, min(decoder.delay, ir.shape[1] - 1) :]
+            same_from = max(0, same_from - decoder.delay)
         return self._mixers.prepare(ir, like=like, same_from=same_from)
 
     @property
     def preparation(self) -> Hashable:
-        """A key that is equal for renderers which prepare IRs with a head, or of ambisonics, in the same way and may
-        share them."""
-        return self._mixers.preparer().preparation
+        """A key that is equal for renderers which prepare IRs of two ears in the same way and may share them."""
+        return self._mixers.preparer(2).preparation
 
     def prepare_hearing(self, channels: int) -> None:
         """Prepare for `set_channels`, on any thread."""
         self._mixers.prepare_hearing(channels)
 
     def set_channels(self, channels: int) -> None:
-        """Switch to hearing with a head (2 channels) or without one (1) for new emitters and those without IRs. An
-        emitter that has an IR follows with its first IR of this number of channels."""
+        """Switch to hearing with a head (2 channels), without one (1) or by a bus, for new emitters and those without
+        IRs. An emitter that has an IR follows with its first IR of this number of channels."""
         self._mixer = self._mixers.of(channels)
         for emitter in self._emitters.values():
             if not emitter.has_ir and emitter.mixer is not self._mixer:

@@ -18,6 +18,7 @@ from server.acoustics.geometry import FloorPlan, Pose
 from server.acoustics.sound_path import SoundPathFinder, SoundPaths
 from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
+from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import HeadFilters, NoHead
 from server.rendering.limiter import CEILING
 from server.rendering.renderer import Renderer
@@ -114,14 +115,13 @@ class DirectSound:
     @classmethod
     def of(cls, bundle: Bundle, filters: HeadFilters, *, order: int | None = None) -> "DirectSound":
         manifest = bundle.manifest
-        without_head = EarlyReflections.of(bundle, NoHead(filters.sample_rate))
         return cls(
             bundle.floor_plan,
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.absorption_db_per_m,
             filters=filters if manifest.direct_sound == "geometry" else None,
-            early_reflections=EarlyReflections.of(bundle, filters) if order is None else without_head,
-            early_without_head=without_head,
+            early_reflections=EarlyReflections.of(bundle, filters),
+            early_without_head=EarlyReflections.of(bundle, NoHead(filters.sample_rate)),
             binauralization=Binauralization.of(bundle, filters),
             field_gain=float(db_to_amplitude(-manifest.reference_level_db)),
             order=order,
@@ -138,7 +138,12 @@ class DirectSound:
         switches_tail: bool = False,
         outputs: int = 2,
         has_head: bool = True,
+        buses: Iterable[int] = (),
     ) -> Renderer:
+        """`buses` are the orders of ambisonic responses that the head may hear by a bus."""
+        decoders = []
+        if self._filters is not None and self.order is None:
+            decoders = [HeadDecoder.of(self._filters, order) for order in buses]
         # guard: a session's sound is limited
         return Renderer(
             block_size=block_size,
@@ -154,12 +159,13 @@ class DirectSound:
             outputs=outputs,
             has_head=has_head,
             order=self.order,
+            decoders=decoders,
         )
 
-    def heard(self, field: AcousticField) -> AcousticField:
-        """The field heard through the head of this direct sound, or as its ambisonic channels."""
-        if self.order is not None:
-            return field.encoded(self.order)
+    def heard(self, field: AcousticField, channels: int) -> AcousticField:
+        """The field heard through the head of this direct sound or, for more channels than two, as ambisonic ones."""
+        if channels > 2:
+            return field.encoded(round(channels**0.5) - 1)
         return field if self._filters is None else field.through(self._filters)
 
     def early(self, channels: int) -> EarlyReflections | None:
@@ -174,7 +180,7 @@ class DirectSound:
         """
         if self._filters is None:
             return
-        listener = self.axes_for(listener)
+        listener = self.axes_for(listener, responses.shape[1])
         for ways in self.ways_from(enumerate(emitters)):
             for row, length_m, arrival, gain_db in zip(ways.keys, *ways.find(listener), strict=True):
                 emitter = emitters[row]
@@ -187,9 +193,10 @@ class DirectSound:
                     np.array([length_m]), arrival[np.newaxis], gain[np.newaxis], listener.orientation, responses[row]
                 )
 
-    def axes_for(self, listener: Pose) -> Pose:
+    @staticmethod
+    def axes_for(listener: Pose, channels: int) -> Pose:
         """The pose whose axes responses have: the listener's, or for ambisonic channels those of the world."""
-        return listener if self.order is None else Pose(listener.position)
+        return listener if channels <= 2 else Pose(listener.position)
 
     @property
     def is_heard_apart(self) -> bool:

@@ -80,7 +80,7 @@ def composed_irs(
     """Return responses (B, channel, sample) with the parts that the emitters' effects call for. The field computes only
     those of emitters with `late` on. `remember` is as in `AcousticField.impulse_responses`."""
     count = len(emitters)
-    field, listener = direct.heard(field), direct.axes_for(listener)
+    field, listener = direct.heard(field, channels), direct.axes_for(listener, channels)
     held = _held(field, direct, listener, emitters, remember=remember)
     if direct.binauralization is not None:
         places = [emitter.pose.position for emitter in emitters]

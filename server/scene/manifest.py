@@ -234,7 +234,9 @@ class QualityLevel(Strict):
     listener share one late reverberation. With `reuse` poses near each other share responses. `tail` is how the end of
     a response is made: as its beginning, by an inverse transform of spectrograms (stft), or from frozen noises in
     octave bands, whose gains follow the prediction (bands; for fields of directions). `order` is the highest order of
-    the directions' harmonics that is used; by default, all are.
+    the directions' harmonics that is used; by default, all are. With `bus` (for fields of directions) headphones hear
+    reflected sound as ambisonic channels of this order, mixed of all emitters and turned with the head: a turn asks for
+    no response. By default each emitter has a response of two ears.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
@@ -246,6 +248,7 @@ class QualityLevel(Strict):
     shared_tail: bool = False
     tail: Literal["stft", "bands"] = "stft"
     order: Annotated[int, Field(ge=0, le=HIGHEST_ORDER)] | None = None
+    bus: Annotated[int, Field(ge=1, le=HIGHEST_ORDER)] | None = None
     accuracy: Accuracy | None = None
     cost: Cost | None = None
 
@@ -254,8 +257,9 @@ class QualityLevel(Strict):
         document: dict[str, object] = write(self)
         if self.tail == "stft":
             document.pop("tail", None)
-        if self.order is None:
-            document.pop("order", None)
+        for name in ("order", "bus"):
+            if getattr(self, name) is None:
+                document.pop(name, None)
         return document
 
 
@@ -370,6 +374,8 @@ class Manifest(Strict):
                     f"levels.{level.name}: a field of directions is heard anew at every pose and predicts no phase; "
                     "leave out reuse, and take another phase than integrated"
                 )
+            if level.bus is not None and field.predicts != "directions":
+                raise ValueError(f"levels.{level.name}.bus: is for fields of directions")
             if level.order is not None and (field.order is None or level.order > field.order):
                 has = "no directions" if field.order is None else f"order {field.order}"
                 raise ValueError(f"levels.{level.name}.order: is {level.order}, but field {level.field} has {has}")
@@ -393,6 +399,8 @@ class Manifest(Strict):
             raise ValueError(f"levels: a scene without fields has one level, of field {NO_FIELD!r}")
         if self.levels[0].tail != "stft":
             raise ValueError(f"levels.{self.levels[0].name}.tail: bands are for fields of directions")
+        if self.levels[0].bus is not None:
+            raise ValueError(f"levels.{self.levels[0].name}.bus: is for fields of directions")
         if self.levels[0].order is not None:
             raise ValueError(f"levels.{self.levels[0].name}.order: a scene without fields has no directions")
         if self.direct_sound == "field":

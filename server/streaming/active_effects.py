@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Mapping
 
 from server.acoustics.directivity import OMNIDIRECTIONAL
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.planning.catalogue import ENERGY_EFFECTS, emitter_effects
 from server.planning.planned_effects import PlannedEffects
 from server.rendering.convolver import PartitionedIr
@@ -29,6 +30,8 @@ class ActiveEffects:
     ) -> None:
         self.planned = planned
         self._renderer = renderer
+        self.bus: int | None = None
+        """The order of the bus of the wanted quality level; None where emitters have responses of two ears."""
         self.shared = self._called_for()
         self._sample_rate = sample_rate
         has = {EffectName.EARLY_REFLECTIONS: has_early, EffectName.LATE_REVERBERATION: has_late}
@@ -40,24 +43,44 @@ class ActiveEffects:
         return self._renderer.sample_clock / self._sample_rate
 
     @property
+    def _wanted_channels(self) -> int:
+        """The number of channels of responses that output, effects and quality level call for."""
+        if self._renderer.order is not None:
+            return self._renderer.channels
+        if self.shared.head and self.bus is not None:
+            return harmonic_count(self.bus)
+        return self.shared.channels
+
+    @property
     def wants_other_ears(self) -> bool:
-        """Whether the effects call for another number of channels than the renderer has."""
-        return self._renderer.order is None and self.shared.channels != self._renderer.channels
+        """Whether other channels are called for than the renderer has."""
+        return self._wanted_channels != self._renderer.channels
 
     @property
     def awaits_ears(self) -> bool:
-        """Whether the effects call for another number of channels, and the renderer has room to switch."""
-        return self.wants_other_ears and self._renderer.can_set_channels(self.shared.channels)
+        """Whether other channels are called for, and the renderer has room to switch."""
+        return self.wants_other_ears and self._renderer.can_set_channels(self._wanted_channels)
 
     @property
     def channels(self) -> int:
         """The number of channels of the IRs to request."""
-        return self.shared.channels if self.awaits_ears else self._renderer.channels
+        return self._wanted_channels if self.awaits_ears else self._renderer.channels
+
+    @property
+    def turns_ask(self) -> bool:
+        """Whether a turn of the head asks for responses: those of two ears are of one orientation, while a bus turns by
+        itself."""
+        return self.shared.head and self.shared.head_rotation and self.channels == 2
+
+    def bakes(self, emitter: StreamedEmitter) -> bool:
+        """Whether the direct sound of an emitter belongs into its response. In a bus it would lose its direction."""
+        effects = emitter.effects
+        return effects.bakes_direct and (self._renderer.order is not None or self.channels <= 2 or effects.holds_still)
 
     def enforce(self, emitters: Mapping[str, StreamedEmitter]) -> list[str]:
         """Put the plan into effect. Return the emitters that it includes for the first time and that need no IR."""
         assert self.planned is not None
-        ears = self.shared.channels
+        ears = self._wanted_channels
         self.shared = self._called_for()
         begin = []
         for name, emitter in emitters.items():
@@ -68,7 +91,7 @@ class ActiveEffects:
                 begin.append(name)
             self._switch(name, emitter, effects)
             emitter.decide()
-            if ears != self.shared.channels:
+            if ears != self._wanted_channels:
                 emitter.discard_response()
         return begin
 
@@ -89,6 +112,18 @@ class ActiveEffects:
         """Make emitters share one late tail, if the quality level does or the plan finds no audible difference."""
         several = sum(emitter.effects.late for emitter in emitters.values()) > 1
         self._renderer.share_tail(is_shared or (several and not self.shared.own_tails))
+
+    def as_asked(self, emitter: StreamedEmitter) -> EmitterState:
+        """Return the state to request an IR for. The direct sound is baked only once there is an IR of the pose without
+        it."""
+        effects = emitter.effects
+        if not effects.bakes_direct or (self.bakes(emitter) and (emitter.wants_baking or effects.holds_still)):
+            return emitter.state
+        return dataclasses.replace(emitter.state, effects=dataclasses.replace(effects, propagation_delay=True))
+
+    def wants_baking(self, emitter: StreamedEmitter) -> bool:
+        """Whether the direct sound is to be baked into an IR that is otherwise up to date."""
+        return emitter.wants_baking and self.bakes(emitter)
 
     def accept_ir(
         self, name: str, emitter: StreamedEmitter, ir: PartitionedIr, asked: EmitterEffects, token: int
@@ -154,12 +189,3 @@ class ActiveEffects:
             distance=effects.distance_attenuation,
             air=effects.air_absorption,
         )
-
-
-def as_asked(emitter: StreamedEmitter) -> EmitterState:
-    """Return the state to request an IR for. The direct sound is baked only once there is an IR of the pose without
-    it."""
-    effects = emitter.effects
-    if not effects.bakes_direct or emitter.wants_baking or effects.holds_still:
-        return emitter.state
-    return dataclasses.replace(emitter.state, effects=dataclasses.replace(effects, propagation_delay=True))

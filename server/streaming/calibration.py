@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from server.acoustics.geometry import Pose
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
@@ -46,8 +47,14 @@ class Listener:
         self._time_s = time_s
         self._direct_sound = DirectSound.of(field.bundle, filters, order=order)
         self._renderer = self._direct_sound.renderer(
-            block_size=_BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
+            block_size=_BLOCK_SIZE,
+            ir_samples=field.ir_samples,
+            sample_rate=field.sample_rate,
+            max_emitters=1,
+            buses=self._levels.buses,
         )
+        is_by_bus = order is None and field.level.bus is not None
+        self._channels = harmonic_count(field.level.bus or 0) if is_by_bus else self._renderer.channels
         self._emitter = EmitterState(Pose(field.bundle.manifest.start.emitter))
         self._heard: Shared | None = None
 
@@ -61,8 +68,8 @@ class Listener:
         if self._heard is None or not self._heard.around.holds(listener):
             shared = shared_response(self._field, self._direct_sound.early_reflections, listener, self._emitter)
             if shared is None or self._heard is None or shared.identity != self._heard.identity:
-                asked, channels = (AskedIr(0, self._emitter),), self._renderer.channels
-                request = IrRequest(0, self._field.level.name, listener, asked, self._direct_sound, channels)
+                asked = (AskedIr(0, self._emitter),)
+                request = IrRequest(0, self._field.level.name, listener, asked, self._direct_sound, self._channels)
                 compute_irs(self._levels, request, self._renderer)
             self._heard = shared
         return 1000 * (self._time_s() - started_s)

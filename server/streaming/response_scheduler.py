@@ -18,7 +18,7 @@ from server.rendering.renderer import Renderer
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_cache import Shared, shared_response
 from server.responses.ir_request import AskedIr, IrRequest, IrResponse
-from server.streaming.active_effects import ActiveEffects, as_asked
+from server.streaming.active_effects import ActiveEffects
 from server.streaming.emitters import StreamedEmitter, Validity
 from server.streaming.quality_steps import QualityStep
 
@@ -84,6 +84,7 @@ class ResponseScheduler:
         self._demand = _Demand.UNKNOWN
         self._interval_s = 0.0
         self._next_request_clock = 0
+        effects.bus = levels[quality.level].level.bus
         renderer.share_tail(quality.shared_tail)
 
     @property
@@ -104,6 +105,7 @@ class ResponseScheduler:
             self._look_again()
             self._next_request_clock = 0
         self._wanted, self._reason = quality, reason
+        self._effects.bus = self._levels[quality.level].level.bus
         return self.change_quality() if quality.level == self.heard.level else self.change_quality_unheard()
 
     def change_quality_unheard(self) -> list[ServerMessage]:
@@ -192,7 +194,7 @@ class ResponseScheduler:
         return request
 
     def _request(self, listener: Pose, emitters: list[StreamedEmitter], *, is_first: bool) -> IrRequest:
-        states = [as_asked(emitter) for emitter in emitters]
+        states = [self._effects.as_asked(emitter) for emitter in emitters]
         for emitter in emitters:
             emitter.is_outdated = False
         asked = tuple(
@@ -260,7 +262,7 @@ class ResponseScheduler:
             return False
         if emitter.is_outdated and emitter.heard.identity is not None:
             emitter.is_outdated = not self._still_hears(emitter, listener)
-        return emitter.is_outdated or emitter.wants_baking
+        return emitter.is_outdated or self._effects.wants_baking(emitter)
 
     def _still_hears(self, emitter: StreamedEmitter, listener: Pose) -> bool:
         """Return whether the IR that is playing for an emitter is also its response at this pose. This is fast while
@@ -280,7 +282,7 @@ class ResponseScheduler:
         return shared and shared.identity
 
     def _shared(self, emitter: StreamedEmitter, listener: Pose) -> Shared | None:
-        if emitter.effects.bakes_direct:
+        if self._effects.bakes(emitter):
             return None
         field = self._levels[self._wanted.level]
         shared = shared_response(field, self._direct_sound.early_reflections, listener, emitter.state)

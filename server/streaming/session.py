@@ -121,6 +121,7 @@ class Session:
             switches_tail=planned is not None or any(field.kind.shares_tail for field in levels.values()),
             outputs=1 if hello.output == "mono" else 2,
             has_head=planned is None or planned.shared.head,
+            buses=levels.buses,
         )
         self._effects = ActiveEffects(
             self.renderer,
@@ -243,13 +244,16 @@ class Session:
         self._checked += 1
         emitter = self._emitters[named[self._checked % len(named)]]
         whole, head = self._effects.whole()
+        # A bus is heard by two ears: how it differs from responses of ears is the quality level's affair.
+        is_by_bus = self.renderer.order is None and self.renderer.channels > 2
+        channels = 2 if is_by_bus else self.renderer.channels
         check = PlanAudit(
             self.quality.level,
             self._listener,
             emitter.state,
             whole,
-            self.renderer.channels,
-            2 if head else self.renderer.channels,
+            channels,
+            2 if head else channels,
             self._direct_sound,
         )
         return check if check.finds_anything else None
@@ -331,10 +335,10 @@ class Session:
         self._bundle.require_inside(pose.position, "position")
         self._responses.advance(message.pose_id)
         moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
-        shared = self._effects.shared
+        has_head, turns_ask = self._effects.shared.head, self._effects.turns_ask
         for identifier, emitter in self._emitters.items():
-            emitter.is_outdated |= moves or (turns and shared.head and shared.head_rotation)
-            if moves or (turns and shared.head):
+            emitter.is_outdated |= moves or (turns and turns_ask)
+            if moves or (turns and has_head):
                 self._effects.unbake(identifier, emitter)
         self._listener = pose
         if self._effects.planned is not None:

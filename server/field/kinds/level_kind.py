@@ -51,6 +51,8 @@ class LevelKind(ABC):
             parts.append("shared late reverberation")
         if self.level.frames is not None:
             parts.append("shortened reverberation")
+        if self.level.bus is not None:
+            parts.append(f"turned as ambisonics of order {self.level.bus}")
         if self.level.ir_rate_hz is not None:
             parts.append(f"at most {self.level.ir_rate_hz:g} responses a second")
         title = ", ".join(parts) or "full"
