@@ -132,9 +132,8 @@ export class Panel {
     this.#spark.clear();
     this.#find("buffer").textContent = "–";
     this.#find("buffer-note").textContent = "";
-    for (const id of ["latency", "part-server", "part-buffer", "part-device", "latency-reverberation", "latency-turn", "latency-turn-held", "field-cost"]) {
-      this.#find(id).textContent = "–";
-    }
+    for (const id of ["latency", "latency-reverberation", "latency-turn", "latency-turn-held", "field-cost"]) this.#find(id).textContent = "–";
+    for (const id of ["part-server", "part-buffer", "part-device"]) this.#find(id).textContent = "–";
     this.#find("latency-note").textContent = "measured while playing";
     for (const part of this.#find("stack").children) part.style.flexGrow = 0;
   }

@@ -100,8 +100,8 @@ def default_point(best: Sequence[Point], *, ms: float) -> Point:
 
 
 def default_among(points: Sequence[Point], *, ms: float) -> Point:
-    """The default level of a bundle with all these eligible points. Where a field predicts directions it is one of these,
-    because they are heard through any head that is turned in any way."""
+    """The default level of a bundle with all these eligible points. Where a field predicts directions it is one of
+    these, because they are heard through any head that is turned in any way."""
     directional = [point for point in points if point.predicts == "directions"]
     return default_point(_optimal(directional or points), ms=ms)
 
@@ -110,8 +110,8 @@ def offered_points(points: Sequence[Point], best: Sequence[Point], default: Poin
     """A few of the Pareto-optimal points, the default first. From it on down and up, each is the most accurate of those
     that cost a third of the one before or less, or three times as much or more.
 
-    If no such point is of a field of ears, or of directions, and there are eligible `points` of one, what would be the default
-    among these with this `ms` follows: both ways to predict a response can be heard side by side.
+    If no such point is of a field of ears, or of directions, and there are eligible `points` of one, what would be the
+    default among these with this `ms` follows: both ways to predict a response can be heard side by side.
     """
     offered = [default]
     for point in reversed(best):
