@@ -60,7 +60,7 @@ def error_over_time(result: Result) -> Figure:
         xlabel="milliseconds per pose of a walk; points at the mean, bars from the median to the slowest of a hundred",
         ylabel="mean error, just-noticeable differences",
     )
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=9, loc="lower left")
     return figure
 
 

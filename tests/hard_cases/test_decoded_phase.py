@@ -48,7 +48,7 @@ def test_griffin_lim_from_next_to_nothing_does_not_divide_by_it(size, measured):
 def test_a_silent_response_is_nothing_to_take_a_phase_from():
     """Iterations from it would find that silence has no phase, and stay there."""
     phases = PhaseCache()
-    place = np.zeros(3), np.ones(3), 0.0
+    place = np.zeros(3), np.ones(3), np.array([0.0, 0.0, 0.0, 1.0])
     phases.keep(*place, np.zeros((2, 100), np.float32))
     assert phases.nearest(*place) is None
     sound = np.ones((2, 100), np.float32)

@@ -29,6 +29,7 @@ class Laborious:
     """A field whose responses take so much of a core's time each, whatever else runs."""
 
     channels, sample_rate, ir_samples = 2, 24_000, 2_000
+    knows_directions = False
 
     def __init__(self, field, name, cost_s):
         self.bundle, self.level, self._cost_s = field.bundle, QualityLevel(name=name, field="arithmetic"), cost_s

@@ -37,15 +37,15 @@ def test_what_is_rendered_is_shown_with_reasons_and_can_be_switched(browser, ser
 
     # One loudspeaker: both channels alike, and no head.
     page.select_option("#output", "mono")
-    page.wait_for_function("nafir.state().effects.decisions.some((d) => d.name === 'hrtf' && !d.called_for)")
+    # Where the page turned the head, this takes another stream, and there is no plan for a while.
+    page.wait_for_function("nafir.state().effects?.decisions.some((d) => d.name === 'hrtf' && !d.called_for)")
     # Responses for one ear come when there is time for them, and what was heard through the head before rings out.
     for _ in range(40):
         heard = listen(page, seconds=0.5)
-        if np.abs(heard[0] - heard[1]).max() < 1e-3:
+        if np.abs(heard[0] - heard[1]).max() < 1e-3 and np.all(level_db(heard) > -70):
             break
     else:
-        pytest.fail("two ears still hear two things")
-    assert np.all(level_db(heard) > -70)
+        pytest.fail("two ears still hear two things, or nothing")
     box, rail = page.locator("#effects").bounding_box(), page.locator("#rendered").bounding_box()
     assert rail["x"] <= box["x"]
     assert box["x"] + box["width"] <= rail["x"] + rail["width"]

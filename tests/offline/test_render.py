@@ -30,6 +30,7 @@ class NoiseField:
     """Decaying noise, another for each pair of poses: enough to tell which impulse response was used, and where."""
 
     ir_samples = 1_500
+    channels = 2
     sample_rate = SAMPLE_RATE
     level = QualityLevel(name="noise", field="noise")
     kind = kind_of(level)

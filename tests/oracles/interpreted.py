@@ -7,7 +7,8 @@
 before anything of the server is imported; by this path, because some installed package may be called `tests`.
 
 What only loops over numbers is run by Python as it stands. What works on vectors, or would take too long in Python, is
-done by an oracle: the loops and transforms of the direct path, sound paths, reflections and the gate. Blocks are mixed
+done by an oracle: the loops and transforms of the direct path, sound paths, reflections, the gate, and what ears hear of
+directions. Blocks are mixed
 and convolved, and spectrograms decoded, as those of sizes are that compiled code does not take.
 """
 
@@ -76,11 +77,22 @@ def _render_by_numpy() -> None:
 
 
 def _decode_by_numpy() -> None:
-    from server.field import decoder, gate
-    from server.health.double_precision import DoubleGate
+    from server.acoustics.spherical_harmonics import rotation
+    from server.field import band_tail, decoder, directional_graph, gate
+    from server.health.double_precision import DoubleBandTail, DoubleDirectionalGraph, DoubleGate
 
     decoder.is_compiled_size = _is_none
     gate.Gate._open = DoubleGate._open  # type: ignore[method-assign]
+    for name in ("_add", "_gains", "_length"):
+        setattr(band_tail.BandTail, name, vars(DoubleBandTail)[name])
+    for name in ("at_ears", "_at_ears", "relative"):
+        setattr(directional_graph.DirectionalGraph, name, vars(DoubleDirectionalGraph)[name])
+
+    def turned(graph: Any, orientation: Any) -> Any:
+        products = graph.turning.level @ rotation(orientation, graph.heard_order)
+        return products.reshape(-1, directional_graph.PRODUCTS, products.shape[-1])
+
+    directional_graph.DirectionalGraph._turned = turned  # type: ignore[method-assign]
 
 
 def _feed_networks_singles() -> None:

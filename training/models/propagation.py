@@ -108,7 +108,8 @@ class Propagation(nn.Module):
         shortest = torch.where(sight, straight, via.amin(dim=(1, 2))[:, None])
         return (
             shortest,
-            torch.exp((straight - shortest) / _PENUMBRA_M),
+            # A place further away than _FAR may be straight ahead of a way that is called shorter.
+            torch.exp(torch.clamp(straight - shortest, max=0.0) / _PENUMBRA_M),
             torch.where(sight[..., None], other, self._bends[via.argmin(dim=-1)]),
         )
 

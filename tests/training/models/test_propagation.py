@@ -115,3 +115,14 @@ def test_a_listener_at_the_emitter_is_finite(case):
         assert part.isfinite().all()
     path.length.sum().backward()
     assert points.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e6])
+def test_sight_of_places_far_outside_is_a_share(far):
+    """A network that is asked there multiplies by it."""
+    turns = np.linspace(0, 2 * np.pi, 40)
+    listeners = np.stack([far * np.cos(turns), far * np.sin(turns), np.full(40, 1.5)], axis=-1).astype(np.float32)
+    emitters = np.tile(np.array([[1.0, 1.0, 1.5]], np.float32), (40, 1))
+    path = Propagation(PLANS["apartment"])(torch.from_numpy(listeners), torch.from_numpy(emitters))
+    assert ((path.visible >= 0) & (path.visible <= 1)).all()
+    assert torch.isfinite(path.length).all()
