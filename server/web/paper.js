@@ -181,14 +181,18 @@ export class Paper {
     for (let metre = 0; metre <= view.east - view.west + 1e-6; metre += step) {
       const [x, y] = view.toScreen([view.west + metre, view.south]);
       line(x, y + gap, x, y + gap + tick);
-      context.fillText(metre === 0 ? "0" : `${metre}`, x, y + gap + tick + 2);
+      const label = `${metre}`;
+      // The last one may end beyond the plan, where nothing is left of the canvas.
+      const most = view.width - context.measureText(label).width / 2 - 1;
+      context.fillText(label, Math.min(x, most), y + gap + tick + 2);
     }
     context.textAlign = "right";
     context.textBaseline = "middle";
+    const least = context.measureText("0").fontBoundingBoxAscent / 2 + 1;
     for (let metre = 0; metre <= view.north - view.south + 1e-6; metre += step) {
       const [x, y] = view.toScreen([view.west, view.south + metre]);
       line(x - gap - tick, y, x - gap, y);
-      if (metre > 0) context.fillText(`${metre}`, x - gap - tick - 3, y);
+      if (metre > 0) context.fillText(`${metre}`, x - gap - tick - 3, Math.max(y, least));
     }
   }
 }
