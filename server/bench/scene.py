@@ -67,6 +67,10 @@ class BankField(AcousticField):
     def through(self, filters: HeadFilters) -> "BankField":  # noqa: ARG002  its responses were recorded
         return self
 
+    @property
+    def knows_directions(self) -> bool:
+        return False
+
     def impulse_responses(
         self,
         listeners: npt.ArrayLike,

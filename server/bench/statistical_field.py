@@ -113,6 +113,10 @@ class StatisticalField(AcousticField):
     def through(self, filters: HeadFilters) -> "StatisticalField":  # noqa: ARG002  one head is as good as another
         return self
 
+    @property
+    def knows_directions(self) -> bool:
+        return False
+
     def impulse_responses(
         self,
         listeners: npt.ArrayLike,

@@ -7,9 +7,9 @@
 before anything of the server is imported; by this path, because some installed package may be called `tests`.
 
 What only loops over numbers is run by Python as it stands. What works on vectors, or would take too long in Python, is
-done by an oracle: the loops and transforms of the direct path, sound paths, reflections, the gate, and what ears hear of
-directions. Blocks are mixed
-and convolved, and spectrograms decoded, as those of sizes are that compiled code does not take.
+done by an oracle: the loops and transforms of the direct path, sound paths, reflections, the gate, and what ears hear
+of directions. Blocks are mixed and convolved, and spectrograms decoded, as those of sizes are that compiled code does
+not take.
 """
 
 import sys

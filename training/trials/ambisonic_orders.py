@@ -28,6 +28,7 @@ from server.rendering.head_decoder import ORDERS, HeadDecoder
 from server.rendering.hrtf import kemar
 from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.scene.bundle import Bundle
+from training.models.frozen_noise import even_noise
 
 _Floats = npt.NDArray[np.float64]
 
@@ -85,7 +86,8 @@ def compare(bundle: Bundle, *, pairs: int, seed: int, level: str | None = None) 
     """(part, measure, band) mean differences from the ears of the field, by way. Raises BundleError for a level that
     there is not, and RequestError for a field that knows no directions."""
     field = AcousticField.load(bundle, level=level)
-    other_noise = AcousticField.load(replace(bundle, frozen_noise=bundle.frozen_noise[:, ::-1].copy()), level=level)
+    noise = even_noise(bundle.manifest.codec.codec, np.random.default_rng(seed))
+    other_noise = AcousticField.load(replace(bundle, frozen_noise=noise), level=level)
     rate, filters = field.sample_rate, kemar(field.sample_rate)
 
     def ears(of: AcousticField) -> Callable[[IrQuery], npt.NDArray[np.floating]]:
