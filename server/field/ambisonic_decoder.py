@@ -1,7 +1,8 @@
 """Decoding of what arrives at a point, by direction, to ambisonic channels.
 
-The channels are frozen noises in octave bands, one noise for each channel, mixed so that the channels have the
-covariance of the arriving sound: gains of each band and column of a prediction, interpolated in between. A first order
+The channels are frozen noises (`server.field.ambisonic_noise`) in octave bands, one noise for each channel, mixed so
+that the channels have the covariance of the arriving sound: gains of each band and column of a prediction, interpolated
+in between. Bands overlap, and there their amplitudes add up: gains make up for the power that this lacks. A first order
 follows exactly from harmonics of the second (`server.field.ambisonic_kernel`). For higher orders, sound is spread over
 virtual directions, with powers that are never negative and whose harmonics are those predicted, as nearly as such
 powers can have them. The first channel is the same at all orders.
@@ -22,6 +23,7 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
 from server.acoustics.codec import Codec
 from server.acoustics.spherical_harmonics import harmonic_count, mean_squares, real_harmonics
 from server.field.ambisonic_kernel import find_first_order, mix_bands
+from server.field.ambisonic_noise import even_noises
 from server.field.directional_graph import Arrivals
 from server.kernels.cache_lines import zeros_on_lines
 from server.kernels.simd import LANES
@@ -30,7 +32,6 @@ from server.scene.manifest import CodecParameters
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-_SEED = 24_05_2011
 _STEPS, _BEYOND = 40, 1.8
 _SNUB_CUBE = (0.866246818107821, 0.422518653761111, 0.266635401516705)
 """Coordinates by which the corners of a snub cube are a spherical 7-design (Hardin and Sloane, Discrete Comput. Geom.
@@ -142,14 +143,15 @@ def _roots(directions: npt.NDArray[np.floating], channels: int) -> Floats:
 
 @lru_cache(maxsize=8)
 def _noises(codec: Codec, channels: int) -> tuple[npt.NDArray[np.int16], Float32]:
-    """(noise, band, sample) independent noises of unit power density in octave bands, the same in every process, and
-    their units (noise, band). Squares of the bands' amplitudes add up to one."""
-    bands = np.sqrt(band_weights(np.fft.rfftfreq(codec.samples, 1 / codec.sample_rate)))
+    """(noise, band, sample) noises of unit power density in octave bands, the same in every process, and their units
+    (noise, band). Amplitudes of the bands add up to one, so that equal gains give back a noise whose spectrogram is
+    level."""
+    bands = band_weights(np.fft.rfftfreq(codec.samples, 1 / codec.sample_rate))
     noises = np.empty((channels, len(OCTAVE_BANDS_HZ), codec.samples), np.int16)
     steps = np.empty(noises.shape[:2], np.float32)
-    for channel, (noise, step) in enumerate(zip(noises, steps, strict=True)):
-        white = np.random.default_rng([_SEED, channel]).standard_normal((len(noise), codec.samples))
-        filtered = np.fft.irfft(bands * np.fft.rfft(white), codec.samples) / np.sqrt(codec.window_energy)
+    whole = even_noises(codec.sample_rate, codec.samples, channels) / np.sqrt(codec.window_energy)
+    for white, noise, step in zip(whole, noises, steps, strict=True):
+        filtered = np.fft.irfft(bands * np.fft.rfft(white), codec.samples)
         step[:] = np.maximum(np.abs(filtered).max(axis=-1) / np.iinfo(np.int16).max, 1e-12)
         noise[:] = np.round(filtered / step[:, None])
     return noises, steps

@@ -10,6 +10,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from server.field.band_tail_kernel import balance
 from server.kernels.compiled import compiled
 from server.kernels.simd import (
     LANES,
@@ -184,20 +185,24 @@ def mix_bands(
     begin: int,
     response: Float32,
 ) -> None:
-    """Write a response (k, sample) that begins at sample `begin`.
+    """Write a response (k, sample).
 
     `log_magnitude` (band, column) is what an ideal omnidirectional microphone hears, and `mixing` (k, noise, band,
     column) makes channels of unit power from the `noises` (noise, band, sample), whose units are `steps` (noise, band).
     It is multiplied by the magnitudes. Values hold at the samples `places` (column,), and are interpolated between
-    them.
+    them. The first one rises from nothing at sample `begin`, as it does where the windows of a first frame overlap with
+    none before.
     """
     channels, bands, columns = response.shape[0], log_magnitude.shape[0], log_magnitude.shape[1]
-    for band in range(bands):
-        for column in range(columns):
-            magnitude = max(np.exp(log_magnitude[band, column]) - np.float32(log_floor), np.float32(0.0))
+    for column in range(columns):
+        before = magnitude = _magnitude(log_magnitude[0, column], log_floor)
+        for band in range(bands):
+            after = _magnitude(log_magnitude[min(band + 1, bands - 1), column], log_floor)
+            gain = magnitude * balance(before, magnitude, after)
+            before, magnitude = magnitude, after
             for i in range(channels):
                 for j in range(channels):
-                    mixing[i, j, band, column] *= magnitude * steps[j, band]
+                    mixing[i, j, band, column] *= gain * steps[j, band]
     for channel in range(channels):
         for n in range(response.shape[1]):
             response[channel, n] = 0
@@ -209,17 +214,25 @@ def mix_bands(
         stop = end if column == last else min(end, math.ceil(places[column + 1]))
         stop = min(stop, at + _AT_ONCE)
         low, high = max(column, 0), min(column + 1, last)
-        apart = places[high] - places[low]
-        share = (at - places[low]) / apart if apart > 0 else 0.0
+        since = places[low] if column >= 0 else begin
+        apart = places[high] - since
+        share = (at - since) / apart if apart > 0 else 0.0
         step = 1.0 / apart if apart > 0 else 0.0
         for band in range(bands):
             for i in range(channels):
                 # The first channel has a noise alone.
                 for j in range(channels if i > 0 else 1):
                     before, after = mixing[i, j, band, low], mixing[i, j, band, high]
+                    if column < 0:
+                        before = np.float32(0.0)
                     first, slope = np.float32(before + (after - before) * share), np.float32((after - before) * step)
                     _add(first, slope, noises[j, band], response[i], at, stop)
         at = stop
+
+
+@compiled
+def _magnitude(log_magnitude, log_floor):
+    return max(np.exp(log_magnitude) - np.float32(log_floor), np.float32(0.0))
 
 
 @compiled

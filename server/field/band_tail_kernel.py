@@ -64,8 +64,8 @@ def find_band_gains(
         for band in range(bands):
             after = min(band + 1, bands - 1)
             left, right, coherence = gains[0, band, to], gains[1, band, to], gains[2, band, to]
-            at_left = left * _balance(before_left, left, gains[0, after, to])
-            at_right = right * _balance(before_right, right, gains[1, after, to])
+            at_left = left * balance(before_left, left, gains[0, after, to])
+            at_right = right * balance(before_right, right, gains[1, after, to])
             before_left, before_right = left, right
             # Noises of coherence d with gains b and a have the coherence b + a d and the power a^2 + b^2 + 2 a b d.
             of_diffuse = diffuse[band, 2]
@@ -76,7 +76,7 @@ def find_band_gains(
 
 
 @compiled
-def _balance(before: np.float32, gain: np.float32, after: np.float32) -> np.float32:
+def balance(before: np.float32, gain: np.float32, after: np.float32) -> np.float32:
     """The factor by which a band's gain makes up for what is lacking between bands.
 
     There the bands' amplitudes add up, and not their powers. Over the octave between bands with gains g and h, this

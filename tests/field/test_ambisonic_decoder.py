@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import Quaternion
@@ -249,6 +250,47 @@ def test_levels_are_those_of_the_slow_way(order):
     for part in parts:
         found, expected = (np.sum(each[:, part].astype(float) ** 2, axis=-1) for each in (quick, slow))
         assert_allclose(10 * np.log10(found / expected)[: 4 if order < 2 else None], 0, atol=0.8)
+
+
+def expected_energy(log, centres, starts, aligned):
+    """(start, octave) energy of what an omnidirectional microphone hears, after a filter of each octave there and back,
+    by arithmetic: power is interpolated over the logarithm of frequency, and its root in time."""
+    place = centres * 64 - LONG.codec.frame_lead_samples + 128 + aligned
+    sample = np.arange(SAMPLES)
+    frequency = np.fft.rfftfreq(4096, 1 / 24_000)
+    position = np.clip(np.log2(np.maximum(frequency, 1) / 125), 0, BANDS - 1)
+    weights = np.maximum(0, 1 - np.abs(position - np.arange(BANDS)[:, None]))
+    gains = np.array([np.abs(sosfreqz(octave(band), frequency, fs=24_000)[1]) ** 4 for band in range(BANDS)])
+    shares = np.mean(weights * gains[:, None], axis=-1)  # of each octave's filter, from each band
+    power = np.array([np.interp(sample, place, np.exp(level)) ** 2 for level in log]) / LONG.codec.window_energy
+    return np.array([power[:, start:].sum(axis=1) @ shares.T for start in starts])
+
+
+def octave(band):
+    return butter(2, OCTAVE_BANDS_HZ[band] * np.sqrt([0.5, 1.98]), "bandpass", fs=24_000, output="sos")
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_each_octave_has_its_level_and_its_directions_whenever_one_listens(order):
+    """A decay unlike in each band, partly from one side: from each of many moments on, what is heard is what is asked.
+    White noises would be off by twice as much."""
+    edges = DECAYING.frame_axis.edges
+    centres = (edges[:-1] + edges[1:] - 1) / 2
+    decay_s = np.linspace(0.6, 0.3, BANDS)
+    log = (-np.log(1000) * (centres * 64 / 24_000) / decay_s[:, None]).astype(np.float32)
+    relative = mixed((0.6, -0.48, 0.64), 0.6).astype(np.float32)
+    arrivals = Arrivals(log[None], np.ones((1, 8, *log.shape), np.float32) * relative[1:, None, None])
+    channels = AmbisonicDecoder(DECAYING, ir_samples=SAMPLES).decode(arrivals, np.array([333.3]), order)[0]
+    starts = np.arange(700, 6000, 330)
+    filtered = [sosfiltfilt(octave(band), channels.astype(np.float64), axis=-1) for band in range(BANDS)]
+    found = np.array([[part[:, start:] @ part[:, start:].T for part in filtered] for start in starts])
+    relative_to_asked = found / expected_energy(log.astype(float), centres, starts, 333.3)[..., None, None]
+    level_db = 10 * np.log10(relative_to_asked[..., 0, 0])
+    assert (np.sqrt(np.mean(level_db**2, axis=0)) < [1.0, 0.5, 0.4, 0.35, 0.3, 0.2, 0.2]).all()
+    assert_allclose(level_db.mean(axis=0), 0, atol=0.3)
+    root = _mixing(arrivals.directions[0], harmonic_count(order))[..., 0, 0].astype(np.float64)
+    off = relative_to_asked - root @ root.T
+    assert (np.sqrt(np.mean(off**2, axis=(0, 2, 3))) < [0.25, 0.13, 0.07, 0.06, 0.05, 0.04, 0.03]).all()
 
 
 def test_responses_are_the_same_in_any_batch_and_on_any_thread():

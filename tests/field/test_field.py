@@ -1,17 +1,21 @@
 """A field's responses: what the graph of `conftest` says, as sound, and what the bundled apartment sounds like."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import onnx
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from onnx import TensorProto, helper, numpy_helper
+from scipy.signal import butter, sosfiltfilt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.room_parameters import level_db
 from server.core.errors import BundleError
 from server.field.field import AcousticField
 from server.field.graph import OUTPUTS
+from server.rendering.hrtf import kemar
 from server.scene.bundle import BUNDLED, Bundle, write_bundle
 
 
@@ -216,3 +220,28 @@ def test_whole_turns_are_no_turn(field):
 @pytest.mark.parametrize("yaw", [1e300, -1e300])
 def test_headings_beyond_any_meaning_are_finite(field, yaw):
     assert np.isfinite(field.impulse_responses([(2.0, 2.5, 1.5)], [(4.0, 4.0, 1.5)], [yaw])).all()
+
+
+def test_ambisonics_have_the_levels_of_ears_without_a_head(apartment):
+    """What each octave of the first channel holds, after the first 60 ms too, is what ears in the open air hear. At
+    125 Hz the noise of ears is itself uncertain by 1.2 dB."""
+    head = kemar(apartment.sample_rate)
+    bare = replace(head, cepstra=np.zeros_like(head.cepstra), delays_s=np.zeros_like(head.delays_s))
+    rng = np.random.default_rng(4)
+    listeners, emitters = rng.uniform((3.0, 0.6, 1.0), (5.0, 2.2, 1.8), (2, 12, 3))
+    ears = apartment.through(bare).impulse_responses(listeners, emitters, np.zeros(12))
+    assert_allclose(level_db(ears[:, 0]), level_db(ears[:, 1]), atol=0.3)
+    channels = apartment.ambisonics(listeners, emitters, 1)[:, :1]
+    for after_s in (0.0, 0.06):
+        off = [
+            level_db(_octave(channels, centre_hz, apartment.sample_rate, after_s)[:, 0])
+            - level_db(_octave(ears, centre_hz, apartment.sample_rate, after_s)).mean(axis=1)
+            for centre_hz in OCTAVE_BANDS_HZ
+        ]
+        assert (np.abs(np.mean(off, axis=1)) < [2.0, 0.8, 0.4, 0.4, 0.3, 0.3, 0.2]).all()
+
+
+def _octave(signals, centre_hz, sample_rate, after_s):
+    edges_hz = np.minimum(centre_hz * np.sqrt([0.5, 2.0]), 0.49 * sample_rate)
+    filtered = sosfiltfilt(butter(2, edges_hz, "bandpass", fs=sample_rate, output="sos"), signals, axis=-1)
+    return filtered[..., round(after_s * sample_rate) :]
