@@ -56,7 +56,8 @@ def main() -> None:
     """Entry point of the console script."""
     collect_rarely_at_start()
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # to look for them, all packages are read
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # no product here is large; waiting threads cost 0.2 s at the start
+    # No product here is large, and threads that wait for one cost 0.2 s of processor time at the start.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()
     except NafirError as exc:
