@@ -15,7 +15,7 @@ from server.field.runtime import open_session
 from tests.training.told_paths import in_tiny
 from training.bundling import export as export_module
 from training.bundling.export import INPUTS, MODEL_FILE, OUTPUTS, PATH, ExportError, export
-from training.bundling.graphs import halve_weights, to_int8
+from training.bundling.graphs import halve_weights, to_int8, to_onnx
 from training.learning.runs import Configuration, NafRecipe
 from training.learning.train import load_learner, train
 from training.models.factorised import ExportedField
@@ -61,10 +61,13 @@ def test_the_graph_computes_what_torch_does(session, dataset, run):
 
 
 def test_graphs_leave_the_logs_of_their_process_as_they_were(tiny_bundle):
-    logger = logging.getLogger()
-    assert logger.level == logging.WARNING  # the graphs of the bundle were exported in this process
+    loggers = [logging.getLogger(name) for name in (None, "torch.onnx")]
+    before = [logger.level for logger in loggers]
+    assert before[0] == logging.WARNING
+    to_onnx(torch.nn.Linear(3, 2).eval(), (torch.zeros(1, 3),), ("y",), free_batch=False)
+    assert [logger.level for logger in loggers] == before
     to_int8(onnx.load_from_string(tiny_bundle.models[MODEL_FILE]), least_weights=1)
-    assert logger.level == logging.WARNING
+    assert [logger.level for logger in loggers] == before
 
 
 def test_poses_in_a_batch_do_not_meet(session):
