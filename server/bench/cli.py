@@ -77,8 +77,7 @@ def field(
     poses: Annotated[int, typer.Option(min=1, help="Random poses per round.")] = 20,
     as_json: AsJson = False,
 ) -> Outcome:
-    """Time from a pose to a binaural impulse response at every quality level, and to partitions ready for convolution
-    at the default level, one at a time on one core."""
+    """Time from a pose to a binaural impulse response, one at a time on one core, at every quality level."""
     from server.bench.field import measure_levels
     from server.field.fields_by_level import FieldsByLevel
     from server.scene.bundle import Bundle, find_bundle
@@ -90,10 +89,8 @@ def field(
     else:
         print_measures("Host", measured["host"])
         print_rows(f"One impulse response of scene {measured['scene']}, {measured['ir_s']:g} s", measured["levels"])
-        print_rows("Partitions of the default level, with first reflections", measured["prepared"])
         print_judgements("Goals", judgements)
     figures = {f"{scene}, {level['name']}, {name}": level[name] for level in measured["levels"] for name in _TIMES}
-    figures |= {f"{scene}, partitions, {row['name']}": row["ms_p50"] for row in measured["prepared"]}
     return Outcome("field", figures, tuple(missed(judgements)))
 
 

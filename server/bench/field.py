@@ -1,5 +1,4 @@
-"""Time for an impulse response (IR) at each quality level, from a pose to a binaural IR, and of what a stream asks of
-the default level: from a pose to partitions ready for convolution. One at a time on one core."""
+"""Time for an impulse response (IR) at each quality level: from a pose to a binaural IR, one at a time on one core."""
 
 import math
 import statistics
@@ -10,38 +9,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.geometry import Pose, Vector3
+from server.acoustics.geometry import Vector3
 from server.bench.machine import describe_machine
-from server.bench.report import Goal, Judgement
+from server.bench.report import Goal
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES
-from server.rendering.hrtf import kemar
 from server.scene.manifest import NO_FIELD
-from server.streaming.calibration import Listener
 
 Floats = npt.NDArray[np.float64]
 
 GOAL = Goal("ms_p50 of the default level", 1.0, is_at_most=True)
-MOVED = "a moved listener"
-TURNED = "a head that only turned"
-AMBISONIC = "a moved listener, ambisonics of order 1"
-_WIDE_VECTORS = "AVX-512"
-MOVED_GOALS = {
-    is_wide: Goal(f"ms_p50 to partitions, {MOVED}", limit_ms, stretch_ms, is_at_most=True)
-    for is_wide, limit_ms, stretch_ms in ((False, 0.25, 0.12), (True, 0.15, 0.07))
-}
-"""By whether the processor has AVX-512."""
-TURNED_GOAL = Goal(f"ms_p50 to partitions, {TURNED}", 0.05, is_at_most=True)
 
 _STEP_M = 0.1
 
 
 def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[str, Any]:
     """Wall time of single IRs by level: the median of the rounds' medians, and the p99 of all. Also the part of it that
-    the graph takes; the rest is decoding. Then the same of partitions at the default level, with first reflections, as
-    a stream asks for them: for a listener who moved, for a head that only turned, and for ambisonics if the field knows
-    directions.
+    the graph takes; the rest is decoding.
 
     The poses are those of a walking listener. Levels take turns from round to round, so that other load on the host
     affects all alike; within a round each level has the CPU caches to itself, as in a server. For levels that reuse
@@ -49,57 +34,23 @@ def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[st
     """
     _fill_node_cache(levels)
     times_ms: dict[str, list[list[tuple[float, float]]]] = {name: [] for name in levels}
-    listeners = _listeners(levels.default)
-    prepared_ms: dict[str, list[list[float]]] = {name: [] for name in listeners}
     for number in range(rounds + 1):
         walk = _walk(levels, number, poses)
-        for name, listener in listeners.items():
-            taken_ms = [listener.time_ms(pose) for pose in _asked(name, walk)]
-            if number:
-                prepared_ms[name].append(taken_ms)
         for name, field in levels.items():
             times = [_time(field, *pose) for pose in walk]
             if number:  # the first round warms up
                 times_ms[name].append(times)
     default = levels.default
     summaries = [{"name": name, **_summary(times_ms[name])} for name in levels]
-    prepared = [{"name": name, **_percentiles(times)} for name, times in prepared_ms.items()]
-    host = describe_machine()
     return {
-        "host": host,
+        "host": describe_machine(),
         "scene": levels.bundle.id,
         "ir_s": default.ir_samples / default.sample_rate,
         "rounds": rounds,
         "poses": poses,
         "levels": summaries,
-        "prepared": prepared,
-        "summary": [
-            asdict(GOAL.judge(summaries[0]["ms_p50"])),
-            *(asdict(judgement) for judgement in _judge_prepared(prepared, host["instruction_set"])),
-        ],
+        "summary": [asdict(GOAL.judge(summaries[0]["ms_p50"]))],
     }
-
-
-def _judge_prepared(prepared: list[dict[str, Any]], instruction_set: str) -> list[Judgement]:
-    found = {row["name"]: row["ms_p50"] for row in prepared}
-    return [
-        MOVED_GOALS[instruction_set == _WIDE_VECTORS].judge(found[MOVED]),
-        TURNED_GOAL.judge(found[TURNED]),
-    ]
-
-
-def _listeners(field: AcousticField) -> dict[str, Listener]:
-    filters = kemar(field.sample_rate)
-    listeners = {name: Listener(field, filters) for name in (MOVED, TURNED)}
-    if field.knows_directions:
-        listeners[AMBISONIC] = Listener(field, filters, order=1)
-    return listeners
-
-
-def _asked(name: str, walk: list[tuple[Floats, Floats, float]]) -> list[Pose]:
-    """The poses of a walk; for a head that only turns, its headings at the first place."""
-    still = walk[0][0]
-    return [Pose.from_yaw(tuple((still if name == TURNED else place).tolist()), yaw) for place, _, yaw in walk]
 
 
 def _fill_node_cache(levels: FieldsByLevel) -> None:
@@ -122,16 +73,12 @@ def _fill_node_cache(levels: FieldsByLevel) -> None:
 
 def _summary(rounds: list[list[tuple[float, float]]]) -> dict[str, Any]:
     whole, graph = (np.array([[times[part] for times in each] for each in rounds]) for part in (0, 1))
-    found, graph_p50 = _percentiles(whole), _percentiles(graph)["ms_p50"]
-    return {**found, "graph_ms_p50": graph_p50, "decode_ms_p50": max(0.0, found["ms_p50"] - graph_p50)}
-
-
-def _percentiles(rounds: npt.ArrayLike) -> dict[str, float]:
-    """The median of the rounds' medians, and the p99 of all times (round, pose)."""
-    times_ms = np.asarray(rounds)
+    p50, graph_p50 = (statistics.median(np.median(part, axis=1).tolist()) for part in (whole, graph))
     return {
-        "ms_p50": statistics.median(np.median(times_ms, axis=1).tolist()),
-        "ms_p99": float(np.percentile(times_ms, 99)),
+        "ms_p50": p50,
+        "ms_p99": float(np.percentile(whole, 99)),
+        "graph_ms_p50": graph_p50,
+        "decode_ms_p50": max(0.0, p50 - graph_p50),
     }
 
 

@@ -2,10 +2,10 @@
 
 import pytest
 
-from server.bench.field import AMBISONIC, MOVED, TURNED, _judge_prepared, measure_levels
+from server.bench.field import measure_levels
 from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES
-from server.scene.bundle import Bundle, find_bundle, write_bundle
+from server.scene.bundle import write_bundle
 from server.scene.manifest import ARRAYS_FILE, NO_FIELD, Phase, QualityLevel, Reuse
 from server.streaming.calibration import calibrate
 
@@ -27,31 +27,6 @@ def test_the_dear_level_costs_more_and_it_is_decoding_that_costs(levels):
     for level in (standard, dear):
         assert 0 < level["graph_ms_p50"] <= level["ms_p50"] <= level["ms_p99"]
     assert measured["summary"][0]["value"] == standard["ms_p50"]
-
-
-def test_partitions_are_timed_of_moves_and_of_turns(levels):
-    measured = measure_levels(levels, rounds=2, poses=4)
-    moved, turned = measured["prepared"]
-    assert (moved["name"], turned["name"]) == (MOVED, TURNED)  # no ambisonics of a field that knows one head
-    for row in (moved, turned):
-        assert 0 < row["ms_p50"] <= row["ms_p99"]
-    assert [row["value"] for row in measured["summary"][1:]] == [moved["ms_p50"], turned["ms_p50"]]
-
-
-def test_where_directions_are_known_a_turn_takes_less_than_a_move_and_ambisonics_are_timed():
-    levels = FieldsByLevel.load(Bundle.load(find_bundle("apartment")))
-    prepared = {row["name"]: row["ms_p50"] for row in measure_levels(levels, rounds=5, poses=8)["prepared"]}
-    assert list(prepared) == [MOVED, TURNED, AMBISONIC]
-    assert prepared[TURNED] < prepared[MOVED]
-    assert prepared[AMBISONIC] > 0
-
-
-@pytest.mark.parametrize(("instruction_set", "limit_ms"), [("AVX2", 0.25), ("AVX-512", 0.15)])
-def test_a_goal_is_that_of_the_processor(instruction_set, limit_ms):
-    prepared = [{"name": MOVED, "ms_p50": 0.2}, {"name": TURNED, "ms_p50": 0.06}]
-    moved, turned = _judge_prepared(prepared, instruction_set)
-    assert moved.limit == limit_ms
-    assert (moved.reached, turned.reached) == ("goal" if limit_ms > 0.2 else None, None)
 
 
 def test_calibration_tells_them_apart_too(levels, filters):
