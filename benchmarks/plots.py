@@ -13,6 +13,7 @@ from benchmarks.record import Result, Table
 from server.bench.history import Run
 from server.planning.plan_figure import figure_of
 from server.planning.plan_query import PlanDocument
+from training.frontier.labels import Label, place_labels
 
 _FIRST, _OTHER, _FLOOR, _TEXT = "#0b6e99", "#aeb9c1", "#8d6a9f", "#2b3a42"
 _METHODS: Final = {
@@ -40,27 +41,33 @@ def error_over_time(result: Result) -> Figure:
     times, errors = table.column("mean ms"), table.column("mean error, JND")
     middle, slowest = table.column("p50 ms"), table.column("p99 ms")
     figure, axes = _one_panel(9.0, 5.2)
+    labels: list[Label] = []
+    markers: list[tuple[float, float]] = []
+    floors: list[float] = []
     for name, time_ms, error, p50, p99 in zip(names, times, errors, middle, slowest, strict=True):
         if error is None:
             continue
         if time_ms is None:
             axes.axhline(error, color=_FLOOR, linestyle="--", linewidth=1.2, label="the same simulated twice (floor)")
+            floors.append(error)
             continue
         is_offered = "(o" in name
         if p50 is not None and p99 is not None:
             axes.hlines(error, p50, p99, color="#bfdbe6", linewidth=3, zorder=1)
         axes.scatter(time_ms, error, s=40, facecolors=_FIRST if is_offered else "white", edgecolors=_FIRST, zorder=3)
+        markers.append((time_ms, error))
         if is_offered:
             said = name.split("`")[1] + (" (default)" if "default" in name else "")
-            axes.annotate(said, (time_ms, error), xytext=(8, 6), textcoords="offset points", fontsize=9, color=_TEXT)
+            labels.append(Label(time_ms, error, said))
     axes.set_xscale("log")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.08 * max(error for error in errors if error is not None))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set(
         xlabel="milliseconds per pose of a walk; points at the mean, bars from the median to the slowest of a hundred",
         ylabel="mean error, just-noticeable differences",
     )
     axes.legend(frameon=False, fontsize=9, loc="lower left")
+    place_labels(axes, labels, markers, lines_y=floors, colour=_TEXT, line_colour=_OTHER)
     return figure
 
 

@@ -4,9 +4,16 @@ Sound decays, is louder nearby (1 / distance), and louder in the ear on its side
 """
 
 import io
+import os
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
+# Before NumPy is imported. The waiting threads of its products and torch's would take the time of other workers.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# isort: split
 import numpy as np
 import onnx
 import pytest
@@ -52,8 +59,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Raises UsageError for a `timed` test where `make test` would not look for it."""
 
+    @cache
+    def place(path: Path) -> str:
+        return path.parent.relative_to(Path(__file__).parent).as_posix() + "/"
+
     def folder(item: pytest.Item) -> str:
-        return item.path.parent.relative_to(Path(__file__).parent).as_posix() + "/"
+        return place(item.path)
 
     for item in items:
         if item.get_closest_marker("timed") and not folder(item).startswith(_TIMED):

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path_kernel import find_sound_paths
+from server.acoustics.sound_path_kernel import describe_paths, find_sound_paths
 
+Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
@@ -47,6 +48,22 @@ class SoundPaths:
         )
 
 
+DESCRIPTION = 6
+"""Numbers that describe a path."""
+
+
+@dataclass(frozen=True)
+class DescribedPaths:
+    """The shortest paths of B pairs of listener and emitter, as a field needs them.
+
+    `length_m` (B,). `described` (B, DESCRIPTION): that length; sight, which is 1 where the two see each other and falls
+    to 0 behind a corner; and two unit vectors in plan, in which the path leaves the listener and the emitter.
+    """
+
+    length_m: Floats
+    described: Float32
+
+
 class SoundPathFinder:
     """Finds the shortest paths in one floor plan; safe to share between threads."""
 
@@ -57,6 +74,7 @@ class SoundPathFinder:
         self._bend_lengths_m = np.ascontiguousarray(plan.bend_lengths_m)
         # Compile here, where it may take long, and not on the audio thread at the first pose.
         self.find(np.zeros(3), np.zeros((1, 3)))
+        self.describe(np.zeros((1, 3)), np.zeros((1, 3)))
 
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike, into: SoundPaths | None = None) -> SoundPaths:
         """Find the paths to `listener` (3,) from `emitters` (n, 3), all inside the room. They are written to `into`,
@@ -80,5 +98,21 @@ class SoundPathFinder:
             paths.excess_m,
             paths.in_sight,
             paths.screen_db,
+        )
+        return paths
+
+    def describe(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> DescribedPaths:
+        """Describe the paths to listeners (B, 3) from emitters (B, 3), by pairs."""
+        listeners = np.ascontiguousarray(listeners, dtype=np.float64)
+        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        paths = DescribedPaths(np.empty(len(listeners)), np.empty((len(listeners), DESCRIPTION), np.float32))
+        describe_paths(
+            self._corners,
+            self._bends,
+            self._bend_lengths_m,
+            listeners,
+            emitters,
+            paths.length_m,
+            paths.described,
         )
         return paths

@@ -12,8 +12,18 @@ from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.geometry import COINCIDENT_M, TOUCH_M
 from server.kernels.compiled import compiled
 
+Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+Numbers = npt.NDArray[np.int64]
+
+PENUMBRA_M = 0.05
+"""Sight has fallen to 1 / e where the path round a corner is this much longer in plan than the straight line: half a
+wavelength at 3 kHz. Reflected sound does not change at once where the line of sight breaks, so predicted levels must
+not jump there."""
+SOFTENED_M = 1e-4
+"""Directions in plan are divided by lengths that are longer by this, so that they turn without a jump where two places
+coincide in plan."""
 
 
 @compiled
@@ -84,6 +94,54 @@ def _clearance_m(bends: Floats, from_listener: Floats, listener: Floats, emitter
 
 
 @compiled
+def _reach_bends(
+    corners: Floats,
+    bends: Floats,
+    bend_lengths_m: Floats,
+    listener: Floats,
+    from_listener: Floats,
+    to_bend: Floats,
+    first: Numbers,
+) -> None:
+    """Write lengths in plan from the listener: to each visible corner, and to each corner by the shortest path over
+    others; `first` is the first corner of this path."""
+    count = len(bends)
+    for bend in range(count):
+        x, y = bends[bend]
+        from_listener[bend], to_bend[bend], first[bend] = np.inf, np.inf, 0
+        distance = math.hypot(x - listener[0], y - listener[1])
+        if distance >= COINCIDENT_M and is_visible(corners, listener[0], listener[1], x, y):
+            from_listener[bend] = distance
+    for bend in range(count):
+        for via in range(count):
+            length = from_listener[via] + bend_lengths_m[via, bend]
+            if length < to_bend[bend]:
+                to_bend[bend], first[bend] = length, via
+
+
+@compiled
+def _way_around(
+    corners: Floats, bends: Floats, to_bend: Floats, listener: Floats, emitter: Floats
+) -> tuple[float, int]:
+    """The length in plan of the path round corners, and the last of them; infinity and -1 if the emitter is seen, or if
+    no path leads to it."""
+    count = len(bends)
+    around, last = np.inf, -1
+    if count == 0 or is_visible(corners, listener[0], listener[1], emitter[0], emitter[1]):
+        return around, last
+    for bend in range(count):
+        x, y = bends[bend]
+        distance = math.hypot(x - emitter[0], y - emitter[1])
+        if (
+            distance >= COINCIDENT_M
+            and to_bend[bend] + distance < around
+            and is_visible(corners, emitter[0], emitter[1], x, y)
+        ):
+            around, last = to_bend[bend] + distance, bend
+    return around, last
+
+
+@compiled
 def find_sound_paths(
     corners: Floats,
     bends: Floats,
@@ -100,38 +158,15 @@ def find_sound_paths(
 ) -> None:
     """Fill the last six arrays, one row per emitter; see SoundPaths."""
     count = len(bends)
-    # Lengths in plan from the listener: to each visible corner, and to each corner by the shortest path over others;
-    # `first` is the first corner of this path.
-    from_listener, to_bend = np.full(count, np.inf), np.full(count, np.inf)
-    first = np.zeros(count, np.int64)
-    for bend in range(count):
-        x, y = bends[bend]
-        distance = math.hypot(x - listener[0], y - listener[1])
-        if distance >= COINCIDENT_M and is_visible(corners, listener[0], listener[1], x, y):
-            from_listener[bend] = distance
-    for bend in range(count):
-        for via in range(count):
-            length = from_listener[via] + bend_lengths_m[via, bend]
-            if length < to_bend[bend]:
-                to_bend[bend], first[bend] = length, via
-
+    from_listener, to_bend = np.empty(count), np.empty(count)
+    first = np.empty(count, np.int64)
+    _reach_bends(corners, bends, bend_lengths_m, listener, from_listener, to_bend, first)
     for row in range(len(emitters)):
         emitter = emitters[row]
         rise = emitter[2] - listener[2]
         plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
         straight = math.hypot(plan, rise)
-        seen = count == 0 or is_visible(corners, listener[0], listener[1], emitter[0], emitter[1])
-        around, last = np.inf, -1
-        if not seen:
-            for bend in range(count):
-                x, y = bends[bend]
-                distance = math.hypot(x - emitter[0], y - emitter[1])
-                if (
-                    distance >= COINCIDENT_M
-                    and to_bend[bend] + distance < around
-                    and is_visible(corners, emitter[0], emitter[1], x, y)
-                ):
-                    around, last = to_bend[bend] + distance, bend
+        around, last = _way_around(corners, bends, to_bend, listener, emitter)
         in_sight[row] = last < 0
         if last < 0:
             length_m[row], excess_m[row] = straight, 0.0
@@ -154,3 +189,46 @@ def find_sound_paths(
             detour = excess_m[row]
         for band in range(len(wavelengths_m)):
             screen_db[row, band] = diffraction_gain_db(2 * detour / wavelengths_m[band])
+
+
+@compiled
+def describe_paths(
+    corners: Floats,
+    bends: Floats,
+    bend_lengths_m: Floats,
+    listeners: Floats,
+    emitters: Floats,
+    length_m: Floats,
+    described: Float32,
+) -> None:
+    """Fill the last two arrays, one row for each listener and its emitter; see DescribedPaths."""
+    count = len(bends)
+    from_listener, to_bend = np.empty(count), np.empty(count)
+    first = np.empty(count, np.int64)
+    for row in range(len(emitters)):
+        listener, emitter = listeners[row], emitters[row]
+        if row == 0 or _is_elsewhere(listener, listeners[row - 1]):
+            _reach_bends(corners, bends, bend_lengths_m, listener, from_listener, to_bend, first)
+        around, last = _way_around(corners, bends, to_bend, listener, emitter)
+        plan = math.hypot(emitter[0] - listener[0], emitter[1] - listener[1])
+        after, before, level, sight = emitter, listener, plan, 1.0
+        if last >= 0:
+            after, before, level = bends[first[last]], bends[last], around
+            sight = math.exp(min(0.0, plan - around) / PENUMBRA_M)
+        length_m[row] = math.hypot(level, emitter[2] - listener[2])
+        described[row, 0], described[row, 1] = length_m[row], sight
+        _point(listener, after, described[row, 2:4])
+        _point(emitter, before, described[row, 4:6])
+
+
+@compiled
+def _is_elsewhere(one: Floats, other: Floats) -> bool:
+    return bool(one[0] != other[0] or one[1] != other[1])
+
+
+@compiled
+def _point(start: Floats, end: Floats, direction: Float32) -> None:
+    """Write the unit vector in plan, shorter within a millimetre of the end."""
+    x, y = end[0] - start[0], end[1] - start[1]
+    scale = 1.0 / (math.hypot(x, y) + SOFTENED_M)
+    direction[0], direction[1] = x * scale, y * scale

@@ -166,7 +166,8 @@ def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:
     become_background()
     for scene, levels in host.scenes.items():
         try:
-            host.effect_costs[scene] = measure_costs(levels.default, rest=duty_cycle.rest)
+            costs = {bus: measure_costs(field, rest=duty_cycle.rest) for bus, field in levels.by_bus.items()}
+            host.effect_costs[scene] = costs
         except CancelledError:  # the server shuts down
             return
 

@@ -110,8 +110,8 @@ class StreamHost:
     """The same for streams of ambisonics, by scene and order, once one was asked for."""
     places: dict[str, SceneAcoustics] = dataclasses.field(default_factory=dict)
     """Acoustics of each scene, for the planner of effects."""
-    effect_costs: dict[str, Costs] = dataclasses.field(default_factory=dict)
-    """Costs of effects by scene, once they are measured."""
+    effect_costs: dict[str, Mapping[int | None, Costs]] = dataclasses.field(default_factory=dict)
+    """Costs of effects by scene, once they are measured, for each order of its levels' buses and without one (None)."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
     """Counts of all streams, open and ended."""
     streams: int = 0
@@ -312,7 +312,7 @@ class Connection:
             shared_tail=host.settings.shared_tail,
             window=window,
             place=place_of(levels.bundle, host.places[hello.scene].reverberations, block_size=hello.block_size),
-            costs=lambda: host.effect_costs.get(hello.scene, {}),
+            costs=lambda bus: host.effect_costs.get(hello.scene, {}).get(bus, {}),
         )
 
     async def _pump(self, stream: Stream, hello: Hello) -> Goodbye | None:

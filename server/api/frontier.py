@@ -23,15 +23,18 @@ class LevelPoint(_Document):
     people. A level that is not `is_offered` was measured on the frontier, but cannot be chosen.
 
     Times are milliseconds on one core from a pose until its binaural impulse response is ready to be convolved.
-    `ms_mean`, `ms_p50` and `ms_p99` are over a walk, and `ms_miss` is for poses for which no kept response can be
-    reused; these were measured on the host `measured_on`. `ms_here` was measured on this host when the server started.
-    `errors` are means by metric over `pairs` held-out pairs at `yaws` head orientations. `floor` is the repeatability
-    floor: the difference between two references of the same pair. `audible` and `audible_floor` are the means of these
-    in just-noticeable differences, over all metrics that have one except EDT, whose threshold is relative. `steps` are
-    the largest changes between poses a centimetre apart, by metric, in just-noticeable differences.
+    `ms_mean`, `ms_p50` and `ms_p99` are over a walk, `ms_miss` is for poses for which no kept response can be reused,
+    and `ms_turn` for a head that has only turned. `block_us` is the time in microseconds to render a block of 256
+    samples, per emitter of four. All these were measured on the host `measured_on`; `ms_here` was measured on this host
+    when the server started. `errors` are means by metric over `pairs` held-out pairs at `yaws` head orientations.
+    `floor` is the repeatability floor: the difference between two references of the same pair. `audible` and
+    `audible_floor` are the means of these in just-noticeable differences, over all metrics that have one except EDT,
+    whose threshold is relative. `steps` are the largest changes between poses a centimetre apart, by metric, in
+    just-noticeable differences.
 
     An emitter gets at most `ir_rate_hz` responses a second or, if that is null, one for every pose. If `frames` is
-    given, only that many frames of each are computed. With `reuse`, poses near each other share responses.
+    given, only that many frames of each are computed. With `reuse`, poses near each other share responses. With `bus`,
+    the order of ambisonic channels, turns of the head ask for none.
     `architecture` is that of the level's field; None if the scene has no field.
     """
 
@@ -42,6 +45,8 @@ class LevelPoint(_Document):
     ms_p50: float | None
     ms_p99: float | None
     ms_miss: float | None
+    ms_turn: float | None
+    block_us: float | None
     ms_here: float | None
     measured_on: str | None
     storage_mb: float | None
@@ -60,6 +65,7 @@ class LevelPoint(_Document):
     reuse: Reuse | None
     ir_rate_hz: float | None
     shared_tail: bool
+    bus: int | None
 
     @classmethod
     def of(cls, entry: LevelOfField, title: str, *, ms_here: float | None = None, is_offered: bool = True) -> Self:
@@ -73,6 +79,8 @@ class LevelPoint(_Document):
             ms_p50=cost and cost.ms_p50,
             ms_p99=cost and cost.ms_p99,
             ms_miss=cost and cost.ms_miss,
+            ms_turn=None if cost is None else cost.ms_turn,
+            block_us=None if cost is None else cost.block_us,
             ms_here=ms_here,
             measured_on=cost and cost.host,
             storage_mb=cost and cost.storage_mb,
@@ -91,6 +99,7 @@ class LevelPoint(_Document):
             reuse=level.reuse,
             ir_rate_hz=level.ir_rate_hz,
             shared_tail=level.shared_tail,
+            bus=level.bus,
         )
 
 

@@ -246,6 +246,7 @@ async def plan(
     output: Annotated[
         str, Query(description="headphones, mono or ambisonics", json_schema_extra={"enum": [*OUTPUTS]})
     ] = "headphones",
+    level: LevelText = None,
     effect: Annotated[list[EffectText] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
 ) -> Response:
     """The effects that a situation calls for, with reasons and their costs on this host."""
@@ -261,10 +262,12 @@ async def plan(
         output=output,
         effects=parse_effects(effect or []),
     )
-    field = _levels(request, scene).default
+    levels = _levels(request, scene)
+    field = levels.choose(level)
     query.check(field)
-    costs = _host(request).effect_costs.get(scene)
-    # Until the costs are measured, the plan measures them once for this process.
+    bus = field.level.bus
+    costs = _host(request).effect_costs.get(scene, {}).get(bus) if levels.by_bus[bus] is field else None
+    # Until the costs are measured, and for other levels, the plan measures them once for this process.
     costs_by_effect = None if costs is None else {name: asdict(cost) for name, cost in costs.items()}
     body = await _computed(
         request,

@@ -77,7 +77,11 @@ def field(
     poses: Annotated[int, typer.Option(min=1, help="Random poses per round.")] = 20,
     as_json: AsJson = False,
 ) -> Outcome:
-    """Time from a pose to a binaural impulse response, one at a time on one core, at every quality level."""
+    """Time from a pose to a binaural impulse response, one at a time on one core, at every quality level.
+
+    At the default level also until it is ready to be convolved: for a pose that moved, for a head that only turned, and
+    for ambisonic channels.
+    """
     from server.bench.field import measure_levels
     from server.field.fields_by_level import FieldsByLevel
     from server.scene.bundle import Bundle, find_bundle
@@ -89,8 +93,11 @@ def field(
     else:
         print_measures("Host", measured["host"])
         print_rows(f"One impulse response of scene {measured['scene']}, {measured['ir_s']:g} s", measured["levels"])
+        if measured["responses"]:
+            print_rows("From a pose to a response ready to be convolved, default level", measured["responses"])
         print_judgements("Goals", judgements)
-    figures = {f"{scene}, {level['name']}, {name}": level[name] for level in measured["levels"] for name in _TIMES}
+    rows = [*measured["levels"], *measured["responses"]]
+    figures = {f"{scene}, {row['name']}, {name}": row[name] for row in rows for name in _TIMES}
     return Outcome("field", figures, tuple(missed(judgements)))
 
 

@@ -1,4 +1,5 @@
-"""Time for an impulse response (IR) at each quality level: from a pose to a binaural IR, one at a time on one core."""
+"""Time for an impulse response (IR) at each quality level: from a pose to a binaural IR, one at a time on one core. For
+the default level also the time until it is ready to be convolved (`server.bench.responses`)."""
 
 import math
 import statistics
@@ -9,9 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.geometry import Vector3
+from server.acoustics.geometry import Pose, Vector3
 from server.bench.machine import describe_machine
 from server.bench.report import Goal
+from server.bench.responses import judge, measure_responses
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.field.node_responses import NODE_CACHE_BYTES
@@ -41,6 +43,11 @@ def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[st
             if number:  # the first round warms up
                 times_ms[name].append(times)
     default = levels.default
+    walks = [
+        [Pose.from_yaw(tuple(at.tolist()), yaw) for at, _, yaw in _walk(levels, number, poses)]
+        for number in range(rounds + 1)
+    ]
+    responses = measure_responses(default, walks)
     summaries = [{"name": name, **_summary(times_ms[name])} for name in levels]
     return {
         "host": describe_machine(),
@@ -49,7 +56,14 @@ def measure_levels(levels: FieldsByLevel, *, rounds: int, poses: int) -> dict[st
         "rounds": rounds,
         "poses": poses,
         "levels": summaries,
-        "summary": [asdict(GOAL.judge(summaries[0]["ms_p50"]))],
+        "responses": responses,
+        "summary": [
+            asdict(judgement)
+            for judgement in (
+                GOAL.judge(summaries[0]["ms_p50"]),
+                *judge(responses, knows_directions=bool(responses) and default.knows_directions),
+            )
+        ],
     }
 
 

@@ -56,7 +56,8 @@ def main() -> None:
     """Entry point of the console script."""
     collect_rarely_at_start()
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # to look for them, all packages are read
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # no product here is large; waiting threads cost 0.2 s at the start
+    # No product here is large, and threads that wait for one cost 0.2 s of processor time at the start.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()
     except NafirError as exc:
@@ -349,6 +350,7 @@ def plan(
     ambisonics: Annotated[
         bool, typer.Option("--ambisonics", help="Plan for ambisonic channels instead of headphones.")
     ] = False,
+    level: Level = None,
     effect: Annotated[
         list[str] | None, typer.Option(help="Switch an effect on or off; repeatable.", metavar="NAME=on|off")
     ] = None,
@@ -359,6 +361,7 @@ def plan(
 ) -> None:
     """Show which effects a situation calls for, why, and what they cost on this host."""
     from server.field.field import AcousticField
+    from server.field.fields_by_level import require_level
     from server.planning.plan_figure import draw
     from server.planning.plan_query import PlanDocument, PlanQuery, parse_effects, rounded
     from server.planning.plan_table import print_plan
@@ -375,7 +378,8 @@ def plan(
         output="ambisonics" if ambisonics else "mono" if mono else "headphones",
         effects=parse_effects(effect or ()),
     )
-    field = AcousticField.load(Bundle.load(find_bundle(scene)))
+    bundle = Bundle.load(find_bundle(scene))
+    field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
     document = PlanDocument.of(field.bundle.id, query.plan(field))
     if figure is not None:
         draw(document, figure)

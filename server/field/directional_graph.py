@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ, band_positions, band_weights
 from server.acoustics.geometry import orientations_of
+from server.acoustics.sound_path import DescribedPaths
 from server.acoustics.spherical_harmonics import harmonic_count, sampled
 from server.field.directions_kernel import TURNED_SCRATCH, Turning, ears_of_directions, turn_products
 from server.field.graph import INPUTS, FieldGraph, Spectrograms
@@ -89,10 +90,12 @@ class DirectionalGraph(FieldGraph):
             vars(other).pop(kept, None)
         return other
 
-    def arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
-        """What arrives at listeners (B, 3) from emitters (B, 3), whatever their heads."""
-        listeners = np.asarray(listeners, dtype=np.float32)
-        return self._arrivals_of(self.run(listeners, emitters, np.zeros(len(listeners))))
+    def arrivals(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, paths: DescribedPaths | None = None
+    ) -> Arrivals:
+        """What arrives at listeners (B, 3) from emitters (B, 3), whatever their heads, with their `paths` if they are
+        known."""
+        return self._arrivals_of(self.run(listeners, emitters, (), paths))
 
     def _arrivals_of(self, outputs: Sequence[Float32]) -> Arrivals:
         said = list(outputs)
@@ -101,9 +104,11 @@ class DirectionalGraph(FieldGraph):
             said.append(np.zeros((rows, 0, *axes), np.float32))
         return Arrivals(*said)
 
-    def heard_arrivals(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Arrivals:
+    def heard_arrivals(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, paths: DescribedPaths | None = None
+    ) -> Arrivals:
         """What arrives, with directions up to the heard order."""
-        arrivals = self.arrivals(listeners, emitters)
+        arrivals = self.arrivals(listeners, emitters, paths)
         return Arrivals(arrivals.log_magnitude, arrivals.directions[:, : harmonic_count(self.heard_order) - 1])
 
     def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:

@@ -20,7 +20,7 @@ from server.acoustics.fast_length import next_fast_length
 from server.acoustics.geometry import Vector3, orientations_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import DescribedPaths, SoundPathFinder
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError, FieldError
@@ -127,7 +127,7 @@ class AcousticField:
         self.graph = graph
         if level.order is not None and isinstance(graph, DirectionalGraph):
             self.graph = graph = graph.of_order(level.order)
-        self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+        self._paths = graph.paths
         is_whole = bundle.manifest.direct_sound == "field"
         # Measured sound may arrive earlier than geometry predicts: the gate opens with the first coded sample.
         self._lead = 0 if is_whole else graph.parameters.lead_samples
@@ -290,9 +290,10 @@ class AcousticField:
         from server.field.ambisonic_decoder import AmbisonicDecoder
 
         assert isinstance(self.graph, DirectionalGraph)
-        aligned = self._aligned(listeners, emitters)
+        paths = self._paths.describe(listeners, emitters)
+        aligned = self._aligned(paths)
         decoder = AmbisonicDecoder(self.graph.parameters, ir_samples=self.ir_samples, frames=self.level.frames)
-        arrivals = self.graph.heard_arrivals(listeners, emitters)
+        arrivals = self.graph.heard_arrivals(listeners, emitters, paths)
         responses = self._finite(decoder.decode(arrivals, aligned, order), listeners, emitters)
         onsets, echoes = self._opening(listeners, emitters, aligned)
         for response, onset, echo in zip(responses, onsets, onsets if echoes is None else echoes, strict=True):
@@ -340,9 +341,7 @@ class AcousticField:
 
     def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
         """(B,) time at which the first sound can arrive, around corners if necessary."""
-        pairs = zip(np.asarray(listeners), np.asarray(emitters)[:, None], strict=True)
-        length_m = [self._paths.find(*pair).length_m for pair in pairs]
-        return np.asarray(np.concatenate(length_m) / self.bundle.manifest.speed_of_sound)
+        return self._paths.describe(listeners, emitters).length_m / self.bundle.manifest.speed_of_sound
 
     def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool) -> Float32:
         if self._order is not None:
@@ -352,20 +351,24 @@ class AcousticField:
             responses = self._tail.responses(self._decoder, told.arrivals, orientations_of(heads), told.aligned)
             self._gate.open(self._finite(responses, listeners, emitters), told.onsets, told.echoes)
             return responses
-        aligned = self._aligned(listeners, emitters)
+        paths = self._paths.describe(listeners, emitters)
+        aligned = self._aligned(paths)
         if self._decoder is None:
             coded = self.graph.impulse_responses(listeners, emitters, heads)
             responses = self._finite(self._placed(coded, aligned), listeners, emitters)
         else:
+            predicted = self.graph.predictions(listeners, emitters, heads, paths)
             cache = self._cache if remember else None
-            responses = self._decoded(self._decoder, listeners, emitters, heads, aligned, cache)
+            responses = self._decoded(self._decoder, predicted, listeners, emitters, heads, aligned, cache)
         self._gate.open(responses, *self._opening(listeners, emitters, aligned))
         return responses
 
     def _tell(self, listeners: Floats, emitters: Floats) -> _Told:
         assert isinstance(self.graph, DirectionalGraph)
-        aligned = self._aligned(listeners, emitters)
-        return _Told(self.graph.arrivals(listeners, emitters), aligned, *self._opening(listeners, emitters, aligned))
+        paths = self._paths.describe(listeners, emitters)
+        aligned = self._aligned(paths)
+        arrivals = self.graph.arrivals(listeners, emitters, paths)
+        return _Told(arrivals, aligned, *self._opening(listeners, emitters, aligned))
 
     def _remembered(self, listeners: Floats, emitters: Floats) -> _Told:
         keys = [row.tobytes() for row in np.concatenate([listeners, emitters], axis=-1)]
@@ -378,10 +381,11 @@ class AcousticField:
                 self._told.put(keys[row], one, one.nbytes)
         return _Told.joined([told for told in known if told is not None])
 
-    def _aligned(self, listeners: Floats, emitters: Floats) -> Floats:
+    def _aligned(self, paths: DescribedPaths) -> Floats:
         """(B,) the sample of each response on which the first coded sample lies, with its fraction."""
         parameters = self.graph.parameters
-        aligned = self.onset_s(listeners, emitters) * parameters.sample_rate - parameters.lead_samples
+        onset_s = paths.length_m / self.bundle.manifest.speed_of_sound
+        aligned = onset_s * parameters.sample_rate - parameters.lead_samples
         # guard: a way without end is no index of a sample
         if not (aligned < _NEVER).all():
             raise FieldError(f"scene {self.bundle.id}: no way leads from emitter to listener; is one inside a wall?")
@@ -400,6 +404,7 @@ class AcousticField:
     def _decoded(
         self,
         decoder: Decoder,
+        predicted: Spectrograms,
         listeners: Floats,
         emitters: Floats,
         heads: Floats,
@@ -407,7 +412,6 @@ class AcousticField:
         cache: PhaseCache | None,
     ) -> Float32:
         """Decoded responses (B, channel, ir_samples), including the energy that windows smear to before the onset."""
-        predicted = self.graph.predictions(listeners, emitters, heads)
         if self.channels == 1:
             # Decoders expect two ears; a single microphone is stored as the left one.
             predicted = predicted.twice()

@@ -72,9 +72,14 @@ class FieldsByLevel(Mapping[str, AcousticField]):
         return tuple(sorted(measured, key=measured.__getitem__))
 
     @property
+    def by_bus(self) -> dict[int | None, AcousticField]:
+        """The first field for each order of a bus, and the first for none."""
+        return {field.level.bus: field for field in reversed(self._fields.values())}
+
+    @property
     def buses(self) -> list[int]:
         """The orders of the levels whose reflected sound is heard by a bus."""
-        return sorted({field.level.bus for field in self._fields.values() if field.level.bus is not None})
+        return sorted(order for order in self.by_bus if order is not None)
 
     def with_directions(self, chosen: str | None = None) -> "FieldsByLevel":
         """Those levels whose fields know from where sound arrives. Raises RequestError `no_directions` if there are

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from server.acoustics.cells import Axis
 from server.acoustics.geometry import yaws_of
+from server.acoustics.sound_path import DESCRIPTION, DescribedPaths, SoundPathFinder
 from server.core.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
 from server.rendering.hrtf import HeadFilters
@@ -30,6 +31,8 @@ Float32 = npt.NDArray[np.float32]
 
 INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
 """The inputs of a graph, with their shapes after the batch axis."""
+PATH = "path"
+"""The input of graphs that want to be told the shortest path, as DescribedPaths has it."""
 OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
 """The outputs of a graph that gives spectrograms."""
 RESPONSE = "impulse_response"
@@ -108,8 +111,14 @@ class FieldGraph:
         self.gives_responses = RESPONSE in outputs and entry.predicts == "ears"
         """Whether the graph gives impulse responses and not spectrograms."""
         inputs = {given.name: given.shape[1:] for given in session.get_inputs()}
-        if inputs != self._inputs:
-            raise BundleError(self._path, "inputs", f"are {inputs}, expected {self._inputs} after the batch axis")
+        expected = {**self._inputs, PATH: [DESCRIPTION]}
+        self._wants = tuple(inputs)
+        if inputs != expected and inputs != self._inputs:
+            raise BundleError(
+                self._path, "inputs", f"are {inputs}, expected {expected} after the batch axis, or all but {PATH}"
+            )
+        self.paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+        """Finds the paths of the graph's poses."""
         if any(outputs.get(output) != _TENSOR for output in self._shapes):
             raise BundleError(self._path, "outputs", f"are {outputs}, expected {self._expected_outputs}")
         self._check_outputs(bundle)
@@ -122,19 +131,30 @@ class FieldGraph:
         """The same field heard through this head; the field itself if it predicts the ears of one head."""
         return self
 
-    def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> list[Float32]:
-        """Run the network for B poses: positions (B, 3), and heads as yaws (B,) or orientations (B, 4). Returns the
-        outputs in the order of the graph's contract."""
-        given = self._feed(listeners, emitters, heads)
-        return list(self._session.run(tuple(self._shapes), {name: given[name] for name in self._inputs}))
+    def run(
+        self,
+        listeners: npt.ArrayLike,
+        emitters: npt.ArrayLike,
+        heads: npt.ArrayLike,
+        paths: DescribedPaths | None = None,
+    ) -> list[Float32]:
+        """Run the network for B poses: positions (B, 3), and heads as yaws (B,) or orientations (B, 4), with their
+        `paths` if they are known. Returns the outputs in the order of the graph's contract."""
+        return list(self._session.run(tuple(self._shapes), self.feed(listeners, emitters, heads, paths)))
 
     def spectrograms(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
         """Predictions for every frame. Only for a graph that gives spectrograms."""
         return self.predictions(listeners, emitters, heads).spread(self.parameters.frame_axis)
 
-    def predictions(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> Spectrograms:
+    def predictions(
+        self,
+        listeners: npt.ArrayLike,
+        emitters: npt.ArrayLike,
+        heads: npt.ArrayLike,
+        paths: DescribedPaths | None = None,
+    ) -> Spectrograms:
         """Predictions as the graph gives them, per frame or per cell. Only for a graph that gives spectrograms."""
-        return self.spectrograms_of(self.run(listeners, emitters, heads), heads)
+        return self.spectrograms_of(self.run(listeners, emitters, heads, paths), heads)
 
     def spectrograms_of(self, outputs: Sequence[Float32], heads: npt.ArrayLike) -> Spectrograms:  # noqa: ARG002  for fields of any head
         """Predictions from the outputs of `run` for these heads."""
@@ -175,13 +195,23 @@ class FieldGraph:
     def _expected_outputs(self) -> str:
         return f"{_TENSOR} {OUTPUTS[: 2 + self.channels]}, or {RESPONSE} alone"
 
-    @staticmethod
-    def _feed(listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> dict[str, Float32]:
-        # guard: whole turns come off in double precision
-        return {
+    def feed(
+        self,
+        listeners: npt.ArrayLike,
+        emitters: npt.ArrayLike,
+        heads: npt.ArrayLike,
+        paths: DescribedPaths | None = None,
+    ) -> dict[str, Float32]:
+        """The inputs of the graph, by name, for the poses of `run`."""
+        given = {
             "listener": np.asarray(listeners, dtype=np.float32),
             "emitter": np.asarray(emitters, dtype=np.float32),
+        }
+        if "yaw" in self._wants:
             # Subtract whole turns in double precision: in single precision, large angles lose their heading, or
             # overflow.
-            "yaw": np.remainder(yaws_of(heads) + np.pi, 2 * np.pi).astype(np.float32) - np.float32(np.pi),
-        }
+            # guard: whole turns come off in double precision
+            given["yaw"] = np.remainder(yaws_of(heads) + np.pi, 2 * np.pi).astype(np.float32) - np.float32(np.pi)
+        if PATH in self._wants:
+            given[PATH] = (paths or self.paths.describe(listeners, emitters)).described
+        return given

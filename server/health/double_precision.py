@@ -17,6 +17,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from server.acoustics.geometry import axes_of, orientations_of
 from server.acoustics.phase import MOST_COHERENT, NO_PHASE, UNDECIDED
+from server.acoustics.sound_path import DescribedPaths
 from server.acoustics.spherical_harmonics import harmonic_count, rotation
 from server.field.band_tail import BandTail
 from server.field.band_tail_kernel import MOST_IN_A_BAND
@@ -150,8 +151,14 @@ class DoubleDirectionalGraph(DirectionalGraph):
         vars(self).update(vars(graph))
         self._single = graph
 
-    def run(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> list[_Float32]:
-        return self._single.run(listeners, emitters, heads)
+    def run(
+        self,
+        listeners: npt.ArrayLike,
+        emitters: npt.ArrayLike,
+        heads: npt.ArrayLike,
+        paths: DescribedPaths | None = None,
+    ) -> list[_Float32]:
+        return self._single.run(listeners, emitters, heads, paths)
 
     def at_ears(self, arrivals: Arrivals, heads: npt.ArrayLike, *, columns: int | None = None) -> Spectrograms:  # noqa: ARG002  all are computed
         rows = [

@@ -310,6 +310,8 @@ class _Walk:
         )
         self._effects.bus = field.level.bus
         self._listener = start
+        self._responded_at: dict[str, Pose] = {}
+        """The pose of each emitter's newest response."""
         self._has_begun = False
         self._emitters: dict[str, StreamedEmitter] = {}
         self._aim = DirectPathTracker(direct_sound, self.renderer, self._emitters)
@@ -334,16 +336,23 @@ class _Walk:
         if self._has_begun:
             self._aim.follow(self._listener)
         if reverberation is not None:
-            for emitter in self._emitters.values():
-                emitter.is_outdated = True
             pose, field = reverberation
             is_other, self._field = field is not self._field, field
             self._effects.bus = field.level.bus
+            for name, emitter in self._emitters.items():
+                emitter.is_outdated |= is_other or self._calls_for_response(name, pose)
             self._respond(pose)
             if is_other:
                 self._effects.share_tail(field.kind.shares_tail, self._emitters)
         elif self._effects.planned is not None and self._has_begun:
             self._respond(self._listener)
+
+    def _calls_for_response(self, emitter: str, pose: Pose) -> bool:
+        """Whether a pose calls for another response than the newest."""
+        before = self._responded_at.get(emitter)
+        if before is None or pose.position != before.position:
+            return True
+        return pose.orientation != before.orientation and self._effects.turns_ask
 
     def _move(self, pose: Pose) -> None:
         moves, turns = pose.position != self._listener.position, pose.orientation != self._listener.orientation
@@ -377,6 +386,7 @@ class _Walk:
             self.renderer.set_channels(self._effects.channels)
         if not named:
             return
+        self._responded_at |= dict.fromkeys(named, listener)
         asked = [self._effects.as_asked(emitter) for emitter in named.values()]
         irs = composed_irs(self._field, self._direct_sound, listener, asked, self._effects.channels)
         for (name, emitter), state, ir in zip(named.items(), asked, irs, strict=True):

@@ -63,7 +63,8 @@ PerPose = Callable[[Bundle, int], Callable[[], object]]
 class Measured:
     """Measurements of renderers with one emitter and with `emitters`, by variant. `per_pose_us` is for one emitter, by
     effect. `late_us` and `early_us` are the times to compute the field's part and the first reflections of a response,
-    and `responses_per_block` is the rate for an emitter that moves. Without a field no responses are computed."""
+    and `responses_per_block` is the rate for an emitter that moves. Without a field no responses are computed. With
+    `has_bus`, responses are those of a bus, which turns with the head without new ones."""
 
     emitters: int
     us: Mapping[tuple[Variant, int], float]
@@ -73,6 +74,7 @@ class Measured:
     early_us: float
     responses_per_block: float
     has_field: bool
+    has_bus: bool = False
 
     def between(self, more: Variant, less: Variant) -> tuple[float, float]:
         """Return the difference in time per emitter, and the fixed part that all emitters share."""

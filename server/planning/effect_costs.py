@@ -17,10 +17,12 @@ import numpy as np
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import Pose
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.field.field import AcousticField
 from server.planning.catalogue import CATALOGUE
 from server.planning.cost import STILL, Costs, Measured, Variant, variants_of
 from server.rendering.convolver import FloatArray
+from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import kemar
 from server.rendering.renderer import Renderer
 from server.rendering.sources import ClipPlayer
@@ -52,7 +54,7 @@ class _Lane:
         self, field: AcousticField, block_size: int, variant: Variant, *, emitters: int, rest: Rest = _no_rest
     ) -> None:
         manifest, rate = field.bundle.manifest, field.sample_rate
-        effects, channels = variant.effects, variant.shared.channels
+        effects, channels, bus = variant.effects, _channels(field, variant), field.level.bus
         self._renderer = Renderer(
             block_size=block_size,
             ir_samples=field.ir_samples,
@@ -62,9 +64,11 @@ class _Lane:
             air_db_per_m=manifest.air.absorption_db_per_m,
             max_emitters=emitters,
             shared_tail=not variant.shared.own_tails,
-            outputs=channels,
+            outputs=variant.shared.channels,
             has_head=variant.shared.head,
+            decoders=() if bus is None else [HeadDecoder.of(kemar(rate), bus)],
         )
+        self._renderer.set_channels(channels)
         rng = np.random.default_rng(0)
         decay = 10 ** (-3 * np.arange(field.ir_samples) / field.ir_samples)
         self._names = [str(number) for number in range(emitters)]
@@ -107,14 +111,21 @@ class _Lane:
         self._renderer.set_paths(self._names, lengths_m, arrivals, np.zeros((count, len(OCTAVE_BANDS_HZ))))
 
 
+def _channels(field: AcousticField, variant: Variant) -> int:
+    """Return the number of channels of responses at the field's level."""
+    bus = field.level.bus
+    return variant.shared.channels if bus is None or not variant.shared.head else harmonic_count(bus)
+
+
 @lru_cache(maxsize=16)
 def measured_costs(field: AcousticField, block_size: int = 256) -> Costs:
-    """Return the costs in a field's scene, measured once."""
+    """Return the costs in a field's scene, at the field's level, measured once."""
     return measure_costs(field, block_size)
 
 
 def measure_costs(field: AcousticField, block_size: int = 256, *, rest: Rest = _no_rest) -> Costs:
-    """Measure the costs in a field's scene: half a second of work, and longer in the first run of all."""
+    """Measure the costs in a field's scene, at the field's level: half a second of work, and longer in the first run of
+    all."""
     has_field = bool(field.bundle.manifest.fields)
     variants = variants_of([effect.costs_in for effect in CATALOGUE.values() if effect.costs_in], has_field=has_field)
     lanes = {
@@ -139,6 +150,7 @@ def measure_costs(field: AcousticField, block_size: int = 256, *, rest: Rest = _
         early_us=early_us,
         responses_per_block=RESPONSES_PER_S * block_size / field.sample_rate,
         has_field=has_field,
+        has_bus=field.level.bus is not None,
     )
     return {name: effect.cost(measured) for name, effect in CATALOGUE.items()}
 
@@ -175,7 +187,8 @@ def _response_us(field: AcousticField, *, meanwhile: Callable[[], None], rest: R
             rest()
             meanwhile()
             started_s = time.thread_time()
-            composed_irs(field, direct, listener, [EmitterState(Pose(start.emitter), effects=effects)])
+            emitter = EmitterState(Pose(start.emitter), effects=effects)
+            composed_irs(field, direct, listener, [emitter], _channels(field, STILL))
             of_it.append(1e6 * (time.thread_time() - started_s))
         if turn and sum(map(sum, times_us.values())) > 1e6 * _LONGEST_S:
             break

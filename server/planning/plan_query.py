@@ -109,7 +109,13 @@ class PlanQuery:
         held = reverberation_of(scene, listener, places) if bundle.manifest.fields else [None] * len(places)
         return Situation(
             place_of_field(scene),
-            Listener(listener, speed_m_s=WALKING_M_S if self.walks else 0.0, turns=self.walks, output=output),
+            Listener(
+                listener,
+                speed_m_s=WALKING_M_S if self.walks else 0.0,
+                turns=self.walks,
+                output=output,
+                bus=scene.level.bus,
+            ),
             {
                 str(number): Emitter(Pose(place), speed_m_s=speed_m_s, reverberation=rest)
                 for number, (place, rest) in enumerate(zip(places, held, strict=True), start=1)

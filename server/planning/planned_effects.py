@@ -16,7 +16,7 @@ from server.planning.cost import Costs
 from server.planning.motion import Motion
 from server.planning.plan import Plan, RenderingDecision
 from server.planning.planner import make_plan
-from server.planning.scene_acoustics import Emitter, Listener, Output, SceneAcoustics, Situation
+from server.planning.scene_acoustics import Emitter, Listener, Output, SceneAcoustics, Situation, turns_with_head
 from server.responses.effect_flags import EmitterEffects, SharedEffects
 from server.responses.emitter_state import EmitterState
 from server.scene.effects import EffectName, Overrides
@@ -55,7 +55,8 @@ class PlanRequest:
 
 class PlannedEffects:
     """The plans of one session in `place`. Overrides by the listener (`own`) take precedence over those by the scene's
-    author (`scene`). `costs` returns what effects cost on this host, or nothing while that is unknown."""
+    author (`scene`). `costs` returns what effects cost on this host at quality levels with a bus of the given order, or
+    without one; nothing while that is unknown."""
 
     def __init__(
         self,
@@ -65,10 +66,11 @@ class PlannedEffects:
         output: Output = "headphones",
         scene: Overrides | None = None,
         own: Overrides | None = None,
-        costs: Callable[[], Costs] = dict,
+        costs: Callable[[int | None], Costs] = lambda _: {},
     ) -> None:
         self.place = place
         self.output = output
+        self._bus: int | None = None
         self.plan: Plan | None = None
         self.corrections: dict[EffectName, str] = {}
         self._scene = dict(scene or {})
@@ -104,15 +106,20 @@ class PlannedEffects:
         self.output = output or self.output
         self._is_stale = True
 
+    def hear_by_bus(self, order: int | None) -> None:
+        """Plan from now on for a quality level with a bus of this order, or for one without."""
+        self._is_stale |= order != self._bus
+        self._bus = order
+
     def correct(self, corrections: Mapping[EffectName, str]) -> None:
         """Keep effects on from now on, for the reasons given."""
         self.corrections.update(corrections)
         self._is_stale = True
 
     def follow_listener(self, pose: Pose, clock_s: float) -> None:
-        turned = self._listener.turns(clock_s)
+        turned = self._hears_turns(clock_s)
         self._follow(self._listener, pose, clock_s)
-        self._is_stale |= turned != self._listener.turns(clock_s)
+        self._is_stale |= turned != self._hears_turns(clock_s)
 
     def follow_emitter(self, name: str, pose: Pose, clock_s: float) -> None:
         """Note the pose of an emitter; a new emitter is at rest until it moves."""
@@ -146,10 +153,10 @@ class PlannedEffects:
         motion = self._listener
         situation = Situation(
             self.place,
-            Listener(listener, motion.speed_m_s(clock_s), motion.turns(clock_s), self.output),
+            Listener(listener, motion.speed_m_s(clock_s), motion.turns(clock_s), self.output, self._bus),
             {name: self._emitter(name, emitter, clock_s) for name, emitter in emitters.items()},
         )
-        costs = self._costs()
+        costs = self._costs(self._bus)
         seen = _coarse(situation), bool(costs)
         if not self._is_stale and seen == self._seen:
             return None
@@ -182,9 +189,11 @@ class PlannedEffects:
 
     def _is_under_way(self, name: str, clock_s: float) -> bool:
         """Whether the direct sound of an emitter changes with poses."""
-        listener = self._listener
-        turns = listener.turns(clock_s) and self.output == "headphones"
-        return self._emitters[name].moves(clock_s) or listener.moves(clock_s) or turns
+        return self._emitters[name].moves(clock_s) or self._listener.moves(clock_s) or self._hears_turns(clock_s)
+
+    def _hears_turns(self, clock_s: float) -> bool:
+        """Whether the direct sound changes because the head turns."""
+        return self._listener.turns(clock_s) and turns_with_head(self.output)
 
     def _emitter(self, name: str, state: EmitterState, clock_s: float) -> Emitter:
         motion = self._emitters[name]
@@ -208,7 +217,7 @@ def _coarse(situation: Situation) -> object:
         (name, cell(emitter.pose), emitter.speed_m_s, emitter.turns, emitter.gain_db)
         for name, emitter in situation.emitters.items()
     )
-    return cell(listener.pose), listener.speed_m_s, listener.turns, emitters
+    return cell(listener.pose), listener.speed_m_s, listener.hears_turns, emitters
 
 
 def _switched_on(plan: Plan) -> frozenset[tuple[str | None, EffectName, bool, bool]]:

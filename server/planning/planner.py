@@ -145,7 +145,7 @@ class _Planner:
         us = cost.us + share * cost.first_us
         if emitter.speed_m_s or listener.speed_m_s:
             return us + cost.moving_us + share * cost.moving_first_us
-        return us + cost.turning_us + share * cost.turning_first_us if listener.turns else us
+        return us + cost.turning_us + share * cost.turning_first_us if listener.hears_turns else us
 
     def _was_on(self, name: EffectName, emitter: str | None) -> bool:
         if self._previous is None:

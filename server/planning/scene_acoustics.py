@@ -28,6 +28,12 @@ Bands = npt.NDArray[np.float64]
 WALKING_M_S = 1.4
 
 
+def turns_with_head(output: Output) -> bool:
+    """Whether what is rendered for an output turns with the head: one microphone has no front, and a client turns
+    ambisonic channels itself."""
+    return output == "headphones"
+
+
 @dataclass(frozen=True, eq=False)
 class Reverberation:
     """The reverberation of one emitter in a field's responses, over both ears: all sound but the direct sound and the
@@ -61,10 +67,25 @@ class Emitter(EmitterState):
 
 @dataclass(frozen=True)
 class Listener:
+    """A listener who moves at most at `speed_m_s` and whose head may turn. With a `bus`, the order of a quality level's
+    bus, headphones hear the reflected sound by it (`server.rendering.bus`)."""
+
     pose: Pose
     speed_m_s: float = 0.0
     turns: bool = False
     output: Output = "headphones"
+    bus: int | None = None
+
+    @property
+    def hears_turns(self) -> bool:
+        """Whether the head turns, and what is rendered turns with it."""
+        return self.turns and turns_with_head(self.output)
+
+    @property
+    def turns_responses(self) -> bool:
+        """Whether turns of the head call for new responses: those of two ears are of one orientation, while a bus turns
+        what it has."""
+        return self.hears_turns and self.bus is None
 
 
 @dataclass(frozen=True, eq=False)

@@ -193,13 +193,18 @@ class Cost(Strict):
 
     `ms_p50`, `ms_p99` and `ms_mean` are over the poses of a walk. `ms_miss` is the median over poses for which no kept
     response could be reused; deadlines have to allow for it. If `ms_mean` or `ms_miss` was not measured, it equals
-    `ms_p50`. `storage_mb` is the size of the field's file, `memory_mb` the memory that serving it adds to a process.
+    `ms_p50`. `ms_turn` is the median over poses of a head that has only turned, next to nothing with a bus. All these
+    are per emitter. `block_us` is the time in microseconds to render a block of 256 samples in which nothing changes,
+    per emitter of four. `ms_turn` and `block_us` are absent if they were not measured. `storage_mb` is the size of the
+    field's file, `memory_mb` the memory that serving it adds to a process.
     """
 
     ms_p50: Positive
     ms_p99: Positive
     ms_mean: Positive
     ms_miss: Positive
+    ms_turn: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    block_us: Positive | None = None
     storage_mb: Positive
     memory_mb: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     host: str
@@ -210,6 +215,11 @@ class Cost(Strict):
         if isinstance(values, dict) and "ms_p50" in values:
             return {"ms_mean": values["ms_p50"], "ms_miss": values["ms_p50"], **values}
         return values
+
+    @model_serializer(mode="wrap")
+    def _without_what_was_not_measured(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+        document: dict[str, object] = write(self)
+        return {name: value for name, value in document.items() if value is not None}
 
 
 class Reuse(Strict):

@@ -30,12 +30,22 @@ class ActiveEffects:
     ) -> None:
         self.planned = planned
         self._renderer = renderer
-        self.bus: int | None = None
-        """The order of the bus of the wanted quality level; None where emitters have responses of two ears."""
+        self._bus: int | None = None
         self.shared = self._called_for()
         self._sample_rate = sample_rate
         has = {EffectName.EARLY_REFLECTIONS: has_early, EffectName.LATE_REVERBERATION: has_late}
         self._lacking = frozenset(name for name, is_there in has.items() if not is_there)
+
+    @property
+    def bus(self) -> int | None:
+        """The order of the bus of the wanted quality level; None where emitters have responses of two ears."""
+        return self._bus
+
+    @bus.setter
+    def bus(self, order: int | None) -> None:
+        self._bus = order
+        if self.planned is not None:
+            self.planned.hear_by_bus(order)
 
     @property
     def clock_s(self) -> float:

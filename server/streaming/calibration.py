@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from server.acoustics.geometry import Pose
+from server.acoustics.geometry import Pose, Vector3
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.bounded_cache import BoundedCache
 from server.field.field import AcousticField
@@ -57,14 +57,19 @@ class Listener:
         self._channels = harmonic_count(field.level.bus or 0) if is_by_bus else self._renderer.channels
         self._emitter = EmitterState(Pose(field.bundle.manifest.start.emitter))
         self._heard: Shared | None = None
+        self._turned_at: Vector3 | None = None
+        """The position of the newest response, where it turns without another."""
 
     @property
     def kept_bytes(self) -> int:
         return self._node_cache.bytes
 
     def time_ms(self, listener: Pose) -> float:
-        """Return the milliseconds that a pose takes: next to nothing if its response is already playing."""
+        """Return the milliseconds that a pose takes: next to nothing if its response is already playing, as one of
+        ambisonic channels is where the head only turns."""
         started_s = self._time_s()
+        if self._turned_at == listener.position:
+            return 1000 * (self._time_s() - started_s)
         if self._heard is None or not self._heard.around.holds(listener):
             shared = shared_response(self._field, self._direct_sound.early_reflections, listener, self._emitter)
             if shared is None or self._heard is None or shared.identity != self._heard.identity:
@@ -72,12 +77,13 @@ class Listener:
                 request = IrRequest(0, self._field.level.name, listener, asked, self._direct_sound, self._channels)
                 compute_irs(self._levels, request, self._renderer)
             self._heard = shared
+            self._turned_at = listener.position if self._channels > 2 else None
         return 1000 * (self._time_s() - started_s)
 
     def forget(self) -> None:
         """Clear the cache and the response that is playing."""
         self._node_cache.clear()
-        self._heard = None
+        self._heard = self._turned_at = None
 
 
 def calibrate(

@@ -41,8 +41,9 @@ class Offer:
 
     def steps(self, choice: str, *, block_s: float) -> tuple[QualityStep, ...]:
         """Return the steps, best first, for a client that chose a level or `AUTO`. For `AUTO` these are of all levels
-        whose IR takes no longer than a block lasts or, if there is none, of the cheapest. Raises RequestError
-        unknown_level."""
+        whose IR takes no longer than a block lasts or, if there is none, of the cheapest. Levels with a bus are not
+        among them, if there are others: they are less accurate than they are cheap, and pay only where heads turn, so a
+        client has to choose them. Raises RequestError unknown_level."""
         least_hz = self.thresholds.least_ir_rate_hz
         if choice != AUTO:
             level = next((level for level in self.levels if level.name == choice), None)
@@ -50,7 +51,8 @@ class Offer:
                 known = ", ".join(sorted(level.name for level in self.levels))
                 raise RequestError("unknown_level", f"{choice!r} is none of {AUTO}, {known}", field="level")
             return (*self._slower(level), self._step(level, least_hz))
-        fitting = [level for level in self.levels if self.ms_here[level.name] <= 1000 * block_s] or self.levels[:1]
+        levels = [level for level in self.levels if level.bus is None] or self.levels
+        fitting = [level for level in levels if self.ms_here[level.name] <= 1000 * block_s] or levels[:1]
         # The most expensive level is the best, but levels that share a tail come last.
         best_first = reversed(fitting)
         best, *cheaper = sorted(best_first, key=lambda level: kind_of(level).shares_tail)

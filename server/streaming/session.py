@@ -90,7 +90,7 @@ class Session:
         shared_tail: bool = False,
         window: int = 40,
         place: SceneAcoustics | None = None,
-        costs: Callable[[], Costs] = dict,
+        costs: Callable[[int | None], Costs] = lambda _: {},
     ) -> None:
         field = levels.default
         _require_served(hello, field.sample_rate)

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import SoundPathFinder, SoundPaths
+from server.acoustics.sound_path import DescribedPaths, SoundPathFinder, SoundPaths
 from tests.oracles.sound_path import NumpySoundPathFinder, diffraction_gain_db
 
 Floats = npt.NDArray[np.float64]
@@ -339,3 +339,89 @@ def test_in_any_room_the_shortest_path_is_found_whichever_way_it_is_computed(see
     paths = finder.find(listener, np.array(emitters))
     np.testing.assert_allclose(paths.length_m, plan.path_length_m(listener, np.array(emitters)), rtol=1e-12)
     assert_same(paths, NumpySoundPathFinder(plan, SPEED_OF_SOUND).find(listener, np.array(emitters)))
+
+
+# Paths as a field is told of them.
+
+
+@pytest.fixture(params=PLANS)
+def told(request: pytest.FixtureRequest) -> tuple[FloorPlan, Floats, Floats, DescribedPaths]:
+    """A plan, listeners and emitters in it, and their described paths."""
+    plan = PLANS[request.param]
+    points = points_inside(plan, 1200, 21, clearance_m=0.01)
+    listeners, emitters = points[:600], points[600:]
+    return plan, listeners, emitters, FINDERS[request.param].describe(listeners, emitters)
+
+
+def test_told_lengths_are_those_of_the_paths(told: tuple[FloorPlan, Floats, Floats, DescribedPaths]) -> None:
+    plan, listeners, emitters, paths = told
+    np.testing.assert_allclose(paths.length_m, plan.path_length_m(emitters, listeners), rtol=1e-9)
+    np.testing.assert_array_equal(paths.described[:, 0], paths.length_m.astype(np.float32))
+
+
+def test_told_sight_fades_with_what_a_corner_adds_to_the_way(
+    told: tuple[FloorPlan, Floats, Floats, DescribedPaths],
+) -> None:
+    plan, listeners, emitters, paths = told
+    level = (1, 1, 0)
+    excess_m = plan.path_length_m(emitters * level, listeners * level)
+    excess_m = excess_m - np.linalg.norm((emitters - listeners)[:, :2], axis=-1)
+    np.testing.assert_allclose(paths.described[:, 1], np.exp(-excess_m / 0.05), atol=1e-5)
+    assert (paths.described[:, 1] == 1).all() == (plan is BOX)
+
+
+def test_no_step_of_a_millimetre_changes_told_sight_by_much() -> None:
+    """Past the corner of an L."""
+    plan = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
+    across = np.linspace(2.1, 4.5, 2401)
+    listeners = np.column_stack([np.full_like(across, 1.0), across, np.full_like(across, 1.5)])
+    emitters = np.tile([5.0, 1.0, 1.5], (len(across), 1))
+    sight = SoundPathFinder(plan, SPEED_OF_SOUND).describe(listeners, emitters).described[:, 1]
+    assert sight.min() < 0.1
+    assert sight.max() == 1
+    assert np.abs(np.diff(sight)).max() < 0.02
+
+
+def test_told_directions_are_those_in_which_the_paths_leave_both_ends(
+    told: tuple[FloorPlan, Floats, Floats, DescribedPaths],
+) -> None:
+    plan, listeners, emitters, paths = told
+    finder = SoundPathFinder(plan, SPEED_OF_SOUND)
+    for row, (listener, emitter) in enumerate(zip(listeners, emitters, strict=True)):
+        found = one(finder, listener, emitter)
+        for direction, told_so in ((found.arrival[0], 2), (found.departure[0], 4)):
+            expected = direction[:2] / np.linalg.norm(direction[:2])
+            np.testing.assert_allclose(paths.described[row, told_so : told_so + 2], expected, atol=0.01)
+
+
+def test_compiled_and_numpy_paths_are_told_the_same(told: tuple[FloorPlan, Floats, Floats, DescribedPaths]) -> None:
+    plan, listeners, emitters, paths = told
+    expected = NumpySoundPathFinder(plan, SPEED_OF_SOUND).describe(listeners, emitters)
+    np.testing.assert_allclose(paths.length_m, expected.length_m, rtol=1e-12)
+    np.testing.assert_allclose(paths.described, expected.described, atol=1e-6)
+
+
+def test_told_paths_there_and_back_are_one(told: tuple[FloorPlan, Floats, Floats, DescribedPaths]) -> None:
+    plan, listeners, emitters, paths = told
+    back = SoundPathFinder(plan, SPEED_OF_SOUND).describe(emitters, listeners)
+    np.testing.assert_allclose(back.described[:, [0, 1, 4, 5, 2, 3]], paths.described, atol=1e-5)
+
+
+def test_each_pair_is_told_as_if_it_were_alone(told: tuple[FloorPlan, Floats, Floats, DescribedPaths]) -> None:
+    """Pairs with one listener share work."""
+    plan, listeners, emitters, _ = told
+    finder = SoundPathFinder(plan, SPEED_OF_SOUND)
+    listeners = np.repeat(listeners[:30], 4, axis=0)
+    together = finder.describe(listeners, emitters[:120])
+    alone = [finder.describe(listeners[row : row + 1], emitters[row : row + 1]).described for row in range(120)]
+    np.testing.assert_array_equal(together.described, np.concatenate(alone))
+
+
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e6])
+def test_told_sight_of_places_far_outside_is_a_share(far: float) -> None:
+    """A network that is asked there multiplies by it."""
+    turns = np.linspace(0, 2 * np.pi, 40)
+    listeners = np.stack([far * np.cos(turns), far * np.sin(turns), np.full(40, 1.5)], axis=-1)
+    paths = FINDER.describe(listeners, np.tile([1.0, 1.0, 1.5], (40, 1)))
+    assert ((paths.described[:, 1] >= 0) & (paths.described[:, 1] <= 1)).all()
+    assert np.isfinite(paths.described).all()

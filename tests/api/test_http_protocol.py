@@ -87,8 +87,8 @@ def talk(*pieces, pause_s=0.0, **settings):
 
     async def run():
         async with serving(**settings) as connect:
+            begin_s = time.monotonic()  # before the server can know of the connection, whose patience then begins
             reader, writer = await connect()
-            begin_s = time.monotonic()
 
             async def speak():
                 with contextlib.suppress(ConnectionError):

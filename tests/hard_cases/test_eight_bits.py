@@ -11,7 +11,8 @@ from onnx import helper, numpy_helper
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
-from server.field.graph import INPUTS, OUTPUTS
+from server.acoustics.sound_path import SoundPathFinder
+from server.field.graph import INPUTS, OUTPUTS, PATH
 from server.field.runtime import open_session
 from training.bundling.graphs import to_int8, to_onnx
 from training.models.cells import Cells
@@ -36,7 +37,7 @@ def graphs():
         field.mean[field.heads.slices["fine"]] = -3.0
         field.mean[field.heads.slices["late"]] = -6.0
     poses = tuple(torch.from_numpy(part[:2]) for part in scattered(2))
-    plain = to_onnx(ExportedField(field, cells).eval(), poses, OUTPUTS)
+    plain = to_onnx(ExportedField(field, cells).eval(), poses, OUTPUTS, inputs=(*INPUTS, PATH))
     uneven = onnx.ModelProto()
     uneven.CopyFrom(plain)
     (basis,) = [tensor for tensor in uneven.graph.initializer if tensor.name == "_basis"]
@@ -52,19 +53,25 @@ def graphs():
 
 def scattered(count):
     rng = np.random.default_rng(count)
-    ends = (rng.uniform((0.0, 0.0, 1.0), (4.0, 3.0, 2.0), (count, 3)) for _ in range(2))
-    return [part.astype(np.float32) for part in (*ends, rng.uniform(-np.pi, np.pi, count))]
+    ends = [rng.uniform((0.0, 0.0, 1.0), (4.0, 3.0, 2.0), (count, 3)) for _ in range(2)]
+    return told(*ends, rng.uniform(-np.pi, np.pi, count))
+
+
+def told(listeners, emitters, yaws):
+    """Poses as the graph's inputs."""
+    paths = SoundPathFinder(PLAN, 343.0).describe(listeners, emitters).described
+    return [part.astype(np.float32) for part in (listeners, emitters, yaws, paths)]
 
 
 def corners():
     ends = np.array(list(product((0.0, 4.0), (0.0, 3.0), (1.0, 2.0))), np.float32)
     pairs = np.array(list(product(range(8), range(8))))
-    return [ends[pairs[:, 0]], ends[pairs[:, 1]], np.linspace(-np.pi, np.pi, 64, dtype=np.float32)]
+    return told(ends[pairs[:, 0]], ends[pairs[:, 1]], np.linspace(-np.pi, np.pi, 64))
 
 
 def levels(session, poses):
     """Logarithms of magnitude, with all outputs finite."""
-    outputs = session.run(list(OUTPUTS), dict(zip(INPUTS, poses, strict=True)))
+    outputs = session.run(list(OUTPUTS), dict(zip((*INPUTS, PATH), poses, strict=True)))
     assert all(np.isfinite(output).all() for output in outputs)
     return outputs[0].astype(float)
 

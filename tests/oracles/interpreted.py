@@ -99,10 +99,10 @@ def _feed_networks_singles() -> None:
     from server.field import graph
 
     single = np.dtype("f4")
-    feed, run = graph.FieldGraph._feed, graph.FieldGraph.run
+    feed, run = graph.FieldGraph.feed, graph.FieldGraph.run
 
     def feed_singles(*pose: Any) -> dict[str, Any]:
         return {name: value.astype(single) for name, value in feed(*pose).items()}
 
-    graph.FieldGraph._feed = staticmethod(feed_singles)  # type: ignore[method-assign]
+    graph.FieldGraph.feed = feed_singles  # type: ignore[method-assign]
     graph.FieldGraph.run = lambda *given: [output.astype(np.float64) for output in run(*given)]  # type: ignore[method-assign]

@@ -9,7 +9,8 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.diffraction import CLEAR_FRESNEL_NUMBER, GRAZING_LOSS_DB, SMALL_ARGUMENT
 from server.acoustics.geometry import COINCIDENT_M, FloorPlan
-from server.acoustics.sound_path import SoundPaths
+from server.acoustics.sound_path import DescribedPaths, SoundPaths
+from server.acoustics.sound_path_kernel import PENUMBRA_M, SOFTENED_M
 
 Floats = npt.NDArray[np.float64]
 
@@ -40,6 +41,26 @@ class NumpySoundPathFinder:
         for field in fields(SoundPaths):
             getattr(into, field.name)[...] = getattr(paths, field.name)
         return into
+
+    def describe(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> DescribedPaths:
+        pairs = zip(np.asarray(listeners, np.float64), np.asarray(emitters, np.float64), strict=True)
+        lengths, described = zip(*(self._describe(*pair) for pair in pairs), strict=True)
+        return DescribedPaths(np.array(lengths), np.array(described, dtype=np.float32))
+
+    def _describe(self, listener: Floats, emitter: Floats) -> tuple[float, Floats]:
+        here, there = listener[:2], emitter[:2]
+        straight = level = float(np.linalg.norm(there - here))
+        after, before = there, here
+        if len(self._bends) and not self._plan.is_visible(listener, emitter):
+            via = self._to_bends_m(listener)[:, None] + self._bend_lengths_m
+            over = np.min(via, axis=0) + self._to_bends_m(emitter)
+            last = int(np.argmin(over))
+            if np.isfinite(over[last]):
+                level, after, before = float(over[last]), self._bends[np.argmin(via[:, last])], self._bends[last]
+        length = float(np.hypot(level, emitter[2] - listener[2]))
+        sight = np.exp(min(0.0, straight - level) / PENUMBRA_M)
+        legs = [leg / (np.linalg.norm(leg) + SOFTENED_M) for leg in (after - here, before - there)]
+        return length, np.concatenate([[length, sight], *legs])
 
     def _find(self, listener: Floats, emitters: Floats) -> SoundPaths:
         offset = emitters - listener

@@ -23,8 +23,10 @@ from server.planning.places import reverberation_of
 from server.planning.plan_query import PlanDocument, PlanQuery, parse_effects
 from server.planning.plan_table import print_plan
 from server.rendering.still_paths import StillPaths
-from server.scene.bundle import Bundle, find_bundle
+from server.scene.bundle import Bundle, find_bundle, write_bundle
 from server.scene.effects import EffectName
+from server.scene.manifest import QualityLevel
+from tests.directional_flat import write_directional
 
 PLAN = "/v1/scenes/flat/plan"
 
@@ -165,3 +167,38 @@ def test_a_plan_can_be_drawn(scene, tmp_path, monkeypatch):
         main()
     assert not ended.value.code
     assert np.ptp(np.asarray(Image.open(picture).convert("L"))) > 100
+
+
+@pytest.fixture(scope="module")
+def two_ways(tmp_path_factory):
+    """A scene with a level of ears and one with a bus."""
+    bundle = write_directional(tmp_path_factory.mktemp("flat"), order=2, towards=(0.6, 0.64, 0.48))
+    levels = (*bundle.manifest.levels, QualityLevel(name="by-bus", field="directional", bus=1))
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    return write_bundle(bundle.folder, bundle.manifest.model_copy(update={"levels": levels}), files)
+
+
+def test_a_plan_is_of_a_level_and_with_a_bus_turning_costs_nothing(two_ways, hrtfs, monkeypatch, capsys):
+    levels = FieldsByLevel.load(two_ways)
+    assert {bus: field.level.name for bus, field in levels.by_bus.items()} == {None: "standard", 1: "by-bus"}
+    ears, bus = (measured_costs(levels[name]) for name in ("standard", "by-bus"))
+    assert ears[EffectName.HEAD_ROTATION].turning_us > 0
+    assert bus[EffectName.HEAD_ROTATION].turning_us == bus[EffectName.HEAD_ROTATION].turning_first_us == 0
+    late = EffectName.LATE_REVERBERATION
+    # Four channels of a response in place of two.
+    assert bus[late].memory_bytes > ears[late].memory_bytes + 2 * 2 * 4 * levels.default.ir_samples
+    assert bus[late].moving_us > 0
+
+    def rotation(document):
+        (found,) = (each for each in document["decisions"] if each["name"] == "head_rotation")
+        return found["called_for"], found["cost_us"], found["reason"]
+
+    with TestClient(create_app(Settings(ir_workers=1), scenes={"flat": levels}, hrtfs=hrtfs)) as client:
+        default, by_bus = (rotation(client.get(PLAN, params=level).json()) for level in ({}, {"level": "by-bus"}))
+        assert client.get(PLAN, params={"level": "no"}).json()["code"] == "unknown_level"
+    assert default[0]
+    assert by_bus[:2] == (False, 0)
+    monkeypatch.setattr(sys, "argv", ["nafir", "plan", str(two_ways.folder), "--level", "by-bus", "--json"])
+    with pytest.raises(SystemExit):
+        main()
+    assert rotation(json.loads(capsys.readouterr().out)) == by_bus

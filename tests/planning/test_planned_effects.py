@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.geometry import Pose
+from server.planning.cost import Cost
 from server.planning.places import place_of_field
 from server.planning.planned_effects import PlannedEffects
 from server.planning.reach import HORIZON_S
@@ -79,3 +80,38 @@ def test_plans_are_made_less_often_under_load_but_before_they_are_outdated(mirro
     assert np.diff(plans_of_a_walk(200.0)).max() < HORIZON_S - 0.8
     planned.wish({EffectName.AIR_ABSORPTION: False}, None)
     assert planned.take_request(Pose(HERE), emitters, 206.0) is not None  # whoever wishes does not wait
+
+
+@pytest.mark.parametrize(("output", "asks"), [("headphones", True), ("ambisonics", False), ("mono", False)])
+def test_a_head_that_begins_to_turn_asks_for_a_plan_only_where_it_is_heard(mirrored_field, output, asks):
+    planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE), output=output)
+    emitters = {"one": EmitterState(Pose(THERE))}
+    planned.follow_emitter("one", emitters["one"].pose, 0.0)
+    planned.accept(planned.take_request(Pose(HERE), emitters, 0.0).plan())
+    for step in range(1, 50):
+        clock_s = 0.1 * step
+        pose = Pose.from_yaw(HERE, 0.1 * step)
+        planned.follow_listener(pose, clock_s)
+        assert (planned.take_request(pose, emitters, clock_s) is not None) is (asks and step == 1)
+        if asks and step == 1:
+            planned.give_up()
+
+
+def test_another_bus_is_planned_for_at_once_and_at_its_costs(mirrored_field):
+    costs = {None: {EffectName.HRTF: Cost(1.0)}, 1: {EffectName.HRTF: Cost(2.0)}}
+    planned = PlannedEffects(place_of_field(mirrored_field), Pose(HERE), costs=lambda bus: costs[bus])
+    emitters = {"one": EmitterState(Pose(THERE))}
+    planned.follow_emitter("one", emitters["one"].pose, 0.0)
+
+    def cost_us():
+        request = planned.take_request(Pose(HERE), emitters, 0.1)
+        if request is None:
+            return None
+        planned.accept(request.plan())
+        return planned.plan.about(EffectName.HRTF)[0].cost_us
+
+    assert cost_us() == 1.0
+    planned.hear_by_bus(None)
+    assert cost_us() is None
+    planned.hear_by_bus(1)
+    assert cost_us() == 2.0

@@ -183,6 +183,28 @@ def test_responses_turn_with_the_head_only_where_it_turns():
     assert not make_plan(situation(OPEN, at(4), turns=True)).is_on(EffectName.HEAD_ROTATION)
 
 
+def test_a_bus_turns_reflected_sound_by_itself_and_direct_sound_follows():
+    ears, bus = (make_plan(situation(ROOM, at(4), turns=True, bus=order)) for order in (None, 1))
+    assert on(ears) - on(bus) == {EffectName.HEAD_ROTATION}
+    (decision,) = bus.about(EffectName.HEAD_ROTATION)
+    assert "without new responses" in decision.reason
+    assert decision.change_jnd == 0
+
+
+@pytest.mark.parametrize("output", ["mono", "ambisonics"])
+def test_where_no_head_is_rendered_turns_change_no_decision_and_cost_nothing(output):
+    costs = {name: Cost(1.0, turning_us=1000.0, turning_first_us=1000.0) for name in EffectName}
+    turned, still = (
+        make_plan(situation(ROOM, at(4), output=output, turns=turns), costs=costs) for turns in (True, False)
+    )
+    switched, cost_us = [
+        [[getattr(each, name) for each in plan.decisions] for plan in (turned, still)]
+        for name in ("called_for", "cost_us")
+    ]
+    assert switched[0] == switched[1]
+    assert cost_us[0] == cost_us[1]
+
+
 def test_a_direct_sound_buried_in_reverberation_is_not_called_for_nor_anything_about_it():
     drowned = replace(ROOM, reverberation=replace(LIVELY, energy=np.full(BANDS, 1000.0)))
     plan = make_plan(situation(drowned, at(5, 4, speed_m_s=1.0)))

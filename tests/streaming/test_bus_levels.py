@@ -11,8 +11,9 @@ from server.offline.render import PathPoint, RenderedEmitter, planned_effects, r
 from server.planning.places import place_of_field
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, SetEffects
 from server.responses.direct_sound import DirectSound
-from server.responses.ir_request import compute_irs
+from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle
+from server.scene.effects import EffectName
 from server.scene.manifest import Manifest, QualityLevel
 from server.streaming.calibration import calibrate
 from server.streaming.quality_steps import QualityStep
@@ -181,6 +182,40 @@ def test_an_offline_render_is_the_stream(levels, filters, choice):
     emitters = [RenderedEmitter(NOISE, Pose(THERE))]
     rendered = render(levels["by-bus"], direct, emitters, path, length=40 * 256, planned=planned, levels=dict(levels))
     np.testing.assert_array_equal(rendered, streamed)
+
+
+def test_an_offline_render_asks_for_no_response_where_only_the_head_turns_on_a_bus(levels, filters, monkeypatch):
+    asked = []
+    monkeypatch.setattr("server.offline.render.composed_irs", lambda *args: asked.append(args) or composed_irs(*args))
+    path = [PathPoint.at(256 * number, Pose.from_yaw(HERE, 0.1 * number)) for number in range(20)]
+    path.append(PathPoint.at(256 * 20, Pose((2.2, 2.5, 1.5))))
+    direct = DirectSound.of(levels.bundle, filters)
+    render(levels["by-bus"], direct, [RenderedEmitter(NOISE, Pose(THERE))], path, length=40 * 256, levels=dict(levels))
+    assert len(asked) == 2  # where the path begins, and one step
+
+
+def test_a_plan_of_a_turning_head_knows_the_level(levels, filters):
+    """Head rotation calls for responses of ears; on a bus it has nothing to ask for."""
+    session = open_session(levels, filters, BUS, effects=ALL_OFF, place=place_of_field(levels.default))
+    advance(session, levels, 30)
+
+    def turn(first, blocks):
+        answered = 0
+        for number in range(first, first + blocks):
+            session.receive(ListenerPose(pose_id=number, position=HERE, yaw=0.05 * number))
+            answered += advance(session, levels, 1)[1]
+        (decision,) = session._effects.planned.plan.about(EffectName.HEAD_ROTATION)
+        return decision.called_for, answered
+
+    assert turn(2, 40) == (False, 0)
+    session.set_quality(EARS, "chosen")
+    advance(session, levels, 100)
+    is_on, answered = turn(50, 40)
+    assert is_on
+    assert answered > 30
+    session.set_quality(BUS, "chosen")
+    advance(session, levels, 100)
+    assert turn(100, 40) == (False, 0)
 
 
 def test_sound_at_rest_keeps_its_direct_sound_off_the_bus(levels, filters):

@@ -12,6 +12,7 @@ from server.field.node_responses import NODE_CACHE_BYTES
 from server.scene.bundle import write_bundle
 from server.scene.manifest import QualityLevel, Reuse
 from server.streaming.calibration import Listener, calibrate
+from tests.directional_flat import write_directional
 
 
 def two_levels(bundle, folder):
@@ -69,3 +70,20 @@ def test_a_response_that_is_kept_is_no_measure_of_one_that_is_not(mirrored_bundl
     listener, pose = Listener(one, filters, node_cache=kept, time_s=time.thread_time), Pose((2.0, 2.0, 1.5))
     listener.time_ms(pose)
     assert min(listener.time_ms(pose) for _ in range(20)) < 0.1 * found_ms
+
+
+def test_a_bus_takes_next_to_nothing_where_the_head_only_turns_and_ears_take_a_response(tmp_path, filters):
+    bundle = write_directional(tmp_path)
+    ears = AcousticField.load(bundle)
+    bus = AcousticField(bundle, QualityLevel(name="by-bus", field="directional", bus=1), ears.graph)
+    here, turned = (Pose.from_yaw((2.0, 2.5, 1.5), yaw) for yaw in (0.0, 0.5))
+    step = Pose.from_yaw((2.1, 2.5, 1.5), 0.5)
+    took_ms = []
+    for field in (ears, bus):
+        listener = Listener(field, filters, time_s=time.thread_time)
+        listener.time_ms(here)
+        took_ms.append([listener.time_ms(pose) for pose in (here, turned, step, here)])
+    (_, ears_turn, ears_step, _), (_, bus_turn, bus_step, bus_back) = took_ms
+    assert ears_turn > 0.2 * ears_step
+    assert bus_turn < 0.05 * bus_step
+    assert bus_back > 0.2 * bus_step  # another place

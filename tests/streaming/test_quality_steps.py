@@ -55,6 +55,19 @@ def test_levels_that_reuse_responses_may_ask_more_often():
     ]
 
 
+def test_auto_leaves_a_bus_to_whoever_asks_for_it():
+    levels = (
+        QualityLevel(name="fast", field="any"),
+        QualityLevel(name="good", field="any"),
+        QualityLevel(name="by-bus", field="any", bus=3),
+    )
+    ms_here = {"fast": 0.3, "good": 2.0, "by-bus": 5.0}
+    steps = Offer(levels, ms_here).steps(AUTO, block_s=BLOCK_S)
+    assert {step.level for step in steps} == {"good", "fast"}
+    assert {step.level for step in Offer(levels, ms_here).steps("by-bus", block_s=BLOCK_S)} == {"by-bus"}
+    assert {step.level for step in Offer(levels[2:], ms_here).steps(AUTO, block_s=BLOCK_S)} == {"by-bus"}
+
+
 def test_a_level_that_was_chosen_is_kept_and_only_its_rate_falls():
     steps = offer(fast=0.5, exact=700.0).steps("exact", block_s=BLOCK_S)
     assert {step.level for step in steps} == {"exact"}

@@ -1,6 +1,5 @@
 """The smallest scene, simulated, trained and exported once for all tests."""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +12,8 @@ from server.rendering import hrtf
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from tests.training.held_out import make_held_out  # noqa: F401  a fixture
+from tests.training.traced_once import traced_once
+from training.bundling import export as export_module
 from training.bundling import noise
 from training.bundling.export import export
 from training.data.dataset import Dataset
@@ -22,8 +23,6 @@ from training.learning.train import train
 from training.models.encoders import FieldShape
 from training.simulation.responses import SimulatedResponses
 from training.simulation.run import simulate
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers of the simulation
 
 TINY = Path(__file__).parents[1] / "data" / "tiny.toml"
 CONFIGURATION = Configuration(
@@ -75,6 +74,14 @@ def _few_draws() -> Iterator[None]:
     """Of noise, for bundles that nobody listens to."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(noise, "DRAWS", 2)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _traced_once(tmp_path_factory) -> Iterator[None]:
+    """An export still compares what it writes with torch."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export_module, "to_onnx", traced_once(export_module.to_onnx, tmp_path_factory))
         yield
 
 

@@ -18,8 +18,8 @@ from torch import nn
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.core.errors import NafirError
-from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
-from server.field.graph import INPUTS, OUTPUTS, RESPONSE
+from server.field.directional_graph import DIRECTIONAL_INPUTS, DIRECTIONS, LOG_MAGNITUDE
+from server.field.graph import INPUTS, OUTPUTS, PATH, RESPONSE
 from server.field.runtime import open_session
 from server.health.check import Effort, Health, check, check_fields
 from server.health.findings import LAWS
@@ -42,10 +42,10 @@ from training.learning.runs import Configuration
 from training.learning.train import load_learner
 from training.models.basis_field import BasisField
 from training.models.directional import ExportedDirections
-from training.models.encoders import GEOMETRY
 from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
+from training.models.site import Site
 from training.models.targets import LEAD_SAMPLES, codec_of
 from training.simulation.responses import SimulatedResponses
 
@@ -290,7 +290,7 @@ class _Form:
     """How fields of one kind with a basis become graphs."""
 
     module: type[ExportedField | ExportedDirections]
-    inputs: int
+    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     known_frames: int
     order: int | None
@@ -298,10 +298,11 @@ class _Form:
 
 def _form_of(learner: BasisLearner) -> _Form:
     if isinstance(learner, FactorisedLearner):
-        return _Form(ExportedField, 3, _outputs(learner), learner.cells.known_frames, None)
+        return _Form(ExportedField, (*INPUTS, PATH), _outputs(learner), learner.cells.known_frames, None)
     if isinstance(learner, DirectionalLearner):
         order = learner.recipe.order
-        return _Form(ExportedDirections, 2, (LOG_MAGNITUDE, DIRECTIONS)[: 1 + (order > 0)], 0, order)
+        outputs = (LOG_MAGNITUDE, DIRECTIONS)[: 1 + (order > 0)]
+        return _Form(ExportedDirections, (*DIRECTIONAL_INPUTS, PATH), outputs, 0, order)
     raise TypeError(f"{type(learner)} has no graph")
 
 
@@ -311,21 +312,21 @@ def _of_a_basis(
     """All graphs of a run of a factorised or directional field, each checked."""
     form, cells, whole, kind = _form_of(learner), learner.cells, learner.field, configuration.name
     trained_at, poses = (
-        _poses(learner.responses, count, configuration.seed)[: form.inputs]
+        _poses(learner.responses, count, configuration.seed, form.inputs)
         for count in (_TRUNCATION_POSES, _CHECK_POSES[kind])
     )
     lower = sorted({rank for rank in variants.ranks if rank < len(whole.basis)}, reverse=True)
     codec = _codec_parameters(cells.codec, form.known_frames, cells.all_frames)
-    traced = to_onnx(form.module(whole, cells).eval(), _tensors(poses, 2), form.outputs)
+    traced = to_onnx(form.module(whole, cells).eval(), _tensors(poses, 2), form.outputs, inputs=form.inputs)
     exported = []
     for field in (whole, *(whole.truncated(rank, *_tensors(trained_at, _TRUNCATION_POSES)) for rank in lower)):
         module = form.module(field, cells).eval()
         graph = traced if field is whole else with_weights(traced, module)
         for precision in variants.precisions:
             least_weights = min(_INT8_LEAST_WEIGHTS, field.basis.numel())
-            small = to_int8(graph, least_weights=least_weights, exact=GEOMETRY) if precision == "int8" else graph
-            model = halve_weights(small, exact=GEOMETRY)
-            _check(model, module, poses, form.outputs, precision)
+            small = to_int8(graph, least_weights=least_weights) if precision == "int8" else graph
+            model = halve_weights(small)
+            _check(model, module, poses, form.outputs, precision, inputs=form.inputs)
             name = f"{_sized_name(kind, field, usual_width)}{_suffix(precision)}"
             exported.append(_Exported(name, model, kind, len(field.basis), codec, form.order))
     return exported
@@ -385,15 +386,20 @@ def _codec_parameters(codec: Codec, known_frames: int, frames: Axis | None = Non
     )
 
 
-def _poses(responses: ResponseSet, count: int, seed: int) -> tuple[npt.NDArray[np.float32], ...]:
-    """Random listeners, emitters and yaws near the measured ones."""
+def _poses(
+    responses: ResponseSet, count: int, seed: int, inputs: tuple[str, ...] = tuple(INPUTS)
+) -> tuple[npt.NDArray[np.float32], ...]:
+    """Random poses near the measured ones, as the `inputs` of a graph."""
     rng = np.random.default_rng(seed)
     listener, emitter = (
         end[rng.integers(0, len(end), count)] + rng.uniform(-0.05, 0.05, (count, 3))
         for end in (responses.listener, responses.emitter)
     )
     yaw = rng.uniform(-np.pi, np.pi, count)
-    return listener.astype(np.float32), emitter.astype(np.float32), yaw.astype(np.float32)
+    given: dict[str, npt.NDArray[np.floating]] = {"listener": listener, "emitter": emitter, "yaw": yaw}
+    if PATH in inputs:
+        given[PATH] = Site.of(responses).paths(listener, emitter)
+    return tuple(given[name].astype(np.float32) for name in inputs)
 
 
 def _tensors(poses: tuple[npt.NDArray[np.float32], ...], count: int) -> tuple[torch.Tensor, ...]:
@@ -406,9 +412,11 @@ def _check(
     poses: tuple[npt.NDArray[np.float32], ...],
     outputs: tuple[str, ...],
     precision: Precision,
+    *,
+    inputs: tuple[str, ...] = tuple(INPUTS),
 ) -> None:
     session = open_session(model.SerializeToString())
-    found = dict(zip(outputs, session.run(list(outputs), dict(zip(INPUTS, poses, strict=False))), strict=True))
+    found = dict(zip(outputs, session.run(list(outputs), dict(zip(inputs, poses, strict=True))), strict=True))
     with torch.no_grad():
         # One pose at a time, because a batch of `naf` would not fit into memory.
         rows = [module(*(torch.from_numpy(part[row : row + 1]) for part in poses)) for row in range(len(poses[0]))]

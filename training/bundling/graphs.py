@@ -22,11 +22,15 @@ _HALVE_ABOVE_BYTES = 16_384
 
 
 def to_onnx(
-    module: nn.Module, poses: tuple[torch.Tensor, ...], outputs: tuple[str, ...], *, free_batch: bool = True
+    module: nn.Module,
+    poses: tuple[torch.Tensor, ...],
+    outputs: tuple[str, ...],
+    *,
+    inputs: tuple[str, ...] = tuple(INPUTS),
+    free_batch: bool = True,
 ) -> onnx.ModelProto:
-    """The graph without metadata. Its batch axis is free, or has the length of that of the poses. A graph without yaw
-    has the first two inputs only."""
-    inputs = list(INPUTS)[: len(poses)]
+    """The graph without metadata, whose `inputs` are the poses. Its batch axis is free, or has the length of that of
+    the poses."""
     batch = torch.export.Dim("batch")
     with _quiet("torch.onnx"), warnings.catch_warnings():
         # Warnings of PyTorch's exporter about its own pytrees, and about the name that all batch axes share.
@@ -35,7 +39,7 @@ def to_onnx(
         program = torch.onnx.export(
             module,
             poses,
-            input_names=inputs,
+            input_names=list(inputs),
             output_names=list(outputs),
             dynamic_shapes={name: {0: batch} for name in inputs} if free_batch else None,
             opset_version=_OPSET,
@@ -101,16 +105,16 @@ def pose_by_pose(model: onnx.ModelProto) -> onnx.ModelProto:
     return wrapped
 
 
-def halve_weights(model: onnx.ModelProto, *, exact: str | None = None) -> onnx.ModelProto:
+def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
     """Stores large float32 constants as float16, which are converted back when the graph is loaded. This halves the
-    bundle and leaves the arithmetic the same. Constants of the module named `exact` stay as they are."""
+    bundle and leaves the arithmetic the same."""
     halved = onnx.ModelProto()
     halved.CopyFrom(model)
     graph = halved.graph
     casts = []
     for tensor in graph.initializer:
         values = numpy_helper.to_array(tensor)
-        if values.dtype != np.float32 or values.nbytes < _HALVE_ABOVE_BYTES or _has_part(tensor.name, exact):
+        if values.dtype != np.float32 or values.nbytes < _HALVE_ABOVE_BYTES:
             continue
         name = tensor.name
         tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
@@ -121,10 +125,9 @@ def halve_weights(model: onnx.ModelProto, *, exact: str | None = None) -> onnx.M
     return halved
 
 
-def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = None) -> onnx.ModelProto:
+def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
     """Computes products with at least `least_weights` constant weights in 8-bit integers: weights are quantised per
-    column, the other factor at each call. Smaller products stay in float32, because they take little time and their
-    results must be exact; so does the module named `exact`."""
+    column, the other factor at each call. Smaller products stay in float32, because they take little time."""
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     constants = {tensor.name: int(np.prod(tensor.dims)) for tensor in model.graph.initializer}
@@ -133,8 +136,7 @@ def to_int8(model: onnx.ModelProto, *, least_weights: int, exact: str | None = N
         name
         for node in model.graph.node
         for name in (node.name, f"{node.name}_MatMul")
-        if node.op_type in {"MatMul", "Gemm"}
-        and (constants.get(node.input[1], 0) < least_weights or _has_part(node.input[1], exact))
+        if node.op_type in {"MatMul", "Gemm"} and constants.get(node.input[1], 0) < least_weights
     ]
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
@@ -167,7 +169,3 @@ def _quiet(name: str | None) -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-
-
-def _has_part(name: str, part: str | None) -> bool:
-    return part is not None and part in name.split(".")

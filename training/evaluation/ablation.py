@@ -93,8 +93,10 @@ def _errors(learner: FactorisedLearner, rows: npt.NDArray[np.int64]) -> tuple[fl
     spectral, level, decay = [], [], []
     for start in range(0, len(rows), _BATCH):
         some = rows[start : start + _BATCH]
-        ends = (part[some].astype(np.float32) for part in (responses.listener, responses.emitter, responses.yaw))
-        predicted = graph.forward_all_frames(*map(torch.from_numpy, ends))[0].numpy().astype(np.float64)
+        listener, emitter = responses.listener[some], responses.emitter[some]
+        poses = (listener, emitter, responses.yaw[some], learner.site.paths(listener, emitter))
+        tensors = (torch.from_numpy(part.astype(np.float32)) for part in poses)
+        predicted = graph.forward_all_frames(*tensors)[0].numpy().astype(np.float64)
         read = responses.read(some)
         truth = np.stack([align(one, delay_samples(responses, row)) for one, row in zip(read, some, strict=True)])
         power = np.abs(codec.transform(truth)) ** 2

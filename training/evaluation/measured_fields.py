@@ -53,11 +53,10 @@ def run_column(run: Path, responses: ResponseSet, held_out: HeldOut) -> Column:
 
     def source(index: int, yaw_indices: npt.NDArray[np.integer]) -> Responses:
         shape = (len(yaw_indices), 3)
-        poses = (
-            np.broadcast_to(listeners[index], shape),
-            np.broadcast_to(emitters[index], shape),
-            held_out.yaws[yaw_indices],
-        )
+        listener, emitter = np.broadcast_to(listeners[index], shape), np.broadcast_to(emitters[index], shape)
+        poses = [listener, emitter, held_out.yaws[yaw_indices]]
+        if isinstance(learner, FactorisedLearner):
+            poses.append(learner.site.paths(listener, emitter))
         with torch.no_grad():
             outputs = predict(*(torch.from_numpy(np.array(pose, dtype=np.float32)) for pose in poses))
         aligned = decoded(tuple(output.numpy() for output in outputs), codec, noise)

@@ -15,8 +15,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from server.acoustics.geometry import FloorPlan
-from server.field.graph import INPUTS
-from server.field.runtime import InferenceSession, open_session
+from server.field.graphs import graph_of
+from server.field.runtime import open_session
 from server.scene.bundle import Bundle
 from training.baselines.held_out import EvaluationError, HeldOut, require_same_scene
 from training.evaluation.decoding import FOLDS, Decoding, RidgeRegression, decode
@@ -79,15 +79,15 @@ class HiddenFeatures:
 
     def __init__(self, bundle: Bundle, field: str) -> None:
         model = onnx.load_model_from_string(bundle.models[bundle.manifest.fields[field].file])
-        self._session: InferenceSession = open_session(with_hidden_output(model).SerializeToString())
+        self._session = open_session(with_hidden_output(model).SerializeToString())
+        self._graph = graph_of(bundle, field, self._session)
 
     def of(self, listeners: _Floats, emitters: _Floats, yaws: _Floats) -> _Floats:
         """Compute features (B, feature) for listeners (B, 3), emitters (B, 3) and yaws (B,)."""
         features = []
         for start in range(0, len(yaws), _CHUNK):
             part = slice(start, start + _CHUNK)
-            poses = (np.asarray(array[part], dtype=np.float32) for array in (listeners, emitters, yaws))
-            (hidden,) = self._session.run([HIDDEN], dict(zip(INPUTS, poses, strict=True)))
+            (hidden,) = self._session.run([HIDDEN], self._graph.feed(listeners[part], emitters[part], yaws[part]))
             features.append(hidden.reshape(len(yaws[part]), -1, hidden.shape[-1]).mean(axis=1, dtype=np.float64))
         return np.concatenate(features)
 

@@ -16,8 +16,8 @@ from server.acoustics.codec import Codec
 from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_loss
 from server.acoustics.room_parameters import RoomParameters, measure
 from server.field.field import AcousticField
-from server.responses.full_response import FullResponse
 from training.data.dataset import TAKES, Dataset
+from training.frontier.heard_by_bus import full_response
 from training.simulation.references import References
 
 _STEP_M = 0.05
@@ -73,11 +73,11 @@ class Errors:
 
 
 class Estimate:
-    """Whole responses of a field. If its phase iteration starts from the previous response, each pose is computed after
-    its neighbour, as on a walk."""
+    """Whole responses of a field, as its level is heard. If its phase iteration starts from the previous response, each
+    pose is computed after its neighbour, as on a walk."""
 
     def __init__(self, field: AcousticField) -> None:
-        self._whole = FullResponse.through_kemar(field)
+        self._whole = full_response(field)
         self._is_warm = field.level.phase.warm
 
     def __call__(self, entry: Entry) -> _Responses:

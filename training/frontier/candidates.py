@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 
 from server.core.errors import BundleError
 from server.field.kinds.catalogue import KINDS
+from server.rendering.head_decoder import ORDERS
 from server.scene.bundle import Bundle
 from server.scene.manifest import FieldFile, Manifest, Phase, QualityLevel
 
@@ -25,7 +26,8 @@ def candidates(
     `phases_of` names the fields for which all methods of finding the phase are measured, by default all fields; the
     time of Griffin and Lim's iteration does not depend on the field. `reuse_of` names the fields for which all kinds
     of reuse are measured. Either may be `NONE`. A field of directions is measured at each order, with both ways to make
-    the tail; it has no reuse. Raises BundleError for a name that is not a field, or for reuse of directions.
+    the tail, and by a bus of each order; it has no reuse. Raises BundleError for a name that is
+    not a field, or for reuse of directions.
     """
     fields = bundle.manifest.fields
     reused = set(reuse_of)
@@ -51,6 +53,10 @@ def _levels(manifest: Manifest, name: str, file: FieldFile, with_phases: bool) -
         for order in range(file.order):
             yield QualityLevel(name=f"{name}-o{order}", field=name, order=order)
             yield QualityLevel(name=f"{name}-o{order}-bands", field=name, order=order, tail="bands")
+        # Responses of a bus do not depend on the tail. Its first reflections are sharper with each order, whatever the
+        # field's.
+        for order in ORDERS:
+            yield QualityLevel(name=f"{name}-bus{order}", field=name, bus=order)
     # A field in the time domain predicts samples: there is no phase to choose.
     if not with_phases or file.architecture.endswith("time-domain"):
         return

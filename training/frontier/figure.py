@@ -2,18 +2,16 @@
 
 from pathlib import Path
 
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from training.frontier.labels import Label, place_labels
 from training.frontier.points import Point
 from training.frontier.sweep import Frontier
 
 _PARETO, _OTHER, _FLOOR, _DEADLINE, _BOUND, _TEXT = "#0b6e99", "#aeb9c1", "#8d6a9f", "#d1495b", "#66a182", "#2b3a42"
 _SPREAD = "#bfdbe6"
-_LABEL_HEIGHT = 0.042
-"""The least distance between labels, as a share of the axes' height."""
 
 
 def draw_frontier(frontier: Frontier, path: Path) -> None:
@@ -58,7 +56,6 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
     slowest = [point.cost.ms_p99 for point in best]
     axes.set_xlim(min(costs) / 2, max([*costs, *slowest, frontier.block_ms]) * 2)
     axes.set_ylim(0, 1.12 * max(point.audible_error for point in best))
-    _name(axes, offered, frontier.default)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set(
@@ -69,27 +66,20 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
     axes.set_title(f"What accuracy costs in time: {frontier.scene}, {measured_on}", fontsize=12)
     axes.grid(alpha=0.25, which="major")
     axes.legend(frameon=False, fontsize=9, loc="lower left")
+    place_labels(
+        axes,
+        [_label(point, is_default=point is frontier.default) for point in offered],
+        zip(*_coordinates([*best, *others, *bounds]), strict=True),
+        lines_y=[floor],
+        colour=_TEXT,
+        line_colour=_OTHER,
+    )
     figure.savefig(path, dpi=110)
 
 
-def _name(axes: Axes, points: list[Point], default: Point) -> None:
-    """Puts names to the right of the points and above them, without overlap."""
-    top = axes.get_ylim()[1]
-    taken = top
-    for point in sorted(points, key=lambda point: point.audible_error, reverse=True):
-        name = f"{point.level.name} (default)" if point is default else point.level.name
-        height = min(point.audible_error + 0.5 * _LABEL_HEIGHT * top, taken - _LABEL_HEIGHT * top)
-        taken = height
-        axes.annotate(
-            name,
-            (point.cost.ms_mean, point.audible_error),
-            xytext=(1.35 * point.cost.ms_mean, height),
-            textcoords="data",
-            fontsize=9,
-            color=_TEXT,
-            va="center",
-            arrowprops={"arrowstyle": "-", "color": _OTHER, "linewidth": 0.8},
-        )
+def _label(point: Point, *, is_default: bool) -> Label:
+    name = point.level.name
+    return Label(point.cost.ms_mean, point.audible_error, f"{name} (default)" if is_default else name)
 
 
 def _coordinates(points: list[Point]) -> tuple[list[float], list[float]]:

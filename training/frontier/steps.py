@@ -14,6 +14,7 @@ from server.acoustics.metrics import parameter_errors
 from server.acoustics.room_parameters import measure
 from server.field.field import AcousticField
 from server.responses.full_response import FullResponse
+from training.frontier.heard_by_bus import HeardByBus, full_response
 from training.frontier.walk import SPEED_M_PER_S, walk
 
 STEP_M = 0.01
@@ -34,7 +35,7 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
         steps = [step for step, (one, other) in zip(steps, itertools.pairwise(nodes), strict=True) if one != other]
     spread = np.linspace(0, len(steps) - 1, min(count, len(steps))).astype(int) if steps else np.array([], int)
     chosen = np.unique(spread)
-    whole = FullResponse.through_kemar(field)
+    whole = full_response(field)
     largest: dict[str, float] = {}
     for number in chosen:
         before, after = (measure(_response(whole, pose), field.sample_rate) for pose in steps[number])
@@ -48,6 +49,6 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
     return largest
 
 
-def _response(whole: FullResponse, pose: Pose) -> npt.NDArray[np.float32]:
+def _response(whole: FullResponse | HeardByBus, pose: Pose) -> npt.NDArray[np.float32]:
     emitter = whole.bundle.manifest.start.emitter
     return np.asarray(whole.impulse_responses([pose.position], [emitter], [pose.yaw])[0])

@@ -74,13 +74,13 @@ class DirectionalLearner(BasisLearner):
 
     def batch(self, rows: Rows, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         pairs = self._pair[rows]
-        listener, emitter = (torch.from_numpy(end[pairs]) for end in (self.targets.listener, self.targets.emitter))
+        listener, emitter = self.targets.listener[pairs], self.targets.emitter[pairs]
         if rng is not None and self.recipe.noise_m:
             listener, emitter = (
-                end + torch.from_numpy(rng.normal(0, self.recipe.noise_m, end.shape).astype(np.float32))
-                for end in (listener, emitter)
+                end + rng.normal(0, self.recipe.noise_m, end.shape).astype(np.float32) for end in (listener, emitter)
             )
-        return (listener, emitter), (self._flat(rows),)
+        poses = (listener, emitter, self.site.paths(listener, emitter))
+        return tuple(map(torch.from_numpy, poses)), (self._flat(rows),)
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
         (flat,) = targets

@@ -80,13 +80,12 @@ class FactorisedLearner(BasisLearner):
         parts = [_rows_of(self.targets, rows[:measured])]
         if self._distilled is not None:
             parts.append(_rows_of(self._distilled, rows[measured:] - len(self.targets.yaw)))
-        listener, emitter, yaw, flat = (
-            torch.from_numpy(np.concatenate(columns)) for columns in zip(*parts, strict=True)
-        )
+        listener, emitter, yaw, flat = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         if self.recipe.swap and rng is not None:
-            swapped = torch.from_numpy(rng.random(len(rows)) < 0.5)[:, None]
-            listener, emitter = torch.where(swapped, emitter, listener), torch.where(swapped, listener, emitter)
-        return (listener, emitter, yaw), (flat, torch.arange(len(rows)) < measured)
+            swapped = (rng.random(len(rows)) < 0.5)[:, None]
+            listener, emitter = np.where(swapped, emitter, listener), np.where(swapped, listener, emitter)
+        poses = (listener, emitter, yaw, self.site.paths(listener, emitter))
+        return tuple(map(torch.from_numpy, poses)), (torch.from_numpy(flat), torch.arange(len(rows)) < measured)
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
         flat, measured = targets[0].float(), targets[1]

@@ -34,7 +34,7 @@ def tile(shapes: dict[str, tuple[int, ...]]) -> tuple[list[int], dict[str, slice
 
 class BasisField(nn.Module):
     """Flat predictions (B, heads.size), normalised by the mean and spread of each output over the training set. The
-    inputs are those of the encoder: listener, emitter and, for ears, yaw.
+    inputs are those of the encoder: listener, emitter, for ears the yaw, and path.
 
     `level_correction` (2, heads.size) is what to add to predicted levels, of pairs out of sight and in sight
     (`training.models.level_correction`).
@@ -66,7 +66,7 @@ class BasisField(nn.Module):
 
     def coefficients(self, *pose: Tensor) -> Tensor:
         """(B, rank) coefficients of the basis."""
-        # In low precision, a path would go through walls.
+        # In low precision, places would be rounded to centimetres.
         with torch.autocast(pose[0].device.type, enabled=False):
             features = self.encoder(*pose)
         return self.coefficients_of(features)

@@ -1,9 +1,10 @@
 """The directional field: the power of the reflected sound that arrives at a place, and from where, without any head.
 
-Inputs: `listener` (B, 3), `emitter` (B, 3). Outputs, for the seven octave bands and cells of frames: `log_magnitude`
-(B, band, cell), the natural logarithm of the magnitude that an ideal omnidirectional microphone hears, and `directions`
-(B, harmonic, band, cell), the powers in the spherical harmonics after the first, as shares of that in the first
-(`server.acoustics.spherical_harmonics`). A field of order 0 has no directions and no such output.
+Inputs: `listener` (B, 3), `emitter` (B, 3), `path` (B, 6) as in `server.acoustics.sound_path.DescribedPaths`. Outputs,
+for the seven octave bands and cells of frames: `log_magnitude` (B, band, cell), the natural logarithm of the magnitude
+that an ideal omnidirectional microphone hears, and `directions` (B, harmonic, band, cell), the powers in the spherical
+harmonics after the first, as shares of that in the first (`server.acoustics.spherical_harmonics`). A field of order 0
+has no directions and no such output.
 
 Axes are those of the world, so a head may be turned any way afterwards.
 """
@@ -63,8 +64,8 @@ class ExportedDirections(ExportedBasis):
         self._sizes, self._shapes = field.heads.sizes, list(field.heads.shapes.values())
         self._silence = float(torch.log(torch.tensor(cells.codec.log_floor)))
 
-    def forward(self, listener: Tensor, emitter: Tensor) -> tuple[Tensor, ...]:
-        parts = torch.split(self._flat(listener, emitter), self._sizes, dim=1)
+    def forward(self, listener: Tensor, emitter: Tensor, path: Tensor) -> tuple[Tensor, ...]:
+        parts = torch.split(self._flat(listener, emitter, path), self._sizes, dim=1)
         levels, *directions = (part.reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True))
         # guard: no direction has more power than there is
         shares = [torch.clamp(part, min=-1.0, max=1.0) for part in directions]

@@ -1,5 +1,8 @@
-"""Encodes where listener and emitter are, as features of a network: learned features of both places, and the geometry
-of the path between them."""
+"""Encodes where listener and emitter are, as features of a network: learned features of both places, and the shortest
+path between them, of which the network is told.
+
+A path (B, DESCRIPTION) is described as in `server.acoustics.sound_path.DescribedPaths`.
+"""
 
 from dataclasses import dataclass
 
@@ -9,11 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from server.acoustics.geometry import FloorPlan
-from training.models.propagation import Path, Propagation
+from server.acoustics.sound_path import DESCRIPTION
 from training.models.site import Reach
 
-GEOMETRY = "_propagation"
-"""The name of the module whose constants are positions, not weights. Rounding them would let sound through walls."""
 _AZIMUTH_HARMONICS = 5
 _YAW_HARMONICS = 3
 _PATH_DIRECTIONS = 2 + 2
@@ -85,8 +86,7 @@ class _Encoder(nn.Module):
         self._nearest_m = reach.nearest_m
         self.register_buffer("_low", torch.tensor(reach.low, dtype=torch.float32), persistent=False)
         self.register_buffer("_high", torch.tensor(reach.high, dtype=torch.float32), persistent=False)
-        self._propagation = Propagation(plan)
-        self.sees_all = self._propagation.sees_all
+        self.sees_all = not len(plan.bend_corners)
         """Whether all places see each other."""
         self._grid = FeatureGrid(plan, shape.grid_spacing_m, shape.grid_features)
         low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
@@ -106,12 +106,12 @@ class _Encoder(nn.Module):
     def _keep(self, name: str, values: npt.NDArray[np.floating | np.integer]) -> None:
         self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.float32), persistent=False)
 
-    def _features(self, listener: Tensor, emitter: Tensor, path: Path, azimuth: Tensor) -> Tensor:
+    def _features(self, listener: Tensor, emitter: Tensor, path: Tensor, azimuth: Tensor) -> Tensor:
         """(B, feature) all features but those of the head, with the `azimuth` of the path at the listener."""
-        distance = torch.clamp(path.length, min=self._nearest_m)
-        visible = path.visible
+        length, visible, directions = torch.split(path, [1, 1, _PATH_DIRECTIONS], dim=-1)
+        distance = torch.clamp(length, min=self._nearest_m)
         ends = torch.minimum(torch.maximum(torch.stack([listener, emitter], dim=1), self._low), self._high)
-        scalars = torch.cat([torch.log(distance), 1 / (1 + distance), path.rise / distance], dim=-1)
+        scalars = torch.cat([torch.log(distance), 1 / (1 + distance), (emitter - listener)[:, 2:] / distance], dim=-1)
         return torch.cat(
             [
                 self._grid(ends).flatten(1),
@@ -121,7 +121,7 @@ class _Encoder(nn.Module):
                 scalars,
                 scalars * visible,
                 visible,
-                path.directions.flatten(1),
+                directions,
             ],
             dim=-1,
         )
@@ -141,19 +141,18 @@ class _Encoder(nn.Module):
 
 
 class PathEncoder(_Encoder):
-    """Encodes listener and emitter, without a head, as `size` features in world axes."""
+    """Encodes listener, emitter and path, without a head, as `size` features in world axes."""
 
     def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
         super().__init__(plan, shape, reach)
-        self.size = self(torch.zeros(1, 3), torch.ones(1, 3)).shape[-1]
+        self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1, DESCRIPTION)).shape[-1]
 
-    def forward(self, listener: Tensor, emitter: Tensor) -> Tensor:
-        path = self._propagation(listener, emitter)
-        return self._features(listener, emitter, path, self._multiples(path.directions[:, :1]))
+    def forward(self, listener: Tensor, emitter: Tensor, path: Tensor) -> Tensor:
+        return self._features(listener, emitter, path, self._multiples(_at_listener(path)))
 
 
 class PoseEncoder(_Encoder):
-    """Encodes listener, emitter and the yaw of the listener's head as `size` features."""
+    """Encodes listener, emitter, the yaw of the listener's head, and path as `size` features."""
 
     _yaw_multiples: Tensor
     _yaw_phases: Tensor
@@ -167,11 +166,15 @@ class PoseEncoder(_Encoder):
         self._keep("yaw_multiples", np.tile(np.arange(1, _YAW_HARMONICS + 1), 2))
         self._keep("yaw_phases", np.repeat([np.pi / 2, 0.0], _YAW_HARMONICS))
         self._keep("turns_back", turns_back)
-        self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1)).shape[-1]
+        self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1), torch.zeros(1, DESCRIPTION)).shape[-1]
 
-    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> Tensor:
-        path = self._propagation(listener, emitter)
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor, path: Tensor) -> Tensor:
         # Cosines are sines of angles a quarter turn ahead: this takes fewer nodes.
         heading = torch.sin(yaw[:, None] * self._yaw_multiples + self._yaw_phases)
-        towards = path.directions[:, :1] @ (heading @ self._turns_back).reshape(-1, 2, 2)
+        towards = _at_listener(path) @ (heading @ self._turns_back).reshape(-1, 2, 2)
         return torch.cat([self._features(listener, emitter, path, self._multiples(towards)), heading], dim=-1)
+
+
+def _at_listener(path: Tensor) -> Tensor:
+    """(B, 1, 2) the direction in plan in which paths leave the listener."""
+    return path[:, None, 2:4]

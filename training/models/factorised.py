@@ -86,8 +86,8 @@ class ExportedField(ExportedBasis):
         self._silence = float(np.log(cells.codec.log_floor))
         self._to_frames = torch.from_numpy(cells.all_frames.spread())
 
-    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
-        flat = self._flat(listener, emitter, yaw)
+    def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor, path: Tensor) -> tuple[Tensor, ...]:
+        flat = self._flat(listener, emitter, yaw, path)
         parts = torch.split(flat, [int(np.prod(shape)) for shape in self._shapes], dim=1)
         bins, bands, fine, *phasor = (part.reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True))
         spread = torch.cat([bins, self._bands @ bands], dim=2)
@@ -95,9 +95,9 @@ class ExportedField(ExportedBasis):
         log_magnitude = torch.clamp(torch.cat([fine, late], dim=-1), min=self._silence)
         return log_magnitude, *self._phase(*phasor), *interaural
 
-    def forward_all_frames(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
+    def forward_all_frames(self, listener: Tensor, emitter: Tensor, yaw: Tensor, path: Tensor) -> tuple[Tensor, ...]:
         """The same outputs, with time spread to every frame."""
-        log_magnitude, frequency, certainty, *interaural = self(listener, emitter, yaw)
+        log_magnitude, frequency, certainty, *interaural = self(listener, emitter, yaw, path)
         return log_magnitude @ self._to_frames, frequency, certainty, *(part @ self._to_frames for part in interaural)
 
     def _phase(self, real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,11 +1,14 @@
 """Where responses were measured: the geometry that a field is given before training."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import FloorPlan
+from server.acoustics.sound_path import SoundPathFinder
+from training.data.dataset import SPEED_OF_SOUND
 from training.data.responses import ResponseSet
 from training.simulation.responses import SimulatedResponses
 
@@ -48,6 +51,14 @@ class Site:
     yaws: npt.NDArray[np.float64]
     listener_axes: tuple[int, ...]
     emitter_axes: tuple[int, ...]
+
+    @cached_property
+    def _finder(self) -> SoundPathFinder:
+        return SoundPathFinder(self.plan, SPEED_OF_SOUND)
+
+    def paths(self, listeners: npt.NDArray[np.floating], emitters: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+        """Describe the shortest paths of pairs, (B, 3) and (B, 3), as a field is told of them."""
+        return self._finder.describe(listeners, emitters).described
 
     @classmethod
     def of(cls, responses: ResponseSet) -> "Site":

@@ -4,7 +4,7 @@ import numpy as np
 
 from server.planning.between_ears import LATERAL_ILD_DB, delay_s
 from server.planning.change import UNCHANGED, Change, in_jnd, most
-from server.planning.cost import Cost, Measured
+from server.planning.cost import NOTHING, Cost, Measured
 from server.planning.effect import RESPONSES, SharedEffect
 from server.planning.prediction import ALL_ON, Prediction
 from server.planning.reasons import no_head
@@ -19,7 +19,7 @@ _EAR_GAIN = 3.0
 def _change(prediction: Prediction) -> Change:
     """Return the change if responses keep one orientation while the head turns."""
     listener = prediction.listener
-    if not listener.turns or listener.output != "headphones":
+    if not listener.turns_responses:
         return UNCHANGED
     if prediction.place.holds_direct_sound:
         between_s = delay_s(1.0, prediction.place.speed_of_sound)
@@ -40,12 +40,17 @@ def _change(prediction: Prediction) -> Change:
 
 
 def _absence(situation: Situation, _: Emitter | None) -> str:
-    return no_head(situation.listener) or ("" if situation.listener.turns else "the head keeps still")
+    listener = situation.listener
+    if listener.output == "headphones" and listener.bus is not None:
+        return "a bus turns the reflected sound with the head, without new responses"
+    return no_head(listener) or ("" if listener.turns else "the head keeps still")
 
 
 def _responses(measured: Measured) -> Cost:
-    """Return the cost of responses while only the head turns. A listener who walks needs new responses in any case, and
-    they follow the head too."""
+    """Return the cost of responses while only the head turns: none with a bus. A listener who walks needs new responses
+    in any case, and they follow the head too."""
+    if measured.has_bus:
+        return NOTHING
     each_us, first_us = measured.response_us
     return Cost(turning_us=each_us, turning_first_us=first_us)
 

@@ -19,11 +19,10 @@ def _change(prediction: Prediction, number: int) -> Change:
     speed_m_s = listener.speed_m_s + emitter.speed_m_s
     mine = prediction.reach.paths.length_m[prediction.reach.owner == number]
     shift_ms = 1e3 * float(np.ptp(mine)) / place.speed_of_sound if speed_m_s else 0.0
-    turns = listener.turns and listener.output == "headphones"
     return most(
         in_jnd("pitch", 100 * speed_m_s / place.speed_of_sound),
         in_jnd("onset", shift_ms),
-        in_jnd("itd", 2e6 * delay_s(1.0, place.speed_of_sound) if turns else 0.0),
+        in_jnd("itd", 2e6 * delay_s(1.0, place.speed_of_sound) if listener.hears_turns else 0.0),
     )
 
 

@@ -11,6 +11,7 @@ from server.acoustics.geometry import Quaternion
 from server.field.fields_by_level import FieldsByLevel
 from server.field.runtime import open_session
 from server.responses.full_response import FullResponse
+from tests.training.told_paths import in_tiny
 from training.bundling.export import ExportError, export
 from training.learning.runs import Configuration, DirectionalRecipe
 from training.learning.train import load_learner, train
@@ -41,10 +42,8 @@ def alone(dataset, directional_run, tmp_path_factory):
 
 def places(count):
     rng = np.random.default_rng(1)
-    return {
-        name: rng.uniform((0.4, 0.4, 1.2), (3.6, 2.6, 1.8), (count, 3)).astype(np.float32)
-        for name in ("listener", "emitter")
-    }
+    ends = [rng.uniform((0.4, 0.4, 1.2), (3.6, 2.6, 1.8), (count, 3)).astype(np.float32) for _ in range(2)]
+    return dict(zip(("listener", "emitter", "path"), (*ends, in_tiny(*ends)), strict=True))
 
 
 def test_the_manifest_says_what_it_predicts(alone, dataset):
@@ -66,7 +65,7 @@ def test_the_graph_computes_what_torch_does(alone, dataset, directional_run):
         expected = ExportedDirections(learner.field, learner.cells)(*map(torch.from_numpy, given.values()))
     for name, tolerance in (("directional", 0.03), ("directional-r16-int8", 0.5)):
         session = open_session(alone.models[f"{name}.onnx"])
-        assert [each.name for each in session.get_inputs()] == ["listener", "emitter"]
+        assert [each.name for each in session.get_inputs()] == ["listener", "emitter", "path"]
         found = session.run(["log_magnitude", "directions"], given)
         for values, true in zip(found, expected, strict=True):
             assert values.shape == tuple(true.shape)

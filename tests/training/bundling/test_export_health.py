@@ -32,7 +32,7 @@ def test_a_field_that_breaks_a_law_is_refused_and_nothing_is_written(
         return learner
 
     monkeypatch.setattr(export_module, "load_learner", ill)
-    monkeypatch.setattr(export_module, "_check", lambda *_: None)  # the graph does what the field does
+    monkeypatch.setattr(export_module, "_check", lambda *_, **__: None)  # the graph does what the field does
     with pytest.raises(error, match=problem):
         export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
@@ -50,7 +50,7 @@ def _rising(responses, folder):
 
 def test_a_broken_law_may_be_accepted_with_a_reason_that_the_bundle_keeps(dataset, run, tmp_path, monkeypatch):
     monkeypatch.setattr(export_module, "load_learner", _rising)
-    monkeypatch.setattr(export_module, "_check", lambda *_: None)
+    monkeypatch.setattr(export_module, "_check", lambda *_, **__: None)
     with pytest.raises(HealthError, match=r"rise within 60 dB of decay.*--accept decay='why'"):
         export(SimulatedResponses(dataset), [run], tmp_path / "refused")
     reasons = {"decay": "the room has an echo", "peak": "not broken at all"}
@@ -84,7 +84,7 @@ def test_a_field_is_checked_before_its_noise_is_chosen(dataset, run, tmp_path, m
         raise AssertionError("noise was chosen for a field that is refused")
 
     monkeypatch.setattr(export_module, "load_learner", _rising)
-    monkeypatch.setattr(export_module, "_check", lambda *_: None)
+    monkeypatch.setattr(export_module, "_check", lambda *_, **__: None)
     monkeypatch.setattr(export_module, "choose_noise", choose)
     with pytest.raises(HealthError):
         export(SimulatedResponses(dataset), [run], tmp_path / "bundle")

@@ -24,7 +24,7 @@ class Oracle(torch.nn.Module):
         super().__init__()
         self._codec = cells.codec
 
-    def forward_all_frames(self, listener, emitter, yaw):
+    def forward_all_frames(self, listener, emitter, yaw, path):  # noqa: ARG002  it looks poses up
         responses, found = self.responses, []
         for pose in zip(listener.numpy(), emitter.numpy(), yaw.numpy(), strict=True):
             asked = np.concatenate([pose[0], pose[1], [pose[2]]])

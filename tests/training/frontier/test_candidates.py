@@ -16,9 +16,10 @@ def bundle(tmp_path):
 
 def test_directions_are_measured_at_each_order_with_both_tails(bundle, tmp_path):
     levels = candidates(bundle, ["none"])
-    assert {(level.order, level.tail) for level in levels} == {
+    assert {(level.order, level.tail) for level in levels if level.bus is None} == {
         (order, tail) for order in (None, 0, 1) for tail in ("stft", "bands")
     }
+    assert [level.bus for level in levels if level.bus] == [1, 2, 3]
     assert len({level.name for level in levels}) == len(levels)
     files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
     offered = bundle.manifest.model_copy(update={"levels": tuple(levels)})

@@ -47,9 +47,10 @@ def test_rows_have_the_places_and_target_of_their_pair(dataset, directional):
     learner.prepare(SILENT)
     rows = np.flatnonzero(~responses.held_out)
     chosen = np.array([7, 2, len(rows) - 1])
-    (listener, emitter), (flat,) = learner.batch(chosen, None)
+    (listener, emitter, path), (flat,) = learner.batch(chosen, None)
     np.testing.assert_allclose(listener, responses.listener[rows[chosen]], atol=1e-5)
     np.testing.assert_allclose(emitter, responses.emitter[rows[chosen]], atol=1e-5)
+    np.testing.assert_array_equal(path, learner.site.paths(listener.numpy(), emitter.numpy()))
     assert flat.shape == (3, learner.field.heads.size)
     per_pair = len(dataset.yaws)
     shares = learner.field.heads.slices["directions"]

@@ -57,9 +57,9 @@ def test_what_a_microphone_heard_is_learned(measured, mono_run):
     learner = load_learner(measured, mono_run)
     rows = np.flatnonzero(measured.held_out)
     field = ExportedField(learner.field, learner.cells).eval()
-    poses = (
-        torch.from_numpy(part[rows].astype(np.float32)) for part in (measured.listener, measured.emitter, measured.yaw)
-    )
+    paths = learner.site.paths(measured.listener[rows], measured.emitter[rows])
+    given = (measured.listener[rows], measured.emitter[rows], measured.yaw[rows], paths)
+    poses = (torch.from_numpy(part.astype(np.float32)) for part in given)
     with torch.no_grad():
         log_magnitude, frequency, certainty = (output.numpy() for output in field.forward_all_frames(*poses))
     codec = learner.cells.codec
@@ -90,7 +90,7 @@ def test_swapping_shows_every_response_with_its_ends_exchanged_half_of_the_time(
     learner = FactorisedLearner(measured, Configuration.read(mono_run))
     learner.prepare(SILENT)
     rows = np.arange(len(learner.targets.yaw))
-    (listener, emitter, _), (flat, _) = learner.batch(rows, np.random.default_rng(0))
+    (listener, emitter, *_), (flat, _) = learner.batch(rows, np.random.default_rng(0))
     swapped = np.array([not np.allclose(a, b) for a, b in zip(listener, learner.targets.listener[rows], strict=True)])
     assert 0.3 < swapped.mean() < 0.7
     np.testing.assert_allclose(emitter[swapped], learner.targets.listener[rows][swapped])

@@ -89,14 +89,19 @@ def test_the_loss_falls(run, configuration):
     assert np.mean(training[-3:]) < 0.8 * np.mean(training[:3])
 
 
+def told(learner, targets):
+    """Poses of a field's targets as its inputs."""
+    paths = learner.site.paths(targets.listener, targets.emitter)
+    return [torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw, paths)]
+
+
 def test_learning_beats_the_mean_of_all_poses(dataset, run, tmp_path):
     learner = trained(dataset, run)
     field, responses = learner.field, SimulatedResponses(dataset)
     targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True), expected=True)
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
-        poses = (torch.from_numpy(part) for part in (targets.listener, targets.emitter, targets.yaw))
-        predicted = field.in_physical_units(field(*poses))
+        predicted = field.in_physical_units(field(*told(learner, targets)))
     for name in ("fine", "phasor"):
         part = field.heads.slices[name]
         error = (predicted - flat)[:, part].square().mean()
@@ -118,7 +123,7 @@ def test_corrected_levels_carry_the_power_of_the_training_set(dataset, configura
     targets = load_targets(responses, learner.cells, tmp_path, Progress(disable=True))
     flat = torch.from_numpy(np.asarray(targets.flat, dtype=np.float32))
     with torch.no_grad():
-        features = field.encoder(*map(torch.from_numpy, (targets.listener, targets.emitter, targets.yaw)))
+        features = field.encoder(*told(learner, targets))
         predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
         correction = field.level_correction[field.encoder.sight(features)[:, 0].long()]
     levels, part = field.heads.levels, field.heads.slices["late"]

@@ -4,6 +4,7 @@ import torch
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
+from tests.training.told_paths import told_paths
 from training.models.cells import Cells
 from training.models.directional import DirectionalField, ExportedDirections
 from training.models.encoders import FieldShape
@@ -21,9 +22,10 @@ def made(order=2):
 
 def places(count, seed=0):
     rng = np.random.default_rng(seed)
-    return [
+    ends = [
         torch.from_numpy(rng.uniform((0.3, 0.3, 1), (1.7, 4.7, 2), (count, 3)).astype(np.float32)) for _ in range(2)
     ]
+    return [*ends, told_paths(PLAN, *ends)]
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
@@ -61,7 +63,7 @@ def test_no_feature_is_that_of_a_head():
     rng = np.random.default_rng(2)
     ends = [torch.from_numpy(rng.uniform((0.1, 0.1, 1), (5.9, 1.9, 2), (300, 3)).astype(np.float32)) for _ in range(2)]
     ends[0][:150, :2] = ends[0][:150, [1, 0]]
-    features = made().encoder(*ends).detach()
+    features = made().encoder(*ends, told_paths(PLAN, *ends)).detach()
     assert (features.std(dim=0) > 1e-6).all()
 
 
@@ -69,14 +71,15 @@ def test_sight_is_found_among_the_features():
     field = made()
     listener = torch.tensor([[1.0, 4.5, 1.5], [1.0, 4.5, 1.5]])
     emitter = torch.tensor([[5.0, 1.0, 1.5], [1.0, 1.0, 1.5]])  # round the corner, and in sight
-    sight = field.encoder.sight(field.encoder(listener, emitter)).flatten().tolist()
+    path = told_paths(PLAN, listener, emitter)
+    sight = field.encoder.sight(field.encoder(listener, emitter, path)).flatten().tolist()
     assert sight == pytest.approx([0.0, 1.0], abs=1e-4)
     with torch.no_grad():
         field.level_correction[0, field.heads.levels] = 0.5
-    corrected, _ = ExportedDirections(field, CELLS)(listener, emitter)
+    corrected, _ = ExportedDirections(field, CELLS)(listener, emitter, path)
     with torch.no_grad():
         field.level_correction.zero_()
-    plain, _ = ExportedDirections(field, CELLS)(listener, emitter)
+    plain, _ = ExportedDirections(field, CELLS)(listener, emitter, path)
     torch.testing.assert_close((corrected - plain)[:, 0, 0], torch.tensor([0.5, 0.0]), rtol=0, atol=1e-4)
 
 

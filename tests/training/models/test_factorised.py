@@ -4,8 +4,9 @@ import torch
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
+from tests.training.told_paths import told_paths
 from training.models.cells import Cells
-from training.models.encoders import GEOMETRY, FeatureGrid, FieldShape, PoseEncoder
+from training.models.encoders import FeatureGrid, FieldShape, PoseEncoder
 from training.models.factorised import ExportedField, FactorisedField, Heads
 from training.models.site import Reach
 
@@ -22,8 +23,9 @@ def field():
 
 def poses(count, seed=0):
     rng = np.random.default_rng(seed)
-    ends = (rng.uniform((0.3, 0.3, 1), (1.7, 4.7, 2), (count, 3)) for _ in range(2))
-    return [torch.from_numpy(array.astype(np.float32)) for array in (*ends, rng.uniform(-3, 3, count))]
+    ends = [rng.uniform((0.3, 0.3, 1), (1.7, 4.7, 2), (count, 3)) for _ in range(2)]
+    given = [torch.from_numpy(array.astype(np.float32)) for array in (*ends, rng.uniform(-3, 3, count))]
+    return [*given, told_paths(PLAN, *given[:2])]
 
 
 def test_heads_tile_the_output():
@@ -53,9 +55,9 @@ def test_the_grid_reads_mostly_its_nearest_node():
 
 
 def test_turning_by_a_full_turn_changes_nothing(field):
-    listener, emitter, yaw = poses(20)
+    listener, emitter, yaw, path = poses(20)
     torch.testing.assert_close(
-        field(listener, emitter, yaw + 2 * np.pi), field(listener, emitter, yaw), atol=1e-4, rtol=0
+        field(listener, emitter, yaw + 2 * np.pi, path), field(listener, emitter, yaw, path), atol=1e-4, rtol=0
     )
 
 
@@ -65,7 +67,7 @@ def test_the_head_meets_the_azimuth_it_turned_to():
     listener = torch.tensor([[1.0, 1.0, 1.5]]).repeat(3, 1)
     angle = torch.tensor([0.0, 0.5, 1.2])
     emitter = listener + torch.stack([0.8 * torch.cos(angle), 0.8 * torch.sin(angle), torch.zeros(3)], dim=-1)
-    features = encoder(listener, emitter, angle)
+    features = encoder(listener, emitter, angle, told_paths(PLAN, listener, emitter))
     start = 2 * SHAPE.grid_features + 2 * encoder._waves(listener).shape[-1]
     azimuth = features[:, start : start + 10]
     torch.testing.assert_close(azimuth, torch.tensor([[1.0] * 5 + [0.0] * 5]).repeat(3, 1), atol=2e-3, rtol=0)
@@ -79,7 +81,11 @@ def test_what_was_not_learned_is_what_was_learned_next_to_it():
     yaw = torch.zeros(1)
 
     def coefficients(listener, emitter):
-        return field.coefficients(torch.tensor([listener]), torch.tensor([emitter]), yaw)
+        return field.coefficients(*pose(listener, emitter))
+
+    def pose(listener, emitter):
+        ends = torch.tensor([listener]), torch.tensor([emitter])
+        return *ends, yaw, told_paths(PLAN, *ends)
 
     inside = coefficients((0.4, 0.4, 1.5), (0.4, 3.0, 1.5))
     # Moved along with each other, so that neither direction nor distance is another.
@@ -87,16 +93,16 @@ def test_what_was_not_learned_is_what_was_learned_next_to_it():
     torch.testing.assert_close(
         coefficients((0.4, 0.4, 0.6), (0.4, 3.0, 0.6)), coefficients((0.4, 0.4, 1.1), (0.4, 3.0, 1.1))
     )
-    at_most = field.encoder(torch.tensor([[1.0, 1.0, 1.5]]), torch.tensor([[1.7, 1.0, 1.5]]), yaw)
-    nearer = field.encoder(torch.tensor([[1.0, 1.0, 1.5]]), torch.tensor([[1.1, 1.0, 1.5]]), yaw)
+    at_most = field.encoder(*pose((1.0, 1.0, 1.5), (1.7, 1.0, 1.5)))
+    nearer = field.encoder(*pose((1.0, 1.0, 1.5), (1.1, 1.0, 1.5)))
     places = 2 * SHAPE.grid_features + 2 * field.encoder._waves(torch.zeros(1, 3)).shape[-1]
     torch.testing.assert_close(nearer[:, places:], at_most[:, places:], atol=1e-2, rtol=0)
 
 
 def test_neighbours_have_similar_outputs(field):
-    listener, emitter, yaw = poses(50)
-    near = field(listener + 1e-4, emitter, yaw)
-    assert (near - field(listener, emitter, yaw)).abs().max() < 0.05
+    listener, emitter, yaw, path = poses(50)
+    near = field(listener + 1e-4, emitter, yaw, told_paths(PLAN, listener + 1e-4, emitter))
+    assert (near - field(listener, emitter, yaw, path)).abs().max() < 0.05
 
 
 def test_phase_is_coded_as_the_codec_does(field):
@@ -130,21 +136,14 @@ def test_of_nothing_the_phase_is_finite(field):
     assert certainty.max() == 0
 
 
-def test_what_is_kept_exact_by_name_is_there(field):
-    kept = {
-        name.split(".")[-1] for name, _ in ExportedField(field, CELLS).named_buffers() if GEOMETRY in name.split(".")
-    }
-    assert {"_of_place", "_bends", "_corners"} <= kept
-
-
 def test_geometry_is_exact_where_training_is_not(field):
-    """Few digits for products of weights are enough; a path's length and whether a wall is in its way are not."""
-    listener, emitter, yaw = poses(200)
-    plain = field.encoder(listener, emitter, yaw)
+    """Few digits for products of weights are enough; for places and a path's length they are not."""
+    given = poses(200)
+    plain = field.encoder(*given)
     seen = []
     handle = field.encoder.register_forward_hook(lambda _, __, features: seen.append(features))
     with torch.autocast("cpu", torch.bfloat16):
-        field.coefficients(listener, emitter, yaw)
+        field.coefficients(*given)
     handle.remove()
     torch.testing.assert_close(seen[0], plain)
 
@@ -187,14 +186,12 @@ def test_levels_are_corrected_by_what_pairs_of_their_kind_lack(field):
         field.level_correction[:] = torch.tensor([[0.5], [-0.25]])
     listener = torch.tensor([[1.0, 4.5, 1.5], [1.0, 4.5, 1.5]])
     emitter = torch.tensor([[5.0, 1.0, 1.5], [1.0, 1.0, 1.5]])  # round the corner, and in sight
-    yaw = torch.zeros(2)
-    assert field.encoder.sight(field.encoder(listener, emitter, yaw)).flatten().tolist() == pytest.approx(
-        [0.0, 1.0], abs=1e-4
-    )
-    corrected, *_ = ExportedField(field, CELLS)(listener, emitter, yaw)
+    pose = (listener, emitter, torch.zeros(2), told_paths(PLAN, listener, emitter))
+    assert field.encoder.sight(field.encoder(*pose)).flatten().tolist() == pytest.approx([0.0, 1.0], abs=1e-4)
+    corrected, *_ = ExportedField(field, CELLS)(*pose)
     with torch.no_grad():
         field.level_correction.zero_()
-    plain, *_ = ExportedField(field, CELLS)(listener, emitter, yaw)
+    plain, *_ = ExportedField(field, CELLS)(*pose)
     torch.testing.assert_close(
         corrected - plain, torch.tensor([0.5, -0.25])[:, None, None, None].expand_as(plain), rtol=0, atol=1e-4
     )
