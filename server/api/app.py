@@ -31,6 +31,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.effect_costs import measure_costs
 from server.planning.places import place_of_field
 from server.protocol.client_messages import AUTO, PROTOCOL, AddEmitter, BlockSize, Hello, ListenerPose
+from server.rendering.head_decoder import ORDERS, HeadDecoder
 from server.rendering.warm_up import compile_rendering, warm_up
 from server.responses.ir_request import compute_irs
 from server.runtime.drain import Drain
@@ -155,10 +156,27 @@ async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:
     duty_cycle = DutyCycle(_COSTS_SHARE)
     try:
         await run_in_own_thread(partial(_measure_effects, host, duty_cycle), "nafir-costs")
-    except Exception:  # plans go on without costs
-        _logger.exception("what effects cost could not be measured: plans do not say")
+        await run_in_own_thread(partial(_prepare_decoders, host, duty_cycle), "nafir-decoders")
+    except Exception:  # plans go on without costs, and streams make decoders when they need them
+        _logger.exception("what effects cost, or decoders of heads, could not be computed: plans may not say costs")
     finally:
         duty_cycle.call_off()
+
+
+def _prepare_decoders(host: StreamHost, duty_cycle: DutyCycle) -> None:
+    """Design the decoders by which each head hears buses, and pages the reverberation of scenes that know directions.
+    Without this the first stream or page to need one would wait for a second."""
+    become_background()
+    for levels in host.scenes.values():
+        orders = {*levels.buses}
+        if levels.bundle.manifest.fields and any(levels[name].knows_directions for name in levels):
+            orders.add(ORDERS[0])
+        for head in host.hrtfs.names:
+            for order in sorted(orders):
+                try:
+                    HeadDecoder.of(host.hrtfs.filters(head, levels.default.sample_rate), order, rest=duty_cycle.rest)
+                except CancelledError:  # the server shuts down
+                    return
 
 
 def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:

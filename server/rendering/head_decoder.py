@@ -14,6 +14,7 @@ that the cut ones have (alternating projections, as in Griffin and Lim's method)
 Channels are ACN and SN3D (`server.acoustics.spherical_harmonics`), in the head's frame: x ahead, y left, z up.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -54,8 +55,9 @@ class HeadDecoder:
     delay: int
 
     @classmethod
-    def of(cls, filters: HeadFilters, order: int) -> "HeadDecoder":
-        """Design the filters of a head, half a second of work; for the same head they are kept.
+    def of(cls, filters: HeadFilters, order: int, *, rest: Callable[[], None] = lambda: None) -> "HeadDecoder":
+        """Design the filters of a head, half a second of work; for the same head they are kept. Meanwhile `rest` is
+        called often: it may sleep, or raise what ends the work.
 
         Raises ValueError for an order that is none of ORDERS.
         """
@@ -63,14 +65,14 @@ class HeadDecoder:
             raise ValueError(f"order: is {order}, must be 1, 2 or 3")
         kept = _KEPT.setdefault(filters, {})
         if order not in kept:
-            kept[order] = cls(order, filters.sample_rate, *_design(filters, order))
+            kept[order] = cls(order, filters.sample_rate, *_design(filters, order, rest))
         return kept[order]
 
 
 _KEPT: "WeakKeyDictionary[HeadFilters, dict[int, HeadDecoder]]" = WeakKeyDictionary()
 
 
-def _design(filters: HeadFilters, order: int) -> tuple[npt.NDArray[np.float32], int]:
+def _design(filters: HeadFilters, order: int, rest: Callable[[], None]) -> tuple[npt.NDArray[np.float32], int]:
     """Filters (ear, k, tap), and their delay in samples."""
     rate = filters.sample_rate
     delay, taps = round(_DELAY_S * rate), round(_LENGTH_S * rate)
@@ -85,8 +87,9 @@ def _design(filters: HeadFilters, order: int) -> tuple[npt.NDArray[np.float32], 
     waves = np.moveaxis(wave_spectra(filters, directions, _BINS), -1, 0)
     is_free = _share(frequencies, _FITS_PHASE_BELOW_HZ, _FITS_MAGNITUDE_FROM_HZ)
     is_mixed = _share(frequencies, order * _DIFFUSE_FROM_HZ, order * _DIFFUSE_FULLY_FROM_HZ)
-    fitted = _from_low_to_high(waves, harmonics, inverse, is_free)
+    fitted = _from_low_to_high(waves, harmonics, inverse, is_free, rest)
     for _ in range(_ROUNDS):
+        rest()
         fitted += is_mixed * (_with_diffuse_field(fitted, waves, mean_squares(order)) - fitted)
         late_ones = fitted * late
         late_ones[[0, -1]] = late_ones[[0, -1]].real
@@ -108,7 +111,9 @@ def _window(delay: int, taps: int) -> _Floats:
     return window
 
 
-def _from_low_to_high(waves: _Complex, harmonics: _Floats, inverse: _Floats, is_free: _Floats) -> _Complex:
+def _from_low_to_high(
+    waves: _Complex, harmonics: _Floats, inverse: _Floats, is_free: _Floats, rest: Callable[[], None]
+) -> _Complex:
     """(bin, ear, k) filters that fit waves (bin, direction, ear). A free phase is the one that the filters of the bin
     before make."""
     fitted = np.empty((len(waves), waves.shape[-1], harmonics.shape[1]), dtype=np.complex128)
@@ -116,6 +121,7 @@ def _from_low_to_high(waves: _Complex, harmonics: _Floats, inverse: _Floats, is_
     for number, wave in enumerate(waves):
         fitted[number] = _least_squares(inverse, _with_free_phase(wave, before, is_free[number]))
         before = harmonics @ fitted[number].T
+        rest()
     return fitted
 
 

@@ -21,6 +21,7 @@ import { Walking } from "./walking.js";
 import { World } from "./world.js";
 
 const ORDER = 1; // of ambisonic streams
+const NO_FIELD = "none";
 const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
 const LONGEST_RETRY_MS = 30_000;
@@ -143,6 +144,8 @@ class Page {
     this.clips = clips;
     this.world = new World(scene, { mostEmitters });
     this.turning.directionalLevels = scene.directional_levels ?? [];
+    // Where nothing reverberates, all that is heard is the direct sound. It is sharper through the filters of the head itself.
+    if (scene.levels.every(({ field }) => field === NO_FIELD)) this.turning.usual = "server";
     this.panel.turnsHere = this.turning.isHere;
     this.#turnHead();
     if (clips.length > 0) this.world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });

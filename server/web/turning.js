@@ -8,6 +8,7 @@ const NO_HEAD = "One loudspeaker is the same wherever the head looks.";
 export class Turning extends EventTarget {
   #choice;
   #wish = "browser";
+  #isChosen = false;
   #levels = []; // of the scene, those that know directions
   #level = "auto";
   #isUsed = true;
@@ -19,6 +20,7 @@ export class Turning extends EventTarget {
     this.#wish = choice.value;
     choice.addEventListener("change", () => {
       this.#wish = choice.value;
+      this.#isChosen = true;
       this.dispatchEvent(new Event("chosen"));
     });
   }
@@ -26,6 +28,12 @@ export class Turning extends EventTarget {
   /** Whether the browser is to turn the sound. */
   get isHere() {
     return this.#choice.value === "browser" && this.#isUsed;
+  }
+
+  /** Where sound is turned until someone chooses: "browser" or "server". */
+  set usual(where) {
+    if (!this.#isChosen) this.#wish = where;
+    this.#show();
   }
 
   /** Takes the names of the levels that know from where sound arrives. */

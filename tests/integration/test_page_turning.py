@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from server.scene.bundle import BUNDLED
 from tests import visitor
 from tests.directional_flat import write_directional
 from tests.visitor import free_port, level_db, listen, open_page, serving, start
@@ -17,10 +18,10 @@ pytestmark = visitor.needs_browser
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory) -> Iterator[str]:
-    """A server whose scene `flat` knows directions, at the page of that scene."""
+    """A server whose scene `flat` knows directions, at the page of that scene; it has the open field too."""
     folder = tmp_path_factory.mktemp("scenes") / "flat"
     write_directional(folder)
-    with serving(free_port(), "--bundle", str(folder)) as url:
+    with serving(free_port(), "--bundle", str(folder), "--bundle", str(BUNDLED / "open-field")) as url:
         yield f"{url}/?scene=flat"
 
 
@@ -128,3 +129,12 @@ def test_without_the_filters_of_the_head_the_server_turns(browser, server):
     page.evaluate(f"nafir.setListener({{ yaw: {math.pi} }})")
     assert np.all(level_db(listen(page)) > -70)
     context.close()
+
+
+def test_without_a_field_two_ears_are_heard_until_the_browser_is_chosen(browser, server):
+    with visitor.visit(browser, server.replace("scene=flat", "scene=open-field")) as page:
+        assert page.eval_on_selector("#turning", "menu => [menu.value, menu.disabled]") == ["server", False]
+        start(page)
+        assert page.evaluate("nafir.state().output") == "headphones"
+        page.select_option("#turning", "browser")
+        page.wait_for_function("nafir.state().output === 'ambisonics' && nafir.state().connection === 'live'")
