@@ -49,7 +49,7 @@ class SoundPaths:
 
 
 DESCRIPTION = 6
-"""Numbers that describe a path."""
+"""How many numbers describe a path."""
 
 
 @dataclass(frozen=True)

@@ -223,12 +223,13 @@ def describe_paths(
 
 @compiled
 def _is_elsewhere(one: Floats, other: Floats) -> bool:
+    """Whether two points differ in plan."""
     return bool(one[0] != other[0] or one[1] != other[1])
 
 
 @compiled
 def _point(start: Floats, end: Floats, direction: Float32) -> None:
-    """Write the unit vector in plan, shorter within a millimetre of the end."""
+    """Write the unit vector in plan from `start` to `end`; within a millimetre it shrinks to nothing."""
     x, y = end[0] - start[0], end[1] - start[1]
     scale = 1.0 / (math.hypot(x, y) + SOFTENED_M)
     direction[0], direction[1] = x * scale, y * scale

@@ -51,6 +51,8 @@ _CALIBRATION_POSES = 3
 _COSTS_AFTER_S = 5.0
 _COSTS_SHARE = 0.05
 """Share of a core that the measurement of effects' costs may take."""
+_PAGE_ORDER = ORDERS[0]
+"""The order of the ambisonics that the page asks for."""
 WEB = Path(__file__).parents[1] / "web"
 
 _logger = logging.getLogger(__name__)
@@ -154,11 +156,16 @@ async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:
     # Nothing waits for these measurements, so clients that already wait are served first.
     await asyncio.sleep(_COSTS_AFTER_S)
     duty_cycle = DutyCycle(_COSTS_SHARE)
+    later = (
+        (_measure_effects, "nafir-costs", "what effects cost could not be measured: plans do not say"),
+        (_prepare_decoders, "nafir-decoders", "decoders of heads are not prepared: the first to need one waits for it"),
+    )
     try:
-        await run_in_own_thread(partial(_measure_effects, host, duty_cycle), "nafir-costs")
-        await run_in_own_thread(partial(_prepare_decoders, host, duty_cycle), "nafir-decoders")
-    except Exception:  # plans go on without costs, and streams make decoders when they need them
-        _logger.exception("what effects cost, or decoders of heads, could not be computed: plans may not say costs")
+        for work, thread, failure in later:
+            try:
+                await run_in_own_thread(partial(work, host, duty_cycle), thread)
+            except Exception:  # the server serves without either
+                _logger.exception(failure)
     finally:
         duty_cycle.call_off()
 
@@ -169,8 +176,8 @@ def _prepare_decoders(host: StreamHost, duty_cycle: DutyCycle) -> None:
     become_background()
     for levels in host.scenes.values():
         orders = {*levels.buses}
-        if levels.bundle.manifest.fields and any(levels[name].knows_directions for name in levels):
-            orders.add(ORDERS[0])
+        if levels.bundle.manifest.fields and levels.knows_directions:
+            orders.add(_PAGE_ORDER)
         for head in host.hrtfs.names:
             for order in sorted(orders):
                 try:
@@ -207,6 +214,8 @@ def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
         offer = host.offers[scene] = Offer(
             tuple(levels[name].level for name in levels.names), calibrate(levels, filters, _CALIBRATION_POSES)
         )
+        if levels.knows_directions:
+            host.measure_ambisonics(scene, levels.with_directions(), _PAGE_ORDER)
         clips = clips_of[scene]
         hello = Hello(protocol=PROTOCOL, scene=scene)
         (best, *_) = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)

@@ -16,6 +16,7 @@ from types import TracebackType
 
 from server.field.fields_by_level import FieldsByLevel
 from server.kernels.compiled import functions_compiled, is_kept
+from server.rendering.head_decoder import ORDERS
 from server.rendering.hrtf import kemar
 from server.rendering.output_kernel import mix_listeners
 from server.responses.impulse_response import ImpulseResponse, IrQuery
@@ -81,12 +82,16 @@ async def tell_while_compiling() -> None:
 
 
 def _compile(folder: Path) -> None:
-    """Compute responses of a bundle, at its default level and at each for rendering, so that the code is on disk."""
+    """Compute responses of a bundle, at its default level and at each for rendering, in ears and in ambisonics, so that
+    the code is on disk."""
     levels = FieldsByLevel.load(Bundle.load(folder))
     field = levels.default
     start = field.bundle.manifest.start
     ImpulseResponse.compute(field, IrQuery(start.listener, start.emitter))
-    calibrate(levels, kemar(field.sample_rate), poses=1)
+    filters = kemar(field.sample_rate)
+    calibrate(levels, filters, poses=1)
+    if levels.knows_directions:
+        calibrate(levels.with_directions(), filters, poses=1, order=ORDERS[0])
 
 
 if __name__ == "__main__":

@@ -81,6 +81,11 @@ class FieldsByLevel(Mapping[str, AcousticField]):
         """The orders of the levels whose reflected sound is heard by a bus."""
         return sorted(order for order in self.by_bus if order is not None)
 
+    @property
+    def knows_directions(self) -> bool:
+        """Whether the field of any level knows from where sound arrives."""
+        return any(field.knows_directions for field in self._fields.values())
+
     def with_directions(self, chosen: str | None = None) -> "FieldsByLevel":
         """Those levels whose fields know from where sound arrives. Raises RequestError `no_directions` if there are
         none, or if the `chosen` level is not among them."""

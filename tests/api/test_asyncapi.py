@@ -289,7 +289,7 @@ def codes_refused_with():
     for path in SERVER.rglob("*.py"):
         if path.name in ELSEWHERE:
             continue
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(ast.parse(path.read_bytes())):
             match node:
                 case ast.Call(func=ast.Name(id="RequestError"), args=[code, *_]):
                     yield code

@@ -11,6 +11,7 @@ from server.api import first_start
 from server.api.first_start import CompilingProcess, tell_while_compiling
 from server.responses.impulse_response import ImpulseResponse
 from server.scene.bundle import Bundle, find_bundle
+from tests.directional_flat import write_directional
 
 
 @pytest.fixture
@@ -49,6 +50,20 @@ def test_the_other_process_computes_a_whole_response_of_the_bundle_and_prepares_
     assert response.scene == field.bundle.id
     assert np.abs(response.samples).max() > 0
     assert [set(times_ms) for times_ms in prepared] == [{level.name for level in field.bundle.manifest.levels}]
+
+
+def test_where_directions_are_known_the_other_process_prepares_ambisonics_too(tmp_path, monkeypatch):
+    """The page asks for them, and its first sound would wait for seconds."""
+    bundle = write_directional(tmp_path / "flat")
+    prepared, calibrate = {}, first_start.calibrate
+
+    def counted(*asked, order=None, **more):
+        prepared[order] = calibrate(*asked, order=order, **more)
+
+    monkeypatch.setattr(first_start, "calibrate", counted)
+    first_start._compile(bundle.folder)
+    assert set(prepared) == {None, 1}
+    assert set(prepared[1]) == {level.name for level in bundle.manifest.levels}
 
 
 @pytest.mark.parametrize(("cores", "is_kept"), [(1, False), (2, True)])

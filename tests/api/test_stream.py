@@ -149,6 +149,16 @@ def test_integer_samples_and_other_block_sizes_are_negotiated(client):
         assert 0.001 < np.abs(ears.until_sound().samples).max() <= 1
 
 
+def test_a_server_that_is_ready_has_measured_what_the_page_asks_for(client_of_directions, monkeypatch):
+    """Its first sound waits for no calibration of ambisonics."""
+    from server.api import connection
+
+    monkeypatch.setattr(connection, "calibrate", None)
+    with client_of_directions.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, Hello(protocol=PROTOCOL, scene="flat", output="ambisonics", order=1))
+        assert ears.welcome.order == 1
+
+
 def test_a_stream_of_ambisonics_from_hello_to_sound(client_of_directions):
     hello = Hello(protocol=PROTOCOL, scene="flat", output="ambisonics", order=2, encoding="s16")
     with client_of_directions.websocket_connect("/v1/stream") as socket:
