@@ -1,5 +1,7 @@
 """Ambisonic sound in the browser: turned and decoded as the server would."""
 
+import base64
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from server.rendering.hrtf import kemar
 from tests import visitor
 
 browser = visitor.browser
-page = visitor.page
+page = visitor.one_page
 pytestmark = visitor.needs_browser
 
 ORDERS = pytest.mark.parametrize("order", [1, 2, 3])
@@ -24,17 +26,19 @@ ROTATE = """async ({ orientations, order }) => {
 
 DECODE = """async ({ order, channels, heads, turns }) => {
   const { HeadDecoder } = await import(new URL("ambisonics.js", document.baseURI));
+  const floats = (text) => new Float32Array(Uint8Array.from(atob(text), (char) => char.charCodeAt(0)).buffer);
+  const sound = channels.map(floats);
   const decoder = new HeadDecoder({ order, frames: 128 });
-  const played = [[], []];
-  for (let quantum = 0; 128 * quantum < channels[0].length; quantum++) {
-    if (heads[quantum]) decoder.use(heads[quantum]);
+  const played = [new Float32Array(sound[0].length), new Float32Array(sound[0].length)];
+  for (let quantum = 0; 128 * quantum < sound[0].length; quantum++) {
+    if (heads[quantum]) decoder.use(heads[quantum].map((ear) => ear.map(floats)));
     if (turns[quantum]) decoder.turn(turns[quantum]);
     const ears = [new Float32Array(128), new Float32Array(128)];
-    const some = channels.map((samples) => Float32Array.from(samples.slice(128 * quantum, 128 * (quantum + 1))));
+    const some = sound.map((samples) => samples.slice(128 * quantum, 128 * (quantum + 1)));
     decoder.decode(some, ...ears);
-    ears.forEach((ear, index) => played[index].push(...ear));
+    ears.forEach((ear, index) => played[index].set(ear, 128 * quantum));
   }
-  return played;
+  return played.map((ear) => btoa(String.fromCharCode(...new Uint8Array(ear.buffer))));
 }"""
 
 
@@ -43,15 +47,23 @@ def random_orientations(count):
     return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
 
 
+def as_text(samples):
+    """Float32 as base64: playwright passes an array number by number, which takes seconds."""
+    return base64.b64encode(np.float32(samples).tobytes()).decode()
+
+
 def decode(page, order, channels, *, heads, turns=()):
     """(2, n) what the browser makes of channels (k, n); `heads` and `turns` by the quantum where they begin."""
     parameters = {
         "order": order,
-        "channels": channels.tolist(),
-        "heads": {str(quantum): filters.tolist() for quantum, filters in heads.items()},
+        "channels": [as_text(channel) for channel in channels],
+        "heads": {
+            str(quantum): [[as_text(taps) for taps in ear] for ear in filters] for quantum, filters in heads.items()
+        },
         "turns": {str(quantum): list(turn) for quantum, turn in dict(turns).items()},
     }
-    return np.array(page.evaluate(DECODE, parameters))
+    played = page.evaluate(DECODE, parameters)
+    return np.array([np.frombuffer(base64.b64decode(ear), np.float32) for ear in played], np.float64)
 
 
 def by_server(decoder, channels):
