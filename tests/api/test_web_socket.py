@@ -453,7 +453,9 @@ def test_of_pings_that_come_together_the_newest_is_answered():
             await is_open.wait()
             pings = [Frame(Opcode.PING, bytes([number])).serialize(mask=True) for number in range(20)]
             writer.write(b"".join(pings) + _frames("end"))
-            client.receive_data(await reader.read())
+            while data := await reader.read(65_536):
+                client.receive_data(data)
+                writer.writelines(client.data_to_send())  # the answer to the close, for which the server would wait
             writer.close()
         pongs.extend(event.data for event in client.events_received() if getattr(event, "opcode", None) is Opcode.PONG)
 
