@@ -1,5 +1,6 @@
 """The figure of `nafir-train evaluate`: what it says, and that all of it can be read."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from matplotlib.text import Text
 from PIL import Image
 
+from tests.training.held_out import held_out_in
 from training.evaluation.evaluate import METRICS, Column, evaluate
 from training.evaluation.figure import draw_figure, figure_of
 from training.evaluation.methods import METHODS
@@ -31,12 +33,13 @@ def column(name, kind="baseline", **changes):
     return Column(name, lambda index, turns: response(HELD_OUT[index], **changes)[turns], kind)
 
 
-@pytest.fixture
-def held_out(make_held_out):
-    return make_held_out(response, held_out=HELD_OUT, yaws=2, visible=(True, True, False))
+@pytest.fixture(scope="module")
+def held_out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("held_out")
+    return held_out_in(folder, response, held_out=HELD_OUT, yaws=2, visible=(True, True, False))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def columns():
     """Two levels of a field, every method there is, and the floor; the last method errs a thousand times more."""
     methods = [column(name, seed=3 + number, gain=1.01) for number, name in enumerate(METHODS)]
@@ -45,13 +48,27 @@ def columns():
     return [*fields, *methods, column("floor", "floor", seed=2)]
 
 
+@pytest.fixture(scope="module")
+def evaluated(held_out):
+    """The errors of columns, by their names measured once for all tests; `of` so many pairs that there were."""
+    measured = {}
+
+    def evaluated(columns, of=None):
+        names = tuple(each.name for each in columns)
+        if names not in measured:
+            measured[names] = evaluate(held_out, columns)
+        return measured[names] if of is None else dataclasses.replace(measured[names], held_out=of)
+
+    return evaluated
+
+
 @pytest.fixture
-def draw(held_out, columns):
+def draw(held_out, columns, evaluated):
     """The figure of these columns, of so many pairs that there were."""
 
     def drawn(of=None, *, columns=columns):
         return figure_of(
-            evaluate(held_out, columns, of=of),
+            evaluated(columns, of),
             references=held_out.reference,
             reference_name="measured response",
             columns={each.name: each.source for each in columns if each.name in {LEVEL, "nearest"}},
@@ -74,9 +91,10 @@ def panel(figure, label):
 def test_the_heading_says_how_many_pairs_of_how_many(draw):
     (heading,) = [each for each in texts(draw(of=106)) if each.get_text().startswith("Errors")]
     assert heading.get_text().startswith("Errors of 3 of 106 held-out pairs, 2 orientations each")
-    (heading,) = [each for each in texts(draw()) if each.get_text().startswith("Errors")]
+    of_all = draw()
+    (heading,) = [each for each in texts(of_all) if each.get_text().startswith("Errors")]
     assert heading.get_text().startswith("Errors of all 3 held-out pairs")
-    assert "DRR (dB), 2 in sight" in {each.get_text() for each in texts(draw())}
+    assert "DRR (dB), 2 in sight" in {each.get_text() for each in texts(of_all)}
 
 
 def test_decays_are_those_of_the_data_a_field_and_a_baseline(draw, columns):
