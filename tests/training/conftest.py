@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 from rich.progress import Progress
@@ -21,6 +23,8 @@ from training.data.scene_file import SceneFile
 from training.learning.runs import Configuration
 from training.learning.train import train
 from training.models.encoders import FieldShape
+from training.simulation import planner
+from training.simulation.predictions import Predictions
 from training.simulation.responses import SimulatedResponses
 from training.simulation.run import simulate
 
@@ -82,6 +86,25 @@ def _traced_once(tmp_path_factory) -> Iterator[None]:
     """An export still compares what it writes with torch."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(export_module, "to_onnx", traced_once(export_module.to_onnx, tmp_path_factory))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _tried_once() -> Iterator[None]:
+    """Predictions, whose trial takes a second, are kept for all plans of a scene and its probes: they follow from these
+    alone. Trials of large scenes are large, so few are kept."""
+    kept: dict[tuple[str, bytes], Predictions] = {}
+
+    def predictions(scene: SceneFile, probes: npt.NDArray[np.float64]) -> Predictions:
+        key = scene.model_dump_json(exclude={"effects"}), probes.tobytes()
+        found = kept.pop(key, None) or Predictions(scene, probes)
+        if len(kept) == 4:
+            del kept[next(iter(kept))]
+        kept[key] = found  # the latest at the end
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planner, "Predictions", predictions)
         yield
 
 

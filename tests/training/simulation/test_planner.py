@@ -9,7 +9,7 @@ import pytest
 from server.scene.geometry import Opening
 from training.data.scene_file import SceneFile, SceneFileError
 from training.data.simulation_plan import SimulatedEffect, SimulationPlan, overrides_among
-from training.simulation.planner import THRESHOLD, planner_of
+from training.simulation.planner import THRESHOLD, SimulationPlanner, planner_of
 from training.simulation.predictions import Predictions
 
 TWO_ROOMS = ((0, 0), (3, 0), (3, 4), (3.2, 4), (3.2, 0), (7, 0), (7, 5), (0, 5))
@@ -69,15 +69,22 @@ def decided(planned):
 
 
 def test_the_same_scene_has_the_same_plan(box):
-    assert planner_of(box, 3).plan({}) == planner_of(box, 3).plan({})
+    probes = box.probe_positions(3)
+    one, other = (SimulationPlanner(Predictions(box, probes)).plan({}) for _ in range(2))
+    assert one == other
 
 
 def test_an_effect_is_on_where_its_change_reaches_the_threshold(planned, apartment, box):
-    for scene in (apartment, box):
+    for scene in (box, apartment):
         for each in planned(scene).decisions:
             assert np.isfinite(each.change_jnd)
             assert each.called_for == (each.change_jnd >= THRESHOLD.enter_jnd)
             assert each.reason
+
+
+def test_everything_has_all_that_the_scene_file_allows(apartment):
+    plan = planner_of(apartment, 0).everything
+    assert plan.settings == SimulationPlan.everything(3, 20_000).settings
 
 
 def test_an_anechoic_room_has_no_rays_and_no_images(box, decided):
@@ -248,11 +255,6 @@ def test_overrides_are_followed_and_told(box, is_on):
     assert plan.image_order == (box.simulation.image_order if is_on else 1)
     assert plan.rays == (box.simulation.rays if is_on else 0)
     assert (plan.scattering, plan.air_absorption, plan.diffraction) == (is_on,) * 3
-
-
-def test_everything_has_all_that_the_scene_file_allows(apartment):
-    plan = planner_of(apartment, 0).everything
-    assert plan.settings == SimulationPlan.everything(3, 20_000).settings
 
 
 @pytest.mark.parametrize("name", ["directivity", "transmission"])
