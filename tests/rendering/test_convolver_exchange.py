@@ -25,7 +25,6 @@ def expected_with_exchanges(dry, schedule, partitioning):
     expected = np.zeros((channels, dry.shape[1]))
     for source, changes in enumerate(schedule):
         for stage in partitioning.stages:
-
             whole = {}
 
             def heard(ir, stage=stage, source=source, whole=whole):
