@@ -30,6 +30,8 @@ _POINTS_ACROSS = 8
 _CHUNK = 4
 """Cells between two checkpoints: about 15 ms of work."""
 _PIXELS_PER_METRE = 80
+_MOST_PIXELS = 2_000
+"""Limit of the longer side of a picture: a hundred metres would have 64 million pixels, 1.5 GB while they are drawn."""
 _RANGE_DB = 30.0
 # Perceptually even, dark to bright, legible under dark and light drawings (a subset of the CAM02-UCS path of
 # "viridis").
@@ -62,7 +64,7 @@ class LoudnessMap:
 
     def to_png(self) -> bytes:
         """Return a PNG with north at the top, transparent outside the room; the brightest colour is the loudest level,
-        30 dB above the darkest."""
+        30 dB above the darkest. It has 80 pixels per metre, in scenes of more than 25 m fewer."""
         from PIL import Image  # the two imports take 0.1 s
         from scipy.ndimage import distance_transform_edt
 
@@ -70,7 +72,7 @@ class LoudnessMap:
         # Cells outside take the level of the nearest cell inside; else the enlargement would blend them into the room.
         nearest = distance_transform_edt(outside, return_distances=False, return_indices=True)
         levels = self.levels_db[tuple(nearest)].astype(np.float32)
-        scale = self.spacing_m * _PIXELS_PER_METRE
+        scale = min(self.spacing_m * _PIXELS_PER_METRE, _MOST_PIXELS / max(levels.shape))
         size = (max(1, round(levels.shape[1] * scale)), max(1, round(levels.shape[0] * scale)))
         enlarged = np.asarray(Image.fromarray(levels[::-1]).resize(size, Image.Resampling.BILINEAR))
         mask = Image.fromarray(np.where(outside, 0, 255).astype(np.uint8)[::-1]).resize(size, Image.Resampling.NEAREST)

@@ -76,6 +76,11 @@ def test_walls_are_cut_out_sharply_and_do_not_bleed():
     assert len(np.unique(image[image[..., 3] > 0], axis=0)) == 1
 
 
+def test_a_picture_of_a_large_place_has_fewer_pixels_per_metre():
+    drawn = LoudnessMap(np.zeros((44, 22)), (0.0, 0.0), 2.24, 1.5).to_png()
+    assert Image.open(io.BytesIO(drawn)).size == (1_000, 2_000)
+
+
 def test_json_has_no_numbers_outside_the_room():
     chart = LoudnessMap(np.array([[np.nan, -3.0]]), (0.0, 0.0), 0.5, 1.5)
     assert chart.to_json()["levels_db"] == [[None, -3.0]]
