@@ -33,7 +33,7 @@ def test_what_is_off_is_not_heard(name):
         assert row.is_on or row.simulated < AUDIBLE_JND
 
 
-def decaying(t60_s, rng, pairs=40):
+def decaying(t60_s, rng, pairs=16):
     time_s = np.arange(RATE) / RATE
     return rng.standard_normal((pairs, 2, RATE)) * 10 ** (-3 * time_s / t60_s)
 
