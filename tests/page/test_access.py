@@ -3,6 +3,7 @@
 Contrast is that of WCAG 2 (1.4.3): (lighter + 0.05) / (darker + 0.05) of relative luminances, at least 4.5 for text.
 """
 
+import contextlib
 import re
 
 import pytest
@@ -105,6 +106,17 @@ def another_level(page) -> str:
     return [name for name in offered if name not in {"auto", page.evaluate("nafir.state().level")}][-1]
 
 
+def change_level(page, choose) -> None:
+    """Until the page lists a change: a stream that begins anew meanwhile begins with what is chosen, without one."""
+    change = page.locator("#level-changes li").first
+    for _ in range(6):
+        choose(another_level(page))
+        with contextlib.suppress(visitor.sync_api.TimeoutError):
+            change.wait_for(timeout=5_000)
+            return
+    raise AssertionError("no change of level is listed")
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_text_stands_out_from_what_is_behind_it(browser, server, scheme):
     context = browser.new_context(viewport={"width": 1280, "height": 800}, color_scheme=scheme)
@@ -114,8 +126,7 @@ def test_every_text_stands_out_from_what_is_behind_it(browser, server, scheme):
         page.click("#add-source")
     start(page)
     page.wait_for_function("nafir.state().effects !== null")
-    page.select_option("#level-choice", another_level(page))
-    page.locator("#level-changes li").first.wait_for()
+    change_level(page, lambda level: page.select_option("#level-choice", level))
     page.evaluate("document.getElementById('dropouts').classList.add('alarm')")
     count, faint = faint_texts(page)
     assert count > 60
@@ -212,12 +223,13 @@ def test_everything_is_done_by_keyboard(browser, server):
     hold("ArrowLeft")
     assert page.evaluate("nafir.state().listener.yaw") > yaw
 
+    def choose(level: str) -> None:
+        keys.press("End")
+        while page.input_value("#level-choice") != level:
+            keys.press("ArrowUp")
+
     page.focus("#level-choice")
-    level = another_level(page)
-    keys.press("End")
-    while page.input_value("#level-choice") != level:
-        keys.press("ArrowUp")
-    page.wait_for_function("document.querySelectorAll('#level-changes li').length > 0")
+    change_level(page, choose)
     page.wait_for_function("nafir.state().effects !== null")
     page.focus("#effects [data-effect=late_reverberation] input")
     keys.press("Space")
