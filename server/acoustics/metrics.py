@@ -44,13 +44,14 @@ class Definition:
 
 @dataclass(frozen=True)
 class Metric:
-    """A description of an error: its key, its label in tables, its unit, whether it needs the direct sound, and what it
-    means."""
+    """A description of an error: its key, its label in tables, its unit, whether it needs the direct sound or two ears,
+    and what it means."""
 
     name: str
     label: str
     unit: str
     needs_direct_sound: bool = False
+    needs_two_ears: bool = False
     definition: Definition = field(kw_only=True)
 
 
@@ -158,6 +159,7 @@ PARAMETER_METRICS = (
         "iacc",
         "IACC",
         "",
+        needs_two_ears=True,
         error=_between_ears("interaural_cross_correlation"),
         definition=Definition(
             formula="absolute difference of IACC, the largest magnitude of the normalised interaural cross-correlation "
@@ -170,6 +172,7 @@ PARAMETER_METRICS = (
         "iacc_early",
         "IACC early",
         "",
+        needs_two_ears=True,
         error=_between_ears("early_interaural_cross_correlation"),
         definition=Definition(
             formula="as IACC", over=f"the first {1e3 * EARLY_S:g} ms from the onset", source="ISO 3382-1:2009, B.2"
@@ -189,6 +192,7 @@ PARAMETER_METRICS = (
         "ITD",
         "us",
         needs_direct_sound=True,
+        needs_two_ears=True,
         error=_between_ears("interaural_time_difference_s", scale=1e6),
         definition=Definition(
             formula="absolute difference of ITD, the lag of the largest interaural cross-correlation within "

@@ -17,6 +17,22 @@ from typing import Any
 from server.core.errors import NafirError
 
 HASHED_SHARE = 0.1
+_NERAF = "split.json of https://github.com/AmandineBtto/NeRAF"
+_RAF = "data-split of https://github.com/facebookresearch/real-acoustic-fields"
+PUBLISHED: Mapping[str, str] = {
+    "d4a24ec2d5750e576d998b46392ca6df9fe1420aac736dce1e31fc09b4cbe798": f"{_NERAF}, apartment_1",
+    "353ee369a6e2a8015eeaa2a41d3b2841efccff0b94baa2e2db57502a16f5f02e": f"{_NERAF}, apartment_2",
+    "aaab7a02c696dd3951c369ceed8ff02af0cb04df8c2cae35146a80a463bfa0b7": f"{_NERAF}, frl_apartment_2",
+    "05abc922242371ebe3d5aa44d2205fce75e445d109ec3ed367c07c0f6065e23f": f"{_NERAF}, frl_apartment_4",
+    "8dd17bf8c4692e7fbb24e9b1d918432977f1f3368a73f18c9bf431fac97c0b7c": f"{_NERAF}, office_4",
+    "45bd9f240f1f5bdda4d8f487a047f16d143a841a3ab4a48672b364ec755cad62": f"{_NERAF}, room_2",
+    "1d0c1278869088be884e0505dc7b9f2d065edb9cae74edbd2dae46635f857246": f"{_RAF}, EmptyRoom",
+    "687cd40ca19e467860b59bb6e450ad71e70e7622eb7790115f91247d7107a7d3": f"{_RAF}, FurnishedRoom",
+    "d857d203f2c8e594fb6fae8244f3fd9f1e2e32a420fdfce50d7bb060fa507f34": "seen_test_split.pkl of "
+    "https://github.com/DragonLiu1995/xRIR_code",
+}
+"""Sources of published splits, by the SHA-256 of their test responses' names."""
+UNKNOWN_SOURCE = "a file that is none of the published splits known here"
 _LISTED = 5
 _TEST = ("test", "val")
 _MOST_BYTES = 2**26
@@ -39,8 +55,7 @@ class Split:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the names of the test, then of the training responses, sorted, one a line."""
-        parts = (sorted(self.test), [""], sorted(self.train))
-        return hashlib.sha256("\n".join(name for part in parts for name in part).encode()).hexdigest()
+        return _digest([*sorted(self.test), "", *sorted(self.train)])
 
     def role(self, name: str) -> str:
         """`test`, `train` or `validation`; nothing for a response that the split does not name."""
@@ -48,12 +63,13 @@ class Split:
         return next((role for role, names in roles.items() if name in names), "")
 
 
-def read_split(path: Path, names: Collection[str], normal: Callable[[str], str], *, source: str = "") -> Split:
+def read_split(path: Path, names: Collection[str], normal: Callable[[str], str]) -> Split:
     """Reads a split of the responses called `names`. `normal` turns what a file may call a response into its name.
 
     A file is JSON or a pickle of plain lists and texts. It has lists of names by `train`, `test` and perhaps
     `validation`; or training and test lists by heading, as NAF's; or the test responses alone, and then all others are
-    for training. Raises SplitError for another file, and for test responses that the dataset does not have.
+    for training. The names of the test responses tell whether a split is a published one. Raises SplitError for another
+    file, and for test responses that the dataset does not have.
     """
     parts = _parts(path, _content(path))
     known = frozenset(names)
@@ -71,7 +87,8 @@ def read_split(path: Path, names: Collection[str], normal: Callable[[str], str],
     )
     both = sorted(test & train)
     _require(path, not both, f"has {len(both)} responses both to learn from and to test on: {_first(both)}")
-    return Split(path.name, source or f"file {path.name}", train, test, named.get("validation", frozenset()))
+    source = PUBLISHED.get(_digest(sorted(test)), UNKNOWN_SOURCE)
+    return Split(path.name, source, train, test, named.get("validation", frozenset()))
 
 
 def hashed_split(pairs: Mapping[str, str], share: float = HASHED_SHARE) -> Split:
@@ -101,6 +118,10 @@ def split_of_groups(groups: Mapping[str, str], test_groups: Collection[str], *, 
     if not test:
         raise SplitError(f"{name}: the dataset has none of its {len(test_groups)} test groups")
     return Split(name, source, frozenset(groups) - test, test)
+
+
+def _digest(lines: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def _draw(pair: str) -> float:

@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from training.baselines.baselines import TrainingPairs
-from training.baselines.held_out import EvaluationError, HeldOut, open_held_out
+from training.baselines.held_out import EvaluationError, HeldOut, open_held_out, unique_points
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.importers.audio import UnreadableError
 from training.data.importers.conditioning import SourceError
 from training.data.importers.entries import Entry, Pose
-from training.data.importers.layouts import Options, layout_of
+from training.data.importers.layouts import Options, layout_of, without_suffix
 from training.data.importers.report import ImportReport
 from training.data.responses import FILE
 from training.data.splits import Split
@@ -26,7 +26,6 @@ from training.evaluation.literature import resampled
 
 PAIRS = "pairs.h5"
 OWN_LAYOUT = "nafir"
-OWN_NAMING = "<listener>_<emitter>_<orientation>"
 _Responses = npt.NDArray[np.float32]
 
 
@@ -58,7 +57,6 @@ class BenchmarkData:
 
     name: str
     layout: str
-    naming: str
     channels: int
     sample_rate: int
     split: Split
@@ -121,7 +119,6 @@ def _own(folder: Path) -> BenchmarkData:
         return BenchmarkData(
             name=held_out.name,
             layout=OWN_LAYOUT,
-            naming=OWN_NAMING,
             channels=held_out.channels,
             sample_rate=held_out.sample_rate,
             split=Split("held out", "the dataset's own held-out pairs", frozenset(train), frozenset(test)),
@@ -135,7 +132,7 @@ def _own(folder: Path) -> BenchmarkData:
                 for index, pair in enumerate(held_out.held_out)
             ],
             known=frozenset(test | train),
-            normal=_without_suffix,
+            normal=without_suffix,
             groups=lambda: [Group(held_out, lambda index, yaw: name(int(held_out.held_out[index]), yaw))],
             files=(folder / (FILE if held_out.simulated is None else PAIRS),),
             file_digest=None if held_out.simulated is None else partial(_digest, folder / PAIRS),
@@ -156,10 +153,6 @@ def _own_poses(held_out: HeldOut, index: int) -> tuple[Pose, ...]:
     return tuple(Pose(listener, emitter, float(held_out.yaws[yaw])) for yaw in held_out.yaw_indices)
 
 
-def _without_suffix(name: str) -> str:
-    return name.rsplit(".", 1)[0]
-
-
 def _published(folder: Path, layout_name: str, split_name: str, options: Options) -> BenchmarkData:
     layout = layout_of(folder, layout_name)
     entries = layout.entries(folder, ImportReport(), options)
@@ -170,7 +163,6 @@ def _published(folder: Path, layout_name: str, split_name: str, options: Options
     return BenchmarkData(
         name=folder.resolve().name,
         layout=layout.name,
-        naming=layout.naming,
         channels=layout.channels,
         sample_rate=rate,
         split=split,
@@ -237,8 +229,8 @@ def _groups(folder: Path, layout: str, entries: Sequence[Entry], split: Split, r
 
 def _group(folder: Path, layout: str, members: list[Entry], held_out: npt.NDArray[np.bool_], rate: int) -> Group:
     poses = [_poses(entry)[0] for entry in members]
-    listeners, listener = _points([pose.listener for pose in poses])
-    emitters, emitter = _points([pose.emitter for pose in poses])
+    listeners, listener = unique_points(np.array([pose.listener for pose in poses]))
+    emitters, emitter = unique_points(np.array([pose.emitter for pose in poses]))
     tested = np.flatnonzero(held_out)
     channels, samples = _read(members[tested[0]])[0].shape
     for index in tested[1:]:
@@ -263,11 +255,6 @@ def _group(folder: Path, layout: str, members: list[Entry], held_out: npt.NDArra
         ),
         lambda index, _: members[int(tested[index])].name,
     )
-
-
-def _points(positions: Sequence[tuple[float, float, float]]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.integer]]:
-    points, index = np.unique(np.array(positions), axis=0, return_inverse=True)
-    return points, index.reshape(-1)
 
 
 def truth_digest(names: Sequence[str], responses: Mapping[str, str]) -> str:

@@ -102,8 +102,6 @@ def _of_parameter(name: str, *, needs_direct_sound: bool) -> Callable[[Compariso
     return error
 
 
-_OF_TWO_EARS = frozenset({"iacc", "iacc_early", "itd"})
-
 OWN_METRICS: tuple[Metric, ...] = (
     Metric(
         name=SPECTRAL_LOSS.name,
@@ -128,7 +126,7 @@ OWN_METRICS: tuple[Metric, ...] = (
             unit=metric.unit,
             definition=metric.definition,
             error=_of_parameter(metric.name, needs_direct_sound=metric.needs_direct_sound),
-            channels=2 if metric.name in _OF_TWO_EARS else 1,
+            channels=2 if metric.needs_two_ears else 1,
         )
         for metric in PARAMETER_METRICS
     ),

@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from training.data.splits import SplitError, hashed_split, read_split, split_of_groups
+from training.data.splits import UNKNOWN_SOURCE, SplitError, hashed_split, read_split, split_of_groups
 
 NAMES = [f"{heading}/{receiver}_{source}" for heading in (0, 90) for receiver in range(4) for source in range(4)]
 
@@ -118,3 +118,12 @@ def test_the_digest_is_that_of_both_parts():
     assert split.digest != split_of_groups(groups, {"0"}, name="turned", source="here").digest
     with pytest.raises(SplitError, match="none of its 1 test groups"):
         split_of_groups(groups, {"45"}, name="turned", source="here")
+
+
+def test_a_published_split_is_known_by_the_names_of_its_test_responses(written, monkeypatch):
+    path = written({"train": NAMES[:5], "test": NAMES[5:8]})
+    assert read_split(path, NAMES, plain).source == UNKNOWN_SOURCE
+    digest = hashlib.sha256("\n".join(sorted(NAMES[5:8])).encode()).hexdigest()
+    monkeypatch.setattr("training.data.splits.PUBLISHED", {digest: "a paper"})
+    assert read_split(path, NAMES, plain).source == "a paper"
+    assert read_split(written({"train": NAMES[:5], "test": NAMES[5:9]}), NAMES, plain).source == UNKNOWN_SOURCE

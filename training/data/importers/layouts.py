@@ -11,7 +11,7 @@ from training.data.importers import acousticrooms, meshrir, raf, soundspaces
 from training.data.importers.conditioning import SourceError
 from training.data.importers.entries import Entry
 from training.data.importers.report import ImportReport
-from training.data.splits import HASHED_SHARE, Split, hashed_split, read_split, split_of_groups
+from training.data.splits import Split, hashed_split, read_split, split_of_groups
 
 
 @dataclass(frozen=True)
@@ -24,21 +24,16 @@ class Options:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """name: as in commands. title: of the dataset. channels: of each response. naming: the name of a response, which is
-    also the name of its prediction. normal: turns what split files and folders of predictions call a response into its
-    name. split: what stands in for `--split` if it is not given, in words. built_in: splits that are known without a
-    file. files: where a dataset keeps a published split, relative to its folder, as patterns."""
+    """name: as in commands. channels: of each response. normal: turns what split files and folders of predictions call
+    a response into its name. files: where a dataset keeps a published split, relative to its folder, as patterns.
+    built_in: splits that are known without a file, the first of which is the default."""
 
     name: str
-    title: str
     channels: int
-    naming: str
-    split: str
     recognises: Callable[[Path], bool]
     entries: Callable[[Path, ImportReport, Options], list[Entry]]
     normal: Callable[[str], str]
     files: tuple[str, ...] = ()
-    source: str = ""
     built_in: Mapping[str, Callable[[list[Entry]], Split]] | None = None
 
     def split_of(self, folder: Path, entries: list[Entry], asked: str = "") -> Split:
@@ -59,7 +54,7 @@ class Layout:
             listed = ", ".join(str(path.relative_to(folder)) for path in shipped)
             raise SourceError(folder, "split", f"several files are found ({listed}): choose one by --split")
         if shipped:
-            return read_split(shipped[0], names, self.normal, source=self.source)
+            return read_split(shipped[0], names, self.normal)
         if self.built_in is not None:
             return next(iter(self.built_in.values()))(entries)
         return hashed_split({entry.name: entry.pair for entry in entries})
@@ -92,7 +87,8 @@ _UNSEEN_ROOMS = frozenset(
 )
 
 
-def _without_suffix(name: str) -> str:
+def without_suffix(name: str) -> str:
+    """The name of a file of sound or of an array, without its ending."""
     for suffix in (".wav", ".npy"):
         if name.lower().endswith(suffix):
             return name[: -len(suffix)]
@@ -100,14 +96,14 @@ def _without_suffix(name: str) -> str:
 
 
 def _of_acousticrooms(name: str) -> str:
-    parts = _without_suffix(name).split("/")
+    parts = without_suffix(name).split("/")
     if parts[0] in acousticrooms.RESPONSES:
         parts = parts[1:]
     return "/".join(parts).removesuffix(acousticrooms.SUFFIX)
 
 
 def _of_raf(name: str) -> str:
-    return _without_suffix(name).removeprefix("data/").removesuffix("/rir")
+    return without_suffix(name).removeprefix("data/").removesuffix("/rir")
 
 
 def _unseen(entries: list[Entry]) -> Split:
@@ -130,32 +126,22 @@ def _of_folders(entries: list[Entry]) -> Split:
     return split_of_groups(by_name, {meshrir.TEST}, name="folders", source=source)
 
 
-_HASHED_WORDS = f"none is published; `hashed`, {100 * HASHED_SHARE:g} % of pairs"
-
 LAYOUTS: Mapping[str, Layout] = {
     layout.name: layout
     for layout in (
         Layout(
             name="soundspaces",
-            title="SoundSpaces 1.0, one scene",
             channels=2,
-            naming="<azimuth>/<receiver>_<source>",
-            split="`split.json` of NeRAF in the scene's folder or in its `metadata_AudioNeRF`; else `hashed`. NAF's "
-            "`<scene>_complete.pkl` by `--split`",
             recognises=lambda folder: any(
                 path.is_dir() and path.name in {"0", "90", "180", "270"} for path in folder.iterdir()
             ),
             entries=lambda folder, report, options: soundspaces.entries(folder, report, points=options.points),
-            normal=_without_suffix,
+            normal=without_suffix,
             files=("split.json", "metadata_AudioNeRF/split.json"),
-            source="split.json of https://github.com/AmandineBtto/NeRAF, 90 % and 10 % of responses",
         ),
         Layout(
             name="raf",
-            title="Real Acoustic Fields, one room",
             channels=1,
-            naming="<folder>",
-            split="`data-split*.json` in the room's folder, in `data-split` or in `metadata`; else `hashed`",
             recognises=lambda folder: any(
                 (path / "tx_pos.txt").exists()
                 for path in (folder / "data" if (folder / "data").is_dir() else folder).iterdir()
@@ -163,25 +149,18 @@ LAYOUTS: Mapping[str, Layout] = {
             entries=lambda folder, report, _: raf.entries(folder, report),
             normal=_of_raf,
             files=("data-split*.json", "data-split/data-split*.json", "metadata/data-split*.json"),
-            source="data-split of https://github.com/facebookresearch/real-acoustic-fields, that of its paper",
         ),
         Layout(
             name="meshrir",
-            title="MeshRIR, one room",
             channels=1,
-            naming="<microphone>_<loudspeaker>",
-            split=f"the folders `train` and `test`, where files are sorted into them; else {_HASHED_WORDS}",
             recognises=lambda folder: (folder / "pos_mic.npy").is_file(),
             entries=lambda folder, report, options: meshrir.entries(folder, report, source_rate=options.source_rate),
-            normal=_without_suffix,
+            normal=without_suffix,
             built_in={"folders": _of_folders},
         ),
         Layout(
             name="acousticrooms",
-            title="AcousticRooms, all rooms",
             channels=1,
-            naming="<kind>/<room>/S<source>_R<receiver>",
-            split="`unseen`, the 17 rooms that xRIR is tested on; its `seen_test_split.pkl` by `--split`",
             recognises=lambda folder: any((folder / name).is_dir() for name in acousticrooms.RESPONSES),
             entries=lambda folder, report, _: acousticrooms.entries(folder, report),
             normal=_of_acousticrooms,
