@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from reference_commands import commands_of
+from reference_errors import error_definitions
 from reference_load import load_thresholds
 from reference_packages import package_matrix, packages
 from reference_schemas import manifest, settings
@@ -26,6 +27,7 @@ GENERATORS: Final[Mapping[str, Callable[[], str]]] = {
     "packages": packages,
     "package-matrix": package_matrix,
     "load-thresholds": load_thresholds,
+    "error-definitions": error_definitions,
 }
 _MARK: Final = re.compile(r"^<!-- generated: ([a-z-]+) -->$", re.MULTILINE)
 

@@ -23,7 +23,7 @@ _Integers = npt.NDArray[np.int64]
 ONSET_THRESHOLD_DB = -20.0
 _WINDOW_S = 0.010
 _TAIL_SHARE = 0.1  # the part of the response that serves as the first noise estimate
-_NOISE_MARGIN_DB = 10.0  # ISO 3382-1 5.3.3: noise at least 10 dB below the range that is evaluated
+NOISE_MARGIN_DB = 10.0  # ISO 3382-1 5.3.3: noise at least 10 dB below the range that is evaluated
 _FIT_RANGE_DB = 20.0
 _NOTHING_DB = -120.0  # relative to the largest sample; below it, float16 storage leaves only rounding errors
 _NOISE_EXCESS = 1.25  # ratio of the power in the tail to the power of the fitted decay
@@ -123,7 +123,7 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
             # from the onset on, is an upper bound.
             late = block_power[row, stop - max(1, round(_TAIL_SHARE * (stop - first))) : stop].mean()
             # guard: what does not decay may be noise
-            lowest[row] = late * (last[row] - onset[row]) * db_to_power(_NOISE_MARGIN_DB)
+            lowest[row] = late * (last[row] - onset[row]) * db_to_power(NOISE_MARGIN_DB)
             continue
         decay_per_sample = tail.decay_db / window * np.log(10.0) / 10.0
         at = last[row] / window - first - 0.5
@@ -134,7 +134,7 @@ def _ends(power: _Floats, onset: _Integers, window: int) -> tuple[_Integers, _Fl
         noise[row] = tail.noise_power
         beyond[row] = db_to_power(tail.level_db - tail.decay_db * at) / decay_per_sample
         # guard: a decay is told from noise with a margin
-        lowest[row] = max(beyond[row], noise[row] / decay_per_sample * db_to_power(_NOISE_MARGIN_DB))
+        lowest[row] = max(beyond[row], noise[row] / decay_per_sample * db_to_power(NOISE_MARGIN_DB))
     return end, noise, beyond, lowest
 
 
@@ -158,7 +158,7 @@ def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
     tail: _Tail | None = None
     for _ in range(_ITERATIONS):
         observed = float(block_power[noise_start:].mean())
-        reference_db = float(power_to_db(observed)) + _NOISE_MARGIN_DB
+        reference_db = float(power_to_db(observed)) + NOISE_MARGIN_DB
         stop = _after_last(levels_db >= reference_db)
         start = min(_after_last(levels_db >= reference_db + _FIT_RANGE_DB), max(stop - 3, 0))
         line = _line(levels_db[start:stop])
@@ -169,7 +169,7 @@ def _tail(block_power: _Floats, levels_db: _Floats) -> _Tail | None:
         decayed = float(db_to_power(level_db - decay_db * np.arange(noise_start, count)).mean())
         # Power above the line is noise if it exceeds the scatter of the windows.
         tail = _Tail(level_db, decay_db, observed - decayed if observed > _NOISE_EXCESS * decayed else 0.0)
-        noise_from = int(np.ceil((level_db - reference_db + 2.0 * _NOISE_MARGIN_DB) / decay_db))
+        noise_from = int(np.ceil((level_db - reference_db + 2.0 * NOISE_MARGIN_DB) / decay_db))
         moved_to = max(min(noise_from, tail_start), 0)
         if moved_to == noise_start:
             break

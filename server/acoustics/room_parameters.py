@@ -38,16 +38,21 @@ _Integers = npt.NDArray[np.int64]
 # The direct sound lasts until 2.5 ms after the largest sample near its expected arrival (Zahorik, J. Acoust. Soc. Am.
 # 112, 2110, 2002). The lead covers the rise of an HRIR to its peak.
 DIRECT_SOUND_S = 0.0025
-_DIRECT_LEAD_S = 0.001
-_DIRECT_SEARCH_S = 0.003
+DIRECT_LEAD_S = 0.001
+DIRECT_SEARCH_S = 0.003
 _DIRECT_PEAK_S = 0.001
 """Longest time from the onset of the direct sound to its largest sample. At the far ear an early reflection soon after
 may be louder."""
-_BETWEEN_EARS_S = 0.001
+BETWEEN_EARS_S = 0.001
 """Part of the direct sound, after its peak at the nearer ear, that the ITD is measured in. Reflections follow it."""
-_LAG_LIMIT_S = 0.001  # ISO 3382-1 B.2: interaural lags within +-1 ms
-_EARLY_S = 0.080  # ISO 3382-1 B.2: IACC early
-_LOWPASS_HZ = 3000.0  # Katz and Noisternig, J. Acoust. Soc. Am. 135, 3530, 2014
+LAG_LIMIT_S = 0.001  # ISO 3382-1 B.2: interaural lags within +-1 ms
+EARLY_S = 0.080  # ISO 3382-1 B.2: IACC early
+CLARITY_S = 0.050  # ISO 3382-1 A.2.3: C50
+START_DB = -5.0  # ISO 3382-1 5.3.3: where the evaluation of a reverberation time begins
+DECAY_DB = 30.0
+"""The fall of the decay curve that reverberation times are measured over: T30."""
+EARLY_DECAY_DB = 10.0  # ISO 3382-1 A.2.2
+LOWPASS_HZ = 3000.0  # Katz and Noisternig, J. Acoust. Soc. Am. 135, 3530, 2014
 _UPSAMPLING = 16
 
 
@@ -78,7 +83,7 @@ class RoomParameters:
 
 
 def measure(
-    ir: npt.ArrayLike, sample_rate: float, *, decay_db: float = 30.0, onset: npt.ArrayLike | None = None
+    ir: npt.ArrayLike, sample_rate: float, *, decay_db: float = DECAY_DB, onset: npt.ArrayLike | None = None
 ) -> RoomParameters:
     """All parameters of responses to one microphone or to two ears, `(..., channel, sample)`.
 
@@ -96,15 +101,15 @@ def measure(
     return RoomParameters(
         onset_s=np.where(decay.onset >= 0, decay.onset / sample_rate, np.nan),
         level_db=_level_db(responses),
-        reverberation_time_s=_decay_time_s(decay, sample_rate, -5.0, -5.0 - decay_db),
-        early_decay_time_s=_decay_time_s(decay, sample_rate, 0.0, -10.0),
-        clarity_db=_clarity_db(decay, sample_rate, 0.050),
+        reverberation_time_s=_decay_time_s(decay, sample_rate, START_DB, START_DB - decay_db),
+        early_decay_time_s=_decay_time_s(decay, sample_rate, 0.0, -EARLY_DECAY_DB),
+        clarity_db=_clarity_db(decay, sample_rate, CLARITY_S),
         direct_to_reverberant_db=_direct_to_reverberant_db(responses, decay, direct, sample_rate, DIRECT_SOUND_S),
         interaural_cross_correlation=(
             _iacc(responses, decay.onset, sample_rate, 0.0, None) if binaural else between_ears
         ),
         early_interaural_cross_correlation=(
-            _iacc(responses, decay.onset, sample_rate, 0.0, _EARLY_S) if binaural else between_ears
+            _iacc(responses, decay.onset, sample_rate, 0.0, EARLY_S) if binaural else between_ears
         ),
         interaural_time_difference_s=_itd_s(responses, direct, sample_rate) if binaural else between_ears,
     )
@@ -118,25 +123,25 @@ def energy_decay_db(ir: npt.ArrayLike, sample_rate: float) -> _Floats:
     return power_to_db(decay.energy / start)
 
 
-def reverberation_time_s(ir: npt.ArrayLike, sample_rate: float, *, decay_db: float = 30.0) -> _Floats:
+def reverberation_time_s(ir: npt.ArrayLike, sample_rate: float, *, decay_db: float = DECAY_DB) -> _Floats:
     """Reverberation time `(..., channel)`: least squares line through the decay curve from -5 dB down by `decay_db`.
 
     30 dB gives T30, 20 dB gives T20, both extrapolated to 60 dB (ISO 3382-1:2009, 5.3.3). A response whose curve does
     not reach the lower limit 10 dB above the noise is unmeasurable; a shorter range is never used instead.
     """
     decay = energy_decay(ir, sample_rate)
-    values = _decay_time_s(decay, sample_rate, -5.0, -5.0 - decay_db)
+    values = _decay_time_s(decay, sample_rate, START_DB, START_DB - decay_db)
     known = f"the decay is known down to {np.max(decay.lowest_db):.1f} dB only"
-    return _present(values, f"T{decay_db:g}: needs {-5.0 - decay_db:g} dB of decay; {known}")
+    return _present(values, f"T{decay_db:g}: needs {START_DB - decay_db:g} dB of decay; {known}")
 
 
 def early_decay_time_s(ir: npt.ArrayLike, sample_rate: float) -> _Floats:
     """Early decay time `(..., channel)`: the line from 0 to -10 dB, extrapolated to 60 dB (ISO 3382-1:2009, A.2.2)."""
-    values = _decay_time_s(energy_decay(ir, sample_rate), sample_rate, 0.0, -10.0)
+    values = _decay_time_s(energy_decay(ir, sample_rate), sample_rate, 0.0, -EARLY_DECAY_DB)
     return _present(values, "EDT: the curve has no slope from 0 to -10 dB above the noise")
 
 
-def clarity_db(ir: npt.ArrayLike, sample_rate: float, *, early_s: float = 0.050) -> _Floats:
+def clarity_db(ir: npt.ArrayLike, sample_rate: float, *, early_s: float = CLARITY_S) -> _Floats:
     """Early-to-late index `(..., channel)`: C50, or C80 with `early_s` = 0.080 (ISO 3382-1:2009, A.2.3)."""
     values = _clarity_db(energy_decay(ir, sample_rate), sample_rate, early_s)
     return _present(values, f"clarity: no energy later than {early_s * 1e3:g} ms, or none earlier")
@@ -211,7 +216,7 @@ def _binaural(ir: npt.ArrayLike) -> npt.NDArray[np.generic]:
 def _direct_sample(responses: npt.NDArray[np.generic], onset: npt.ArrayLike, sample_rate: float) -> _Integers:
     """`(..., channel)` index of the peak of the first sound within 3 ms of the expected onset; -1 if there is none."""
     expected = np.broadcast_to(np.asarray(onset, dtype=np.int64), responses.shape[:-1]).reshape(-1)
-    reach, length = round(_DIRECT_SEARCH_S * sample_rate), round(_DIRECT_PEAK_S * sample_rate)
+    reach, length = round(DIRECT_SEARCH_S * sample_rate), round(_DIRECT_PEAK_S * sample_rate)
     peaks = np.full(len(expected), -1)
     for row, (at, response) in enumerate(zip(expected, responses.reshape(len(expected), -1), strict=True)):
         start = max(int(at) - reach, 0)
@@ -274,7 +279,7 @@ def _direct_to_reverberant_db(
     energy, _ = _rows(decay)
     rows = responses.reshape(energy.shape)
     values = np.full(len(energy), np.nan)
-    lead, length = round(_DIRECT_LEAD_S * sample_rate), round(direct_s * sample_rate)
+    lead, length = round(DIRECT_LEAD_S * sample_rate), round(direct_s * sample_rate)
     for row, at in enumerate(direct_at.reshape(-1)):
         stop = int(at) + length
         # guard: what follows the direct sound is within the response
@@ -294,7 +299,7 @@ def _iacc(
     ears = responses.reshape(-1, 2, responses.shape[-1])
     starts = onset.reshape(-1, 2).min(axis=-1) + round(start_s * sample_rate)
     length = ears.shape[-1] if end_s is None else round((end_s - start_s) * sample_rate)
-    lags = round(_LAG_LIMIT_S * sample_rate)
+    lags = round(LAG_LIMIT_S * sample_rate)
     values = np.full(len(ears), np.nan)
     for row in np.flatnonzero(onset.reshape(-1, 2).min(axis=-1) >= 0):
         segment = ears[row, :, starts[row] : starts[row] + length].astype(np.float64)
@@ -312,12 +317,12 @@ def _iacc(
 def _itd_s(responses: npt.NDArray[np.generic], direct_at: _Integers, sample_rate: float) -> _Floats:
     ears = responses.reshape(-1, 2, responses.shape[-1])
     peaks = direct_at.reshape(-1, 2)
-    lead, lags = round(_DIRECT_LEAD_S * sample_rate), round(_LAG_LIMIT_S * sample_rate)
-    length = lead + round(_BETWEEN_EARS_S * sample_rate) + lags
+    lead, lags = round(DIRECT_LEAD_S * sample_rate), round(LAG_LIMIT_S * sample_rate)
+    length = lead + round(BETWEEN_EARS_S * sample_rate) + lags
     size = next_fast_length(length + lags)
     frequencies = np.fft.rfftfreq(size, 1.0 / sample_rate)
     # The low-pass falls as a raised cosine over an octave. A steep one would ring for longer than the window.
-    lowpass = 0.5 + 0.5 * np.cos(np.pi * np.clip(frequencies / _LOWPASS_HZ - 1.0, 0.0, 1.0))
+    lowpass = 0.5 + 0.5 * np.cos(np.pi * np.clip(frequencies / LOWPASS_HZ - 1.0, 0.0, 1.0))
     values = np.full(len(ears), np.nan)
     for row, arrivals in enumerate(peaks):
         if arrivals.min() < 0:

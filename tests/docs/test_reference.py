@@ -26,6 +26,7 @@ from server.streaming.audio_engine import AudioEngine
 from server.streaming.load_thresholds import Thresholds
 from tests.engine_stage import Patient
 from training.cli.main import app as nafir_train
+from training.evaluation.literature import METRICS as BENCHMARK_METRICS
 
 SERVER = Path(__file__).parents[2] / "server"
 Page = Callable[[str], str]
@@ -138,3 +139,10 @@ def test_every_metric_is_listed(page: Page) -> None:
     listed = {re.sub(r"_(total|info)$", "", word) for word in words(page("reference/metrics"))}
     assert len(told) > 15
     assert told <= listed
+
+
+def test_every_error_of_a_benchmark_is_defined(page: Page) -> None:
+    text = page("reference/error-definitions")
+    for metric in BENCHMARK_METRICS:
+        assert f"{metric.label} ({metric.name})" in text
+        assert " ".join(metric.definition.formula.split()) in " ".join(text.split())

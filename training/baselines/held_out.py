@@ -202,8 +202,8 @@ def measured_pairs(dataset: ImportedDataset) -> MeasuredPairs:
     rows = rows[complete]
     if not len(rows):
         raise EvaluationError(f"{dataset.folder}: no pair was measured at all of the {len(yaws)} orientations")
-    emitters, pair_emitter = _points(dataset.emitter[rows[:, 0]])
-    listeners, pair_listener = _points(dataset.listener[rows[:, 0]])
+    emitters, pair_emitter = unique_points(dataset.emitter[rows[:, 0]])
+    listeners, pair_listener = unique_points(dataset.listener[rows[:, 0]])
     responses, training = _MeasuredResponses(dataset, rows), ~dataset.held_out[rows[:, 0]]
     pairs = TrainingPairs(responses, pair_listener, pair_emitter, listeners, emitters, training)
     return MeasuredPairs(pairs, dataset.onset_s[rows[:, 0]], yaws, int((~complete).sum()))
@@ -231,6 +231,7 @@ def _of_measurement(dataset: ImportedDataset) -> HeldOut:
     )
 
 
-def _points(positions: _Floats) -> tuple[_Floats, _Integers]:
+def unique_points(positions: _Floats) -> tuple[_Floats, _Integers]:
+    """The different positions (point, 3) of rows (row, 3), and the point (row,) of each."""
     points, index = np.unique(positions, axis=0, return_inverse=True)
     return points, index.reshape(-1)

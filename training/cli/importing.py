@@ -6,6 +6,7 @@ Each command imports its reader when it runs, because every command of `nafir-tr
 import json
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from training.data.importers.receivers import Receivers
 
 if TYPE_CHECKING:
     from training.data.importers.conditioning import Conditioning
+    from training.data.importers.report import ImportReport
     from training.data.responses import Measurement
 
 importing = StrictTyper(no_args_is_help=True, help="Import responses; each command reads one published layout.")
@@ -43,6 +45,13 @@ HeldOut = Annotated[
     float, typer.Option("--held-out", min=0.0, max=0.9, help="Share of pairs that training never sees.")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Chooses the pairs held out.")]
+Split = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SPLIT",
+        help="Hold out the test responses of this split, in place of a share of pairs: as in nafir-train benchmark.",
+    ),
+]
 Latency = Annotated[
     int,
     typer.Option(
@@ -89,6 +98,7 @@ def import_soundspaces(
     mirror: Mirror = None,
     swap_ears: SwapEars = False,
     accept_ears: AcceptEars = False,
+    split: Split = None,
     as_json: Json = False,
 ) -> None:
     """A scene of SoundSpaces 1.0: points.txt and <azimuth>/<receiver>_<source>.wav, binaural."""
@@ -105,6 +115,7 @@ def import_soundspaces(
         partial(read, points=points),
         held_out=held_out,
         seed=seed,
+        split=_Split(split, points=points),
         as_json=as_json,
     )
 
@@ -123,6 +134,7 @@ def import_meshrir(
     duration_s: Duration = None,
     position_scale: Scale = 1.0,
     mirror: Mirror = None,
+    split: Split = None,
     as_json: Json = False,
 ) -> None:
     """A room of MeshRIR: pos_mic.npy, pos_src.npy and ir_<microphone>.npy, one channel."""
@@ -137,6 +149,7 @@ def import_meshrir(
         partial(read, source_rate=source_rate),
         held_out=held_out,
         seed=seed,
+        split=_Split(split),
         as_json=as_json,
     )
 
@@ -152,13 +165,56 @@ def import_raf(
     duration_s: Duration = None,
     position_scale: Scale = 1.0,
     mirror: Mirror = None,
+    split: Split = None,
     as_json: Json = False,
 ) -> None:
     """A room of Real Acoustic Fields: rir.wav, rx_pos.txt and tx_pos.txt in numbered folders, one channel."""
     from training.data.importers.raf import read
 
     conditioning = _conditioning(latency_samples, sample_rate, duration_s, position_scale, mirror)
-    _import("raf", source, output, conditioning, read, held_out=held_out, seed=seed, as_json=as_json)
+    _import(
+        "raf",
+        source,
+        output,
+        conditioning,
+        read,
+        held_out=held_out,
+        seed=seed,
+        split=_Split(split),
+        as_json=as_json,
+    )
+
+
+@importing.command("acousticrooms")
+def import_acousticrooms(
+    source: Source,
+    output: Output,
+    room: Annotated[str, typer.Option(help="Which room, kind/room, where the folder has several.")] = "",
+    held_out: HeldOut = 0.1,
+    seed: Seed = 0,
+    latency_samples: Latency = 0,
+    sample_rate: Rate = None,
+    duration_s: Duration = None,
+    position_scale: Scale = 1.0,
+    mirror: Mirror = None,
+    split: Split = None,
+    as_json: Json = False,
+) -> None:
+    """One room of AcousticRooms: single_channel_ir/<kind>/<room>/S<source>_R<receiver>_hybrid_IR.wav, one channel."""
+    from training.data.importers.acousticrooms import read
+
+    conditioning = _conditioning(latency_samples, sample_rate, duration_s, position_scale, mirror)
+    _import(
+        "acousticrooms",
+        source,
+        output,
+        conditioning,
+        partial(read, room=room),
+        held_out=held_out,
+        seed=seed,
+        split=_Split(split),
+        as_json=as_json,
+    )
 
 
 @importing.command("sofa")
@@ -211,6 +267,34 @@ def _conditioning(
     return Conditioning(latency_samples, sample_rate, duration_s, position_scale, axis, swap_ears, accept_ears)
 
 
+@dataclass(frozen=True)
+class _Split:
+    """A split that was asked for, and what the layout has to be told to list its responses."""
+
+    asked: str | None = None
+    points: Path | None = None
+
+    def apply(
+        self, named: Iterable[tuple[str, "Measurement"]], layout: str, source: Path, report: "ImportReport"
+    ) -> Iterable[tuple[str, "Measurement"]]:
+        """The measurements of the split's two parts, with the mark of their part; others are skipped."""
+        if self.asked is None:
+            yield from named
+            return
+        from training.data.importers.layouts import LAYOUTS, Options
+        from training.data.importers.report import ImportReport
+
+        entries = LAYOUTS[layout].entries(source, ImportReport(), Options(points=self.points))
+        split = LAYOUTS[layout].split_of(source, entries, self.asked)
+        report.note(f"held out: the test responses of the split {split.name} ({split.source})")
+        for name, measurement in named:
+            role = split.role(measurement.name)
+            if role in {"train", "test"}:
+                yield name, replace(measurement, held_out=role == "test")
+            else:
+                report.skip(name, f"of the split's {role} part" if role else "not in the split")
+
+
 def _import(
     layout: str,
     source: Path,
@@ -221,6 +305,7 @@ def _import(
     held_out: float,
     seed: int,
     as_json: bool,
+    split: _Split = _Split(),
 ) -> None:
     from training.data.importers.conditioning import SourceError, condition, within_limits
     from training.data.importers.report import ImportReport
@@ -236,7 +321,7 @@ def _import(
     report = ImportReport()
     # Closed at once if the import fails: otherwise the progress bar would be drawn after the message.
     with closing(read(source, report, track=tracked)) as named:
-        measurements = condition(named, conditioning, report, source=source)
+        measurements = condition(split.apply(named, layout, source, report), conditioning, report, source=source)
         dataset = ImportedDataset.write(
             output,
             within_limits(measurements, source),

@@ -14,6 +14,7 @@ from server.core.command_line import StrictTyper, require_at_most_one, writable_
 from server.core.errors import NafirError
 from server.core.files import require_matplotlib, require_writable
 from server.core.numerals import parse_integer
+from training.cli import benchmarking
 from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
 from training.cli.importing import importing
@@ -264,6 +265,8 @@ def _print_findings(responses: "ResponseSet") -> None:
 
 for command in (evaluation.evaluate, evaluation.tabulate, evaluation.maps, evaluation.probe):
     app.command()(command)
+app.command()(benchmarking.benchmark)
+app.command()(benchmarking.predict)
 
 
 @app.command()

@@ -99,13 +99,16 @@ class ResponseSet(Protocol):
 
 @dataclass(frozen=True)
 class Measurement:
-    """One response `(channel, sample)` with its pose, as an importer yields it."""
+    """One response `(channel, sample)` with its pose, as an importer yields it. name: what splits call it. held_out:
+    whether training never sees it; None if that is to be drawn."""
 
     listener: tuple[float, float, float]
     emitter: tuple[float, float, float]
     response: _Responses
     sample_rate: int
     yaw: float = 0.0
+    name: str = ""
+    held_out: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -206,8 +209,9 @@ class ImportedDataset:
         seed: int = 0,
     ) -> "ImportedDataset":
         """Writes the measurements to a folder and counts them in the report, which the iteration may still extend.
-        Measurements may differ in length; shorter ones are padded with zeros. The folder appears only when it is
-        complete, and an earlier import in it is replaced.
+        Measurements may differ in length; shorter ones are padded with zeros. Unless they all say whether they are held
+        out, a share of their pairs is drawn. The folder appears only when it is complete, and an earlier import in it
+        is replaced.
 
         Raises ResponsesError if there are no measurements, if they differ in sample rate or channels, or if one is
         empty or not finite, and DatasetError if the folder holds a simulated dataset.
@@ -247,7 +251,7 @@ def _write_rows(
 ) -> None:
     """Writes the measurements to the file `path`. `held_out` is the share of couples that are held out, and the seed
     that chooses them."""
-    listener, emitter, yaw = [], [], []
+    listener, emitter, yaw, held_out_rows = [], [], [], []
     with h5py.File(path, "w") as file:
         channels, samples = first.response.shape
         responses = file.create_dataset(
@@ -271,9 +275,14 @@ def _write_rows(
             listener.append(measurement.listener)
             emitter.append(measurement.emitter)
             yaw.append(measurement.yaw)
+            held_out_rows.append(measurement.held_out)
             report.read += 1
         file["listener"], file["emitter"], file["yaw"] = np.array(listener), np.array(emitter), np.array(yaw)
-        file["held_out"] = choose_held_out(np.array(emitter), np.array(listener), *held_out)
+        file["held_out"] = (
+            choose_held_out(np.array(emitter), np.array(listener), *held_out)
+            if None in held_out_rows
+            else np.array(held_out_rows, dtype=bool)
+        )
         file.attrs.update(
             format=FORMAT,
             sample_rate=first.sample_rate,

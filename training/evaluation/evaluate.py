@@ -39,8 +39,8 @@ _STANDARD_ERRORS = 2.0
 _MISSING_ALLOWANCE = 0.01
 _TIMED_PAIRS = 7
 _TIMED_S = 5.0
-_SPECTRAL_WINDOW_S = 0.0107
-_SPECTRAL_FLOOR = 1e-5
+SPECTRAL_WINDOW_S = 0.0107
+SPECTRAL_FLOOR = 1e-5
 
 Kind = Literal["field", "baseline", "simulation", "floor"]
 RATED = frozenset({"field", "baseline"})
@@ -254,8 +254,8 @@ def spectral_codec(sample_rate: int, samples: int) -> Codec:
     """The codec of spectral losses, the same for every method. Windows are about 11 ms long (256 samples at 24 kHz)
     with a hop of a quarter, and the floor of magnitudes is 100 dB below a unit impulse. The paper's windows are twice
     as long, and its floor is 40 dB higher, which would hide all of our late tails."""
-    n_fft = 2 ** round(np.log2(_SPECTRAL_WINDOW_S * sample_rate))
-    return Codec(sample_rate, n_fft, n_fft // 4, samples, _SPECTRAL_FLOOR)
+    n_fft = 2 ** round(np.log2(SPECTRAL_WINDOW_S * sample_rate))
+    return Codec(sample_rate, n_fft, n_fft // 4, samples, SPECTRAL_FLOOR)
 
 
 def milliseconds_per_response(column: Column, held_out: HeldOut) -> float | None:

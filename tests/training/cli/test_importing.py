@@ -99,3 +99,19 @@ def test_bad_sources_are_told_in_a_line(nafir_train, tmp_path, layout, source, t
     assert last.startswith("nafir-train: ")
     assert told.format(tmp=tmp_path) in last
     assert not (tmp_path / "data").exists()
+
+
+def test_a_published_split_says_what_is_held_out(nafir_train, meshrir, tmp_path):
+    split = tmp_path / "split.json"
+    parts = {"train": [f"{m}_0" for m in range(5)], "test": ["0_1", "3_1"], "validation": ["1_1"]}
+    split.write_text(json.dumps(parts))
+    arguments = ("meshrir", meshrir, "-o", tmp_path / "data", "--source-rate", RATE, "--json", "--split", split)
+    code, out, _ = nafir_train(*arguments)
+    assert code == 0
+    skipped = json.loads(out)["report"]["skipped"]
+    assert skipped["of the split's validation part"]["examples"] == ["ir_1.npy[1]"]
+    assert skipped["not in the split"]["count"] == 2
+    dataset = open_responses(tmp_path / "data")
+    held_out = {tuple(dataset.listener[row]) for row in np.flatnonzero(dataset.held_out)}
+    assert held_out == {tuple(MICROPHONES[0]), tuple(MICROPHONES[3])}
+    assert len(dataset.yaw) == 7

@@ -11,11 +11,13 @@ for zeros; here it counts as missing (Chen et al., "SoundSpaces: audio-visual na
 import math
 import re
 from collections.abc import Callable, Generator, Iterable
+from functools import partial
 from pathlib import Path
 
 from server.core.numerals import parse_decimal, parse_integer
 from training.data.importers.audio import UnreadableError, read_response
 from training.data.importers.conditioning import SourceError
+from training.data.importers.entries import Entry, Pose, at
 from training.data.importers.report import ImportReport
 from training.data.responses import Measurement
 
@@ -28,13 +30,29 @@ def read(
     report: ImportReport,
     *,
     points: Path | None = None,
-    track: Callable[[list[Path]], Iterable[Path]] = iter,
+    track: Callable[[list[Entry]], Iterable[Entry]] = iter,
 ) -> Generator[tuple[str, Measurement]]:
     """Yields a name and a measurement for each response of the scene folder that holds the azimuths. Without `points`,
     points.txt is looked for in that folder, and where a SoundSpaces download has it (`metadata` beside
     `binaural_rirs`).
 
     Raises SourceError for missing or malformed points, or for a folder without azimuths.
+    """
+    for entry in track(entries(folder, report, points=points)):
+        name = f"{entry.name}.wav"
+        try:
+            response, rate = entry.response()
+        except UnreadableError as exc:
+            report.skip(name, str(exc))
+            continue
+        pose = entry.pose()
+        yield name, Measurement(pose.listener, pose.emitter, response, rate, pose.yaw, entry.name)
+
+
+def entries(folder: Path, report: ImportReport, *, points: Path | None = None) -> list[Entry]:
+    """The responses of a scene folder, each named `<azimuth>/<receiver>_<source>`. The report gets what is skipped.
+
+    Raises SourceError as `read` does.
     """
     positions = read_points(points or _points_file(folder))
     azimuths = _azimuths(folder, report)
@@ -51,19 +69,24 @@ def read(
     for azimuth, names in by_azimuth.items():
         for name in sorted(everywhere - names):
             report.skip(f"{azimuth.name}/{name}", "missing at this azimuth")
-    for path in track([azimuth / name for azimuth, names in by_azimuth.items() for name in sorted(names)]):
-        name = f"{path.parent.name}/{path.name}"
+    found = []
+    for path in [azimuth / name for azimuth, names in by_azimuth.items() for name in sorted(names)]:
         receiver, source = (int(index) for index in path.stem.split("_"))
         if receiver not in positions or source not in positions:
-            report.skip(name, "a point that points.txt does not have")
+            report.skip(f"{path.parent.name}/{path.name}", "a point that points.txt does not have")
             continue
-        try:
-            response, rate = read_response(path, channels=2, report=report)
-        except UnreadableError as exc:
-            report.skip(name, str(exc))
-            continue
-        yaw = heading_to_yaw(_azimuth(path.parent))
-        yield name, Measurement(positions[receiver], positions[source], response, rate, yaw)
+        pose = Pose(positions[receiver], positions[source], heading_to_yaw(_azimuth(path.parent)))
+        found.append(
+            Entry(
+                f"{path.parent.name}/{path.stem}",
+                path,
+                "_".join(map(str, sorted((receiver, source)))),
+                at(pose),
+                partial(read_response, path, 2, report),
+                path.parent.name,
+            )
+        )
+    return found
 
 
 def heading_to_yaw(azimuth_deg: float) -> float:
