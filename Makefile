@@ -162,14 +162,16 @@ $(RUNS)/measured: $(RUNS)/trained
 		--figure $(RUNS)/errors.png
 	@touch $@
 
-# The paper's network, `naf` of the sound that our field learns too and `naf-whole` of whole responses, as in the paper.
+# The paper's network: `naf` of draws of the sound that our field learns too, `naf-expected` of the expected values that our
+# field learns, some gigabytes of them, and `naf-whole` of draws of whole responses, as in the paper.
 $(RUNS)/%-exported: $(RUNS)/trained
 	$(STEP) $* $(TRAIN) train $(RUNS)/data -o $(RUNS)/$* --field $* $(NAF) --points 100
 	$(STEP) export-$* $(TRAIN) export $(RUNS)/$* -o $(RUNS)/$*-bundle
 	@touch $@
 
-$(RUNS)/table.md: $(RUNS)/measured $(RUNS)/naf-exported $(RUNS)/naf-whole-exported
-	$(STEP) table $(TRAIN) evaluate $(RUNS)/bundle $(RUNS)/naf-bundle $(RUNS)/naf-whole-bundle $(RUNS)/data \
+$(RUNS)/table.md: $(RUNS)/measured $(RUNS)/naf-exported $(RUNS)/naf-expected-exported $(RUNS)/naf-whole-exported
+	$(STEP) table $(TRAIN) evaluate $(RUNS)/bundle $(RUNS)/naf-bundle $(RUNS)/naf-expected-bundle \
+		$(RUNS)/naf-whole-bundle $(RUNS)/data \
 		--methods $(METHODS) \
 		$(MEASURE) --pairs $(PAIRS) --yaws 1 --draws $(DRAWS) --output $(RUNS)/table.json --markdown > $@
 

@@ -80,9 +80,11 @@ class ExpectedTargets:
         specular = self._mean(emitter, listener, advance)
         mean = np.zeros(variance.shape, np.complex128)
         mean[..., : specular.shape[-1]] = specular[..., :frames]
-        # Windows of consecutive frames overlap, so noise has a product, too.
+        # Windows of consecutive frames overlap, so noise has a product, too. Below the codec's floor there is no phase
+        # worth learning.
         overlap = np.sum(codec.window[codec.hop :] * codec.window[: -codec.hop]) / codec.window_energy
-        noise = np.sqrt(variance[..., 1:] * variance[..., :-1]) * overlap
+        spread = np.sqrt(variance + codec.log_floor**2)
+        noise = spread[..., 1:] * spread[..., :-1] * overlap
         product = mean[..., 1:] * np.conj(mean[..., :-1]) * np.exp(-1j * codec.nominal_advance) + noise
         frequency = np.concatenate([np.angle(mean[..., :1]), np.angle(product)], axis=-1)
         log_magnitude = codec.log_magnitude(np.sqrt(np.abs(mean) ** 2 + variance))

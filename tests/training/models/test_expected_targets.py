@@ -62,19 +62,21 @@ def test_the_expected_level_of_a_point_is_that_of_the_power_of_many_draws(points
 
 
 def test_the_expected_frequency_is_where_products_of_consecutive_frames_point(points):
-    """Weighted by power, drawn products turned back by what is expected point along the real axis, and more so than
-    without: what is specular has a frequency."""
+    """Weighted by power, drawn products turned back by what is expected point along the real axis. Where something else
+    than noise is expected, which is where sound is specular, they do not without."""
     codec, expected, drawn = points
     product = drawn[..., 1:] * np.conj(drawn[..., :-1]) * np.exp(-1j * codec.nominal_advance)
     turned = product * np.exp(-1j * expected[..., 1:, 1])
-    along, unturned = (np.sum(values.real) / np.sum(np.abs(values)) for values in (turned, product))
-    assert along > unturned + 0.01
+    specular = np.abs(expected[..., 1:, 1]) > 1.0
+    along, unturned = (np.sum(values[specular].real) / np.sum(np.abs(values[specular])) for values in (turned, product))
+    assert along > unturned + 0.2
     assert abs(np.sum(turned.imag) / np.sum(np.abs(turned))) < 0.02
 
 
 def test_of_noise_alone_the_expected_frequency_is_zero(points):
+    """After the mirrored reflections, and before an aligned response fades out."""
     _, expected, _ = points
-    assert np.abs(expected[..., -20:, 1]).max() < 1e-3
+    assert np.mean(np.abs(expected[..., 10:20, 1]) < 0.05) > 0.99
 
 
 @pytest.mark.parametrize("name", ["fine", "late"])
