@@ -18,7 +18,7 @@ from server.core.errors import NafirError
 from server.rendering.hrtf import HeadFilters, Hrtf, kemar
 from server.scene.bundle import Bundle
 from training.baselines.baselines import PairResponses, TrainingPairs
-from training.data.dataset import TAKES, Dataset
+from training.data.dataset import TAKES, Dataset, Half
 from training.data.dataset_check import DatasetError
 from training.data.responses import ImportedDataset
 from training.simulation.references import References
@@ -108,6 +108,17 @@ class HeldOut:
             yaws=heads,
             filters=filters,
         )
+
+    def of_half(self, half: Half) -> "HeldOut":
+        """Those of one half of the held-out pairs. Quality levels are chosen by the other one.
+
+        Raises EvaluationError for measured responses, by which no levels are chosen.
+        """
+        if self.simulated is None:
+            raise EvaluationError(f"{self.name}: no levels are chosen by measured responses, so there are no halves")
+        ends = self.simulated.held_out_half(half)
+        kept = np.isin(self.held_out, ends[:, 0] * len(self.simulated.probes) + ends[:, 1])
+        return replace(self, held_out=self.held_out[kept], visible=self.visible[kept])
 
     def sample(self, *, pairs: int | None, yaws: int | None, seed: int) -> "HeldOut":
         """A random subset of `pairs` pairs, and `yaws` evenly spaced orientations; all of them if there are fewer."""

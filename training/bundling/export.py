@@ -4,7 +4,7 @@ torch before anything is written."""
 import io
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -24,21 +24,23 @@ from server.field.runtime import open_session
 from server.health.check import Effort, Health, check, check_fields
 from server.health.findings import LAWS
 from server.scene.bundle import Bundle, write_bundle
-from server.scene.manifest import ARRAYS_FILE, AcceptedLaw, CodecParameters, FieldFile, QualityLevel
+from server.scene.manifest import ARRAYS_FILE, AcceptedLaw, CodecParameters, FieldFile, Phase, QualityLevel
 from training.baselines.held_out import measured_pairs
 from training.baselines.shaped import ShapedNearest
 from training.bundling.data_reference import reference_of
-from training.bundling.graphs import halve_weights, pose_by_pose, to_int8, to_onnx, with_weights
+from training.bundling.graphs import halve_weights, pose_by_pose, to_int8, to_onnx, with_metadata, with_weights
 from training.bundling.manifests import Fields, measured_manifest, simulated_manifest
 from training.bundling.noise import choose_noise
 from training.bundling.shaped_graph import ShapedNearestGraph
 from training.data.responses import FILE, ImportedDataset, ResponseSet
+from training.evaluation.fields import INTEGRATED
 from training.learning.basis import BasisLearner
 from training.learning.directional import DirectionalLearner
 from training.learning.factorised import FactorisedLearner
 from training.learning.learner import Learner
 from training.learning.naf import NafLearner
-from training.learning.runs import Configuration
+from training.learning.record import RECORD
+from training.learning.runs import Configuration, record_of
 from training.learning.train import load_learner
 from training.models.basis_field import BasisField
 from training.models.directional import ExportedDirections
@@ -96,6 +98,11 @@ class _Exported:
     codec: CodecParameters
     order: int | None = None
 
+    @property
+    def learns_phase(self) -> bool:
+        """Whether it predicts a phase throughout, with which its responses can be heard in place of noise."""
+        return self.architecture.startswith("naf") and self.codec.known_frames > 0
+
 
 def export(
     responses: ResponseSet,
@@ -109,7 +116,8 @@ def export(
     progress: Progress | None = None,
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision. The first field is the
-    default. Levels of directional fields make the tail in octave bands. Factorised and directional fields are also
+    default. Levels of directional fields make the tail in octave bands. A `naf` of spectrograms has two levels: with
+    the phase of frozen noise, and with the phase that it has learned. Factorised and directional fields are also
     written at each lower one of `ranks`, with the least loss. With `exact_tables`, a `naf` is also written with less
     arithmetic for the same numbers. In place of a run, the folder of measured responses stands for the field that needs
     no training, `ShapedNearest`, in one precision.
@@ -168,12 +176,15 @@ def _graphs(
     for field, place in zip(fields, places, strict=True):
         if isinstance(field, ImportedDataset):
             exported.append(_shaped(field))
-        elif isinstance(field, BasisLearner):
-            exported += _of_a_basis(field, Configuration.read(place), variants, _usual_width(fields))
+            continue
+        if isinstance(field, BasisLearner):
+            graphs = _of_a_basis(field, Configuration.read(place), variants, _usual_width(fields))
         elif isinstance(field, NafLearner):
-            exported += _naf(field, Configuration.read(place), variants)
+            graphs = _naf(field, Configuration.read(place), variants)
         else:
             raise TypeError(f"{type(field)} has no graph")
+        record = record_of(place)
+        exported += [replace(graph, model=with_metadata(graph.model, {RECORD: record.to_json()})) for graph in graphs]
     _require_different([each.name for each in exported])  # with lower ranks
     return exported
 
@@ -201,14 +212,16 @@ def _contents(exported: Sequence[_Exported], precision: Precision, seed: int) ->
         )
         for title, each in zip(titles, exported, strict=True)
     }
-    levels = tuple(
-        QualityLevel(
-            name=title if number else DEFAULT_LEVEL, field=title, tail="stft" if each.order is None else "bands"
-        )
-        for number, (title, each) in enumerate(zip(titles, exported, strict=True))
-    )
+    levels = []
+    for number, (title, each) in enumerate(zip(titles, exported, strict=True)):
+        tail: Literal["stft", "bands"] = "stft" if each.order is None else "bands"
+        level = QualityLevel(name=title if number else DEFAULT_LEVEL, field=title, tail=tail)
+        levels.append(level)
+        if each.learns_phase:
+            name = f"{level.name}{INTEGRATED}"
+            levels.append(level.model_copy(update={"name": name, "phase": Phase(kind="integrated")}))
     files[ARRAYS_FILE] = _arrays(even_noise(codec.codec, np.random.default_rng([seed, 6])))
-    return files, Fields(codec, fields, levels, dict.fromkeys(files, "0" * 64))
+    return files, Fields(codec, fields, tuple(levels), dict.fromkeys(files, "0" * 64))
 
 
 def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
@@ -345,7 +358,7 @@ def _naf(learner: NafLearner, configuration: Configuration, variants: _Variants)
         graph = to_onnx(module, _tensors(poses, 1), outputs, free_batch=False)
         for precision in variants.precisions:
             small = to_int8(graph, least_weights=field.shape.width**2) if precision == "int8" else graph
-            model = pose_by_pose(small)
+            model = pose_by_pose(halve_weights(small))
             _check(model, module, poses, outputs, precision)
             name = f"{configuration.name}{'-tables' if tabled else ''}{_suffix(precision)}"
             exported.append(_Exported(name, model, configuration.name, None, codec))

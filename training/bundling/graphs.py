@@ -125,6 +125,14 @@ def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
     return halved
 
 
+def with_metadata(model: onnx.ModelProto, metadata: dict[str, str]) -> onnx.ModelProto:
+    """The graph with entries in the metadata that ONNX provides for."""
+    told = onnx.ModelProto()
+    told.CopyFrom(model)
+    helper.set_model_props(told, metadata)
+    return told
+
+
 def to_int8(model: onnx.ModelProto, *, least_weights: int) -> onnx.ModelProto:
     """Computes products with at least `least_weights` constant weights in 8-bit integers: weights are quantised per
     column, the other factor at each call. Smaller products stay in float32, because they take little time."""

@@ -3,7 +3,7 @@
 import json
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 from rich.console import Console
@@ -22,9 +22,13 @@ def evaluate(
     ],
     methods: Annotated[
         str, typer.Option(help="Methods to compare with, separated by commas; an empty string for none.")
-    ] = "nearest,linear,linear-aligned",
+    ] = "nearest,linear,linear-aligned,mean-spectrogram",
     pairs: Annotated[int | None, typer.Option(min=1, help="Held-out pairs to draw; all if not given.")] = None,
     yaws: Annotated[int | None, typer.Option(min=1, help="Head orientations of each; all if not given.")] = None,
+    half: Annotated[
+        str | None,
+        typer.Option(help="report for pairs that levels were not chosen by, choice for the others; all if not given."),
+    ] = None,
     draws: Annotated[int, typer.Option(min=1, help="Compare with medians of so many more simulations.")] = 1,
     hrtf: Annotated[
         Path | None, typer.Option(help="Hear simulated data and fields through this head (SOFA, SimpleFreeFieldHRIR).")
@@ -54,11 +58,15 @@ def evaluate(
     from rich.progress import track
 
     from server.scene.bundle import MANIFEST_FILE, Bundle
+    from training.data.dataset import Half
     from training.evaluation.fields import record_accuracy
     from training.evaluation.report import markdown, report
     from training.evaluation.run import evaluate_bundles
 
     require_at_most_one({"--json": as_json, "--markdown": as_markdown})
+    chosen = next((known for known in get_args(Half) if known == half), None)
+    if half is not None and chosen is None:
+        raise typer.BadParameter(f"knows {' and '.join(get_args(Half))}", param_hint="--half")
     runs = [place for place in places[:-1] if (place / "run.json").is_file()]
     bundles = [Bundle.load(place) for place in places[:-1] if place not in runs]
     if record and (len(bundles) != 1 or runs or draws > 1):
@@ -77,6 +85,7 @@ def evaluate(
         methods=[name.strip() for name in methods.split(",") if name.strip()],
         pairs=pairs,
         yaws=yaws,
+        half=chosen,
         draws=draws,
         hrtf=hrtf,
         tilt_deg=tilt,

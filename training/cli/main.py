@@ -277,7 +277,9 @@ def frontier(
         Path,
         typer.Option("--output", "-o", help="Folder for frontier.json and frontier.png.", callback=writable_folder),
     ],
-    pairs: Annotated[int, typer.Option(min=2, help="Held-out pairs to measure.")] = 40,
+    pairs: Annotated[
+        int, typer.Option(min=4, help="Held-out pairs to measure: half to choose levels, half to report errors.")
+    ] = 80,
     yaws: Annotated[int, typer.Option(min=1, help="Head orientations of each.")] = 3,
     walk_s: Annotated[float, typer.Option(min=10, help="Seconds of the walk that costs are measured on.")] = 300.0,
     phases_of: Annotated[list[str] | None, typer.Option(help="Fields to sweep over phases; all, or none.")] = None,

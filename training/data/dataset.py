@@ -6,8 +6,9 @@ energies, and computes the direct sound and the reflections that are mirrored fr
 Energies are natural logarithms in float16, exact to 0.03 dB, with the axes take, emitter, listener, direction, band and
 bin. The pair of a probe with itself is absent. The second take has the held-out pairs only.
 
-If the simulation plan has one tail for all pairs, the energies of the tail are stored once. Each pair then stores only
-what comes before the tail. Reading gives the energies of whole responses.
+If the simulation plan has one tail for all pairs, the energies of the tail are stored once for each take of the
+held-out pairs, and once more, traced anew, for the pairs to train on. Each pair then stores only what comes before the
+tail. Reading gives the energies of whole responses.
 
 The file keeps the plan that it was simulated by.
 """
@@ -33,6 +34,8 @@ from training.data.simulation_plan import SimulationPlan
 
 SPEED_OF_SOUND = 343.0
 FORMAT = 5
+Half = Literal["choice", "report"]
+"""Halves of the held-out pairs: quality levels are chosen by one, and their errors are reported on the other."""
 GEOMETRIC_ORDER: Literal[1] = 1
 """Reflections of up to this order are computed from geometry, as the direct sound is, and no field learns them."""
 TAKES = ("reflected", "repeats")
@@ -201,6 +204,16 @@ class Dataset:
         chosen = self.held_out if held_out else ~self.held_out & ~np.eye(len(self.probes), dtype=bool)
         return np.argwhere(chosen)
 
+    def held_out_half(self, half: Half) -> npt.NDArray[np.int64]:
+        """(pair, 2) emitter and listener of a random half of the held-out pairs: what is chosen by one half is reported
+        on the other. Both directions of a couple are in the same half; a single couple is in both."""
+        pairs = self.pairs(held_out=True)
+        couples, couple = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
+        shuffled = np.random.default_rng([self.seed, 13]).permutation(len(couples))
+        first = shuffled[: max(1, len(couples) // 2)]
+        chosen = first if half == "choice" else shuffled[min(len(first), len(couples) - 1) :]
+        return pairs[np.isin(couple.reshape(-1), chosen)]
+
     @cached_property
     def tail(self) -> SharedTail | None:
         """The tail that all pairs share, or None if each pair has its own."""
@@ -216,7 +229,11 @@ class Dataset:
         with h5py.File(self.folder / "pairs.h5", "r") as file:
             logarithms = np.stack([file["log_energy"][number, emitter, listener] for emitter, listener in pairs])
         energies = np.exp(logarithms.astype(np.float32))
-        return energies if self.tail is None else np.stack([self.tail.join(number, energy) for energy in energies])
+        tail = self.tail
+        if tail is None:
+            return energies
+        numbers = [tail.number(number, held_out=bool(self.held_out[emitter, listener])) for emitter, listener in pairs]
+        return np.stack([tail.join(*of_pair) for of_pair in zip(numbers, energies, strict=True)])
 
 
 def _histogram(scene: SceneFile, plan: SimulationPlan) -> tuple[int, int, int]:

@@ -37,7 +37,8 @@ def require_possible_energies(path: Path, file: h5py.File, shape: tuple[int, ...
         for name, values in (("energies", energies), ("start_s", start_s)):
             if not np.isfinite(values).all() or np.min(values, initial=0) < 0:
                 raise DatasetError(f"{path}: tail.{name}: has values that are negative or not finite; simulate anew")
-        if energies.shape[:3] != (shape[0], *shape[3:5]):
+        # Files of earlier versions have one tail for a take, and none of the training pairs' own.
+        if len(energies) not in (shape[0], shape[0] + 1) or energies.shape[1:3] != shape[3:5]:
             raise DatasetError(
                 f"{path}: tail.energies: has shape {energies.shape}, expected takes, directions and bands of {shape}; "
                 "simulate anew"

@@ -29,6 +29,7 @@ from server.acoustics.metrics import (
 from server.acoustics.room_parameters import RoomParameters, measure
 from training.baselines.held_out import EvaluationError, HeldOut, Responses
 from training.evaluation.stored_errors import Errors, StoredErrors
+from training.learning.record import TrainingRecord
 
 FLOOR = "floor"
 ONE_SIMULATION = "one simulation"
@@ -54,7 +55,8 @@ _Errors = npt.NDArray[np.float64]
 @dataclass(frozen=True)
 class Column:
     """One method. storage_bytes: what it must store for the scene. method: its name in published tables. extra_ms: time
-    per response that was spent in advance, and that `source` therefore does not take. A column of kind "floor" is a
+    per response that was spent in advance, and that `source` therefore does not take. training: how far a network was
+    trained. A column of kind "floor" is a
     second simulation, which is always compared with the first. One of kind "simulation" is compared like a method."""
 
     name: str
@@ -63,6 +65,7 @@ class Column:
     storage_bytes: int | None = None
     method: str = ""
     extra_ms: float = 0.0
+    training: TrainingRecord | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,7 @@ class Result:
     beats: Mapping[str, tuple[str, ...]]
     surpassed_by: Mapping[str, tuple[str, ...]]
     errors: Mapping[str, _Errors] = field(repr=False, compare=False)
+    training: TrainingRecord | None = None
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,7 @@ class Evaluation:
                 "method": result.method,
                 "storage_bytes": result.storage_bytes,
                 "ms": result.ms,
+                "training": None if result.training is None else asdict(result.training),
                 "metrics": {
                     metric.name: {
                         **asdict(result.summaries[metric.name]),
@@ -297,6 +302,7 @@ def _result(
             for metric in METRICS
         },
         errors=ours,
+        training=column.training,
     )
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import onnx
 
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
@@ -15,7 +16,10 @@ from server.scene.manifest import Accuracy, QualityLevel
 from training.baselines.held_out import EvaluationError, HeldOut, Responses, require_same_scene
 from training.baselines.moved_nodes import with_moved_nodes
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
+from training.learning.record import RECORD, TrainingRecord
 
+INTEGRATED = "-integrated"
+"""The end of the names of levels and rows whose phase is what a network has learned, in place of noise."""
 _LATTICE_POSITIONS = 8
 """The number of random positions of a lattice, which are used for held-out pairs in turn."""
 
@@ -40,16 +44,23 @@ def field_columns(bundles: Sequence[Bundle], held_out: HeldOut) -> list[Column]:
                     "field",
                     storage_bytes=len(bundle.models[file.file]) + bundle.frozen_noise.nbytes,
                     method=_method(file.architecture),
+                    training=training_of(bundle, file.file),
                 )
             )
     return columns
 
 
 def _method(architecture: str) -> str:
-    """The name of the architecture in tables of published figures."""
-    if architecture == "naf-whole":
-        return architecture
-    return "naf" if architecture.startswith("naf") else ""
+    """The name of the architecture in tables, ours and published ones. A variant of a network has its own name, so that
+    it does not stand beside figures of another network."""
+    return architecture if architecture.startswith("naf") else ""
+
+
+def training_of(bundle: Bundle, file: str) -> TrainingRecord | None:
+    """How far the network of a graph was trained; None if the graph does not say."""
+    graph = onnx.load_model_from_string(bundle.models[file])
+    entries = {entry.key: entry.value for entry in graph.metadata_props}
+    return TrainingRecord.from_json(entries[RECORD]) if RECORD in entries else None
 
 
 def field_source(field: AcousticField, held_out: HeldOut) -> Source:

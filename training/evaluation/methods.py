@@ -11,10 +11,12 @@ from training.baselines.coded import AAC, AudioCodec, CodedResponses, Track, opu
 from training.baselines.held_out import EvaluationError, HeldOut, Responses
 from training.baselines.helmholtz import HelmholtzInterpolation
 from training.baselines.image_sources import ImageSources
+from training.baselines.mean_spectrogram import MeanSpectrogram
 from training.baselines.shaped import ShapedNearest
 from training.evaluation.evaluate import FLOOR, ONE_SIMULATION, Column, Source
 
-DEFAULT_METHODS = ("nearest", "linear", "linear-aligned")
+MEAN_SPECTROGRAM = "mean-spectrogram"
+DEFAULT_METHODS = ("nearest", "linear", "linear-aligned", MEAN_SPECTROGRAM)
 Answer = Callable[[int, npt.NDArray[np.integer]], Responses | None]
 
 # Listeners are about a metre from each other in most of our data, so interpolation fails at higher frequencies.
@@ -56,12 +58,12 @@ class _Prepared:
 
     def __init__(self, held_out: HeldOut, track: Track) -> None:
         self.held_out = held_out
-        self._track = track
+        self.track = track
         self._coded: dict[str, CodedResponses] = {}
 
     def coded(self, codec: AudioCodec) -> CodedResponses:
         if codec.name not in self._coded:
-            self._coded[codec.name] = CodedResponses(codec, self.held_out, track=self._track)
+            self._coded[codec.name] = CodedResponses(codec, self.held_out, track=self.track)
         return self._coded[codec.name]
 
 
@@ -115,6 +117,12 @@ def _shaped(name: str, prepared: _Prepared) -> Column:
     return _of_stored(name, held_out, shaped.response)
 
 
+def _mean_spectrogram(name: str, prepared: _Prepared) -> Column:
+    held_out = prepared.held_out
+    mean = MeanSpectrogram(held_out, whole=name.endswith("whole"), track=prepared.track)
+    return Column(name, at_pairs(held_out, mean.response), "baseline", mean.storage_bytes, name)
+
+
 def _image_sources(name: str, prepared: _Prepared) -> Column:
     held_out = prepared.held_out
     dataset = held_out.simulated
@@ -143,6 +151,8 @@ METHODS: dict[str, Callable[[str, _Prepared], Column]] = {
     "linear": _plain,
     "linear-aligned": _aligned,
     "shaped-nearest": _shaped,
+    MEAN_SPECTROGRAM: _mean_spectrogram,
+    f"{MEAN_SPECTROGRAM}-whole": _mean_spectrogram,
     "aac-nearest": _coded,
     "aac-linear": _coded,
     "opus-nearest": _coded,

@@ -32,7 +32,15 @@ def report(evaluation: Evaluation, published: PublishedTable) -> Table:
     for method in _PUBLISHED_OTHERS:
         if method in published.errors:
             table.add_row(Text(f"{method}, published", style="dim"), *_published_cells(published, method), "", "")
+    for sentence in trained(evaluation):
+        table.caption = f"{table.caption}\n{sentence}"
     return table
+
+
+def trained(evaluation: Evaluation) -> list[str]:
+    """A sentence for each network of the table: how far it was trained, and whether its loss was still falling."""
+    records = {result.training.field: result.training for result in evaluation.results if result.training is not None}
+    return [f"{name}: {record.sentence()}." for name, record in records.items()]
 
 
 def markdown(evaluation: Evaluation, published: PublishedTable) -> str:
@@ -56,7 +64,8 @@ def markdown(evaluation: Evaluation, published: PublishedTable) -> str:
                 cell += f" ({missing} missing)"
             cells.append(cell)
         lines.append(f"| {result.name} | " + " | ".join([*cells, _storage(result), _time(result)]) + " |")
-    return "\n".join(lines)
+    remarks = [f"- {sentence}" for sentence in trained(evaluation)]
+    return "\n".join([*lines, *(["", *remarks] if remarks else [])])
 
 
 def _title(evaluation: Evaluation) -> str:

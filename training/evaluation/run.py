@@ -8,6 +8,7 @@ import numpy as np
 from server.scene.bundle import Bundle
 from training.baselines.coded import Track
 from training.baselines.held_out import EvaluationError, HeldOut, open_held_out
+from training.data.dataset import Half
 from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import Column, Evaluation, Kind, evaluate
 from training.evaluation.fields import field_columns
@@ -26,6 +27,7 @@ def evaluate_bundles(
     methods: Sequence[str] = DEFAULT_METHODS,
     pairs: int | None = None,
     yaws: int | None = None,
+    half: Half | None = None,
     draws: int = 1,
     hrtf: Path | None = None,
     tilt_deg: float = 0.0,
@@ -36,15 +38,17 @@ def evaluate_bundles(
 ) -> tuple[Evaluation, PublishedTable]:
     """Evaluate each quality level of each bundle, and the field of each run folder on measured data, beside `methods`
     and the floor. All are evaluated on the same held-out pairs and orientations: all of them, or the numbers given by
-    `pairs` and `yaws`. Parameters are compared with medians over `draws` simulations, or with those of the dataset's
-    own simulation. With `hrtf` (a SOFA file) or `tilt_deg`, all are heard through that head, or with the head tilted by
-    so many degrees. `figure` is the path of a PNG to draw. Errors are stored in the file `keep` pair by pair, so that
-    an interrupted evaluation can be resumed; the file is removed at the end.
+    `pairs` and `yaws`, and with `half` only those of one half of the held-out pairs. Parameters are compared with
+    medians over `draws` simulations, or with those of the dataset's own simulation. With `hrtf` (a SOFA file) or
+    `tilt_deg`, all are heard through that head, or with the head tilted by so many degrees. `figure` is the path of a
+    PNG to draw. Errors are stored in the file `keep` pair by pair, so that an interrupted evaluation can be resumed;
+    the file is removed at the end.
 
     Raises EvaluationError, DatasetError if the dataset and a bundle are of different scenes, and RunError for a run on
     other data.
     """
     with open_held_out(data) as everything:
+        everything = everything if half is None else everything.of_half(half)
         held_out = everything.sample(pairs=pairs, yaws=yaws, seed=seed)
         if hrtf is not None or tilt_deg:
             _require_waveforms(methods, draws)
@@ -53,10 +57,10 @@ def evaluate_bundles(
         columns = field_columns(bundles, held_out)
         if runs:
             # Torch takes seconds to load, and bundles do not need it.
-            from training.evaluation.measured_fields import run_column
+            from training.evaluation.measured_fields import run_columns
 
             responses = open_responses(data)
-            columns += [run_column(run, responses, held_out) for run in runs]
+            columns += [column for run in runs for column in run_columns(run, responses, held_out)]
         columns += method_columns(methods, held_out, track)
         measured = [*columns, *([simulation_column(held_out)] if truth else []), *floor_columns(held_out)]
         stored = None
@@ -64,7 +68,7 @@ def evaluate_bundles(
             depends_on = [[bundle.digest for bundle in bundles], [signature(folder) for folder in (*runs, data)]]
             head = None if hrtf is None else [str(hrtf), hrtf.stat().st_size, hrtf.stat().st_mtime_ns]
             names = [column.name for column in measured]
-            stored = StoredErrors(keep, [depends_on, names, pairs, yaws, draws, seed, tilt_deg, head])
+            stored = StoredErrors(keep, [depends_on, names, pairs, yaws, half, draws, seed, tilt_deg, head])
         evaluation = evaluate(
             held_out,
             measured,

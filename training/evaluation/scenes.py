@@ -7,19 +7,26 @@ It is made from the files that `nafir-train evaluate --json` writes for each sce
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from server.acoustics.metrics import Metric
 from server.core.errors import NafirError
 from training.evaluation.evaluate import FLOOR, METRICS, ONE_SIMULATION
+from training.evaluation.fields import INTEGRATED
+from training.evaluation.methods import MEAN_SPECTROGRAM
 from training.evaluation.report import short
+from training.learning.record import TrainingRecord
 
 TIMES = "times.jsonl"
 """The file with the time of each step, beside the results of a scene."""
 
 NAF, NAF_WHOLE, NEAREST = "naf", "naf-whole", "nearest"
+_NETWORKS = tuple(f"{network}{phase}" for network in (NAF, "naf-expected", NAF_WHOLE) for phase in ("", INTEGRATED))
+"""The rows of the paper's network: trained on draws, as in the paper, on expected values, and on whole responses; each
+with the phase of noise and with its own."""
+_MEANS = (MEAN_SPECTROGRAM, f"{MEAN_SPECTROGRAM}-whole")
 _NOT_METHODS = {ONE_SIMULATION, FLOOR}
 
 
@@ -55,6 +62,8 @@ class SceneResult:
     draws: int
     level: str
     methods: Mapping[str, Method]
+    trained: Mapping[str, TrainingRecord]
+    """How far the networks of the table were trained, by row."""
 
     @classmethod
     def read(cls, path: Path) -> "SceneResult":
@@ -63,18 +72,23 @@ class SceneResult:
             values = json.loads(path.read_text())
             columns: dict[str, dict[str, Any]] = values["columns"]
             fields = [name for name, column in columns.items() if column["kind"] == "field"]
-            nafs = {name: columns[name]["method"] for name in fields if columns[name]["method"] in {NAF, NAF_WHOLE}}
+            nafs = {name: _network(name, columns[name]["method"]) for name in fields if columns[name]["method"]}
             ours = next(name for name in fields if name not in nafs)
             # With several bundles, columns are named by folder and level.
             level = ours.split()[-1]
             names = {ours: level}
             for name, method in nafs.items():
-                if method not in names.values():  # only the first of several
+                if method in _NETWORKS and method not in names.values():  # only the first of several
                     names[name] = method
             methods = {names.get(name, name): _method(column, names) for name, column in columns.items()}
+            trained = {
+                names.get(name, name): TrainingRecord(**column["training"])
+                for name, column in columns.items()
+                if column.get("training") and not name.endswith(INTEGRATED)
+            }
             scene = str(values["data"]).removesuffix(" (simulated)")
             drawn = values["pairs"], values["visible_pairs"], values["yaws"], values.get("draws", 1)
-            return cls(scene, *drawn, level, methods)
+            return cls(scene, *drawn, level, methods, {name: trained[name] for name in _NETWORKS if name in trained})
         except OSError as exc:
             raise ResultError(f"{path}: cannot be read: {exc.strerror}") from exc
         except StopIteration as exc:
@@ -95,6 +109,7 @@ class SceneResult:
             "draws": self.draws,
             "level": self.level,
             "worse_than": {naf: self.worse_than(naf) for naf in (NAF, NAF_WHOLE) if naf in self.methods},
+            "trained": {name: asdict(record) for name, record in self.trained.items()},
             "methods": {
                 name: {"errors": dict(method.errors), "ms": method.ms, "storage_bytes": method.storage_bytes}
                 for name, method in self.methods.items()
@@ -109,6 +124,11 @@ class SceneResult:
         """The metrics in which the default level has a larger mean error than `other`, significantly or not."""
         theirs = self.methods[other].errors
         return [name for name, error in self.ours.errors.items() if error > theirs.get(name, math.inf)]
+
+
+def _network(column: str, method: str) -> str:
+    """The row of a column of the paper's network."""
+    return f"{method}{INTEGRATED}" if column.endswith(INTEGRATED) else method
 
 
 def _method(column: Mapping[str, Any], names: Mapping[str, str]) -> Method:
@@ -150,7 +170,7 @@ def markdown(results: Sequence[SceneResult]) -> str:
 
 
 def _shown(result: SceneResult) -> list[str]:
-    names = (result.level, NAF, NAF_WHOLE, NEAREST, ONE_SIMULATION, FLOOR)
+    names = (result.level, *_NETWORKS, *_MEANS, NEAREST, ONE_SIMULATION, FLOOR)
     return [name for name in names if name in result.methods]
 
 
@@ -208,6 +228,7 @@ def _remarks(results: Sequence[SceneResult]) -> list[str]:
         if result.draws > 1:
             drawn += f", medians of {result.draws} draws"
         remarks.append(f"- {result.scene} ({drawn}): {comparisons}.")
+        remarks += [f"    - {name}: {record.sentence()}." for name, record in result.trained.items()]
     return remarks
 
 

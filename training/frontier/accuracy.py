@@ -16,7 +16,7 @@ from server.acoustics.codec import Codec
 from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_loss
 from server.acoustics.room_parameters import RoomParameters, measure
 from server.field.field import AcousticField
-from training.data.dataset import TAKES, Dataset
+from training.data.dataset import TAKES, Dataset, Half
 from training.frontier.heard_by_bus import full_response
 from training.simulation.references import References
 
@@ -129,15 +129,24 @@ class Scores:
 
 
 class SampledPairs:
-    """A sample of `pairs` pairs at `yaws` evenly spaced orientations, or all if there are fewer."""
+    """A sample of `pairs` pairs at `yaws` evenly spaced orientations, or all if there are fewer: of the pairs that are
+    trained on, of those that are held out, or of one half of these."""
 
     def __init__(
-        self, dataset: Dataset, codec: Codec, *, pairs: int, yaws: int, seed: int, held_out: bool = True
+        self,
+        dataset: Dataset,
+        codec: Codec,
+        *,
+        pairs: int,
+        yaws: int,
+        seed: int,
+        held_out: bool = True,
+        half: Half | None = None,
     ) -> None:
         self._codec = codec
         self._sample_rate = dataset.sample_rate
         rng = np.random.default_rng([seed, 7])
-        all_pairs = dataset.pairs(held_out=held_out)
+        all_pairs = dataset.pairs(held_out=held_out) if half is None else dataset.held_out_half(half)
         chosen = all_pairs[np.sort(rng.choice(len(all_pairs), min(pairs, len(all_pairs)), replace=False))]
         yaw_indices = np.unique(np.linspace(0, len(dataset.yaws), yaws, endpoint=False).astype(int))
         heads = dataset.yaws[yaw_indices]

@@ -8,11 +8,11 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from rich.progress import Progress
@@ -23,22 +23,24 @@ from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Accuracy, Cost, FrontierPoint, QualityLevel
 from training.baselines.held_out import require_same_scene
 from training.baselines.moved_nodes import with_moved_nodes
-from training.data.dataset import Dataset
+from training.data.dataset import Dataset, Half
 from training.frontier.accuracy import Errors, Estimate, SampledPairs
 from training.frontier.bound import TruePhase
 from training.frontier.cost import SEGMENT_S, cost_of, measure, memory_mb, one_core
 from training.frontier.points import Point, default_among, eligible, offered_points, pareto
 from training.frontier.steps import largest_steps
 
-_FORMAT = 4
+_FORMAT = 5
 """Must change whenever the same graph comes to give other responses: older stored errors are then measured again."""
+HALVES: tuple[Half, ...] = get_args(Half)
 _OFFSETS = 4
 _STEPS = 60
 
 
 @dataclass(frozen=True)
 class Frontier:
-    """All measured points, the Pareto-optimal ones (quickest first), the default, and the floor."""
+    """All measured points, the Pareto-optimal ones (quickest first), the default, and the floor. Points are chosen by
+    one half of the held-out pairs; all errors are of the other, of which `pairs` were measured."""
 
     scene: str
     pairs: int
@@ -82,11 +84,12 @@ class Frontier:
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: held-out `pairs` at `yaws` orientations each, and a walk of `walk_s`, of which a level that
-    computes every response anew uses `budget_s`. The default level is the quickest that is about as accurate as the
-    most accurate, among those whose response takes at most `default_ms`; a level of directions if there is one."""
+    """How much is measured: held-out `pairs` at `yaws` orientations each, half of them to choose levels and half to
+    report errors, and a walk of `walk_s`, of which a level that computes every response anew uses `budget_s`. The
+    default level is the quickest that is about as accurate as the most accurate, among those whose response takes at
+    most `default_ms`; a level of directions if there is one."""
 
-    pairs: int = 40
+    pairs: int = 80
     yaws: int = 3
     walk_s: float = 300.0
     budget_s: float = 10.0
@@ -104,9 +107,9 @@ def sweep(
     require_same_scene(bundle, dataset)
     folder.mkdir(parents=True, exist_ok=True)
     trial = with_levels(bundle, levels, folder / "trial")
-    sample = SampledPairs(dataset, trial.manifest.codec.codec, pairs=effort.pairs, yaws=effort.yaws, seed=effort.seed)
-    floor = sample.floor()
-    errors = _accuracies(trial, sample, levels, folder / "accuracy.json", effort, progress)
+    samples = {half: _sample(dataset, trial, half, effort) for half in HALVES}
+    floors = {half: sample.floor() for half, sample in samples.items()}
+    errors = _accuracies(trial, samples, levels, folder / "accuracy.json", effort, progress)
     task = progress.add_task("timing", total=math.ceil(effort.walk_s / SEGMENT_S))
     with one_core():
         times = measure(
@@ -118,25 +121,37 @@ def sweep(
         )
     first_of_field = {level.field: level.name for level in reversed(levels)}
     memory = memory_mb(trial.folder, list(first_of_field.values()))
-    points = []
-    for level in levels:
-        cost = cost_of(trial, level, times[level.name], memory[first_of_field[level.field]])
-        predicts = trial.manifest.fields[level.field].predicts
-        points.append(dataclasses.replace(_point(level, cost, errors[level.name], floor, sample), predicts=predicts))
-    points.append(_true_phase(trial, points[0], sample, floor))
-    best = pareto(points, missing=floor.missing)
-    measurable = eligible(points, missing=floor.missing)
+    costs = {
+        level.name: cost_of(trial, level, times[level.name], memory[first_of_field[level.field]]) for level in levels
+    }
+
+    def points_of(half: Half) -> list[Point]:
+        sample, floor = samples[half], floors[half]
+        points = []
+        for level in levels:
+            point = _point(level, costs[level.name], errors[level.name][half], floor, sample)
+            predicts = trial.manifest.fields[level.field].predicts
+            points.append(dataclasses.replace(point, predicts=predicts))
+        return points
+
+    candidates, points = points_of("choice"), points_of("report")
+    reported = {point.level.name: point for point in points}
+    missing = floors["choice"].missing
+    best, measurable = pareto(candidates, missing=missing), eligible(candidates, missing=missing)
     default = default_among(measurable, ms=effort.default_ms)
+    offered = offered_points(measurable, best, default, ms=effort.default_ms)
+    sample, floor = samples["report"], floors["report"]
+    points.append(_true_phase(trial, points[0], sample, floor))
     codec = trial.manifest.codec
     return Frontier(
         bundle.id,
         *sample.size,
         tuple(points),
-        tuple(best),
-        default,
+        tuple(reported[point.level.name] for point in best),
+        reported[default.level.name],
         floor,
         block_ms=256 / codec.sample_rate * 1000,
-        offered=tuple(offered_points(measurable, best, default, ms=effort.default_ms)),
+        offered=tuple(reported[point.level.name] for point in offered),
     )
 
 
@@ -184,10 +199,20 @@ def _true_phase(trial: Bundle, first: Point, sample: SampledPairs, floor: Errors
     return dataclasses.replace(_point(level, first.cost, errors, floor, sample), bound=True)
 
 
+def _sample(dataset: Dataset, trial: Bundle, half: Half, effort: Effort) -> SampledPairs:
+    pairs, codec = math.ceil(effort.pairs / len(HALVES)), trial.manifest.codec.codec
+    return SampledPairs(dataset, codec, pairs=pairs, yaws=effort.yaws, seed=effort.seed, half=half)
+
+
 def _accuracies(
-    trial: Bundle, sample: SampledPairs, levels: Sequence[QualityLevel], path: Path, effort: Effort, progress: Progress
-) -> dict[str, Errors]:
-    """Errors by level. Those that `path` has for the same graph, noise and sample are not measured again."""
+    trial: Bundle,
+    samples: Mapping[Half, SampledPairs],
+    levels: Sequence[QualityLevel],
+    path: Path,
+    effort: Effort,
+    progress: Progress,
+) -> dict[str, dict[Half, Errors]]:
+    """Errors by level and half. Those that `path` has for the same graph, noise and sample are not measured again."""
     kept: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     task = progress.add_task("accuracy", total=len(levels))
     keys = {level.name: _key(trial, level, effort) for level in levels}
@@ -195,8 +220,12 @@ def _accuracies(
     progress.advance(task, len(levels) - len(missing))
 
     def measured(name: str) -> dict[str, Any]:
-        found = asdict(_errors(AcousticField.load(trial, level=name), sample, effort.seed))
-        return {**found, "by_pair": found["by_pair"].tolist()}
+        field = AcousticField.load(trial, level=name)
+        found = {half: asdict(_errors(field, sample, effort.seed)) for half, sample in samples.items()}
+        steps = largest_steps(field, count=_STEPS, seed=effort.seed)
+        return {
+            half: {**of_half, "by_pair": of_half["by_pair"].tolist(), "steps": steps} for half, of_half in found.items()
+        }
 
     pool = ThreadPoolExecutor(os.cpu_count(), "accuracy")
     try:
@@ -206,17 +235,19 @@ def _accuracies(
             progress.update(task, advance=1, description=f"accuracy  {name}")
     finally:
         pool.shutdown(cancel_futures=True)
-    return {name: Errors(**{**kept[key], "by_pair": np.array(kept[key]["by_pair"])}) for name, key in keys.items()}
+    return {
+        name: {half: Errors(**{**kept[key][half], "by_pair": np.array(kept[key][half]["by_pair"])}) for half in HALVES}
+        for name, key in keys.items()
+    }
 
 
 def _errors(field: AcousticField, sample: SampledPairs, seed: int) -> Errors:
     """The errors of a level. Where it reuses responses, they are the mean over several positions of its nodes."""
-    steps = largest_steps(field, count=_STEPS, seed=seed)
     if not field.kind.reuses_responses:
-        return dataclasses.replace(sample.errors_of(Estimate(field)), steps=steps)
+        return sample.errors_of(Estimate(field))
     rng = np.random.default_rng([seed, 12])
     measured = [sample.errors_of(Estimate(with_moved_nodes(field, rng))) for _ in range(_OFFSETS)]
-    return dataclasses.replace(Errors.mean(measured), steps=steps)
+    return Errors.mean(measured)
 
 
 def _key(trial: Bundle, level: QualityLevel, effort: Effort) -> str:

@@ -17,7 +17,8 @@ def report(frontier: Frontier) -> Table:
     table = Table(
         title=f"{frontier.scene}: {len(frontier.best)} of {len(frontier.points)} levels measured are worth their time",
         caption=(
-            f"mean errors on {frontier.pairs} held-out pairs at {frontier.yaws} orientations, (JND); "
+            f"mean errors on {frontier.pairs} held-out pairs, by which no level was chosen, "
+            f"at {frontier.yaws} orientations, (JND); "
             "milliseconds per pose of a walk, and where the head only turned; microseconds per block of each of four "
             "emitters; largest step between poses 1 cm apart; + offered, * default"
         ),

@@ -16,7 +16,7 @@ from training.learning.runs import Configuration, NafRecipe, RecipeError
 from training.learning.schedule import decay_to_a_tenth
 from training.models.naf import Naf, NafShape
 from training.models.site import Site
-from training.models.stored_targets import Targets, load_aligned
+from training.models.stored_targets import Targets, load_aligned, load_expected_points
 from training.models.targets import align, codec_of, delay_samples
 from training.simulation.responses import SimulatedResponses
 
@@ -37,6 +37,10 @@ class NafLearner:
         shape, recipe = configuration.shape, configuration.recipe
         if not isinstance(shape, NafShape) or not isinstance(recipe, NafRecipe):
             raise TypeError(f"{configuration.kind} is no naf")
+        if recipe.expected and (
+            recipe.whole or shape.domain == "time" or not isinstance(responses, SimulatedResponses)
+        ):
+            raise RecipeError("field: only the spectrograms of simulated late reverberation have expected values")
         self.responses = _whole(responses) if recipe.whole else responses
         self.recipe = recipe
         self.codec = codec_of(responses, N_FFT)
@@ -45,15 +49,21 @@ class NafLearner:
         self.field = Naf(self.site, sizes, responses.channels, shape)
         self._trainable = np.flatnonzero(~responses.held_out)
         self._drawn: Targets | None = None
+        self._expected: Targets | None = None
 
     def prepare(self, progress: Progress) -> None:
-        """Draw the responses of a simulation; measured ones are read as they are needed."""
-        if isinstance(self.responses, SimulatedResponses):
+        """Draw the responses of a simulation, or compute what is expected of them; measured ones are read as they are
+        needed."""
+        if self.recipe.expected:
+            folder = self.responses.file.parent / TARGETS
+            self._expected = load_expected_points(self.responses, self.codec, folder, progress)
+        elif isinstance(self.responses, SimulatedResponses):
             self._drawn = load_aligned(self.responses, self.responses.file.parent / TARGETS, progress)
 
     @property
     def prepared_s(self) -> float:
-        return 0.0 if self._drawn is None else self._drawn.seconds
+        targets = self._expected or self._drawn
+        return 0.0 if targets is None else targets.seconds
 
     @torch.no_grad()
     def initialise(self, rows: Rows, seed: int) -> None:
@@ -64,12 +74,11 @@ class NafLearner:
         count, total, squares = 0, np.zeros(()), np.zeros(())
         cross, power = np.zeros(field.axes, complex), np.zeros((2, *field.axes))
         for row in self._trainable[np.sort(sample)]:
-            aligned = self._aligned(row)
-            values = self._values(aligned)
+            values = self._values_of(row)
             count += len(values)
             total, squares = total + values.sum(axis=0), squares + (values**2).sum(axis=0)
             if hasattr(field, "coherence"):
-                spectrogram = self.codec.transform(aligned)
+                spectrogram = self.codec.transform(self._aligned(row))
                 cross += spectrogram[0] * np.conj(spectrogram[1])
                 power += np.abs(spectrogram) ** 2
         mean = total / count
@@ -121,7 +130,7 @@ class NafLearner:
             reach = frames if padded else min(frames, self._recorded_length(row))
             points = [rng.integers(0, size, recipe.points) for size in (*across, reach)]
             indices[:, number] = points
-            of_ears: Any = self._values(self._aligned(row))
+            of_ears: Any = self._values_of(row)
             values[number] = of_ears[:, *points]
         poses = [part[chosen] for part in (self.responses.listener, self.responses.emitter, self.responses.yaw)]
         if not validating:
@@ -148,6 +157,13 @@ class NafLearner:
             return align(self.responses.read([row])[0], delay_samples(self.responses, row))
         flat = self._drawn.flat[np.searchsorted(self._trainable, row)]
         return np.asarray(flat.reshape(self.responses.channels, -1), np.float64)
+
+    def _values_of(self, row: int) -> npt.NDArray[np.floating]:
+        """Return the values that the network learns of a row: (ear, *axes, outputs)."""
+        if self._expected is None:
+            return self._values(self._aligned(row))
+        flat = self._expected.flat[np.searchsorted(self._trainable, row)]
+        return np.asarray(flat.reshape(self.responses.channels, *self.field.axes, -1), np.float64)
 
     def _values(self, aligned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the values that the network learns, for an aligned response: (ear, *axes, outputs)."""

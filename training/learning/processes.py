@@ -5,6 +5,8 @@ the run folder (all read the targets), and it makes the decisions that depend on
 """
 
 import os
+import platform
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,6 +40,18 @@ class Processes:
         finally:
             dist.destroy_process_group()
 
+    def clock_s(self) -> float:
+        """Seconds for budgets: of this process on all its cores, or of the clock where a GPU computes. CPU time is the
+        same whatever else a machine does, so trainings with equal budgets may run at the same time."""
+        return time.perf_counter() if self.device.type == "cuda" else time.process_time()
+
+    @property
+    def machine(self) -> str:
+        """The device on which steps are computed, by name; bfloat16 may be quicker on one and slower on another."""
+        if self.device.type == "cuda":
+            return torch.cuda.get_device_name(self.device)
+        return f"{platform.node()} ({platform.machine()})"
+
     @property
     def first(self) -> bool:
         return self.rank == 0
@@ -56,6 +70,14 @@ class Processes:
         tensor = torch.tensor(values, dtype=torch.float64, device=self.device)
         dist.broadcast(tensor, 0)
         return [float(value) for value in tensor]
+
+    def total(self, value: float) -> float:
+        """The sum of the values of all processes, the same in every process."""
+        if self.count == 1:
+            return value
+        tensor = torch.tensor(value, dtype=torch.float64, device=self.device)
+        dist.all_reduce(tensor)
+        return float(tensor)
 
     def mean(self, value: Tensor) -> Tensor:
         if self.count == 1:

@@ -13,6 +13,7 @@ import torch
 
 from server.core.errors import NafirError
 from training.data.responses import ResponseSet
+from training.learning.record import RECIPE_EPOCHS, RECIPE_POINTS, TrainingRecord, slope_per_doubling
 from training.models.encoders import FieldShape
 from training.models.naf import NafShape
 from training.simulation.responses import SimulatedResponses
@@ -75,24 +76,25 @@ class NafRecipe:
     noise that is added to positions. `padding`: probability that the silence after a response's end is trained on.
     `phase_weight`: weight of the error of instantaneous frequency (the paper's alpha, whose value it does not state).
     `whole`: train on responses with the direct sound and first reflections, as the paper does, not on late
-    reverberation only (simulated scenes)."""
+    reverberation only (simulated scenes). `expected`: train on expected values, as a factorised field does, and not on
+    random draws, as the paper does (simulated scenes)."""
 
     points: int = 2000
     noise_m: float = 0.1
     padding: float = 0.1
     phase_weight: float = 0.1
     whole: bool = False
+    expected: bool = False
 
 
 @dataclass(frozen=True)
 class Configuration:
     """Everything besides the dataset that decides the result of a run.
 
-    Training lasts for `minutes` of computing if given, else for `epochs`. With `patience` it stops after this many
-    rounds (epochs, or twentieths of the time) without a smaller validation error, and the field with the smallest error
-    is kept. Without it the last field is kept, for which the learning rate is scheduled. `share` is the share of the
-    training pairs that is used.
-    """
+    Training lasts for `minutes` of the processor if given (of the clock on a GPU), else for `epochs`. With `patience`
+    it stops after this many rounds (epochs, or twentieths of the time) without a smaller validation error, and the
+    field with the smallest error is kept. Without it the last field is kept, for which the learning rate is scheduled.
+    `share` is the share of the training pairs that is used."""
 
     seed: int = 0
     epochs: int = 8
@@ -135,6 +137,8 @@ class Configuration:
             return "naf-time-domain"
         if isinstance(self.recipe, NafRecipe) and self.recipe.whole:
             return "naf-whole"
+        if isinstance(self.recipe, NafRecipe) and self.recipe.expected:
+            return "naf-expected"
         return {"shared": "naf", "dual": "naf-dual", "none": "naf-no-grid"}[self.shape.grid]
 
     @classmethod
@@ -165,6 +169,7 @@ _KINDS: dict[str, tuple[type[FieldShape | NafShape], type[FactorisedRecipe | Dir
 _NAFS = {
     "naf": (NafShape(), NafRecipe()),
     "naf-whole": (NafShape(), NafRecipe(whole=True)),
+    "naf-expected": (NafShape(), NafRecipe(expected=True)),
     "naf-dual": (NafShape(grid="dual"), NafRecipe()),
     "naf-no-grid": (NafShape(grid="none"), NafRecipe()),
     "naf-time-domain": (NafShape(domain="time"), NafRecipe()),
@@ -186,6 +191,8 @@ def configure(
 
     Raises RunError for an unknown name, or for an option that this field does not have.
     """
+    if changes.get("epochs") is not None and changes.get("minutes") is not None:
+        raise RunError("epochs: a run has a length in epochs or in minutes; leave one out")
     if field not in FIELDS:
         raise RunError(f"field: there is no {field!r}, but {', '.join(FIELDS)}")
     if order is not None and field != "directional":
@@ -291,6 +298,31 @@ def minutes_of(run: Path) -> float:
     if not state["finished"]:
         raise RunError(f"{run}: is not finished; run train again")
     return float(round((state["seconds"] + state["prepared_s"]) / 60, 3))
+
+
+def record_of(run: Path) -> TrainingRecord:
+    """How far a run was trained. Raises RunError if there is none."""
+    configuration = Configuration.read(run)
+    state = load_checkpoint(run, torch.device("cpu"))
+    recipe, patience = configuration.recipe, configuration.patience
+    curve = [(int(step), float(loss)) for step, loss in state.get("curve", [])]
+    losses = [loss for _, loss in curve]
+    points, share = None, None
+    if isinstance(recipe, NafRecipe):
+        points = int(state.get("responses", 0)) * recipe.points
+        share = float(state["epochs"] * configuration.share * recipe.points / (RECIPE_EPOCHS * RECIPE_POINTS))
+    return TrainingRecord(
+        field=configuration.name,
+        epochs=float(state["epochs"]),
+        steps=int(state["step"]),
+        points=points,
+        recipe_share=share,
+        held_back_loss=(losses[-1] if patience is None else min(losses)) if losses else None,
+        mean_loss=state.get("mean_loss"),
+        slope_per_doubling=slope_per_doubling(curve),
+        patience=patience,
+        stopped=patience is not None and state["stale"] >= patience,
+    )
 
 
 def keep_log(run: Path, rounds: int) -> None:

@@ -1,12 +1,15 @@
 """The training loop for every kind of field, in one process or several, on a GPU if there is one.
 
-A run can be interrupted at any time and continues when it is started again. If its length is given in epochs, then with
-the same seed and number of threads the result is the same as without interruption. If it is given in minutes, it counts
-the time spent on steps and validation, over all parts of the run; the last validation may end later.
-"""
+A run can be interrupted at any time and continues when it is started again, also on another machine, with a GPU or
+without one. If its length is given in epochs, then with the same seed and number of threads on the same kind of machine
+the result is the same as without interruption. If it is given in minutes, it counts the time spent on steps and
+validation, over all parts of the run; the last validation may end later. These are minutes of the processor, of all
+cores and processes together, or of the clock where a GPU computes. So other work on the machine takes nothing from a
+training's budget."""
 
 import dataclasses
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Generator
@@ -28,6 +31,7 @@ from training.learning.learner import Learner, Rows
 from training.learning.pairs import split
 from training.learning.precision import autocast, bfloat16_gains
 from training.learning.processes import Processes
+from training.learning.record import MeasuredLoss
 from training.learning.runs import (
     CHECKPOINT,
     Configuration,
@@ -43,6 +47,9 @@ from training.learning.runs import (
 _CHECKPOINT_S = 60.0
 _ROUNDS = 20
 _BATCHES_AHEAD = 2
+_THREADS_OF_A_GPU = 16
+"""Most threads that make batches for a GPU, whose step takes less time than making its batch. Where the processor
+computes the steps, more than one thread would take its cores away."""
 _PROBE_ROWS = 2
 _LARGEST_GRADIENT = 1.0
 _EXPLODED = 1000.0
@@ -54,8 +61,17 @@ class DivergedError(NafirError):
     """The error for a loss or gradient that is not finite, or far above its first value."""
 
 
-def train(responses: ResponseSet, run: Path, configuration: Configuration, progress: Progress) -> None:
-    """Train to the end, or resume an interrupted run. Under `torchrun`, all processes train together.
+def train(
+    responses: ResponseSet,
+    run: Path,
+    configuration: Configuration,
+    progress: Progress,
+    *,
+    pause_after_s: float | None = None,
+) -> bool:
+    """Train to the end, or resume an interrupted run; returns whether the end is reached. Under `torchrun`, all
+    processes train together. With `pause_after_s` the run is stored after a step and so many seconds of the clock and
+    can be resumed.
 
     Raises RunError if the folder holds a run of another configuration or on other data, RecipeError if the
     configuration does not fit the data, and DivergedError if the loss becomes implausible; the last checkpoint stays.
@@ -76,7 +92,7 @@ def train(responses: ResponseSet, run: Path, configuration: Configuration, progr
         loop = _Loop(
             learner, run, configuration, processes, split(responses, share=configuration.share, seed=configuration.seed)
         )
-        loop.run_to_the_end(progress)
+        return loop.run_to_the_end(progress, pause_after_s)
 
 
 def load_learner(responses: ResponseSet, run: Path) -> Learner:
@@ -91,9 +107,11 @@ def load_learner(responses: ResponseSet, run: Path) -> Learner:
 
 @dataclass
 class _State:
-    """The state of a run: steps and epochs done, seconds that steps and validation took, seconds of preparation (at the
-    end), sum of the current round's losses, least validation error, rounds since it (`stale`), and the parameters to
-    keep."""
+    """The state of a run: steps and epochs done, responses that the steps have seen, seconds that steps and validation
+    took, seconds of preparation (at the end), sum of the current round's losses, least validation error, rounds since
+    it (`stale`), and the parameters to keep. `curve` has the step and the validation error at the end of each round,
+    and `mean_loss` is the validation error of the training set's mean. `machine` is the one that `bfloat16` was chosen
+    on."""
 
     step: int = 0
     epochs: float = 0.0
@@ -108,6 +126,10 @@ class _State:
     bfloat16: bool = False
     finished: bool = False
     first_loss: float | None = None
+    responses: int = 0
+    curve: list[MeasuredLoss] = dataclasses.field(default_factory=list)
+    mean_loss: float | None = None
+    machine: str = ""
 
 
 class _Loop:
@@ -135,6 +157,8 @@ class _Loop:
             # guard: an optimiser goes on as it was
             self._optimiser.load_state_dict(state.pop("optimiser"))
             self._state = _State(**state)
+            if self._state.machine != processes.machine and not self._state.finished:
+                self._choose_precision()
             if processes.first and not self._state.finished:
                 # guard: the log goes no further than the checkpoint
                 keep_log(run, self._state.rounds)
@@ -143,12 +167,13 @@ class _Loop:
                 # guard: a log begins anew with its run
                 keep_log(run, 0)
             learner.initialise(self._rows, configuration.seed)
-            self._state = _State(bfloat16=self._choose_precision())
+            self._state = _State()
+            self._choose_precision()
 
-    def run_to_the_end(self, progress: Progress) -> None:
-        state = self._state
+    def run_to_the_end(self, progress: Progress, pause_after_s: float | None = None) -> bool:
+        state, began_s = self._state, time.monotonic()
         if state.finished:
-            return
+            return True
         parallel = self._processes.parallel(self._learner.field)
         task = progress.add_task("training", total=self._total(), completed=math.floor(self._measure()))
         writer = SummaryWriter(self._run / "tensorboard", purge_step=state.step) if self._processes.first else None
@@ -157,11 +182,11 @@ class _Loop:
         batches = self._batches(state.step)
         try:
             while self._fraction() < 1 and not self._stopped():
-                start = time.perf_counter()
+                start = self._processes.clock_s()
                 due = state.seconds - saved_s > _CHECKPOINT_S
                 self._step(parallel, *next(batches), save=due)
                 saved_s = state.seconds if due else saved_s
-                (state.seconds,) = self._processes.broadcast(state.seconds + time.perf_counter() - start)
+                state.seconds += self._processes.total(self._processes.clock_s() - start)
                 if self._measure() >= round_ends:
                     summary = self._end_round(writer)
                     state.rounds += 1
@@ -170,11 +195,17 @@ class _Loop:
                     round_ends = self._next_round()
                     done = math.floor(self._measure())
                     progress.update(task, completed=done, description=f"training  validation: {summary}")
+                if pause_after_s is not None and self._fraction() < 1 and not self._stopped():
+                    (taken_s,) = self._processes.broadcast(time.monotonic() - began_s)
+                    if taken_s >= pause_after_s:
+                        self._save()
+                        return False
         finally:
             batches.close()
             if writer is not None:
                 writer.close()
         self._finish()
+        return True
 
     def _fraction(self) -> float:
         """The share of training that is done."""
@@ -225,6 +256,7 @@ class _Loop:
             self._save()
         self._optimiser.step()
         state.step += 1
+        state.responses += self._batch
         state.epochs = state.step / self._steps_per_epoch
         state.round_loss += mean_loss
         state.round_steps += 1
@@ -251,13 +283,17 @@ class _Loop:
         """Validates, remembers the parameters to keep, and writes the logs. Returns a line that describes the
         errors."""
         state = self._state
-        start = time.perf_counter()
+        start = self._processes.clock_s()
+        if state.mean_loss is None:
+            parts = self._validate(of_mean=True) if self._processes.first else {}
+            (state.mean_loss,) = self._processes.broadcast(sum(parts.values()))
         parts = self._validate() if self._processes.first else {}
-        seconds = state.seconds + time.perf_counter() - start
-        validation_error, state.seconds = self._processes.broadcast(sum(parts.values()), seconds)
+        (validation_error,) = self._processes.broadcast(sum(parts.values()))
+        state.seconds += self._processes.total(self._processes.clock_s() - start)
         # guard: an error out of proportion is not kept
         if not self._is_plausible(validation_error):  # before parameters are kept and saved
             raise self._diverged(f"the validation error is {validation_error:g} after step {state.step}")
+        state.curve.append((state.step, validation_error))
         if validation_error < state.best_loss:
             state.best_loss, state.stale = validation_error, 0
         else:
@@ -276,13 +312,17 @@ class _Loop:
         return " ".join(f"{name} {value:.4f}" for name, value in parts.items())
 
     @torch.no_grad()
-    def _validate(self) -> dict[str, float]:
+    def _validate(self, *, of_mean: bool = False) -> dict[str, float]:
+        """The losses of what is held back; with `of_mean`, those of a field that predicts the mean of its targets
+        everywhere, which is zero when it is normalised."""
         field = self._learner.field.eval()
         totals: dict[str, float] = {}
         for start in range(0, len(self._validation_rows), self._configuration.batch):
             rows = self._validation_rows[start : start + self._configuration.batch]
             inputs, targets = self._on_device(*self._learner.batch(rows, None))
-            for name, value in self._learner.losses(field(*inputs), targets).items():
+            prediction = field(*inputs)
+            prediction = torch.zeros_like(prediction) if of_mean else prediction
+            for name, value in self._learner.losses(prediction, targets).items():
                 totals[name] = totals.get(name, 0.0) + float(value) * len(rows) / len(self._validation_rows)
         return totals
 
@@ -303,7 +343,7 @@ class _Loop:
             }
             save_checkpoint(self._run, state)
 
-    def _choose_precision(self) -> bool:
+    def _choose_precision(self) -> None:
         processes = self._processes
         inputs, targets = self._on_device(*self._learner.batch(self._order(0)[:_PROBE_ROWS], None))
         gains = processes.first and bfloat16_gains(
@@ -311,7 +351,8 @@ class _Loop:
             processes.device,
         )
         self._optimiser.zero_grad(set_to_none=True)
-        return bool(processes.broadcast(float(gains))[0])
+        self._state.bfloat16 = bool(processes.broadcast(float(gains))[0])
+        self._state.machine = processes.machine
 
     def _order(self, epoch: int) -> Rows:
         return self._learner.epoch(self._rows, np.random.default_rng([self._configuration.seed, 5, epoch]))
@@ -326,22 +367,25 @@ class _Loop:
         """This process's share of every batch, from a step on, without end; computed a little ahead."""
         processes, seed = self._processes, self._configuration.seed
         orders: dict[int, Rows] = {}
+        on_gpu = processes.device.type == "cuda"
+        threads = max(1, min(_THREADS_OF_A_GPU, (os.cpu_count() or 1) // processes.count)) if on_gpu else 1
 
-        def make(step: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        def rows_of(step: int) -> Rows:
             epoch, number = divmod(step, self._steps_per_epoch)
             if epoch not in orders:
                 orders.clear()
                 orders[epoch] = self._order(epoch)
             start = number * self._batch
-            rows = orders[epoch][start + processes.rank : start + self._batch : processes.count]
+            return orders[epoch][start + processes.rank : start + self._batch : processes.count]
+
+        def make(step: int, rows: Rows) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
             return self._learner.batch(rows, np.random.default_rng([seed, 8, step, processes.rank]))
 
-        with ThreadPoolExecutor(1) as pool:
-            ahead: deque[Future[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]] = deque(
-                pool.submit(make, first_step + number) for number in range(_BATCHES_AHEAD)
-            )
-            step = first_step + _BATCHES_AHEAD
+        with ThreadPoolExecutor(threads) as pool:
+            step = first_step
+            ahead: deque[Future[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]] = deque()
             while True:
+                while len(ahead) < _BATCHES_AHEAD * threads:
+                    ahead.append(pool.submit(make, step, rows_of(step)))
+                    step += 1
                 yield self._on_device(*ahead.popleft().result())
-                ahead.append(pool.submit(make, step))
-                step += 1

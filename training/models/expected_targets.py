@@ -68,6 +68,28 @@ class ExpectedTargets:
         )
         return np.concatenate([part.reshape(len(mean), -1) for part in parts], axis=-1).astype(np.float16)
 
+    def points_of_pair(self, emitter: int, listener: int) -> npt.NDArray[np.float16]:
+        """(yaw, ear, frequency, frame, 2) expected log-magnitude and instantaneous frequency of every point, for cells
+        that are fine throughout. The log-magnitude is that of the expected power. The frequency is the angle of the
+        expected product of a frame with the conjugate of the frame before; of noise alone it is zero."""
+        codec, frames = self._cells.codec, self._cells.fine_frames
+        advance = self._dataset.onset_s[emitter, listener] * self._dataset.sample_rate - LEAD_SAMPLES
+        diffuse = self._spectrograms.diffuse_products(emitter, listener, self._pool, advance)
+        # guard: rounding leaves no variance below zero
+        variance = np.maximum(_by_yaw(diffuse[:, :2]), 0)
+        specular = self._mean(emitter, listener, advance)
+        mean = np.zeros(variance.shape, np.complex128)
+        mean[..., : specular.shape[-1]] = specular[..., :frames]
+        # Windows of consecutive frames overlap, so noise has a product, too. Below the codec's floor there is no phase
+        # worth learning.
+        overlap = np.sum(codec.window[codec.hop :] * codec.window[: -codec.hop]) / codec.window_energy
+        spread = np.sqrt(variance + codec.log_floor**2)
+        noise = spread[..., 1:] * spread[..., :-1] * overlap
+        product = mean[..., 1:] * np.conj(mean[..., :-1]) * np.exp(-1j * codec.nominal_advance) + noise
+        frequency = np.concatenate([np.angle(mean[..., :1]), np.angle(product)], axis=-1)
+        log_magnitude = codec.log_magnitude(np.sqrt(np.abs(mean) ** 2 + variance))
+        return np.stack([log_magnitude, frequency], axis=-1).astype(np.float16)
+
     def _mean(self, emitter: int, listener: int, advance: float) -> _Complex:
         """(yaw, ear, frequency, frame) spectrogram of the aligned specular part, up to its end."""
         codec = self._cells.codec

@@ -20,11 +20,10 @@ class NafGraph(nn.Module):
     """Log-magnitude, instantaneous frequency, its certainty, and the interaural coherence of the training set (not for
     one channel). In the time domain the only output is the aligned response.
 
-    The certainty is zero throughout: the paper's network does not predict how certain a phase is, and the paper's own
-    evaluation uses random phase. A quality level that integrates the frequency does not use the certainty.
-    """
+    The certainty is zero throughout, because the paper's network does not predict how certain a phase is. So at a level
+    with frozen noise, its phase is that of the noise, as in the paper's own evaluation, and at a level that integrates
+    the frequency, which does not use the certainty, it is what the network has learned."""
 
-    _points: Tensor
     _weight: Tensor
     _bias: Tensor
 
@@ -33,7 +32,6 @@ class NafGraph(nn.Module):
         self._field = field
         self._tabled = tabled
         self._silence = float(np.log(codec.log_floor))
-        sizes = field.axes
         if tabled:
             with torch.no_grad():
                 for number, layer in enumerate(field.entries):
@@ -42,10 +40,6 @@ class NafGraph(nn.Module):
                 last, folded = field.last, cast(nn.Linear, field.inner[-1])
                 self.register_buffer("_weight", last.weight @ folded.weight, persistent=False)
                 self.register_buffer("_bias", last(folded.bias + field.ears[-1]), persistent=False)
-        else:
-            grids = torch.meshgrid(*(torch.arange(size) for size in sizes), indexing="ij")
-            points = torch.cat([field.encoding(axis)[grid.reshape(-1)] for axis, grid in enumerate(grids)], dim=-1)
-            self.register_buffer("_points", points, persistent=False)
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor) -> tuple[Tensor, ...]:
         field = self._field
@@ -62,10 +56,14 @@ class NafGraph(nn.Module):
         return *outputs, field.coherence.expand(len(listener), -1, -1, -1)
 
     def _from_points(self, features: Tensor, orientation: Tensor) -> Tensor:
-        field, count = self._field, len(self._points)
-        inputs = torch.cat(
-            [features[:, None].expand(-1, count, -1), self._points.expand(len(features), -1, -1)], dim=-1
-        )
+        field = self._field
+        sizes, poses = field.axes, len(features)
+        parts = [features.reshape(poses, *([1] * len(sizes)), -1).expand(-1, *sizes, -1)]
+        # Encodings of axes, and not of all points, are kept in the graph: a table of points would be half of its size.
+        for axis, size in enumerate(sizes):
+            along = [size if number == axis else 1 for number in range(len(sizes))]
+            parts.append(field.encoding(axis).reshape(1, *along, -1).expand(poses, *sizes, -1))
+        inputs = torch.cat(parts, dim=-1).flatten(1, -2)
         hidden = field.trunk(field.first(inputs), field.skip[0](inputs), orientation, field.inner)
         values: Tensor = field.last(hidden)
         return values

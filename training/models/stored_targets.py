@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import Progress
 
+from server.acoustics.codec import Codec
 from training.data.dataset_check import DatasetError
 from training.data.responses import ResponseSet
 from training.models.cells import Cells
@@ -36,7 +37,7 @@ _PAIRS_AT_A_TIME = 64
 @dataclass(frozen=True)
 class Targets:
     """Poses and flat targets, one row per response that is not held out, or one per pair; `flat` is a memory map.
-    `seconds` is the time that their computation took."""
+    `seconds` is the time of the processor that their computation took."""
 
     listener: npt.NDArray[np.float32]
     emitter: npt.NDArray[np.float32]
@@ -77,6 +78,15 @@ def load_directional_targets(responses: ResponseSet, cells: Cells, folder: Path,
     first = rows[np.flatnonzero(np.diff(responses.pair[rows], prepend=-1))]
     choice = {"format": _FORMAT, "cells": asdict(cells), "predicts": "directions"}
     return _load(responses, first, choice, lambda: _Directional(_simulated(responses), cells), folder, progress)
+
+
+def load_expected_points(responses: ResponseSet, codec: Codec, folder: Path, progress: Progress) -> Targets:
+    """Expected log-magnitude and instantaneous frequency of every point (channel, frequency, frame, 2) of all responses
+    that are not held out, for fields that learn other points of them in every step. Some gigabytes a scene. They are
+    stored and raise errors like targets."""
+    rows = np.flatnonzero(~responses.held_out)
+    choice = {"format": _FORMAT, "expected_points": True, "codec": asdict(codec)}
+    return _load(responses, rows, choice, lambda: _ExpectedPoints(_simulated(responses), codec), folder, progress)
 
 
 def load_aligned(responses: ResponseSet, folder: Path, progress: Progress) -> Targets:
@@ -132,7 +142,7 @@ def _complete(
         return
     targets = computation()
     task = progress.add_task("targets", total=len(starts), completed=done)
-    flushed_s = time.monotonic()
+    flushed_s, began_s = time.monotonic(), time.process_time()
     bounds = np.append(starts, len(rows))
     workers = os.cpu_count() or 1
 
@@ -150,10 +160,10 @@ def _complete(
                 progress.advance(task)
             if time.monotonic() - flushed_s > _FLUSH_S or numbers.stop == len(starts):
                 file.flush()
-                now_s = time.monotonic()
                 file.attrs["pairs"] = numbers.stop
-                file.attrs["seconds"] += now_s - flushed_s
-                flushed_s = now_s
+                now_s = time.process_time()
+                file.attrs["seconds"] += now_s - began_s
+                flushed_s, began_s = time.monotonic(), now_s
 
 
 def _simulated(responses: ResponseSet) -> SimulatedResponses:
@@ -189,6 +199,16 @@ class _Expected:
     def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
         emitter, listener = self._responses.ends(rows[0])
         return self._targets.of_pair(emitter, listener)[rows % len(self._responses.dataset.yaws)]
+
+
+class _ExpectedPoints:
+    def __init__(self, responses: SimulatedResponses, codec: Codec) -> None:
+        cells = Cells(codec, fine_frames=codec.frames, known_frames=codec.frames)
+        self._responses, self._targets = responses, ExpectedTargets(responses.dataset, cells)
+
+    def of_rows(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float16]:
+        points = self._targets.points_of_pair(*self._responses.ends(rows[0]))
+        return points[rows % len(self._responses.dataset.yaws)].reshape(len(rows), -1)
 
 
 class _Directional:

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from server.rendering.hrtf import kemar
-from training.data.dataset import TAKES, own_duration_s
+from training.data.dataset import own_duration_s
 from training.data.scene_file import SceneFile
-from training.data.shared_tail import SharedTail
+from training.data.shared_tail import TRAINING, SharedTail
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.late_sound import LateSound, MirroredReflections
 from training.simulation.rays import sphere_directions
@@ -61,8 +61,8 @@ class PairSimulation:
         simulation = cls(scene, probes, yaws, seed, plan)
         if plan.tail_start_s is None:
             return simulation
-        generators = [np.random.default_rng([seed, 3, take]) for take in range(len(TAKES))]
-        with ThreadPoolExecutor(len(TAKES)) as pool:
+        generators = [np.random.default_rng([seed, 3, take]) for take in range(TRAINING + 1)]
+        with ThreadPoolExecutor(len(generators)) as pool:
             rays = min(plan.tail_rays, most_tail_rays or plan.tail_rays)
             traced = pool.map(partial(_tail_energy, scene, probes, replace(plan, tail_rays=rays)), generators)
             energies, seconds = zip(*traced, strict=True)
@@ -80,7 +80,7 @@ class PairSimulation:
             yield listener, energy, self.late_sound.response(emitter, listener, take, energy)
 
     def joined(self, own: _Singles, take: int) -> _Singles:
-        """The energy of a whole response from a listener's `own`."""
+        """The energy of a whole response from a listener's `own`, as that of a held-out pair."""
         return own if self.tail is None else self.tail.join(take, own)
 
     def energies(self, emitter: int, listeners: npt.NDArray[np.integer], take: int) -> npt.NDArray[np.float32]:

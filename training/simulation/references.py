@@ -94,7 +94,15 @@ class References:
         """(head, ear, sample) the late reverberation with direct sound and first reflections."""
         return self._geometric.complete(emitter, listener, self.reflected(emitter, listener))
 
+    def ends(self, pair: int) -> tuple[int, int]:
+        """Probe numbers of the emitter and the listener of a pair, by its flat index emitter * probes + listener."""
+        return divmod(int(pair), len(self._dataset.probes))
+
+    def geometric(self, pair: int) -> _Responses:
+        """(head, ear, sample) direct sound and first reflections of a pair, by its flat index."""
+        ends = self.ends(pair)
+        return self._geometric.direct(*ends) + self._geometric.first_reflections(*ends)
+
     def __getitem__(self, pair: int) -> _Responses:
-        """(head, ear, sample) the complete response, by the flat index emitter * probes + listener."""
-        emitter, listener = divmod(int(pair), len(self._dataset.probes))
-        return self.complete(emitter, listener)
+        """(head, ear, sample) the complete response of a pair, by its flat index."""
+        return self.complete(*self.ends(pair))

@@ -16,7 +16,8 @@ from tests.training.told_paths import in_tiny
 from training.bundling import export as export_module
 from training.bundling.export import INPUTS, MODEL_FILE, OUTPUTS, PATH, ExportError, export
 from training.bundling.graphs import halve_weights, to_int8, to_onnx
-from training.learning.runs import Configuration, NafRecipe
+from training.evaluation.fields import training_of
+from training.learning.runs import Configuration, NafRecipe, record_of
 from training.learning.train import load_learner, train
 from training.models.factorised import ExportedField
 from training.models.naf import NafShape
@@ -200,9 +201,9 @@ def family(dataset, run, naf_run, tmp_path_factory):
 def test_several_runs_become_fields_of_one_bundle(family):
     names = ["factorised", "factorised-r16-int8", "naf", "naf-int8", "naf-tables", "naf-tables-int8"]
     assert list(family.manifest.fields) == names
-    assert [level.name for level in family.manifest.levels] == ["standard", *names[1:]]
-    assert [level.field for level in family.manifest.levels] == names
-    assert all(level.phase.kind == "frozen" for level in family.manifest.levels)
+    of_noise = [level for level in family.manifest.levels if level.phase.kind == "frozen"]
+    assert [level.name for level in of_noise] == ["standard", *names[1:]]
+    assert [level.field for level in of_noise] == names
     fields = family.manifest.fields
     assert fields["factorised"].codec is None
     assert (fields["factorised"].rank, fields["naf"].rank) == (16, None)
@@ -214,6 +215,36 @@ def test_the_first_field_is_what_it_is_alone(family, tiny_bundle):
     assert family.manifest.fields["factorised"] == tiny_bundle.manifest.fields["factorised"]
     assert family.manifest.levels[0] == tiny_bundle.manifest.levels[0]
     assert family.manifest.codec == tiny_bundle.manifest.codec
+
+
+def test_a_naf_is_offered_with_the_phase_that_it_has_learned_too(family):
+    learned = {level.name: level.field for level in family.manifest.levels if level.phase.kind == "integrated"}
+    assert learned == {f"{name}-integrated": name for name in family.manifest.fields if name.startswith("naf")}
+    levels = FieldsByLevel.load(family)
+    noisy, own = (
+        levels.choose(name).impulse_responses([(1.0, 1.0, 1.5)], [(3.0, 2.0, 1.5)], [0.3])[0].astype(float)
+        for name in ("naf", "naf-integrated")
+    )
+    assert abs(np.corrcoef(noisy.ravel(), own.ravel())[0, 1]) < 0.5
+    assert 0.1 < np.sum(own**2) / np.sum(noisy**2) < 10
+
+
+def test_a_graph_says_how_far_it_was_trained(family, run, naf_run):
+    assert training_of(family, "factorised.onnx") == record_of(run)
+    assert training_of(family, "naf-tables-int8.onnx") == record_of(naf_run)
+    assert record_of(naf_run).steps > 0
+
+
+def test_the_papers_network_is_stored_in_half_precision_without_a_table_of_points(dataset, tmp_path, monkeypatch):
+    """As fields with a basis are: two bytes for a weight and for a value of the normalisation, and little else."""
+    _accept_any_health(monkeypatch)
+    shape = NafShape(width=128, grid_features=4)
+    configuration = Configuration.naf(shape, NafRecipe(points=60), epochs=1, batch=4)
+    train(SimulatedResponses(dataset), tmp_path / "run", configuration, Progress(disable=True))
+    bundle = export(SimulatedResponses(dataset), [tmp_path / "run"], tmp_path / "bundle")
+    field = load_learner(SimulatedResponses(dataset), tmp_path / "run").field
+    values = sum(value.numel() for value in field.state_dict().values())
+    assert 2 * values < len(bundle.models["naf.onnx"]) < 2.4 * values + 50_000
 
 
 def test_all_of_them_are_heard(family):
@@ -279,9 +310,13 @@ def test_fields_with_and_without_the_direct_sound_share_no_bundle(dataset, run, 
 def test_a_graph_of_naf_computes_what_torch_does_pose_by_pose(family, dataset, naf_run):
     learner = load_learner(SimulatedResponses(dataset), naf_run)
     arrays = poses(3)
-    with torch.no_grad():
-        expected = NafGraph(learner.field, learner.codec, tabled=False)(*map(torch.from_numpy, arrays[:3]))
-    for name in ("naf.onnx", "naf-tables.onnx"):
+    for name, tabled in (("naf.onnx", False), ("naf-tables.onnx", True)):
+        graph = NafGraph(load_learner(learner.responses, naf_run).field, learner.codec, tabled=tabled)
+        with torch.no_grad():
+            for values in (*graph.parameters(), *graph.buffers()):
+                if values.nbytes >= 16_384:  # stored in half precision
+                    values.copy_(values.half().float())
+            expected = graph(*map(torch.from_numpy, arrays[:3]))
         found = answer(open_session(family.models[name]), arrays)
         for output, values in zip(OUTPUTS, expected, strict=True):
             np.testing.assert_allclose(found[output], values, atol=1e-4)
@@ -301,7 +336,7 @@ def test_eight_bits_are_smaller_and_close(family):
 def test_the_coherence_of_naf_is_the_training_sets(family, dataset, naf_run):
     stored = load_learner(SimulatedResponses(dataset), naf_run).field.coherence.numpy()
     found = answer(open_session(family.models["naf.onnx"]), poses(2))
-    np.testing.assert_allclose(found["interaural_coherence"], np.stack([stored] * 2), atol=1e-6)
+    np.testing.assert_allclose(found["interaural_coherence"], np.stack([stored] * 2), atol=5e-4)
     assert not found["phase_certainty"].any()
 
 

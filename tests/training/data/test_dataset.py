@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from training.data.dataset import TAKES, Dataset, DatasetError, own_duration_s
 from training.data.scene_file import HISTOGRAM_BIN_S
-from training.data.shared_tail import FADE_S
+from training.data.shared_tail import FADE_S, TRAINING, SharedTail
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.run import prepared, simulate
 
@@ -57,15 +57,41 @@ def test_the_share_held_out_is_that_of_the_scene(dataset):
 
 @pytest.mark.parametrize("take", TAKES)
 def test_energies_read_are_those_simulated_with_the_tail_that_all_share(dataset, take):
+    """Held-out pairs share that of the take, and pairs to train on their own."""
     simulation = resimulated(dataset)
     assert simulation.tail is not None
     emitter, _ = dataset.pairs(held_out=True)[0]
     number = TAKES.index(take)
     listeners = (np.delete(np.arange(len(dataset.probes)), emitter), np.flatnonzero(dataset.held_out[emitter]))[number]
-    drawn = np.stack([energy for _, energy, _ in simulation.take(emitter, listeners, number)])
+    tails = [number if held_out else TRAINING for held_out in dataset.held_out[emitter, listeners]]
+    assert len(set(tails)) == 2 - number
+    own = simulation.energies(emitter, listeners, number)
+    drawn = np.stack([simulation.tail.join(*of_pair) for of_pair in zip(tails, own, strict=True)])
     found = dataset.read_energy(np.column_stack([np.full_like(listeners, emitter), listeners]), take)
     assert found.shape[-1] == dataset.scene.simulation.histogram_bins
     np.testing.assert_allclose(found, drawn, rtol=0.01)
+
+
+def test_late_energies_of_held_out_pairs_are_in_no_training_pair(dataset):
+    """Of one room, where late sound is the same at all places: equally loud, and traced with other rays."""
+    late = round((dataset.effects.tail_start_s + FADE_S) / HISTOGRAM_BIN_S) + 1
+    trained, first = (dataset.read_energy(dataset.pairs(held_out=held_out)) for held_out in (False, True))
+    second = dataset.read_energy(dataset.pairs(held_out=True), TAKES[1])
+    tails = [energies[:, :, :, late:] for energies in (trained, first, second)]
+    for energies in tails:
+        assert (energies == energies[:1]).all()
+    levels = [10 * np.log10(energies[0].sum(axis=0, dtype=float) + 1e-30) for energies in tails]
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        heard = levels[one] > levels[one].max() - 30
+        assert (levels[one] != levels[other])[heard].mean() > 0.99
+        np.testing.assert_allclose(tails[one][0].sum(), tails[other][0].sum(), rtol=0.2)
+
+
+def test_files_of_earlier_versions_have_one_tail_for_all_pairs_of_a_take(dataset):
+    old = replace(dataset)
+    old.__dict__["tail"] = SharedTail(dataset.tail.start_s, dataset.tail.energies[: len(TAKES)])
+    late = np.stack([old.read_energy(old.pairs(held_out=held_out)[:1])[0, ..., -20:] for held_out in (False, True)])
+    np.testing.assert_array_equal(*late)
 
 
 def test_no_response_is_stored_and_a_tail_that_all_share_once(dataset, tiny_scene, tmp_path):
@@ -77,6 +103,22 @@ def test_no_response_is_stored_and_a_tail_that_all_share_once(dataset, tiny_scen
     with h5py.File(whole.folder / "pairs.h5", "r") as file:
         assert file["log_energy"].shape[-1] == whole.scene.simulation.histogram_bins
         assert "tail" not in file
+
+
+def test_halves_of_the_held_out_pairs_have_no_couple_in_common_and_are_all(dataset):
+    choice, report = (dataset.held_out_half(half).tolist() for half in ("choice", "report"))
+    assert sorted(choice + report) == dataset.pairs(held_out=True).tolist()
+    couples = [{tuple(sorted(pair)) for pair in half} for half in (choice, report)]
+    assert not couples[0] & couples[1]
+    assert all([listener, emitter] in half for half in (choice, report) for emitter, listener in half)
+    assert len(couples[1]) - len(couples[0]) in (0, 1)
+
+
+def test_a_single_couple_is_in_both_halves(dataset):
+    held_out = np.zeros_like(dataset.held_out)
+    held_out[1, 2] = held_out[2, 1] = True
+    single = replace(dataset, held_out=held_out)
+    assert all(single.held_out_half(half).tolist() == [[1, 2], [2, 1]] for half in ("choice", "report"))
 
 
 def test_of_the_second_take_only_held_out_pairs_are_stored(dataset):

@@ -5,7 +5,7 @@ import pytest
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from training.data.scene_file import HISTOGRAM_BIN_S
-from training.data.shared_tail import FADE_S, SharedTail, shared_power
+from training.data.shared_tail import FADE_S, TRAINING, SharedTail, shared_power
 from training.simulation.rays import sphere_directions
 
 START_S, BINS = 0.06, 75
@@ -14,10 +14,10 @@ DIRECTIONS = sphere_directions(12)
 
 @pytest.fixture(scope="module")
 def energies():
-    """(take, direction, band, bin): mostly from +x, bands that decay differently, the second take twice as loud."""
+    """(tail, direction, band, bin): mostly from +x, bands that decay differently, each tail twice as loud."""
     towards = 1 + 3 * np.maximum(0, DIRECTIONS[:, 0])
     decay = np.exp(-np.outer(np.linspace(8, 25, len(OCTAVE_BANDS_HZ)), np.arange(BINS) * HISTOGRAM_BIN_S))
-    return np.stack([1.0, 2.0])[:, None, None, None] * towards[:, None, None] * decay * 1e-3
+    return np.stack([1.0, 2.0, 4.0])[:, None, None, None] * towards[:, None, None] * decay * 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,21 @@ def test_nothing_is_added_before_it_starts(tail):
     np.testing.assert_allclose(found[..., known:], tail.energies[1][..., known:])
 
 
+def test_the_directions_of_the_training_pairs_tail_are_its_own(energies):
+    turned = energies.copy()
+    turned[TRAINING] = turned[TRAINING, ::-1]
+    found = SharedTail.of(turned, START_S).energies
+    np.testing.assert_allclose(found, turned, rtol=1e-5)
+
+
+def test_a_pair_to_train_on_has_another_tail_than_a_held_out_one(tail):
+    assert [tail.number(take, held_out=True) for take in (0, 1)] == [0, 1]
+    assert tail.number(0, held_out=False) == TRAINING
+    of_earlier_files = SharedTail(tail.start_s, tail.energies[:TRAINING])
+    assert of_earlier_files.number(0, held_out=False) == 0
+
+
 def test_directions_without_any_sound_are_even():
-    silent = SharedTail.of(np.zeros((2, 12, 7, BINS)), START_S)
+    silent = SharedTail.of(np.zeros((3, 12, 7, BINS)), START_S)
     assert np.isfinite(silent.energies).all()
     assert not silent.energies.any()

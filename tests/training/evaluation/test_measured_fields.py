@@ -10,9 +10,13 @@ from training.baselines.held_out import EvaluationError
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset, Measurement
 from training.evaluation.measured_fields import decoded, undo_alignment
+from training.evaluation.published import SOUNDSPACES
+from training.evaluation.report import markdown
 from training.evaluation.run import evaluate_bundles
+from training.learning.runs import Configuration, NafRecipe, configure, record_of
 from training.learning.train import train
 from training.models.frozen_noise import even_noise
+from training.models.naf import NafShape
 from training.models.targets import LEAD_SAMPLES, align
 
 RATE = 16_000
@@ -61,6 +65,14 @@ def test_phase_that_is_not_known_costs_no_energy(codec, noise, channels):
     np.testing.assert_allclose(10 * np.log10(ratio), 0, atol=2.0)
 
 
+@pytest.mark.parametrize("channels", [1, 2])
+def test_a_phase_that_is_predicted_is_heard_if_that_is_asked_for(codec, noise, channels):
+    """However certain the field says that it is."""
+    responses = decaying(channels)
+    found = decoded(answers(codec, responses, 0.0), codec, noise, integrated=True)
+    assert np.square(found - responses).sum() / np.square(responses).sum() < 1e-3
+
+
 def test_a_response_in_the_time_domain_is_taken_as_it_is(codec, noise):
     responses = decaying(1).astype(np.float32)
     np.testing.assert_array_equal(decoded((responses,), codec, noise), responses)
@@ -98,6 +110,28 @@ def test_a_trained_field_is_measured_beside_the_baselines(measured, configuratio
     # The decays are all alike: a field that has learned anything has their level, and their sound arrives in time.
     assert field.summaries["level"].mean < 2.0
     assert field.summaries["onset"].mean < 0.5 + 1e3 * LEAD_SAMPLES / RATE
+
+
+def test_the_papers_network_has_a_row_with_noise_and_one_with_its_own_phase(measured, tmp_path):
+    configuration = Configuration.naf(NafShape(width=8, grid_features=4), NafRecipe(points=20), epochs=1, batch=4)
+    train(measured, tmp_path / "naf", configuration, Progress(disable=True))
+    evaluation, published = evaluate_bundles([], measured.folder, runs=[tmp_path / "naf"], methods=[])
+    assert [result.name for result in evaluation.results] == ["naf", "naf-integrated"]
+    assert {result.method for result in evaluation.results} == {"naf"}
+    table = markdown(evaluation, published)
+    assert f"naf: {record_of(tmp_path / 'naf').sentence()}." in table
+    assert evaluation.to_json()["columns"]["naf"]["training"]["steps"] == record_of(tmp_path / "naf").steps
+
+
+@pytest.mark.parametrize("field", ["naf-dual", "naf-no-grid", "naf-time-domain"])
+def test_a_variant_of_a_network_does_not_stand_beside_the_figures_of_another(measured, tmp_path, field):
+    usual = configure(field, epochs=1, batch=4, points=20)
+    small = dataclasses.replace(usual, shape=dataclasses.replace(usual.shape, width=8, grid_features=4))
+    train(measured, tmp_path / "run", small, Progress(disable=True))
+    evaluation, published = evaluate_bundles([], measured.folder, runs=[tmp_path / "run"], methods=[])
+    assert {result.method for result in evaluation.results} == {field}
+    assert field not in published.errors
+    assert field not in SOUNDSPACES.errors
 
 
 def test_a_run_on_a_simulated_scene_is_to_be_exported(run, dataset):

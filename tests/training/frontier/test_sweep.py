@@ -75,6 +75,26 @@ def test_the_true_phase_bounds_what_phase_can_do(frontier) -> None:
     assert bounds[0] not in frontier.best
 
 
+def test_levels_are_chosen_by_one_half_and_reported_on_the_other(tiny_bundle, dataset, chosen, tmp_path, monkeypatch):
+    taken: dict[frozenset, list] = {}
+    errors_of = SampledPairs.errors_of
+
+    def told(self, estimate):
+        pairs = frozenset((*entry.emitter, *entry.listener) for entry in self.entries)
+        taken.setdefault(pairs, []).append(errors_of(self, estimate))
+        return taken[pairs][-1]
+
+    monkeypatch.setattr(SampledPairs, "errors_of", told)
+    found = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, EFFORT, Progress(disable=True))
+    assert len(taken) == 2  # no more samples than halves
+    probes = {half: dataset.probes[dataset.held_out_half(half)].reshape(-1, 6) for half in ("choice", "report")}
+    for half, is_reported in (("choice", False), ("report", True)):
+        (pairs,) = [pairs for pairs in taken if pairs <= {tuple(ends) for ends in probes[half].tolist()}]
+        of_level = [errors.errors for errors in taken[pairs]]
+        assert (found.best[0].accuracy.errors in of_level) == is_reported
+        assert (found.floor.errors in of_level) == is_reported
+
+
 def test_costs_are_measured_in_one_run(frontier) -> None:
     for point in frontier.points:
         assert 0 < point.cost.ms_p50 <= point.cost.ms_p99

@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from rich.progress import Progress
 
 from training.learning.naf import NafLearner
-from training.learning.runs import Configuration, NafRecipe
+from training.learning.runs import Configuration, NafRecipe, RecipeError
 from training.models.naf import NafShape
+from training.models.stored_targets import load_expected_points
 from training.models.targets import LEAD_SAMPLES, align
 from training.simulation.responses import SimulatedResponses
 
@@ -106,6 +108,26 @@ def test_an_epoch_meets_every_pair_once_in_any_orientation(dataset):
     for order in met:
         assert sorted(pairs[order]) == sorted(set(pairs))
     assert len(np.unique(np.concatenate(met))) > 0.9 * len(rows)
+
+
+def test_what_is_expected_of_responses_is_the_target_if_that_is_asked_for(dataset):
+    it = learner(dataset, expected=True)
+    it.prepare(Progress(disable=True))
+    it.initialise(np.arange(30), seed=0)
+    rows = np.array([3, 40, 7])
+    (*_, bins, frames), (values, _) = it.batch(rows, np.random.default_rng(0))
+    stored = load_expected_points(it.responses, it.codec, dataset.folder / "targets", Progress(disable=True)).flat
+    for number, row in enumerate(rows):
+        points = stored[row].reshape(2, it.codec.bins, it.codec.frames, 2)
+        np.testing.assert_allclose(values[number], points[:, bins[number], frames[number]], atol=1e-6)
+    assert not torch.isnan(it.field.coherence).any()
+    assert it.field.coherence.any()
+
+
+@pytest.mark.parametrize("recipe", [{"whole": True}, {"shape": NafShape(domain="time", width=8)}])
+def test_only_reflected_spectrograms_have_expected_values(dataset, recipe):
+    with pytest.raises(RecipeError, match="expected values"):
+        learner(dataset, expected=True, **recipe)
 
 
 def test_in_the_time_domain_the_waveform_is_the_target(dataset):

@@ -20,6 +20,7 @@ from training.learning.kinds import learner_of
 from training.learning.naf import NafLearner
 from training.learning.pairs import split
 from training.learning.precision import bfloat16_gains
+from training.learning.processes import Processes
 from training.learning.runs import (
     CHECKPOINT,
     Configuration,
@@ -225,7 +226,7 @@ def test_a_run_interrupted_within_an_epoch_goes_on_to_the_same_field(dataset, na
 
     def impatient(self, *given):
         calls.append(0)
-        if len(calls) == 20:
+        if len(calls) == 22:
             raise KeyboardInterrupt
         return losses_of(self, *given)
 
@@ -275,7 +276,7 @@ def keep_time(monkeypatch):
             return losses_of(self, *given)
 
         monkeypatch.setattr(FactorisedLearner, "losses", slow)
-        monkeypatch.setattr(train_module, "time", SimpleNamespace(perf_counter=lambda: clock.now_s))
+        monkeypatch.setattr(Processes, "clock_s", lambda _: clock.now_s)
         return looks
 
     return keep_time
@@ -325,6 +326,62 @@ def test_without_progress_on_what_is_held_back_a_run_stops_and_keeps_the_best(da
     with torch.no_grad():
         found = sum(float(part) for part in learner.losses(learner.field(*inputs), targets).values())
     assert found == pytest.approx(sums.min(), rel=1e-3)
+
+
+def test_a_run_pauses_when_its_time_is_over_and_goes_on_to_the_same_field(dataset, naf_configuration, tmp_path):
+    responses = SimulatedResponses(dataset)
+    train(responses, tmp_path / "whole", naf_configuration, Progress(disable=True))
+    pieces = 0
+    while not train(responses, tmp_path / "pieces", naf_configuration, Progress(disable=True), pause_after_s=0.02):
+        pieces += 1
+    assert pieces > 1
+    whole, pieced = (load_learner(responses, tmp_path / name).field.state_dict() for name in ("whole", "pieces"))
+    for name, values in whole.items():
+        assert torch.equal(pieced[name], values), name
+
+
+def test_a_run_that_moves_to_another_machine_chooses_its_precision_anew(
+    dataset, naf_configuration, tmp_path, monkeypatch
+):
+    """A graphics card has units for bfloat16, and many a processor emulates it."""
+    responses = SimulatedResponses(dataset)
+    monkeypatch.setattr(train_module, "bfloat16_gains", lambda *_: True)
+    with monkeypatch.context() as patch:
+        patch.setattr(Processes, "machine", "a graphics card")
+        assert not train(responses, tmp_path, naf_configuration, Progress(disable=True), pause_after_s=0.0)
+    assert torch.load(tmp_path / CHECKPOINT, weights_only=True)["bfloat16"]
+    monkeypatch.setattr(train_module, "bfloat16_gains", lambda *_: False)
+    assert train(responses, tmp_path, naf_configuration, Progress(disable=True))
+    assert not torch.load(tmp_path / CHECKPOINT, weights_only=True)["bfloat16"]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_run_goes_from_a_gpu_to_the_processor_and_back(dataset, naf_configuration, tmp_path, monkeypatch):
+    responses = SimulatedResponses(dataset)
+    train(responses, tmp_path, naf_configuration, Progress(disable=True), pause_after_s=1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.cuda, "is_available", lambda: False)
+        train(responses, tmp_path, naf_configuration, Progress(disable=True), pause_after_s=1.0)
+    assert train(responses, tmp_path, naf_configuration, Progress(disable=True))
+    assert np.isfinite(losses(tmp_path, "training")).all()
+
+
+def test_minutes_are_of_the_processor_so_that_others_take_none_of_them(dataset, configuration, tmp_path):
+    """The clock runs on while nothing is computed; the budget does not."""
+    slept = []
+
+    class Sleepy(Progress):
+        def update(self, *arguments, **changes):
+            super().update(*arguments, **changes)
+            time.sleep(0.2)
+            slept.append(0.2)
+
+    began_s, began_cpu_s = time.monotonic(), time.process_time()
+    timed = dataclasses.replace(configuration, minutes=2.0 / 60)
+    train(SimulatedResponses(dataset), tmp_path, timed, Sleepy(disable=True))
+    counted_s = torch.load(tmp_path / CHECKPOINT, weights_only=True)["seconds"]
+    assert 2.0 <= counted_s <= time.process_time() - began_cpu_s
+    assert time.monotonic() - began_s > counted_s + 0.9 * sum(slept)
 
 
 @pytest.mark.parametrize("broken", ["loss", "gradient"])
@@ -407,6 +464,7 @@ def test_bfloat16_is_chosen_where_it_is_faster():
         ("directional", {"points": 100}, "whole responses"),
         ("directional", {"teacher": Path("run")}, "only a factorised field"),
         ("factorised", {"points": 100}, "whole responses"),
+        ("naf", {"epochs": 3, "minutes": 1.0}, "in epochs or in minutes"),
     ],
 )
 def test_options_that_a_field_has_not_are_refused(field, options, told):

@@ -5,8 +5,8 @@ from rich.progress import Progress
 from training.models.cells import Cells
 from training.models.expected_targets import expected_phasor
 from training.models.factorised import Heads
-from training.models.stored_targets import load_targets
-from training.models.targets import codec_of
+from training.models.stored_targets import load_expected_points, load_targets
+from training.models.targets import align, codec_of, delay_samples
 from training.simulation.responses import SimulatedResponses
 
 
@@ -38,6 +38,45 @@ def both(dataset, tmp_path_factory):
         flat = np.array(flat, dtype=np.float64)
         found.append({name: flat[:, part].reshape(-1, *heads.shapes[name]) for name, part in heads.slices.items()})
     return found
+
+
+@pytest.fixture(scope="module")
+def points(dataset, tmp_path_factory):
+    """The codec of the paper's network, and expected points (row, ear, frequency, frame, 2) with drawn spectrograms."""
+    responses = SimulatedResponses(dataset)
+    codec = codec_of(responses, 512)
+    stored = load_expected_points(responses, codec, tmp_path_factory.mktemp("points"), Progress(disable=True))
+    expected = np.array(stored.flat, float).reshape(-1, 2, codec.bins, codec.frames, 2)
+    rows = np.flatnonzero(~responses.held_out)
+    aligned = [align(responses.read([row])[0], delay_samples(responses, row)) for row in rows]
+    return codec, expected, codec.transform(np.stack(aligned))
+
+
+def test_the_expected_level_of_a_point_is_that_of_the_power_of_many_draws(points):
+    codec, expected, drawn = points
+    level = np.log(np.mean(np.exp(2 * expected[..., 0]), axis=(0, 1))) / 2
+    true = np.log(np.mean(np.abs(drawn) ** 2, axis=(0, 1)) + codec.log_floor**2) / 2
+    loud = level > np.quantile(level, 0.3)
+    assert abs(np.mean((level - true)[loud])) < 0.05
+    assert np.median(np.abs(level - true)[loud]) < 0.2
+
+
+def test_the_expected_frequency_is_where_products_of_consecutive_frames_point(points):
+    """Weighted by power, drawn products turned back by what is expected point along the real axis. Where something else
+    than noise is expected, which is where sound is specular, they do not without."""
+    codec, expected, drawn = points
+    product = drawn[..., 1:] * np.conj(drawn[..., :-1]) * np.exp(-1j * codec.nominal_advance)
+    turned = product * np.exp(-1j * expected[..., 1:, 1])
+    specular = np.abs(expected[..., 1:, 1]) > 1.0
+    along, unturned = (np.sum(values[specular].real) / np.sum(np.abs(values[specular])) for values in (turned, product))
+    assert along > unturned + 0.2
+    assert abs(np.sum(turned.imag) / np.sum(np.abs(turned))) < 0.02
+
+
+def test_of_noise_alone_the_expected_frequency_is_zero(points):
+    """After the mirrored reflections, and before an aligned response fades out."""
+    _, expected, _ = points
+    assert np.mean(np.abs(expected[..., 10:20, 1]) < 0.05) > 0.99
 
 
 @pytest.mark.parametrize("name", ["fine", "late"])

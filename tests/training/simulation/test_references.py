@@ -77,6 +77,8 @@ def test_late_sound_from_stored_energies_is_that_of_the_simulation(dataset, take
     everyone = np.delete(np.arange(len(dataset.probes)), emitter)
     listeners = (everyone, np.flatnonzero(dataset.held_out[emitter]))[number]
     for listener, _, simulated in simulation.take(emitter, listeners, number):
+        if not dataset.held_out[emitter, listener]:  # whose tail is another
+            continue
         found = references.reflected(int(emitter), listener)
         assert np.sum((found - simulated) ** 2) < 1e-4 * np.sum(simulated**2)
 
