@@ -17,6 +17,7 @@ from server.core.numerals import parse_integer
 from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
 from training.cli.importing import importing
+from training.cli.listening import listening_test
 from training.cli.options import Json, Seed
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 app = StrictTyper(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(importing, name="import")
 app.command()(simulation.plan)
+app.command()(listening_test)
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)]
 
