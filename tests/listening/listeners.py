@@ -129,5 +129,5 @@ def listen(
         else:
             assert choose is not None
             answers = answers_of(trial, choose(trial))
-        file.append(rows_of(at, trial, test.design, answers, {slot: 1 for slot in trial.slots}, 3.0))
+        file.append(rows_of(at, trial, test.design, answers, dict.fromkeys(trial.slots, 1), 3.0))
     return plan

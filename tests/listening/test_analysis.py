@@ -1,5 +1,7 @@
 """A planted preference is found again, and answers that do not count are named with the reason."""
 
+import io
+
 import numpy as np
 import pytest
 from rich.console import Console
@@ -30,11 +32,11 @@ def prefers(rng, share=PLANTED, *, hears_anchors=True):
 
 
 def text_of(results):
-    console = Console(width=200, record=True, quiet=True)
-    with console.capture() as captured:
-        for part in report(results):
-            console.print(part)
-    return captured.get() or console.export_text()
+    written = io.StringIO()
+    console = Console(width=200, file=written)
+    for part in report(results):
+        console.print(part)
+    return written.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +115,8 @@ def ratings(tmp_path_factory):
 
     for number in range(15):
         listen(test, number, rate=rate)
-    listen(test, 15, rate=lambda _, method: 50.0)
-    listen(test, 16, rate=lambda _, method: 100.0)
+    listen(test, 15, rate=lambda *_: 50.0)
+    listen(test, 16, rate=lambda *_: 100.0)
     return analyse(test), true
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from server.listening.answers import COLUMNS, AnswerFile, rows_of
 from server.listening.plan import QUIET, ListenerPlan
-from server.listening.progress import progress
 from tests.listening.listeners import FIELD, answers_of, design_of, listen, write_test
 
 
@@ -24,7 +23,7 @@ def heard(tmp_path):
 
 
 def test_the_file_has_a_row_for_each_sound_of_each_trial(heard):
-    test, plan, path = heard
+    _, plan, path = heard
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == COLUMNS
@@ -40,7 +39,7 @@ def test_the_file_has_a_row_for_each_sound_of_each_trial(heard):
 
 
 def test_a_file_that_is_torn_anywhere_keeps_its_whole_trials_and_goes_on(heard, tmp_path):
-    test, plan, path = heard
+    _, plan, path = heard
     whole = path.read_bytes()
     answered = AnswerFile(path, plan).read()
     ends = [len(",".join(COLUMNS)) + 1]
