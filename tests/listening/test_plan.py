@@ -52,7 +52,7 @@ def test_which_place_has_a_method_on_which_side_is_even_over_listeners():
             trial.slots["a"] == FIELD
             for plan in drawn
             for trial in plan.trials
-            if trial.part == "test" and trial.place == place
+            if (trial.part, trial.place) == ("test", place)
         ]
         # Four standard deviations of 400 tosses.
         assert abs(sum(first) - 200) < 40
@@ -87,9 +87,8 @@ def test_rated_sounds_are_in_slots_at_random():
     firsts = Counter(trial.slots["a"] for plan in drawn for trial in plan.trials if trial.part == "test")
     assert set(firsts) == set(RATED)
     assert max(firsts.values()) < 1.35 * min(firsts.values())
-    assert all(
-        set(trial.slots.values()) == set(RATED) for plan in drawn for trial in plan.trials if trial.place is not None
-    )
+    rated = [trial for plan in drawn for trial in plan.trials if trial.place is not None]
+    assert all(set(trial.slots.values()) == set(RATED) for trial in rated)
 
 
 def test_codes_differ():

@@ -128,6 +128,11 @@ async function ask(node, { sounds, load, keys, missing, answers }) {
     act();
   };
   document.addEventListener("keydown", pressed);
+  for (const done of ["click", "input"]) {
+    node.addEventListener(done, () => {
+      problem.textContent = "";
+    });
+  }
   try {
     const sent = new Promise((resolve) => {
       node.addEventListener("submit", (event) => {

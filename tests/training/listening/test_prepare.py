@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import soundfile
 
+from server.acoustics.audibility import THRESHOLDS
 from server.listening.design import LOW_PASS, REFERENCE, WRONG_PLACE, ListeningTest
-from server.scene.bundle import Bundle, write_bundle
-from tests.training.held_out import SAMPLES
+from server.scene.bundle import Bundle, find_bundle, write_bundle
+from server.scene.manifest import Accuracy
 from training.baselines.held_out import EvaluationError, open_held_out
 from training.data.dataset_check import DatasetError
 from training.listening.loudness import loudness_lufs
@@ -52,9 +53,8 @@ def test_all_sounds_are_equally_loud_within_a_tenth_of_a_unit(test):
 def test_sizes_and_names_tell_nothing(test):
     assert len({path.stat().st_size for path in (test.folder / "sounds").iterdir()}) == 1
     assert {len(samples) for _, samples, _ in sounds_of(test)} == {test.design.samples}
-    assert not [
-        path for path in (test.folder / "sounds").iterdir() for name in test.design.methods if name in path.name
-    ]
+    names = " ".join(path.name for path in (test.folder / "sounds").iterdir())
+    assert not [name for name in test.design.methods if name in names]
 
 
 def test_the_trials_are_those_that_were_asked_for(test, level):
@@ -73,12 +73,11 @@ def test_the_trials_are_those_that_were_asked_for(test, level):
 
 
 def test_the_truth_is_heard_at_pairs_that_training_never_saw(test, dataset):
-    held_out = {
-        (tuple(dataset.probes[listener]), tuple(dataset.probes[emitter]))
-        for emitter, listener in dataset.pairs(held_out=True)
-    }
+    held_out = [
+        np.concatenate(dataset.probes[[listener, emitter]]) for emitter, listener in dataset.pairs(held_out=True)
+    ]
     for place in test.design.places:
-        assert any(np.allclose([*place.listener, *place.emitter], [*one, *other]) for one, other in held_out)
+        assert any(np.allclose([*place.listener, *place.emitter], ends) for ends in held_out)
 
 
 def test_the_same_seed_makes_the_same_test(test, tiny_bundle, dataset, options, tmp_path):
@@ -92,14 +91,14 @@ def test_the_same_seed_makes_the_same_test(test, tiny_bundle, dataset, options, 
 
 def test_a_test_goes_on_and_another_is_not_written_over_it(test, tiny_bundle, dataset, options, tmp_path):
     assert prepare([tiny_bundle], dataset.folder, test.folder, options) == (test, True)
-    with pytest.raises(EvaluationError, match="--output: .* holds another test"):
+    with pytest.raises(EvaluationError, match=r"--output: .* holds another test"):
         prepare([tiny_bundle], dataset.folder, test.folder, replace(options, seed=1))
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(EvaluationError, match="holds other files"):
         prepare([tiny_bundle], dataset.folder, tmp_path, options)
 
 
-def test_a_rating_asks_about_all_levels_beside_reference_and_anchors(tiny_bundle, dataset, level, tmp_path):
+def test_a_rating_asks_about_all_levels_beside_reference_and_anchors(tiny_bundle, dataset, tmp_path):
     made, _ = prepare([tiny_bundle], dataset.folder, tmp_path / "rating", Options(rating=True, places=2, seconds=2.0))
     assert made.design.kind == "rating"
     (trial, *_) = made.design.trials
@@ -108,15 +107,20 @@ def test_a_rating_asks_about_all_levels_beside_reference_and_anchors(tiny_bundle
     assert [each.part for each in made.design.trials].count("test") == 2
 
 
-def test_the_errors_of_levels_in_jnd_come_from_the_manifest(apartment_bundle):
-    levels = {level.name: level.accuracy for level in apartment_bundle.manifest.levels}
-    assert all(accuracy is not None for accuracy in levels.values())
+def test_the_errors_of_levels_in_jnd_come_from_the_manifest(tiny_bundle, dataset, level):
+    accuracy = Accuracy(pairs=2, yaws=1, errors={"t60": 10.0, "c50": 1.0, "edt": 99.0}, floor={}, steps={})
+    (first, *others) = tiny_bundle.manifest.levels
+    levels = (first.model_copy(update={"accuracy": accuracy}), *others)
+    measured = replace(tiny_bundle, manifest=tiny_bundle.manifest.model_copy(update={"levels": levels}))
+    with open_held_out(dataset.folder) as held_out:
+        heard = MethodCatalogue([measured], held_out).heard([level, "nearest"], lambda steps, _: steps)
+    thresholds = [10.0 / THRESHOLDS["t60"].amount, 1.0 / THRESHOLDS["c50"].amount]
+    assert heard[level].method.jnd == pytest.approx(np.mean(thresholds))
+    assert heard["nearest"].method.jnd is None
 
 
 @pytest.fixture(scope="module")
 def apartment_bundle() -> Bundle:
-    from server.scene.bundle import find_bundle
-
     return Bundle.load(find_bundle("apartment"))
 
 
@@ -157,11 +161,8 @@ def test_a_bundle_of_another_scene_is_refused(dataset, apartment_bundle, options
         prepare([apartment_bundle], dataset.folder, tmp_path / "test", options)
 
 
-def test_a_method_that_is_silent_cannot_be_made_as_loud(
-    make_held_out, tiny_bundle, monkeypatch, dataset, options, tmp_path
-):
-    quiet = np.zeros((1, 2, SAMPLES), np.float32)
-    monkeypatch.setattr("training.listening.prepare._response", lambda source, name, index, yaw: quiet[0])
+def test_a_method_that_is_silent_cannot_be_made_as_loud(tiny_bundle, monkeypatch, dataset, options, tmp_path):
+    monkeypatch.setattr("training.listening.prepare._response", lambda *_: np.zeros((2, 100)))
     with pytest.raises(EvaluationError, match="is silent at a held-out place"):
         prepare([tiny_bundle], dataset.folder, tmp_path / "test", options)
 
