@@ -90,7 +90,7 @@ def listening_results(
     if as_json:
         typer.echo(document)
     else:
-        console = Console(width=None if Console().is_terminal else 140)
+        console = Console(width=None if Console().is_terminal else 170)
         for part in report(results):
             console.print(part)
 

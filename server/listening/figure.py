@@ -1,7 +1,7 @@
 """The results of a listening test as a picture."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from server.core.errors import NafirError
 from server.listening.analysis import PAPER, Comparison, Results
@@ -56,7 +56,10 @@ def _draw_choices(axes: "Axes", results: Results) -> None:
         axes.plot([100 * low, 100 * high], [at, at], color=colour, linewidth=2.5, solid_capstyle="butt")
         axes.plot(100 * share.share, at, "o", color=colour, markersize=7)
         text = f"{100 * share.share:.1f} %, {share.count} of {share.trials}"
-        axes.annotate(text, (100 * share.share, at), xytext=(0, 7), textcoords="offset points", ha="center", fontsize=8)
+        side: Literal["left", "center", "right"] = (
+            "right" if share.share > 0.9 else "left" if share.share < 0.1 else "center"
+        )
+        axes.annotate(text, (100 * share.share, at), xytext=(0, 7), textcoords="offset points", ha=side, fontsize=8)
     axes.axvline(50, color="#222222", linewidth=1, linestyle=":")
     axes.set_yticks(range(len(rows)), [title for title, _ in rows], fontsize=8)
     axes.set(xlim=(-4, 104), ylim=(-0.6, len(rows) - 0.3), xlabel="chosen as nearer to the reference (%); Wilson, 95 %")

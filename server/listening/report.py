@@ -40,7 +40,7 @@ def report(results: Results) -> Iterator[RenderableType]:
     if (agreement := results.agreement) is not None:
         yield (
             f"ratings and errors in JND: Spearman's rho {agreement.rho:.2f} over {agreement.count} levels, "
-            f"p = {_p(agreement.p)} (-1: ears and axis agree fully)"
+            f"p {_p(agreement.p, equals='= ')} (-1: ears and axis agree fully)"
         )
 
 
@@ -94,5 +94,5 @@ def _between(interval: Interval, factor: float = 100.0) -> str:
     return f"{factor * low:.0f} to {factor * high:.0f}"
 
 
-def _p(p: float) -> str:
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+def _p(p: float, equals: str = "") -> str:
+    return "< 0.001" if p < 0.001 else f"{equals}{p:.3f}"

@@ -4,6 +4,7 @@ Answers of one person are alike, which binomial intervals do not know. So beside
 listeners are drawn with replacement, and the interval holds the middle 95 % of what those draws give.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -16,6 +17,7 @@ from server.scene.geometry import Strict
 CONFIDENCE: Final = 0.95
 _DRAWS: Final = 4_000
 _SEED: Final = 0
+_MOST_PERMUTED: Final = 7
 
 Interval = tuple[float, float]
 
@@ -84,7 +86,7 @@ def holm(p: Sequence[float]) -> list[float]:
 
 
 class RankAgreement(Strict):
-    """Spearman's rank correlation over `count` methods, and its p."""
+    """Spearman's rank correlation over `count` methods, and its two-sided p: exact for a few methods."""
 
     count: int
     rho: float
@@ -96,7 +98,13 @@ class RankAgreement(Strict):
         if len(first) < 3 or len(set(first)) == 1 or len(set(second)) == 1:
             return None
         found = scipy.stats.spearmanr(first, second)
-        return cls(count=len(first), rho=float(found.statistic), p=float(found.pvalue))
+        rho, p = float(found.statistic), float(found.pvalue)
+        if len(first) <= _MOST_PERMUTED:
+            # The usual p is that of many methods: it is 0 for three in the same order.
+            ranks, others = (scipy.stats.zscore(scipy.stats.rankdata(side)) for side in (first, second))
+            possible = np.array(list(itertools.permutations(ranks))) @ others / len(first)
+            p = float(np.mean(np.abs(possible) >= abs(rho) - 1e-9))
+        return cls(count=len(first), rho=rho, p=p)
 
 
 def _over(listeners: int, statistic: Callable[[npt.NDArray[np.integer]], float]) -> Interval | None:

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from server.cli.main import main
-from tests.listening.listeners import CODED, FIELD, design_of, listen, write_test
+from tests.listening.listeners import FIELD, design_of, listen, write_test
 
 
 @pytest.fixture
@@ -28,7 +28,8 @@ def test_results_are_printed_and_written(nafir, tmp_path):
         listen(test, number, lambda trial: min(set(trial.slots.values()) & {FIELD, "reference"}))
     code, out, _ = nafir("listening-results", test.folder)
     assert code == 0
-    assert f"{FIELD} over {CODED}" in " ".join(out.split())
+    assert f"{FIELD} over" in out
+    assert "12 of 12" in out
     code, out, _ = nafir(
         "listening-results", test.folder, "--json", "-o", tmp_path / "out.json", "--figure", tmp_path / "out.png"
     )

@@ -73,6 +73,8 @@ def test_holm_is_its_definition():
 
 
 def test_agreement_of_ranks_needs_three_different_methods():
-    assert RankAgreement.of([1, 2, 3, 4], [90, 80, 40, 10]).rho == -1.0
+    found = RankAgreement.of([1, 2, 3, 4], [90, 80, 40, 10])
+    assert found.rho == pytest.approx(-1.0)
+    assert found.p == pytest.approx(2 / 24)  # two of the 24 orders of four
     assert RankAgreement.of([1, 2], [2, 1]) is None
     assert RankAgreement.of([1, 1, 1], [3, 2, 1]) is None
