@@ -210,7 +210,7 @@ def _comparisons(design: Design, listeners: Sequence[_Listener]) -> tuple[Compar
     asked = {(trial.part, frozenset(trial.methods)): trial.methods for trial in design.trials if trial.part in _COUNTED}
     found = []
     for (part, methods), (one, other) in asked.items():
-        first, second = (other, one) if part == "hidden-reference" else (one, other)
+        first, second = _ordered(part, one, other, design)
         by_listener = [
             _count([trial for trial in listener.trials(part) if trial.methods == methods], first)
             for listener in listeners
@@ -223,6 +223,13 @@ def _comparisons(design: Design, listeners: Sequence[_Listener]) -> tuple[Compar
     return tuple(
         each.model_copy(update={"p_corrected": next(corrected)}) if each.part == "test" else each for each in found
     )
+
+
+def _ordered(part: str, one: str, other: str, design: Design) -> tuple[str, str]:
+    """The one whose share is counted comes first: a method before the hidden reference, a field before a baseline."""
+    kinds = design.methods[one].kind, design.methods[other].kind
+    swaps = part == "hidden-reference" or (part == "test" and kinds == ("baseline", "field"))
+    return (other, one) if swaps else (one, other)
 
 
 def _is_like_the_paper(first: Method, second: str) -> bool:

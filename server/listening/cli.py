@@ -46,7 +46,12 @@ def listening_test(
     TEST alone the test of that folder is served. Answers are stored in the folder `results` of the test.
     """
     folder = places[0]
-    if len(places) > 1:
+    if len(places) == 1:
+        for_making = {"--methods": methods, "--rating": rating, "--clip": clips, "--no-screening": no_screening}
+        for option, given in for_making.items():
+            if given:
+                raise NafirError(f"{option}: is for making a test: give BUNDLE... DATA too, or leave it out")
+    else:
         folder = output
         _prepare(
             [str(place) for place in places],

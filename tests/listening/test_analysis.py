@@ -8,7 +8,7 @@ from rich.console import Console
 
 from server.core.errors import NafirError
 from server.listening.analysis import PAPER, analyse
-from server.listening.design import LOW_PASS, REFERENCE
+from server.listening.design import LOW_PASS, REFERENCE, Trial
 from server.listening.figure import draw
 from server.listening.plan import ANTIPHASE
 from server.listening.report import report
@@ -97,6 +97,15 @@ def test_the_paper_stands_beside_a_field_over_aac_nearest(choices):
     assert "82.38 %" in text
     assert "21 listeners, 10 places" in text
     assert "listener21, anchors" in text
+
+
+def test_a_field_is_counted_over_a_baseline_however_they_were_named(tmp_path):
+    trials = (Trial(part="test", place=0, methods=(CODED, FIELD)),)
+    test = write_test(tmp_path / "test", design_of(places=1, trials=trials))
+    listen(test, 0, lambda _: FIELD)
+    (found,) = analyse(test).comparisons
+    assert (found.first, found.result.share) == (FIELD, 1.0)
+    assert found.published is PAPER
 
 
 def test_methods_are_ordered_by_what_they_won(choices):

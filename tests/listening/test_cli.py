@@ -46,6 +46,7 @@ def test_results_are_printed_and_written(nafir, tmp_path):
         (("listening-results", "{tmp}"), "test.json: is missing"),
         (("listening-test", "{tmp}/nowhere"), "there is no such folder"),
         (("listening-test", "{test}", "--host", "not an address"), "host: "),
+        (("listening-test", "{test}", "--methods", "nearest"), "--methods: is for making a test"),
         (("listening-results", "{test}", "--figure", "{tmp}/x.txt"), "--figure"),
     ],
 )
