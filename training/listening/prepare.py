@@ -209,7 +209,8 @@ class _Preparation:
             for name, sound in of_place.items():
                 samples = sound.T * 10 ** ((lufs - TARGET_LUFS) / 20)
                 soundfile.write(folder / place.sounds[name], samples, rate, subtype="PCM_24")
-        methods = {REFERENCE: Method(kind="reference"), **{name: self._heard[name].method for name in self._heard}}
+        compared = [name for name in self._names if name != REFERENCE]
+        methods = {REFERENCE: Method(kind="reference"), **{name: self._heard[name].method for name in compared}}
         played = {name for trial in self._trials for name in trial.methods}
         methods |= {name: Method(kind="anchor") for name in self._anchors if name in played}
         manifest = self._bundles[0].manifest
