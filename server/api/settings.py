@@ -2,14 +2,24 @@
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from server.assets.names import named_by_stem
+from server.core.errors import NafirError
 from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
 
@@ -150,3 +160,14 @@ class Settings(BaseSettings):
                 problem = f"the environment has {variable}, which is no setting{suggestion(name, known, _PREFIX)}"
                 raise PydanticCustomError("unknown_setting", "{problem}", {"problem": problem})
         return self
+
+
+def settings_of(given: Mapping[str, Any]) -> Settings:
+    """Settings from options of a command, where None is an option that was not given; the environment has the others.
+    Raises NafirError, which names the setting at fault."""
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        place = f"setting {'.'.join(str(part) for part in first['loc'])}: " if first["loc"] else ""
+        raise NafirError(f"{place}{first['msg'].removeprefix('Value error, ')}") from exc

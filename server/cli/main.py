@@ -10,7 +10,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +19,7 @@ from server.core.command_line import StrictTyper, figure_file, require_at_most_o
 from server.core.errors import NafirError, RequestError
 from server.core.files import require_readable
 from server.health.cli import check
+from server.listening.cli import listening_results, listening_test
 from server.rendering.partitions import BLOCK_SIZES, is_block_size
 from server.runtime.memory import collect_rarely_at_start
 from server.soak.cli import soak
@@ -38,6 +39,8 @@ app = StrictTyper(
 app.add_typer(bench.app, name="bench")
 app.command()(check)
 app.command()(soak)
+app.command()(listening_test)
+app.command()(listening_results)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]
@@ -86,27 +89,20 @@ def serve(
     Every setting can also come from the environment: NAFIR_HOST, NAFIR_PORT, NAFIR_BUNDLES, ...
     """
     import uvicorn
-    from pydantic import ValidationError
     from rich.console import Console
 
     from server.api import serving
     from server.api.app import create_app
     from server.api.catalogue import load_hrtfs, load_scenes
     from server.api.first_start import CompilingProcess
-    from server.api.settings import Settings, usable_cores
+    from server.api.settings import settings_of, usable_cores
     from server.runtime.drain import Drain
     from server.runtime.memory import give_back_large_arrays
     from server.runtime.open_files import allow_connections
     from server.scene.bundle import Bundle, bundled_scenes
 
     give_back_large_arrays()
-    given: dict[str, Any] = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf}
-    try:
-        settings = Settings(**{name: value for name, value in given.items() if value is not None})
-    except ValidationError as exc:
-        first = exc.errors()[0]
-        place = f"setting {'.'.join(str(part) for part in first['loc'])}: " if first["loc"] else ""
-        raise NafirError(f"{place}{first['msg'].removeprefix('Value error, ')}") from exc
+    settings = settings_of({"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf})
     allow_connections(settings.max_connections)
     for name in ("clips", "hrtfs"):
         for path in getattr(settings, name):

@@ -18,6 +18,7 @@ from training.cli import benchmarking
 from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
 from training.cli.importing import importing
+from training.cli.listening import listening_test
 from training.cli.options import Json, Seed
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 app = StrictTyper(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(importing, name="import")
 app.command()(simulation.plan)
+app.command()(listening_test)
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)]
 

@@ -89,7 +89,7 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
             np.broadcast_to(emitters[index], shape),
             held_out.yaws[yaw_indices],
         )
-        return _of_length(responses, held_out.samples)
+        return of_length(responses, held_out.samples)
 
     return source
 
@@ -126,7 +126,7 @@ def _name(bundle: Bundle, level: str, *, several: bool, levels: int) -> str:
     return folder if levels == 1 else f"{folder} {level}"
 
 
-def _of_length(responses: npt.NDArray[np.float32], samples: int) -> npt.NDArray[np.float32]:
+def of_length(responses: npt.NDArray[np.float32], samples: int) -> npt.NDArray[np.float32]:
     """Cut or pad the responses with zeros to `samples`, because a measurement may be longer than the training
     responses."""
     kept = responses[..., :samples]
