@@ -28,11 +28,12 @@ from server.acoustics.metrics import (
 )
 from server.acoustics.room_parameters import RoomParameters, measure
 from training.baselines.held_out import EvaluationError, HeldOut, Responses
+from training.evaluation.paper_metrics import PAPER_METRICS, PaperErrors
 from training.evaluation.stored_errors import Errors, StoredErrors
 
 FLOOR = "floor"
 ONE_SIMULATION = "one simulation"
-METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS)
+METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS, *PAPER_METRICS)
 # A difference of means within this many standard errors is attributed to chance.
 _STANDARD_ERRORS = 2.0
 # A method must not win because its hardest entries cannot be measured.
@@ -164,7 +165,8 @@ class _PairErrors:
         reference = np.asarray(self.held_out.reference(pair), dtype=np.float32)
         simulated = measure(reference, self.held_out.sample_rate, decay_db=self.decay_db)
         spectrogram = self._codec.log_magnitude(self._codec.transform(reference))
-        errors = [self._of_column(column, pair, reference.shape, simulated, spectrogram) for column in self.columns]
+        paper = PaperErrors(reference, self.held_out.sample_rate)
+        errors = [self._of_column(column, pair, paper, simulated, spectrogram) for column in self.columns]
         if self.stored is not None:
             self.stored.put(pair, errors)
         return errors
@@ -173,12 +175,13 @@ class _PairErrors:
         self,
         column: Column,
         pair: int,
-        shape: tuple[int, ...],
+        paper: PaperErrors,
         simulated: RoomParameters,
         spectrogram: npt.NDArray[np.floating],
     ) -> dict[str, _Errors]:
-        """The errors (yaw,) by metric, compared with a reference of this `shape`, with these parameters and this
+        """The errors (yaw,) by metric, compared with the reference of `paper`, which has these parameters and this
         log-magnitude spectrogram."""
+        shape = paper.reference.shape
         answer = column.source(pair, self.held_out.yaw_indices)
         if answer is None:
             return {metric.name: np.full(shape[0], np.nan) for metric in METRICS}
@@ -193,8 +196,10 @@ class _PairErrors:
         errors[SPECTRAL_LOSS.name] = spectral_loss(
             spectrogram, self._codec.log_magnitude(self._codec.transform(estimate))
         )
+        errors |= paper.of(estimate)
         if column.kind == "simulation":  # it is the reference itself
-            errors[SPECTRAL_LOSS.name][:] = np.nan
+            for metric in (SPECTRAL_LOSS, *PAPER_METRICS):
+                errors[metric.name][:] = np.nan
         for metric in METRICS:
             if metric.needs_direct_sound and not self.held_out.visible[pair]:
                 errors[metric.name] = np.full(shape[0], np.nan)
