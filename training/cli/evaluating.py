@@ -1,4 +1,4 @@
-"""`nafir-train evaluate`, `tabulate`, `maps` and `probe`: the accuracy of fields, as tables and pictures."""
+"""`nafir-train evaluate`, `tabulate`, `maps`, `probe`, `fractions`: the accuracy of fields, as tables and pictures."""
 
 import json
 import os
@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from server.core.command_line import figure_file, require_at_most_one, writable_file
-from server.core.files import require_writable
-from training.cli.options import Json, Seed
+from server.core.command_line import figure_file, require_at_most_one, writable_file, writable_folder
+from server.core.files import require_matplotlib, require_writable
+from server.core.numerals import parse_decimal
+from training.cli.options import Json, Seed, progress_bar
 
 
 def evaluate(
@@ -197,3 +198,50 @@ def probe(
     for name, decoding in (("hidden features", probing.features), ("MFCC of the responses", probing.coefficients)):
         spread = f"± {100 * decoding.spread:.1f}"
         typer.echo(f"{name}: {100 * decoding.mean:.1f} {spread} % of the variance over {len(probing.places)} places")
+
+
+def fractions(
+    data: Annotated[Path, typer.Argument(help="Dataset folder from simulate.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder of runs, fractions.json and .png.", callback=writable_folder),
+    ],
+    fields: Annotated[str, typer.Option(help="Fields to train, separated by commas.")] = "naf,naf-no-grid,directional",
+    percents: Annotated[
+        str, typer.Option("--fractions", help="Percentages of the training pairs, separated by commas.")
+    ] = "5,10,25,50,100",
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each field on each fraction.")] = 3,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over all pairs; runs on fewer make as many steps.")] = 8,
+    points: Annotated[int, typer.Option(min=1, help="Points of each response that a naf trains on per step.")] = 100,
+    pairs: Annotated[int, typer.Option(min=1, help="Held-out pairs to score.")] = 40,
+    as_json: Json = False,
+) -> None:
+    """Train fields on fractions of the training pairs, several seeds each; draw their errors. Run again to go on."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from training.trials.fractions import Effort, measure_fractions, trials
+    from training.trials.fractions_figure import SHOWN, figure_of, spreads
+
+    require_matplotlib("--output")
+    chosen = trials(names_of(fields), [percentage(text) for text in names_of(percents)], seeds)
+    with progress_bar() as progress:
+        found = measure_fractions(data, output, chosen, Effort(epochs, points, pairs), progress)
+    figure_of(found).savefig(output / "fractions.png", dpi=110)
+    if as_json:
+        typer.echo(json.dumps(found.to_json(), indent=2))
+        return
+    for metric in SHOWN:
+        for field, by_percent in spreads(found, metric).items():
+            told = [f"{percent:g} %: {mean:.3g} ± {spread:.2g}" for percent, (mean, spread, _) in by_percent.items()]
+            typer.echo(f"{metric}, {field}: {', '.join(told)}")
+
+
+def names_of(text: str) -> list[str]:
+    """The parts of a list that is separated by commas."""
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def percentage(text: str) -> float:
+    try:
+        return parse_decimal(text)
+    except ValueError as exc:
+        raise typer.BadParameter(f"{text!r}: {exc}", param_hint="--fractions") from exc

@@ -216,6 +216,7 @@ def evaluate(
     decay_db: float = 30.0,
     threads: int | None = None,
     stored: StoredErrors | None = None,
+    timed: bool = True,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
     """Measure every column on every held-out pair at every evaluated orientation.
@@ -226,7 +227,8 @@ def evaluate(
     of: the number of held-out pairs from which these were drawn. truth: reference parameters by pair, which are medians
     over `draws` simulations; by default, those of the reference response. Spectra are always compared with the
     reference response. Sources are called from several `threads` (one per core) for errors, and one at a time for
-    timing. Pairs in `stored` are not measured again. `track` may wrap the loop over pairs in a progress bar.
+    timing, if that is asked for (`timed`). Pairs in `stored` are not measured again. `track` may wrap the loop over
+    pairs in a progress bar.
     """
     names = [column.name for column in columns]
     if len(set(names)) < len(names):
@@ -251,7 +253,7 @@ def evaluate(
         channels=held_out.channels,
         left_out=held_out.left_out,
         draws=draws,
-        results=tuple(_result(column, held_out, errors, columns) for column in columns),
+        results=tuple(_result(column, held_out, errors, columns, timed=timed) for column in columns),
     )
 
 
@@ -281,7 +283,12 @@ def milliseconds_per_response(column: Column, held_out: HeldOut) -> float | None
 
 
 def _result(
-    column: Column, held_out: HeldOut, errors: Mapping[str, Mapping[str, _Errors]], columns: Sequence[Column]
+    column: Column,
+    held_out: HeldOut,
+    errors: Mapping[str, Mapping[str, _Errors]],
+    columns: Sequence[Column],
+    *,
+    timed: bool,
 ) -> Result:
     ours = errors[column.name]
     rivals = [other.name for other in columns if other.kind in RATED and other is not column]
@@ -291,7 +298,7 @@ def _result(
         kind=column.kind,
         method=column.method,
         storage_bytes=column.storage_bytes,
-        ms=milliseconds_per_response(column, held_out) if column.kind in RATED else None,
+        ms=milliseconds_per_response(column, held_out) if timed and column.kind in RATED else None,
         summaries={metric.name: summarise(ours[metric.name]) for metric in METRICS},
         beats={
             metric.name: tuple(name for name in baselines if _beats(ours[metric.name], errors[name][metric.name]))
