@@ -249,7 +249,15 @@ def _print_findings(responses: "ResponseSet") -> None:
         typer.echo(f"{responses.file.parent}: {line}", err=True)
 
 
-for command in (evaluation.evaluate, evaluation.tabulate, evaluation.maps, evaluation.probe, evaluation.fractions):
+for command in (
+    evaluation.evaluate,
+    evaluation.tabulate,
+    evaluation.maps,
+    evaluation.spectrograms,
+    evaluation.probe,
+    evaluation.probe_emitters,
+    evaluation.fractions,
+):
     app.command()(command)
 
 
