@@ -12,6 +12,12 @@ METHODS ?= nearest,linear,linear-aligned,mean-spectrogram,mean-spectrogram-whole
 PAIRS ?= 120
 # Of how many simulations of each pair the medians are what its parameters are compared with.
 DRAWS ?= 9
+# The scene of which fractions are trained on, and how; and how a naf is trained on the measured office.
+FRACTIONS_SCENE ?= large1
+FRACTIONS ?=
+OFFICE_NAF ?= --epochs 200 --points 100
+# How the probe of walls is tested: "--spacing-m 0.2 --points 64", say.
+PROBE ?=
 # How long the paper's network is trained for the table.
 NAF ?= --as-long-as $(RUNS)/ears
 RANKS ?= 32,16
@@ -45,7 +51,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
 .PHONY: long mutants attacks docs docs-serve results lock
-.PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%)
+.PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%) paper paper-scene paper-fractions paper-office $(SCENES:%=paper-of-%)
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -92,6 +98,10 @@ office: | $(VENV)/installed-training ## a bundle of responses measured elsewhere
 		--methods nearest,linear,linear-aligned,mean-spectrogram,aac-nearest,aac-linear,opus-nearest,opus-linear > $(OFFICE)/table.md
 	@cat $(OFFICE)/table.md
 
+paper: $(SCENES:%=paper-of-%) paper-fractions $(if $(DATA),paper-office) ## the paper's tables and figures on our scenes, to docs/results/paper.md (DATA= as in office); days; goes on where it stopped
+	$(BIN)/python -m benchmarks.paper runs
+	$(BIN)/python -m benchmarks.pages
+
 own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kinds, and how long they ring beside other simulations: runs/own-scenes.md
 	$(BIN)/python -m training.trials.own_scenes runs/own-scenes
 
@@ -136,8 +146,17 @@ $(SCENES:%=bundle-%): bundle-%: | $(VENV)/installed-training
 $(SCENES:%=table-%): table-%: | $(VENV)/installed-training
 	$(MAKE) table SCENE=$*
 
+$(SCENES:%=paper-of-%): paper-of-%: | $(VENV)/installed-training
+	$(MAKE) paper-scene SCENE=$*
+
+paper-scene: $(RUNS)/paper-table.json $(RUNS)/probe.json $(RUNS)/maps.png $(RUNS)/spectrograms.png
+
+paper-fractions: runs/fractions/fractions.done
+
+paper-office: $(OFFICE)/table.json $(OFFICE)/maps.png
+
 # Of one scene one step at a time: trainings that are compared have as much of the machine.
-ifneq ($(filter bundle table,$(MAKECMDGOALS)),)
+ifneq ($(filter bundle table paper-scene,$(MAKECMDGOALS)),)
 .NOTPARALLEL:
 endif
 
@@ -174,6 +193,39 @@ $(RUNS)/table.md: $(RUNS)/measured $(RUNS)/naf-exported $(RUNS)/naf-expected-exp
 		$(RUNS)/naf-whole-bundle $(RUNS)/data \
 		--methods $(METHODS) \
 		$(MEASURE) --pairs $(PAIRS) --yaws 1 --draws $(DRAWS) --output $(RUNS)/table.json --markdown > $@
+
+# The paper's tables and figures of a scene, from the same bundles and runs.
+$(RUNS)/paper-table.json: $(RUNS)/measured $(RUNS)/naf-exported $(RUNS)/naf-whole-exported
+	$(STEP) paper-table $(TRAIN) evaluate $(RUNS)/bundle $(RUNS)/naf-bundle $(RUNS)/naf-whole-bundle $(RUNS)/data \
+		--methods $(METHODS),helmholtz-lowpass --pairs $(PAIRS) --yaws 1 --output $@ > /dev/null
+
+$(RUNS)/probe.json: $(RUNS)/naf-exported
+	$(STEP) probe $(TRAIN) probe-emitters $(RUNS)/naf $(RUNS)/data $(PROBE) --figure $(RUNS)/probe.png --json > $@
+
+$(RUNS)/maps.png: $(RUNS)/measured
+	$(STEP) maps $(TRAIN) maps $(RUNS)/bundle $(RUNS)/data -o $@ --coded aac,opus
+
+$(RUNS)/spectrograms.png: $(RUNS)/measured $(RUNS)/naf-exported
+	$(STEP) spectrograms $(TRAIN) spectrograms $(RUNS)/bundle $(RUNS)/naf-bundle $(RUNS)/data -o $@
+
+runs/fractions/fractions.done: | $(VENV)/installed-training
+	$(MAKE) runs/$(FRACTIONS_SCENE)/simulated SCENE=$(FRACTIONS_SCENE)
+	$(TRAIN) fractions runs/$(FRACTIONS_SCENE)/data -o runs/fractions $(FRACTIONS)
+	@touch $@
+
+$(OFFICE)/trained: | $(VENV)/installed-training
+	@test -f "$(DATA)/pos_mic.npy" || { echo "DATA= names no folder with pos_mic.npy, pos_src.npy, ir_<number>.npy"; exit 2; }
+	$(TRAIN) import meshrir "$(DATA)" -o $(OFFICE)/data
+	$(TRAIN) export $(OFFICE)/data -o $(OFFICE)/bundle
+	$(TRAIN) train $(OFFICE)/data -o $(OFFICE)/naf --field naf $(OFFICE_NAF)
+	@touch $@
+
+$(OFFICE)/table.json: $(OFFICE)/trained
+	$(TRAIN) evaluate $(OFFICE)/bundle $(OFFICE)/naf $(OFFICE)/data --output $@ \
+		--methods nearest,linear,linear-aligned,aac-nearest,aac-linear,opus-nearest,opus-linear,helmholtz,helmholtz-lowpass
+
+$(OFFICE)/maps.png: $(OFFICE)/trained
+	$(TRAIN) maps $(OFFICE)/naf $(OFFICE)/data -o $@
 
 # Stamps: one per set of dependencies, each larger one satisfying the smaller.
 $(BIN)/python:

@@ -1,5 +1,6 @@
 """Plots of results, and of the history of benchmarks. Each function takes the data and returns a figure."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Final
@@ -115,6 +116,16 @@ def _ratio(rows: Mapping[str, Mapping[str, float | None]], method: str, metric: 
     return np.nan if error is None or not floor else error / floor
 
 
+def fractions(result: Result) -> Figure:
+    """Draw errors over the fraction of training pairs."""
+    from training.trials.fractions import Fractions
+    from training.trials.fractions_figure import figure_of as figure_of_fractions
+
+    # Numbers of records are decimal.
+    plain = json.loads(json.dumps(result.values["fractions"], default=float))
+    return figure_of_fractions(Fractions.from_json(plain))
+
+
 def history(runs: Sequence[Run]) -> Figure:
     """Draw every figure of a benchmark over its runs, divided by the figure's median, with a marker for each host."""
     names = list(dict.fromkeys(name for run in runs for name in run.figures))
@@ -151,6 +162,6 @@ def _bare(axes: Axes) -> None:
 
 
 PLOTS: Final[Mapping[str, Callable[[Result], Figure]]] = {
-    each.__name__: each for each in (plan_of_effects, error_over_time, times_floor)
+    each.__name__: each for each in (plan_of_effects, error_over_time, times_floor, fractions)
 }
 """Functions that draw a plot, by the name used in results."""

@@ -113,6 +113,7 @@ def export(
     ranks: Sequence[int] = (),
     exact_tables: bool = False,
     accepted: Mapping[str, str] | None = None,
+    checked: bool = True,
     progress: Progress | None = None,
 ) -> Bundle:
     """Writes finished runs on one scene as the fields of one bundle, each in every precision. The first field is the
@@ -131,6 +132,9 @@ def export(
     The fields are checked against the laws of `nafir check`, some of them relative to the data
     (`training.bundling.data_reference`), before the noise is chosen. `accepted` gives reasons, by name of a law, to
     offer the scene although its fields break the law. The manifest records those that they do break.
+
+    Without `checked`, neither laws are checked nor is the best noise chosen. That is for evaluations alone, of fields
+    that nobody will hear.
 
     Nothing is written if this raises RunError for an unfinished run; ExportError for a graph that differs from torch,
     a dataset folder that is not that of `responses` or not measured, fields of which only some include the direct
@@ -154,6 +158,8 @@ def export(
     else:
         assert isinstance(responses, ImportedDataset)
         manifest = measured_manifest(responses, described)
+    if not checked:
+        return write_bundle(folder, manifest, files)
     manifest = manifest.model_copy(update={"reference": reference_of(responses, manifest), "accepted": accepting})
     with tempfile.TemporaryDirectory() as trial:
         bundle = write_bundle(Path(trial), manifest, files)

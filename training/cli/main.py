@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from server.core.command_line import StrictTyper, require_at_most_one, writable_folder
 from server.core.errors import NafirError
@@ -20,6 +19,7 @@ from training.cli import simulating as simulation
 from training.cli.importing import importing
 from training.cli.listening import listening_test
 from training.cli.options import Json, Seed
+from training.cli.options import progress_bar as _progress
 
 if TYPE_CHECKING:
     from training.data.responses import ResponseSet
@@ -30,19 +30,6 @@ app.command()(simulation.plan)
 app.command()(listening_test)
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)]
-
-
-def _progress() -> Progress:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    # Of the processes that torchrun starts, only the first shows progress.
-    return Progress(*columns, console=Console(stderr=True), disable=os.environ.get("RANK", "0") != "0")
 
 
 @app.command()
@@ -265,7 +252,15 @@ def _print_findings(responses: "ResponseSet") -> None:
         typer.echo(f"{responses.file.parent}: {line}", err=True)
 
 
-for command in (evaluation.evaluate, evaluation.tabulate, evaluation.maps, evaluation.probe):
+for command in (
+    evaluation.evaluate,
+    evaluation.tabulate,
+    evaluation.maps,
+    evaluation.spectrograms,
+    evaluation.probe,
+    evaluation.probe_emitters,
+    evaluation.fractions,
+):
     app.command()(command)
 app.command()(benchmarking.benchmark)
 app.command()(benchmarking.predict)

@@ -1,8 +1,24 @@
-"""Options that several commands of `nafir-train` have."""
+"""Options that several commands of `nafir-train` have, and their progress bar."""
 
+import os
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
+
+
+def progress_bar() -> Progress:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    # Of the processes that torchrun starts, only the first shows progress.
+    return Progress(*columns, console=Console(stderr=True), disable=os.environ.get("RANK", "0") != "0")

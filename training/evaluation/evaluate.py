@@ -28,12 +28,13 @@ from server.acoustics.metrics import (
 )
 from server.acoustics.room_parameters import RoomParameters, measure
 from training.baselines.held_out import EvaluationError, HeldOut, Responses
+from training.evaluation.paper_metrics import PAPER_METRICS, PaperErrors
 from training.evaluation.stored_errors import Errors, StoredErrors
 from training.learning.record import TrainingRecord
 
 FLOOR = "floor"
 ONE_SIMULATION = "one simulation"
-METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS)
+METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS, *PAPER_METRICS)
 # A difference of means within this many standard errors is attributed to chance.
 _STANDARD_ERRORS = 2.0
 # A method must not win because its hardest entries cannot be measured.
@@ -169,7 +170,8 @@ class _PairErrors:
         reference = np.asarray(self.held_out.reference(pair), dtype=np.float32)
         simulated = measure(reference, self.held_out.sample_rate, decay_db=self.decay_db)
         spectrogram = self._codec.log_magnitude(self._codec.transform(reference))
-        errors = [self._of_column(column, pair, reference.shape, simulated, spectrogram) for column in self.columns]
+        paper = PaperErrors(reference, self.held_out.sample_rate)
+        errors = [self._of_column(column, pair, paper, simulated, spectrogram) for column in self.columns]
         if self.stored is not None:
             self.stored.put(pair, errors)
         return errors
@@ -178,12 +180,13 @@ class _PairErrors:
         self,
         column: Column,
         pair: int,
-        shape: tuple[int, ...],
+        paper: PaperErrors,
         simulated: RoomParameters,
         spectrogram: npt.NDArray[np.floating],
     ) -> dict[str, _Errors]:
-        """The errors (yaw,) by metric, compared with a reference of this `shape`, with these parameters and this
+        """The errors (yaw,) by metric, compared with the reference of `paper`, which has these parameters and this
         log-magnitude spectrogram."""
+        shape = paper.reference.shape
         answer = column.source(pair, self.held_out.yaw_indices)
         if answer is None:
             return {metric.name: np.full(shape[0], np.nan) for metric in METRICS}
@@ -198,8 +201,10 @@ class _PairErrors:
         errors[SPECTRAL_LOSS.name] = spectral_loss(
             spectrogram, self._codec.log_magnitude(self._codec.transform(estimate))
         )
+        errors |= paper.of(estimate)
         if column.kind == "simulation":  # it is the reference itself
-            errors[SPECTRAL_LOSS.name][:] = np.nan
+            for metric in (SPECTRAL_LOSS, *PAPER_METRICS):
+                errors[metric.name][:] = np.nan
         for metric in METRICS:
             if metric.needs_direct_sound and not self.held_out.visible[pair]:
                 errors[metric.name] = np.full(shape[0], np.nan)
@@ -216,6 +221,7 @@ def evaluate(
     decay_db: float = 30.0,
     threads: int | None = None,
     stored: StoredErrors | None = None,
+    timed: bool = True,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Evaluation:
     """Measure every column on every held-out pair at every evaluated orientation.
@@ -226,7 +232,8 @@ def evaluate(
     of: the number of held-out pairs from which these were drawn. truth: reference parameters by pair, which are medians
     over `draws` simulations; by default, those of the reference response. Spectra are always compared with the
     reference response. Sources are called from several `threads` (one per core) for errors, and one at a time for
-    timing. Pairs in `stored` are not measured again. `track` may wrap the loop over pairs in a progress bar.
+    timing, if that is asked for (`timed`). Pairs in `stored` are not measured again. `track` may wrap the loop over
+    pairs in a progress bar.
     """
     names = [column.name for column in columns]
     if len(set(names)) < len(names):
@@ -251,7 +258,7 @@ def evaluate(
         channels=held_out.channels,
         left_out=held_out.left_out,
         draws=draws,
-        results=tuple(_result(column, held_out, errors, columns) for column in columns),
+        results=tuple(_result(column, held_out, errors, columns, timed=timed) for column in columns),
     )
 
 
@@ -281,7 +288,12 @@ def milliseconds_per_response(column: Column, held_out: HeldOut) -> float | None
 
 
 def _result(
-    column: Column, held_out: HeldOut, errors: Mapping[str, Mapping[str, _Errors]], columns: Sequence[Column]
+    column: Column,
+    held_out: HeldOut,
+    errors: Mapping[str, Mapping[str, _Errors]],
+    columns: Sequence[Column],
+    *,
+    timed: bool,
 ) -> Result:
     ours = errors[column.name]
     rivals = [other.name for other in columns if other.kind in RATED and other is not column]
@@ -291,7 +303,7 @@ def _result(
         kind=column.kind,
         method=column.method,
         storage_bytes=column.storage_bytes,
-        ms=milliseconds_per_response(column, held_out) if column.kind in RATED else None,
+        ms=milliseconds_per_response(column, held_out) if timed and column.kind in RATED else None,
         summaries={metric.name: summarise(ours[metric.name]) for metric in METRICS},
         beats={
             metric.name: tuple(name for name in baselines if _beats(ours[metric.name], errors[name][metric.name]))

@@ -1,13 +1,13 @@
 """Loudness maps side by side, as in the paper's figure: simulated on a grid, predicted by the field, and interpolated
-between the training listeners.
+between the training listeners, plain or coded.
 
 The level is energy per ear, averaged over ears and two opposite head orientations, in dB relative to the emitter's free
 field at one metre, as in `server.responses.loudness`. Grids are (row, column), row 0 the southernmost, NaN outside the
 room. Metres.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from server.rendering.hrtf import kemar
 from server.responses.full_response import FullResponse
 from server.responses.loudness import LoudnessMap, loudness_map
 from training.baselines.baselines import TrainingPairs, barycentric
+from training.baselines.coded import AudioCodec, CodedResponses
 from training.baselines.held_out import EvaluationError, HeldOut, require_same_scene
 from training.data.dataset import SPEED_OF_SOUND, Dataset
 from training.simulation.direct_paths import DirectPaths
@@ -71,9 +72,11 @@ def map_emitters(
     *,
     emitters: int,
     spacing_m: float,
+    codecs: Sequence[AudioCodec] = (),
     track: Callable[[Sequence[int], str], Iterable[int]] = lambda steps, _: steps,
 ) -> list[EmitterMaps]:
-    """Make the maps of `emitters` probes as emitters. Raises EvaluationError for measured data, whose walls are
+    """Make the maps of `emitters` probes as emitters. Responses are interpolated as they are, and coded by each of
+    `codecs`. Raises EvaluationError for measured data, whose walls are
     unknown, and DatasetError if the field is of another scene."""
     dataset = held_out.simulated
     if dataset is None:
@@ -82,14 +85,19 @@ def map_emitters(
     whole = FullResponse.through_kemar(field)
     start = dataset.scene.start
     chosen = spread_out(dataset.probes, np.array(start.emitter), emitters)
+    stored = {"": held_out.pairs} | {
+        f"{codec.name}-": replace(held_out.pairs, responses=CodedResponses(codec, held_out, track=track))
+        for codec in codecs
+    }
     return [
-        _maps(held_out, dataset, whole, emitter, listener_height_m=start.listener[2], spacing_m=spacing_m)
+        _maps(stored, held_out.yaws, dataset, whole, emitter, listener_height_m=start.listener[2], spacing_m=spacing_m)
         for emitter in track(chosen, "mapping")
     ]
 
 
 def _maps(
-    held_out: HeldOut,
+    stored: Mapping[str, TrainingPairs],
+    yaws: _Floats,
     dataset: Dataset,
     whole: FullResponse,
     emitter: int,
@@ -104,14 +112,17 @@ def _maps(
     across = np.meshgrid(grid.origin[0] + spacing_m * np.arange(columns), grid.origin[1] + spacing_m * np.arange(rows))
     cells = np.stack([*across, np.full((rows, columns), listener_height_m)], axis=-1)
     inside = ~np.isnan(grid.levels_db) & (dataset.plan.wall_distance_m(cells) >= _CLEARANCE_M)
-    listeners, gram = _training_gram(held_out.pairs, held_out.yaws, emitter)
 
     def on_grid(power: _Floats) -> _Floats:
         levels = np.full(inside.shape, np.nan)
         levels[inside] = power_to_db(power)
         return levels
 
-    nearest, linear = _interpolated_power(listeners, gram, cells[inside])
+    interpolated: dict[str, _Floats] = {}
+    for prefix, pairs in stored.items():
+        listeners, gram = _training_gram(pairs, yaws, emitter)
+        nearest, linear = _interpolated_power(listeners, gram, cells[inside])
+        interpolated |= {f"{prefix}nearest": on_grid(nearest), f"{prefix}linear": on_grid(linear)}
     return EmitterMaps(
         np.asarray(dataset.plan.corners),
         position,
@@ -120,8 +131,7 @@ def _maps(
         {
             "simulation": on_grid(_simulated_power(dataset, position, cells[inside])),
             "field": np.where(inside, grid.levels_db, np.nan),
-            "nearest": on_grid(nearest),
-            "linear": on_grid(linear),
+            **interpolated,
         },
     )
 
@@ -153,21 +163,42 @@ def _interpolated_power(listeners: _Floats, gram: _Floats, cells: _Floats) -> tu
     return gram[nearest, nearest], np.maximum(linear, 0.0)
 
 
+@dataclass(frozen=True)
+class Simulator:
+    """Simulates whole responses at any places of a dataset's scene, as those of the dataset were simulated."""
+
+    dataset: Dataset
+    listeners: _Floats
+    tracer: RoomTracer
+    direct: DirectPaths
+    synthesis: BinauralSynthesis
+
+    @classmethod
+    def of(cls, dataset: Dataset, listeners: _Floats, yaws: _Floats) -> "Simulator":
+        directions = sphere_directions(dataset.scene.simulation.arrival_directions)
+        return cls(
+            dataset,
+            listeners,
+            RoomTracer.of(dataset.scene, dataset.effects, listeners),
+            DirectPaths.of(dataset.scene, dataset.effects),
+            BinauralSynthesis(kemar(dataset.sample_rate), directions, yaws, dataset.samples),
+        )
+
+    def responses(self, emitter: _Floats, rng: np.random.Generator) -> Iterator[npt.NDArray[np.floating]]:
+        """Yield the responses (yaw, ear, sample) of each listener."""
+        dataset, listeners = self.dataset, self.listeners
+        onsets_s = dataset.plan.path_length_m(emitter, listeners) / SPEED_OF_SOUND
+        arrivals = self.tracer.trace(emitter, rays=dataset.scene.simulation.rays, rng=rng)
+        for listener, onset_s, arriving in zip(listeners, onsets_s, arrivals, strict=True):
+            response = self.synthesis.render(arriving, listener, float(onset_s), rng)
+            yield response + self.synthesis.specular(*self.direct.images(emitter, listener), listener)
+
+
 def _simulated_power(dataset: Dataset, emitter: _Floats, cells: _Floats) -> _Floats:
     """(cell,) energies per ear, simulated with the dataset's number of rays."""
-    settings = dataset.scene.simulation
-    directions = sphere_directions(settings.arrival_directions)
-    tracer = RoomTracer.of(dataset.scene, dataset.effects, cells)
-    direct = DirectPaths.of(dataset.scene, dataset.effects)
-    synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, _YAWS, dataset.samples)
     rng = np.random.default_rng([dataset.seed, _SEED])
-    onsets_s = dataset.plan.path_length_m(emitter, cells) / SPEED_OF_SOUND
-    power = np.empty(len(cells))
-    for number, arrivals in enumerate(tracer.trace(emitter, rays=settings.rays, rng=rng)):
-        response = synthesis.render(arrivals, cells[number], float(onsets_s[number]), rng)
-        response += synthesis.specular(*direct.images(emitter, cells[number]), cells[number])
-        power[number] = np.square(response).sum(axis=-1).mean()
-    return power
+    responses = Simulator.of(dataset, cells, _YAWS).responses(emitter, rng)
+    return np.array([np.square(response).sum(axis=-1).mean() for response in responses])
 
 
 def draw_maps(maps: Sequence[EmitterMaps], path: Path) -> None:
@@ -211,7 +242,7 @@ def _draw_map(axes: Axes, maps: EmitterMaps, method: str, walls: _Floats, limits
     )
     closed = np.concatenate([walls, walls[:1]])
     axes.plot(*closed.T, color="black", linewidth=2.0, solid_joinstyle="miter")
-    if method in {"nearest", "linear"}:
+    if method.endswith(("nearest", "linear")):
         axes.plot(*maps.listeners[:, :2].T, ".", color="white", markersize=4, markeredgewidth=0)
     axes.plot(*maps.emitter[:2], marker="*", color="#ff3b30", markeredgecolor="white", markersize=15, linestyle="none")
     low, high = walls.min(axis=0) - 0.2, walls.max(axis=0) + 0.2

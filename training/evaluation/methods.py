@@ -87,9 +87,16 @@ def _of_stored(name: str, held_out: HeldOut, answer: Answer) -> Column:
     return Column(name, at_pairs(held_out, answer), "baseline", stored * _BYTES_PER_SAMPLE, name)
 
 
+def codec_named(name: str) -> AudioCodec:
+    """Raises EvaluationError for another name than aac or opus."""
+    if name not in {"aac", "opus"}:
+        raise EvaluationError(f"--coded: there is no {name!r}, but aac, opus")
+    return AAC if name == "aac" else opus()
+
+
 def _coded(name: str, prepared: _Prepared) -> Column:
     codec_name, way = name.split("-")
-    coded = prepared.coded(AAC if codec_name == "aac" else opus())
+    coded = prepared.coded(codec_named(codec_name))
     interpolate = {"nearest": nearest, "linear": linear}[way]
     held_out = prepared.held_out
     pairs = replace(held_out.pairs, responses=coded)

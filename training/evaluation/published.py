@@ -1,7 +1,9 @@
-"""Results that others have published for the methods in our tables, with the data on which they were measured.
+"""Results that others have published for the methods in our tables, with the data on which they were measured, and what
+Luo et al. printed of their own network.
 
 None is for our scenes. Rooms, source-listener distances and definitions differ, so these numbers only give orientation
-and are never a reference. Numbers that the authors did not print are absent.
+and are never a reference. Numbers that the authors did not print are absent, and so are those of the paper that we did
+not have before us: `NOT_AT_HAND` lists them.
 """
 
 from collections.abc import Mapping
@@ -55,3 +57,37 @@ MESHRIR = PublishedTable(
 def published_table(*, simulated: bool) -> PublishedTable:
     """The published results on data of the same kind: simulated or measured."""
     return SOUNDSPACES if simulated else MESHRIR
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """A number of Luo et al.: what it is of, its value, its unit, and where it stands."""
+
+    subject: str
+    value: float
+    unit: str
+    source: str
+
+
+_PAPER = "Luo et al., Learning Neural Acoustic Fields, NeurIPS 2022"
+_TABLE_UNKNOWN = f"{_PAPER}; told to us without the number of the table"
+PAPER_FIGURES: Mapping[str, PaperFigure] = {
+    "t60-time-domain": PaperFigure("T60 error of the network of waveforms", 49.7, "%", _TABLE_UNKNOWN),
+    "preference": PaperFigure("answers for their network over AAC-nearest", 82.38, "%", _TABLE_UNKNOWN),
+    "listeners": PaperFigure("people who were asked, ten places each", 21, "people", _TABLE_UNKNOWN),
+    "psnr-75-nerf": PaperFigure("PSNR of NeRF alone, 75 images", 25.41, "dB", _TABLE_UNKNOWN),
+    "psnr-75-nerf-naf": PaperFigure("PSNR of NeRF trained with their network, 75 images", 26.19, "dB", _TABLE_UNKNOWN),
+    "psnr-150-gain": PaperFigure("gain of PSNR, 150 images", 0.05, "dB", _TABLE_UNKNOWN),
+}
+"""By a name that `benchmarks.paper` uses."""
+
+NOT_AT_HAND = (
+    "spectral loss and T60 error of all methods",
+    "storage",
+    "the ablations of the grid",
+    "the explained variance of the linear probe",
+    "IACC error",
+    "the results on MeshRIR, with Helmholtz ridge regression",
+    "the errors over fractions of the training data",
+)
+"""What the paper printed and we could not read. No number of these is written anywhere here."""

@@ -12,6 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from server.acoustics.metrics import Metric
 from training.evaluation.evaluate import FLOOR, METRICS, ONE_SIMULATION
+from training.evaluation.paper_metrics import PAPER_METRICS
 from training.evaluation.scenes import NAF, NAF_WHOLE, NEAREST, SceneResult
 
 _DEFAULT = "default level"
@@ -25,7 +26,8 @@ _STYLES = {
 """The marker, colour and label of each method; the last is drawn on top."""
 _FLOOR_COLOUR, _TEXT = "#8d6a9f", "#2b3a42"
 # Early IACC behaves like IACC, and the onset is exact because it comes from geometry.
-_SHOWN = [metric for metric in METRICS if metric.name not in {"iacc_early", "onset"}]
+_HIDDEN = {"iacc_early", "onset", *(metric.name for metric in PAPER_METRICS)}
+_SHOWN = [metric for metric in METRICS if metric.name not in _HIDDEN]
 _ACROSS = 4
 
 

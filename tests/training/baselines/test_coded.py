@@ -47,6 +47,31 @@ def test_coding_keeps_time_and_level(codec, make_held_out, channels) -> None:
         np.testing.assert_allclose(np.square(decoded).sum(), np.square(plain).sum(), rtol=0.5)
 
 
+def coders(path):
+    """The configuration numbers of all packets of an Ogg Opus file, headers left out (RFC 6716, 3.1; RFC 3533, 6)."""
+    data, at, packet, found = path.read_bytes(), 0, b"", []
+    while at < len(data):
+        laces = data[at + 27 : at + 27 + data[at + 26]]
+        at += 27 + len(laces)
+        for lace in laces:
+            packet, at = packet + data[at : at + lace], at + lace
+            if lace < 255:
+                found.append(packet[0] >> 3)
+                packet = b""
+    return found[2:]
+
+
+@pytest.mark.skipif(not OPUS.is_installed, reason="needs opusenc")
+def test_opus_codes_music_as_the_paper_had_it(make_held_out) -> None:
+    """Noise that decays would be taken for speech. Configurations from 16 on are CELT's (RFC 6716, table 2)."""
+    decay = 10 ** (-3 * np.arange(8_000) / 4_000)
+    noise = np.random.default_rng(0).standard_normal((6, 2, 2, 8_000)) * decay
+    held_out = make_held_out(lambda pair: noise[pair], yaws=2)
+    CodedResponses(OPUS, held_out)
+    (file,) = (held_out.folder / "coded").rglob("*.opus")
+    assert min(coders(file)) >= 16
+
+
 @pytest.mark.skipif(not AAC.is_installed, reason="needs ffmpeg")
 def test_what_is_coded_is_coded_once(make_held_out) -> None:
     held_out = make_held_out(pulse, yaws=2)
