@@ -193,9 +193,9 @@ def _map_measured(
 
     if (place / "run.json").is_file():
         # Torch takes seconds to load, and bundles do not need it.
-        from training.evaluation.measured_fields import run_column
+        from training.evaluation.measured_fields import run_columns
 
-        columns = [run_column(place, open_responses(data), held_out)]
+        columns = run_columns(place, open_responses(data), held_out)[:1]
     else:
         columns = field_columns([Bundle.load(place)], held_out)[:1]
     drawn = map_measured(held_out, [*columns, *method_columns(methods, held_out)], emitters=emitters)
@@ -231,9 +231,9 @@ def spectrograms(
             raise EvaluationError(f"--pair: {held_out.name} has {len(held_out)} held-out pairs, counted from 0")
         columns: list[Column] = field_columns(bundles, held_out)
         if runs:
-            from training.evaluation.measured_fields import run_column
+            from training.evaluation.measured_fields import run_columns
 
-            columns += [run_column(run, open_responses(places[-1]), held_out) for run in runs]
+            columns += [column for run in runs for column in run_columns(run, open_responses(places[-1]), held_out)]
         columns += method_columns(names_of(methods), held_out)
         shown = {"truth": held_out.reference(pair)[0, 0]}
         for column in columns:

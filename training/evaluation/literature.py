@@ -16,6 +16,7 @@ from scipy.signal import hilbert, lfilter
 from server.acoustics.decibels import power_to_db
 from server.acoustics.metrics import Definition
 from training.evaluation.comparison import OWN_METRICS, Comparison, Floats, Metric
+from training.evaluation.paper_metrics import interaural_lag_s
 
 _START_DB = -5.0
 _CLARITY_S = 0.050
@@ -263,19 +264,8 @@ def _phase(compared: Comparison) -> Floats:
 
 
 def _lag_error(compared: Comparison) -> Floats:
-    reference, estimate = (
-        np.array([_interaural_lag(row) for row in responses]) / compared.sample_rate for responses in compared.both
-    )
+    reference, estimate = (interaural_lag_s(responses, compared.sample_rate) for responses in compared.both)
     return np.asarray(1e6 * np.abs(estimate - reference))
-
-
-def _interaural_lag(ears: Floats) -> int:
-    """The lag in samples of the largest cross-correlation of two whole responses (2, sample)."""
-    samples = ears.shape[-1]
-    left, right = np.fft.rfft(ears, 2 * samples, axis=-1)
-    correlation = np.fft.irfft(np.conj(left) * right, 2 * samples)
-    lag = int(np.argmax(correlation))
-    return lag if lag < samples else lag - 2 * samples
 
 
 _NAF_T60 = _TwoPoints(30.0)

@@ -19,13 +19,34 @@ import numpy.typing as npt
 
 from server.acoustics.codec import Codec
 from server.acoustics.fast_length import next_fast_length
-from server.acoustics.metrics import Metric, spectral_loss
+from server.acoustics.metrics import Definition, Metric, spectral_loss
 
 _Floats = npt.NDArray[np.float64]
 
 N_FFT, HOP, LOG_FLOOR = 512, 128, 1e-3
-SPECTRAL_LOSS_OF_PAPER = Metric("spectral_loss_paper", "spectral loss, as the paper", "ln")
-INTERAURAL_LAG = Metric("iacc_lag", "IACC lag, as the paper", "us")
+_SOURCE = "Luo et al., NeurIPS 2022"
+SPECTRAL_LOSS_OF_PAPER = Metric(
+    "spectral_loss_paper",
+    "spectral loss, as the paper",
+    "ln",
+    definition=Definition(
+        formula=f"mean |difference| of ln(magnitude + {LOG_FLOOR:g}); n_fft {N_FFT}, hop {HOP}, without the highest bin",
+        over="all bins and frames",
+        failures="none",
+        source=f"{_SOURCE}: `get_spec` of their code",
+    ),
+)
+INTERAURAL_LAG = Metric(
+    "iacc_lag",
+    "IACC lag, as the paper",
+    "us",
+    needs_two_ears=True,
+    definition=Definition(
+        formula="|difference| of the lag at which the interaural cross-correlation is largest",
+        over="the whole response, and all lags",
+        source=f"{_SOURCE}: what its table calls IACC error is a time",
+    ),
+)
 PAPER_METRICS = (SPECTRAL_LOSS_OF_PAPER, INTERAURAL_LAG)
 
 
