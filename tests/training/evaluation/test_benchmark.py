@@ -146,9 +146,10 @@ def test_a_reference_that_cannot_be_read_is_named(tmp_path):
         scored(data, predictions)
 
 
-def test_a_silent_reference_is_scored_for_nobody(tmp_path):
+@pytest.mark.parametrize("samples", [0, SAMPLES])
+def test_a_silent_reference_is_scored_for_nobody(tmp_path, samples):
     folder = written_layouts.raf(tmp_path / "data")
-    wav(folder / "data/000008/rir.wav", np.zeros((1, SAMPLES), np.float32))
+    wav(folder / "data/000008/rir.wav", np.zeros((1, samples), np.float32))
     data = open_benchmark(folder)
     predictions = identity(data, tmp_path / "predictions")
     result = scored(data, predictions)
