@@ -16,7 +16,6 @@ from server.scene.manifest import Accuracy, QualityLevel
 from training.baselines.held_out import EvaluationError, HeldOut, Responses, require_same_scene
 from training.baselines.moved_nodes import with_moved_nodes
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
-from training.evaluation.paper_metrics import PAPER_METRICS
 from training.learning.record import RECORD, TrainingRecord
 
 INTEGRATED = "-integrated"
@@ -117,8 +116,7 @@ def record_accuracy(bundle: Bundle, evaluation: Evaluation) -> Bundle:
 
 def _means(evaluation: Evaluation, column: str) -> dict[str, float]:
     summaries = evaluation.of(column).summaries
-    kept = [metric.name for metric in METRICS if metric not in PAPER_METRICS]
-    return {name: mean for name in kept if (mean := summaries[name].mean) is not None}
+    return {metric.name: mean for metric in METRICS if (mean := summaries[metric.name].mean) is not None}
 
 
 def _name(bundle: Bundle, level: str, *, several: bool, levels: int) -> str:
