@@ -50,7 +50,7 @@ from server.streaming.session import Session
 _CALIBRATION_POSES = 3
 _COSTS_AFTER_S = 5.0
 _COSTS_SHARE = 0.05
-"""Share of a core that the measurement of effects' costs may take."""
+"""Share of a core that the measurement of effects' costs may take while there are streams."""
 _PAGE_ORDER = ORDERS[0]
 """The order of the ambisonics that the page asks for."""
 WEB = Path(__file__).parents[1] / "web"
@@ -155,7 +155,7 @@ async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:
     _logger.info("ready: %s", ", ".join(host.scenes))
     # Nothing waits for these measurements, so clients that already wait are served first.
     await asyncio.sleep(_COSTS_AFTER_S)
-    duty_cycle = DutyCycle(_COSTS_SHARE)
+    duty_cycle = DutyCycle(_COSTS_SHARE, is_idle=lambda: host.streams == 0)
     later = (
         (_measure_effects, "nafir-costs", "what effects cost could not be measured: plans do not say"),
         (_prepare_decoders, "nafir-decoders", "decoders of heads are not prepared: the first to need one waits for it"),

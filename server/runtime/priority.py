@@ -79,16 +79,23 @@ def become_background(niceness: int = _NICENESS) -> None:
 
 
 class DutyCycle:
-    """Limits long work of one thread to a `share` of the time, in stretches of about `stretch_s`.
+    """Limits long work of one thread to a `share` of the time, in stretches of about `stretch_s`. There are no rests
+    while `is_idle` says that there is nothing to disturb.
 
     A low priority is not enough. On a core that streams fill, such work still takes time that impulse responses need,
     and a thread that is suspended while it holds the interpreter's lock blocks more important ones.
     """
 
     def __init__(
-        self, share: float, *, stretch_s: float = 0.002, thread_time_s: Callable[[], float] = time.thread_time
+        self,
+        share: float,
+        *,
+        stretch_s: float = 0.002,
+        is_idle: Callable[[], bool] = lambda: False,
+        thread_time_s: Callable[[], float] = time.thread_time,
     ) -> None:
         self._rest_per_work = 1 / share - 1
+        self._is_idle = is_idle
         self._stretch_s = stretch_s
         self._thread_time_s = thread_time_s
         self._since_s: float | None = None
@@ -102,7 +109,7 @@ class DutyCycle:
             self._since_s = now_s
         if (worked_s := now_s - self._since_s) < self._stretch_s:
             return
-        if self._is_over.wait(worked_s * self._rest_per_work):
+        if self._is_over.wait(0 if self._is_idle() else worked_s * self._rest_per_work):
             raise CancelledError
         self._since_s = self._thread_time_s()
 

@@ -13,7 +13,7 @@ from tests.visitor import free_port, level_db, listen, open_page, serving, start
 
 browser = visitor.browser
 page = visitor.page
-pytestmark = visitor.needs_browser
+pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 MOST_SOURCES = 4
 

@@ -7,7 +7,7 @@ from tests import visitor
 from tests.visitor import level_db, listen, open_page, start
 
 browser = visitor.browser
-pytestmark = visitor.needs_browser
+pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 
 @pytest.mark.parametrize("width", [1280, 390])

@@ -12,7 +12,7 @@ from tests import visitor
 from tests.visitor import free_port, level_db, listen, open_page, serving, start
 
 browser = visitor.browser
-pytestmark = visitor.needs_browser
+pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,8 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     assert page.inner_text("#level") == "At most 20 responses a second"
     assert page.get_attribute("#level", "title") == "quick"
     assert page.locator("#frontier .heard").get_attribute("data-level") == "quick"
-    change = page.locator("#level-changes li").first
+    # A busy machine may have changes of its own.
+    change = page.locator("#level-changes li", has_text="as you chose")
     assert re.fullmatch(r"\d\d:\d\d:\d\d ?At most 20 responses a second.*: as you chose", change.inner_text())
     assert change.get_attribute("title") == "quick"
     page.locator("#frontier [data-level=fine] .touch").click()

@@ -5,7 +5,7 @@ import pytest
 from tests import visitor
 
 browser = visitor.browser
-pytestmark = visitor.needs_browser
+pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 
 @pytest.fixture(scope="module")

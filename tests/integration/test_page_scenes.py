@@ -9,7 +9,7 @@ from tests import visitor
 from tests.visitor import level_db, listen, start
 
 browser = visitor.browser
-pytestmark = visitor.needs_browser
+pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 SCENES = [folder.name for folder in bundled_scenes()]
 
@@ -56,7 +56,6 @@ BROKEN = {
 }
 
 
-@pytest.mark.untimed
 @pytest.mark.parametrize("answer", BROKEN.values(), ids=BROKEN.keys())
 @pytest.mark.parametrize("part", ["frontier", "loudness", "clips"])
 def test_a_part_that_fails_leaves_the_rest_as_it_is(context, server, part, answer):
@@ -69,7 +68,6 @@ def test_a_part_that_fails_leaves_the_rest_as_it_is(context, server, part, answe
     assert page.locator("#connection-text").inner_text() == "Live"
 
 
-@pytest.mark.untimed
 def test_clips_and_frontier_appear_once_the_server_answers(context, server):
     failing = {"is": True}
 
@@ -87,7 +85,6 @@ def test_clips_and_frontier_appear_once_the_server_answers(context, server):
     page.wait_for_function("!document.getElementById('level-choice').disabled", timeout=20_000)
 
 
-@pytest.mark.untimed
 def test_a_scene_that_cannot_be_had_leaves_the_menu_that_leads_out(context, server):
     broken, sound = SCENES[:2]
     context.route(f"**/v1/scenes/{broken}", lambda route: route.fulfill(status=500, body=""))

@@ -1,6 +1,10 @@
 """A few seconds of `nafir soak`: a server of its own, hostile clients and a witness."""
 
+import pytest
+
 from server.soak.run import Plan, soak
+
+pytestmark = pytest.mark.untimed
 
 
 def test_a_short_soak_finds_nothing_wrong():

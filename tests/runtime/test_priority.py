@@ -90,6 +90,26 @@ def test_work_with_breaks_rests_in_proportion_once_it_has_worked_long_enough():
     assert rested_s() >= 3 * 0.1
 
 
+def test_work_that_disturbs_nobody_does_not_rest():
+    worked_s, is_idle = 0.0, True
+    breaks = DutyCycle(1e-6, is_idle=lambda: is_idle, thread_time_s=lambda: worked_s)
+    breaks.rest()
+    for _ in range(10):  # each would rest for more than a day
+        worked_s += 0.1
+        breaks.rest()
+    is_idle = False
+    worked_s += 1e-6
+    breaks.rest()  # what was worked while nobody was disturbed is not made up for
+    worked_s += 0.1
+    with ThreadPoolExecutor(1) as thread:
+        resting = thread.submit(breaks.rest)
+        with pytest.raises(TimeoutError):
+            resting.result(timeout=0.05)
+        breaks.call_off()
+        with pytest.raises(CancelledError):
+            resting.result(timeout=5)
+
+
 def test_work_called_off_ends_with_the_break_it_has():
     breaks = DutyCycle(1e-6, stretch_s=0.001)
 
