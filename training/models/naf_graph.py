@@ -59,10 +59,12 @@ class NafGraph(nn.Module):
         field = self._field
         sizes, poses = field.axes, len(features)
         parts = [features.reshape(poses, *([1] * len(sizes)), -1).expand(-1, *sizes, -1)]
-        # Encodings of axes, and not of all points, are kept in the graph: a table of points would be half of its size.
+        # The graph keeps encodings of axes, and no table of all points, which would be half of its size. The exporter
+        # would fold one from what does not depend on the input; so a factor of one does.
+        one = (0 * features[:, :1] + 1).reshape(poses, *([1] * len(sizes)), 1)
         for axis, size in enumerate(sizes):
             along = [size if number == axis else 1 for number in range(len(sizes))]
-            parts.append(field.encoding(axis).reshape(1, *along, -1).expand(poses, *sizes, -1))
+            parts.append((one * field.encoding(axis).reshape(1, *along, -1)).expand(poses, *sizes, -1))
         inputs = torch.cat(parts, dim=-1).flatten(1, -2)
         hidden = field.trunk(field.first(inputs), field.skip[0](inputs), orientation, field.inner)
         values: Tensor = field.last(hidden)

@@ -28,7 +28,7 @@ def test_one_scene_has_the_variants_and_all_the_network_itself():
 
 
 @pytest.fixture
-def tiny(dataset, tiny_scene, monkeypatch):
+def tiny(tiny_scene, monkeypatch):
     """One scene of few probes, with networks of a few weights."""
     monkeypatch.setattr(networks_to_the_end, "SCENES", tiny_scene.parent)
     monkeypatch.setattr(networks_to_the_end, "VARIANTS", ("naf", "naf-dual"))
