@@ -16,6 +16,7 @@ from server.core.files import require_matplotlib, require_writable
 from server.core.numerals import parse_integer
 from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
+from training.cli import watching
 from training.cli.importing import importing
 from training.cli.options import Json, Seed
 
@@ -262,7 +263,14 @@ def _print_findings(responses: "ResponseSet") -> None:
         typer.echo(f"{responses.file.parent}: {line}", err=True)
 
 
-for command in (evaluation.evaluate, evaluation.tabulate, evaluation.maps, evaluation.probe):
+for command in (
+    evaluation.evaluate,
+    evaluation.tabulate,
+    evaluation.maps,
+    evaluation.probe,
+    watching.draw_views,
+    watching.cross_modal,
+):
     app.command()(command)
 
 
