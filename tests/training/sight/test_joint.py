@@ -102,19 +102,16 @@ def test_training_brings_the_loss_down_and_the_picture_near(dataset, views, tmp_
 def test_an_interrupted_training_ends_as_one_without_interruption(dataset, views, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("training.sight.joint._CHECKPOINT_S", -1.0)
 
-    class Interruption(Exception):
-        pass
-
     def broken(steps, _):
         for number in steps:
             if number == 70:
-                raise Interruption
+                raise InterruptedError
             yield number
 
     whole, parted = tmp_path / "whole", tmp_path / "parted"
     uninterrupted = training(whole, dataset, views, "nerf-naf")
     uninterrupted.go_on(untracked)
-    with pytest.raises(Interruption):
+    with pytest.raises(InterruptedError):
         training(parted, dataset, views, "nerf-naf").go_on(broken)
     resumed = training(parted, dataset, views, "nerf-naf")
     resumed.go_on(untracked)
@@ -177,7 +174,7 @@ def test_a_comparison_has_a_row_for_each_training_and_is_not_trained_twice(datas
     assert len(table(result)) == 5
     assert json.loads((tmp_path / "results.json").read_text()) == result
 
-    def never(steps, doing):
+    def never(_, doing):
         raise AssertionError(doing)
 
     assert run(never)["rows"] == result["rows"]

@@ -63,7 +63,7 @@ def test_a_ray_ends_where_it_leaves_the_box() -> None:
 class _Slab(torch.nn.Module):
     """Red and opaque beyond x = 2 m; empty and blue before."""
 
-    def forward(self, positions, directions, features):
+    def forward(self, positions, *_):
         inside = positions[:, 0] > 0.5  # of a box from 0 to 8/3 m, in scaled coordinates
         colour = torch.where(inside[:, None], torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
         return 1e4 * inside.float(), colour
