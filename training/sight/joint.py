@@ -267,7 +267,8 @@ class Training:
     def _descend(self, step: int, losses: dict[str, Tensor]) -> None:
         total = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(total):
-            raise NafirError(f"{self._run}: the loss is {float(total.detach()):g} in step {step + 1}; lower --learning-rate")
+            value = float(total.detach())
+            raise NafirError(f"{self._run}: the loss is {value:g} in step {step + 1}; lower --learning-rate")
         beta, share = decay_to_a_tenth(step / self._recipe.steps)
         for group in self._optimiser.param_groups:
             group["lr"], group["betas"] = self._recipe.learning_rate * share, (beta, 0.999)
