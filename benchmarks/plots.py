@@ -1,5 +1,7 @@
 """Plots of results, and of the history of benchmarks. Each function takes the data and returns a figure."""
 
+import base64
+import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
@@ -9,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from PIL import Image
 
 from benchmarks.record import Result, Table
 from server.bench.history import Run
@@ -126,6 +129,25 @@ def fractions(result: Result) -> Figure:
     return figure_of_fractions(Fractions.from_json(plain))
 
 
+def pictures_side_by_side(result: Result) -> Figure:
+    """Show the true pictures and those of each method, a column each."""
+    titles, stored = result.values["columns"], result.values["png"]
+    assert isinstance(titles, list)
+    assert isinstance(stored, str)
+    with Image.open(io.BytesIO(base64.b64decode(stored))) as image:
+        pixels = np.asarray(image)
+    height, width = pixels.shape[:2]
+    figure = Figure(figsize=(8.0, 8.0 * height / width + 0.3), layout="constrained", facecolor="white")
+    axes = figure.subplots()
+    axes.imshow(pixels, interpolation="nearest")
+    axes.xaxis.tick_top()
+    axes.set_xticks((np.arange(len(titles)) + 0.5) * width / len(titles), titles, fontsize=11)
+    axes.tick_params(length=0)
+    axes.set_yticks([])
+    axes.spines[:].set_visible(False)
+    return figure
+
+
 def history(runs: Sequence[Run]) -> Figure:
     """Draw every figure of a benchmark over its runs, divided by the figure's median, with a marker for each host."""
     names = list(dict.fromkeys(name for run in runs for name in run.figures))
@@ -162,6 +184,7 @@ def _bare(axes: Axes) -> None:
 
 
 PLOTS: Final[Mapping[str, Callable[[Result], Figure]]] = {
-    each.__name__: each for each in (plan_of_effects, error_over_time, times_floor, fractions)
+    each.__name__: each
+    for each in (plan_of_effects, error_over_time, times_floor, fractions, pictures_side_by_side)
 }
 """Functions that draw a plot, by the name used in results."""

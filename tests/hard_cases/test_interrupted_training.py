@@ -111,8 +111,8 @@ def test_an_error_on_what_is_held_back_that_explodes_is_never_kept(responses, tm
 # Killed.
 
 KILLED_AT = [
-    pytest.param("training.learning.runs._write_whole", 1, id="before anything is written"),
-    pytest.param("training.learning.runs._write_whole", 2, id="between the files that say what the run is"),
+    pytest.param("training.learning.runs.write_json", 1, id="before anything is written"),
+    pytest.param("training.learning.runs.write_json", 2, id="between the files that say what the run is"),
     pytest.param("training.learning.train._Loop._choose_precision", 1, id="before the first step"),
     *(
         pytest.param("training.learning.train._Loop._step", number, id=f"before step {number}")

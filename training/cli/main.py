@@ -16,6 +16,7 @@ from server.core.numerals import parse_integer
 from training.cli import benchmarking
 from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
+from training.cli import watching
 from training.cli.importing import importing
 from training.cli.listening import listening_test
 from training.cli.options import Json, Seed
@@ -260,6 +261,8 @@ for command in (
     evaluation.probe,
     evaluation.probe_emitters,
     evaluation.fractions,
+    watching.draw_views,
+    watching.cross_modal,
 ):
     app.command()(command)
 app.command()(benchmarking.benchmark)

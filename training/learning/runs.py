@@ -158,7 +158,7 @@ class Configuration:
         values = asdict(self)
         stored = {field: name for name, field in _FIELD_NAMES.items()}
         values["recipe"] = {stored.get(name, name): value for name, value in values["recipe"].items()}
-        _write_whole(run / "run.json", {"kind": self.kind, **values})
+        write_json(run / "run.json", {"kind": self.kind, **values})
 
 
 _KINDS: dict[str, tuple[type[FieldShape | NafShape], type[FactorisedRecipe | DirectionalRecipe | NafRecipe]]] = {
@@ -236,7 +236,7 @@ def claim(run: Path, responses: ResponseSet, configuration: Configuration) -> No
             raise RunError(f"{run}: holds a run of another configuration; choose an empty folder")
         require_same_data(responses, run)
     identity = {"folder": str(responses.file.parent.resolve()), **_identity(responses)}
-    _write_whole(run / "dataset.json", identity)
+    write_json(run / "dataset.json", identity)
     configuration.write(run)
 
 
@@ -346,7 +346,7 @@ def append_log(run: Path, row: dict[str, float]) -> None:
         writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
 
 
-def _write_whole(path: Path, document: dict[str, Any]) -> None:
+def write_json(path: Path, document: dict[str, Any]) -> None:
     """Write the file so that an interruption leaves the previous one whole."""
     # guard: what a run is, is written whole
     partial = path.with_suffix(".partial")
