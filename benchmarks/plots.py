@@ -184,7 +184,6 @@ def _bare(axes: Axes) -> None:
 
 
 PLOTS: Final[Mapping[str, Callable[[Result], Figure]]] = {
-    each.__name__: each
-    for each in (plan_of_effects, error_over_time, times_floor, fractions, pictures_side_by_side)
+    each.__name__: each for each in (plan_of_effects, error_over_time, times_floor, fractions, pictures_side_by_side)
 }
 """Functions that draw a plot, by the name used in results."""

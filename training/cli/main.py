@@ -13,10 +13,9 @@ from server.core.command_line import StrictTyper, require_at_most_one, writable_
 from server.core.errors import NafirError
 from server.core.files import require_matplotlib, require_writable
 from server.core.numerals import parse_integer
-from training.cli import benchmarking
+from training.cli import benchmarking, watching
 from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
-from training.cli import watching
 from training.cli.importing import importing
 from training.cli.listening import listening_test
 from training.cli.options import Json, Seed

@@ -30,7 +30,7 @@ SPECTRAL_LOSS_OF_PAPER = Metric(
     "spectral loss, as the paper",
     "ln",
     definition=Definition(
-        formula=f"mean |difference| of ln(magnitude + {LOG_FLOOR:g}); n_fft {N_FFT}, hop {HOP}, without the highest bin",
+        formula=f"mean |difference| of ln(magnitude + {LOG_FLOOR:g}); n_fft {N_FFT}, hop {HOP}, no highest bin",
         over="all bins and frames",
         failures="none",
         source=f"{_SOURCE}: `get_spec` of their code",
