@@ -261,3 +261,16 @@ def test_evaluated_heads_are_tilted_in_turn_however_many_there_are(dataset):
         held_out = everything.sample(pairs=1, yaws=2, seed=0).reheard(None, tilt_deg=30.0)
         expected = tilted(everything.yaws[held_out.yaw_indices], np.radians(30.0))
         np.testing.assert_array_equal(held_out.yaws[held_out.yaw_indices], expected)
+
+
+def test_halves_are_those_by_which_levels_are_chosen_and_reported(dataset, make_held_out):
+    with open_held_out(dataset.folder) as everything:
+        choice, report = (everything.of_half(half) for half in ("choice", "report"))
+        assert sorted([*choice.held_out, *report.held_out]) == everything.held_out.tolist()
+        for half, name in ((choice, "choice"), (report, "report")):
+            ends = [divmod(int(pair), len(dataset.probes)) for pair in half.held_out]
+            assert ends == [tuple(pair) for pair in dataset.held_out_half(name).tolist()]
+            kept = np.isin(everything.held_out, half.held_out)
+            np.testing.assert_array_equal(half.visible, everything.visible[kept])
+    with pytest.raises(EvaluationError, match="no levels are chosen by measured responses"):
+        make_held_out(lambda _: np.zeros((1, 2, 4_000))).of_half("report")
