@@ -86,6 +86,7 @@ def test_every_level_answers_as_the_server_does(evaluation, two_levels, held_out
         "nearest",
         "linear",
         "linear-aligned",
+        "mean-spectrogram",
         "floor",
     ]
     codec = spectral_codec(dataset.sample_rate, dataset.samples)

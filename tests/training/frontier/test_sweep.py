@@ -149,7 +149,7 @@ def test_one_response_for_all_poses_costs_next_to_nothing_and_is_worse_and_jumps
     assert coarse.cost.ms_miss > 0.5 * exact.cost.ms_miss
     # Reflections of another place, beside a direct sound of its own.
     assert coarse.accuracy.errors["drr"] > 1.5 * exact.accuracy.errors["drr"]
-    assert coarse.accuracy.errors["c50"] > 1.2 * exact.accuracy.errors["c50"]
+    assert coarse.accuracy.errors["c50"] > 1.1 * exact.accuracy.errors["c50"]  # of the half that is reported: two pairs
     assert coarse.accuracy.errors["itd"] < 1.2 * exact.accuracy.errors["itd"] + 10  # us
     assert max(exact.accuracy.steps.values()) < max(coarse.accuracy.steps.values())
     assert fine.cost.memory_mb > exact.cost.memory_mb  # what it keeps is memory too
