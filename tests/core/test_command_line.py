@@ -74,7 +74,7 @@ def test_every_command_is_strict(module):
 
 INPUTS = {
     *("bundle", "clip", "hrtf", "path"),
-    *("as_long_as", "data", "points", "teacher"),
+    *("as_long_as", "data", "points", "predictions", "teacher"),
 }
 OUTPUTS = {"output", "figure"}
 NEEDED = {"--listener": "1,1,1", "--emitter": "1,1,1", "--path": "absent.csv", "--output": "new.wav"}

@@ -8,6 +8,7 @@ import soundfile
 from starlette.testclient import TestClient
 
 from server.api.settings import Settings
+from server.core.errors import RequestError
 from server.listening.app import create_app
 from server.listening.design import REFERENCE
 from server.listening.listeners import Listeners
@@ -169,6 +170,13 @@ def test_a_code_that_nobody_has_is_refused(client, code):
     response = client.get(f"/v1/listeners/{code}")
     assert response.status_code == 404
     assert response.json()["code"] in {"unknown_listener", "not_found"}
+
+
+def test_a_code_that_is_none_names_no_file(test):
+    listeners = Listeners(test)
+    (test.results.parent / "plan.json").write_bytes((test.results / f"{listeners.begin()}.json").read_bytes())
+    with pytest.raises(RequestError, match="nobody has begun"):
+        listeners.plan("../plan")
 
 
 def test_a_full_test_takes_nobody_more(test, monkeypatch):

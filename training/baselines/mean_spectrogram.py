@@ -92,7 +92,7 @@ class MeanSpectrogram:
         mean = np.asarray(levels / len(numbers), np.float32)
         if self._held_out.channels == 1:
             return mean, np.zeros_like(mean[:, [0, 0]])
-        # guard: ears in silence have no mean coherence
+        # guard: the mean of silent ears has no coherence
         coherence = cross / np.maximum(np.sqrt(power[0] * power[1]), 1e-20)
         return mean, np.stack([coherence.real, coherence.imag], axis=1).astype(np.float32)
 

@@ -75,8 +75,7 @@ class ExpectedTargets:
         codec, frames = self._cells.codec, self._cells.fine_frames
         advance = self._dataset.onset_s[emitter, listener] * self._dataset.sample_rate - LEAD_SAMPLES
         diffuse = self._spectrograms.diffuse_products(emitter, listener, self._pool, advance)
-        # guard: rounding leaves no variance below zero
-        variance = np.maximum(_by_yaw(diffuse[:, :2]), 0)
+        variance = np.maximum(_by_yaw(diffuse[:, :2]), 0)  # rounding may leave it below zero
         specular = self._mean(emitter, listener, advance)
         mean = np.zeros(variance.shape, np.complex128)
         mean[..., : specular.shape[-1]] = specular[..., :frames]

@@ -65,6 +65,11 @@ def test_one_microphone_has_one_channel(make_held_out):
     assert MeanSpectrogram(data, whole=True).response(3, data.yaw_indices).shape == (YAWS, 1, SAMPLES)
 
 
+def test_silent_ears_have_no_coherence(make_held_out):
+    data = make_held_out(lambda pair: 0 * decay(pair), held_out=(3,), yaws=YAWS)
+    assert np.isfinite(MeanSpectrogram(data, whole=True).response(3, data.yaw_indices)).all()
+
+
 def test_of_a_simulation_it_has_the_direct_sound_of_the_pair(dataset):
     """As a field has, which learns the reflected sound alone; of whole responses it has none."""
     with open_held_out(dataset.folder) as everything:
