@@ -41,6 +41,8 @@ def run(package, **environment):
     """What `outer(1)` gives, and whether it came from disk."""
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
     environment["PYTHONPATH"] = str(package)
+    # Bytecode is told from that of a source which was changed within the same second by its size alone.
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"
     output = subprocess.run(
         [sys.executable, "-c", RUN], cwd=package, env=environment, check=True, capture_output=True, text=True
     )
