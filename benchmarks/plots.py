@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Final
@@ -149,8 +150,10 @@ def pictures_side_by_side(result: Result) -> Figure:
 
 
 def history(runs: Sequence[Run]) -> Figure:
-    """Draw every figure of a benchmark over its runs, divided by the figure's median, with a marker for each host."""
-    names = list(dict.fromkeys(name for run in runs for name in run.figures))
+    """Draw the figures of a benchmark over its runs, divided by the figure's median, with a marker for each host. A
+    figure of one run among several is left out: it is its own median."""
+    count_of = Counter(name for run in runs for name, value in run.figures.items() if value is not None)
+    names = [name for name, count in count_of.items() if count >= min(2, len(runs))]
     hosts = list(dict.fromkeys(run.host.name for run in runs))
     figure, axes = _one_panel(7.5, 2.4 + 0.12 * len(names))
     for name in names:

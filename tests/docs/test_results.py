@@ -99,3 +99,9 @@ def test_a_history_is_plotted_in_units_of_the_median() -> None:
     runs = [Run.now("c", {"ms": value}, ()).model_copy(update={"host": host}) for value in values]
     (axes,) = history(runs).axes
     assert list(axes.lines[0].get_ydata()) == [0.5, 1.0, 2.0]
+
+
+def test_of_several_runs_a_figure_that_one_has_is_not_plotted() -> None:
+    figures = ({"old": 1.0, "ms": 1.0}, {"new": 1.0, "ms": 2.0})
+    (axes,) = history([Run.now("c", each, ()) for each in figures]).axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["ms"]
