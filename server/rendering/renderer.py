@@ -114,7 +114,8 @@ class Renderer:
         self.order = order
         """The order of ambisonic channels; None for ears."""
         self.outputs = outputs if order is None else harmonic_count(order)
-        self._decoders = {harmonic_count(decoder.order): decoder for decoder in decoders}
+        # The factories below refer to this and not to the renderer, which would be freed only by the collector.
+        decoder_of = self._decoders = {harmonic_count(decoder.order): decoder for decoder in decoders}
         # Twice the number of emitters: a removed emitter keeps its slot until its reverberation has rung out.
         slots = 2 * max_emitters
 
@@ -125,7 +126,7 @@ class Renderer:
                 slots=slots,
                 block_size=block_size,
                 sample_rate=sample_rate,
-                filters=filters if channels == 2 or channels in self._decoders else None,
+                filters=filters if channels == 2 or channels in decoder_of else None,
                 speed_of_sound=speed_of_sound,
                 air_db_per_m=air_db_per_m,
                 order=order,
@@ -143,13 +144,13 @@ class Renderer:
             )
 
         def bus_of(channels: int) -> Bus | None:
-            decoder = self._decoders.get(channels)
+            decoder = decoder_of.get(channels)
             return None if decoder is None else Bus(decoder, block_size=block_size)
 
         self._mixers = MixerSet(
             slots=slots,
             block_size=block_size,
-            hearings=(1, 2, *self._decoders) if order is None else (self.outputs,),
+            hearings=(1, 2, *decoder_of) if order is None else (self.outputs,),
             new_direct=direct_of,
             new_convolver=convolver_of,
             new_bus=bus_of,

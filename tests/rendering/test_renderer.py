@@ -1,7 +1,9 @@
 """Laws of the renderer, against SciPy's convolution of what each emitter should have played."""
 
+import gc
 import threading
 import time
+import weakref
 from functools import partial
 
 import numpy as np
@@ -47,6 +49,21 @@ def run(engine, blocks):
 
 def convolve(dry, ir, samples):
     return fftconvolve(dry[np.newaxis].astype(float), ir.astype(float), axes=1)[:, :samples]
+
+
+def test_it_is_freed_with_its_last_reference():
+    """And not by the collector, which runs rarely in a server: streams would leave a megabyte each until then."""
+    engine = renderer()
+    add(engine, "a", noise(0, 700))
+    engine.set_ir("a", room(1))
+    run(engine, 3)
+    reference = weakref.ref(engine)
+    gc.disable()
+    try:
+        del engine
+        assert reference() is None
+    finally:
+        gc.enable()
 
 
 def test_every_emitter_is_its_clip_in_its_room():
