@@ -44,6 +44,7 @@ from server.protocol.client_messages import (
     ListenerStart,
     MoveEmitter,
 )
+from server.rendering.convolver import Sharing
 from server.rendering.hrtf import kemar
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
@@ -293,7 +294,7 @@ class _Player:
             self._levels,
             kemar(field.sample_rate),
             lambda _: clip,
-            quality=QualityStep(field.level.name, None, False, 1.0),
+            quality=QualityStep(field.level.name, None, Sharing.NOTHING, 1.0),
             window=10_000_000,
             place=place_of_field(field, BLOCK_SIZE),
         )

@@ -80,7 +80,19 @@ class BankField(AcousticField):
         remember: bool = False,  # noqa: ARG002  there is no phase to remember
     ) -> FloatArray:
         """IRs as of `AcousticField`; poses outside of the bounds are allowed."""
-        places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), yaws_of(np.atleast_1d(heads))])
-        entry = np.floor(places @ np.arange(1, places.shape[1] + 1) * _POSES_PER_M).astype(np.int64)
+        entry = self._entries(listeners, emitters, heads)
         answer = _POOL.floats(len(entry), *self._bank.shape[1:])
         return self._bank.take(entry, axis=0, out=answer, mode="wrap")  # other modes make an additional copy
+
+    def first_samples(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike, samples: int
+    ) -> FloatArray:
+        """As of `AcousticField`."""
+        entry = self._entries(listeners, emitters, heads)
+        return np.ascontiguousarray(self._bank[entry, :, :samples])
+
+    @staticmethod
+    def _entries(listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """The places in the bank (B,) of the responses to poses."""
+        places = np.column_stack([np.atleast_2d(listeners), np.atleast_2d(emitters), yaws_of(np.atleast_1d(heads))])
+        return np.floor(places @ np.arange(1, places.shape[1] + 1) * _POSES_PER_M).astype(np.int64) % _BANK

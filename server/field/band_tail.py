@@ -75,15 +75,22 @@ class BandTail:
         """The size of the noises, which is nearly all that a tail holds."""
         return self.parts.noises.nbytes
 
-    def responses(self, decoder: Decoder, arrivals: Arrivals, orientations: Floats, aligned: Floats) -> Float32:
+    def responses(
+        self,
+        decoder: Decoder,
+        arrivals: Arrivals,
+        orientations: Floats,
+        aligned: Floats,
+        samples: int | None = None,
+    ) -> Float32:
         """Responses (B, 2, sample) of heads with these orientations (B, 4): the first frames by `decoder`, which uses
         `early_frames` of them, then the tail. The first coded sample lies at sample `aligned` (B,), which may be a
-        fraction."""
+        fraction. With `samples`, only so many of each are computed."""
         constants = decoder.constants
         if constants is None:
             responses = decoder.decode(self._early(arrivals, orientations), aligned)
             self._add(arrivals, orientations, aligned, responses)
-            return responses
+            return np.ascontiguousarray(responses[..., :samples])
         graph = self._graph
         band, share = graph.between_bands
         try:
@@ -91,7 +98,7 @@ class BandTail:
         except IndexError:
             buffers = self._new_buffers()
         with decoder.workspace() as workspace:
-            responses = decoder.room(len(aligned))
+            responses = decoder.room(len(aligned), samples)
             respond(
                 arrivals.log_magnitude,
                 arrivals.directions,

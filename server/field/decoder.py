@@ -105,9 +105,9 @@ class Decoder:
             return None
         return self._columns, self._shape, self._windows, self._noise.parts
 
-    def room(self, count: int) -> Float32:
-        """Room for so many responses, not initialised."""
-        return _POOL.floats(count, 2, self.ir_samples)
+    def room(self, count: int, samples: int | None = None) -> Float32:
+        """Room for so many responses or, with `samples`, for so much of them; not initialised."""
+        return _POOL.floats(count, 2, self.ir_samples if samples is None else samples)
 
     @contextmanager
     def workspace(self) -> Iterator[Workspace]:

@@ -265,6 +265,20 @@ class AcousticField:
             raise ValueError("listeners, emitters and heads must be finite")
         return self.source.responses(listeners, emitters, heads, remember=remember)
 
+    def first_samples(
+        self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike, samples: int
+    ) -> Float32:
+        """The first `samples` of what `impulse_responses` gives, remembering: for a level that decodes the beginning
+        apart from the tail, in less time. Raises as that does."""
+        if self._tail is None or self._order is not None or self.kind.reuses_responses:
+            responses = self.impulse_responses(listeners, emitters, heads, remember=True)
+            return np.ascontiguousarray(responses[..., :samples])
+        listeners, emitters, heads = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
+        # guard: poses that are not finite have no first samples
+        if not all(np.isfinite(part).all() for part in (listeners, emitters, heads)):
+            raise ValueError("listeners, emitters and heads must be finite")
+        return self._with_tail(listeners, emitters, heads, remember=True, samples=samples)
+
     @property
     def knows_directions(self) -> bool:
         """Whether `ambisonics` is possible: the field tells from where sound arrives, and not what one head hears."""
@@ -346,11 +360,8 @@ class AcousticField:
     def _compute(self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool) -> Float32:
         if self._order is not None:
             return self.ambisonics(listeners, emitters, self._order)
-        if self._tail is not None and self._decoder is not None:
-            told = self._remembered(listeners, emitters) if remember else self._tell(listeners, emitters)
-            responses = self._tail.responses(self._decoder, told.arrivals, orientations_of(heads), told.aligned)
-            self._gate.open(self._finite(responses, listeners, emitters), told.onsets, told.echoes)
-            return responses
+        if self._tail is not None:
+            return self._with_tail(listeners, emitters, heads, remember=remember, samples=self.ir_samples)
         paths = self._paths.describe(listeners, emitters)
         aligned = self._aligned(paths)
         if self._decoder is None:
@@ -361,6 +372,18 @@ class AcousticField:
             cache = self._cache if remember else None
             responses = self._decoded(self._decoder, predicted, listeners, emitters, heads, aligned, cache)
         self._gate.open(responses, *self._opening(listeners, emitters, aligned))
+        return responses
+
+    def _with_tail(
+        self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool, samples: int
+    ) -> Float32:
+        """The first `samples` of responses of a level with a tail of bands."""
+        assert self._tail is not None
+        assert self._decoder is not None
+        told = self._remembered(listeners, emitters) if remember else self._tell(listeners, emitters)
+        orientations = orientations_of(heads)
+        responses = self._tail.responses(self._decoder, told.arrivals, orientations, told.aligned, samples)
+        self._gate.open(self._finite(responses, listeners, emitters), told.onsets, told.echoes)
         return responses
 
     def _tell(self, listeners: Floats, emitters: Floats) -> _Told:
@@ -484,6 +507,15 @@ class Silence(AcousticField):
         remember: bool = False,  # noqa: ARG002
     ) -> Float32:
         return np.zeros((len(np.asarray(heads)), self.channels, self.ir_samples), dtype=np.float32)
+
+    def first_samples(
+        self,
+        listeners: npt.ArrayLike,  # noqa: ARG002  the same everywhere
+        emitters: npt.ArrayLike,  # noqa: ARG002
+        heads: npt.ArrayLike,
+        samples: int,
+    ) -> Float32:
+        return np.zeros((len(np.asarray(heads)), self.channels, samples), dtype=np.float32)
 
     @property
     def knows_directions(self) -> bool:

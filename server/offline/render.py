@@ -299,7 +299,7 @@ class _Walk:
             buses=buses,
         )
         self._field = field
-        self.renderer.share_tail(field.kind.shares_tail)
+        self.renderer.share(field.kind.sharing)
         self._direct_sound = direct_sound
         self._effects = ActiveEffects(
             self.renderer,
@@ -343,7 +343,7 @@ class _Walk:
                 emitter.is_outdated |= is_other or self._calls_for_response(name, pose)
             self._respond(pose)
             if is_other:
-                self._effects.share_tail(field.kind.shares_tail, self._emitters)
+                self._effects.share(field.kind.sharing, self._emitters)
         elif self._effects.planned is not None and self._has_begun:
             self._respond(self._listener)
 
@@ -373,7 +373,7 @@ class _Walk:
         if request is not None:
             planned.accept(request.plan())
             self._effects.enforce(self._emitters)
-            self._effects.share_tail(self._field.kind.shares_tail, self._emitters)
+            self._effects.share(self._field.kind.sharing, self._emitters)
 
     def _respond(self, listener: Pose) -> None:
         """Compute the outdated responses and give them to the renderer."""

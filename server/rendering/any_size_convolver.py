@@ -34,28 +34,21 @@ class AnySizeConvolver:
         sources: int,
         channels: int,
         *,
-        has_shared_tail: bool,
-        has_own_tails: bool,
+        own: range,
+        shared: range,
     ) -> None:
         self._partitioning = partitioning
         block_size, stages = partitioning.block_size, partitioning.stages
         self.silent = np.zeros(sources, np.int64)
         self.exchanged = np.zeros(sources, np.int64)
-        self.tail_gain = np.zeros((2, sources), np.float32)
         self.blocks = 0
         self._wanted: list[SpectralFilter | None] = [None] * sources
-        self._own_tails_wanted: list[SpectralFilter | None] = [None] * sources
-        self._tail_wanted: list[SpectralFilter | None] = [None]
-        self._tail_silent = np.zeros(1, np.int64)
+        self._shared_wanted: list[SpectralFilter | None] = [None]
         self._fade_in = raised_cosine(block_size)
-        last = len(stages) - 1
-        self._stages = [
-            _StageState(stage, number, sources, channels)
-            for number, stage in enumerate(stages)
-            if number < last or has_own_tails
-        ]
-        self._own_tails = self._stages[-1] if has_own_tails else None
-        self._shared_tail = _StageState(stages[last], last, 1, channels) if has_shared_tail else None
+        self._own = {number: _StageState(stages[number], number, sources, channels) for number in own}
+        self._shared = {number: _StageState(stages[number], number, 1, channels) for number in shared}
+        self._own_gain = {number: np.zeros((2, sources), np.float32) for number in own if number in shared}
+        self._shared_gain = {number: np.zeros((2, sources), np.float32) for number in shared}
 
     def prepare(self, ir: FloatArray, like: SpectralFilter | None = None, same_from: int = 0) -> SpectralFilter:
         spectra = []
@@ -70,14 +63,17 @@ class AnySizeConvolver:
         return SpectralFilter(tuple(spectra))
 
     def want(self, source: int, filters: SpectralFilter) -> None:
-        self._wanted[source] = self._own_tails_wanted[source] = filters
+        self._wanted[source] = filters
 
-    def want_own_tail(self, source: int, filters: SpectralFilter) -> None:
-        """Set a different filter for a source's last stage; call it after `want`, which sets all stages."""
-        self._own_tails_wanted[source] = filters
+    def want_shared(self, filters: SpectralFilter) -> None:
+        self._shared_wanted[0] = filters
 
-    def want_tail(self, filters: SpectralFilter | None) -> None:
-        self._tail_wanted[0] = filters
+    def take_in(self, number: int, own: bool, shared: FloatArray, at_once: npt.NDArray[np.bool]) -> None:
+        """As of the compiled convolver."""
+        for gain, gains in ((self._own_gain.get(number), np.float32(own)), (self._shared_gain[number], shared)):
+            if gain is not None:
+                gain[1] = gains
+                gain[0, at_once] = gain[1, at_once]
 
     def process(self, blocks: FloatArray, output: FloatArray) -> None:
         shape = self.silent.size, self._partitioning.block_size
@@ -87,35 +83,39 @@ class AnySizeConvolver:
         self.silent[:] = np.where(blocks.any(axis=1), 0, self.silent + 1)
         sounds = np.array([filters is not None for filters in self._wanted]) & (self.silent < quiet)
         samples = np.where(sounds[:, np.newaxis], blocks, np.float32(0))
-        self._tail_silent[0] = 0 if sounds.any() else self._tail_silent[0] + 1
         output.fill(0)
-        for stage in self._stages:
-            wanted = self._own_tails_wanted if stage is self._own_tails else self._wanted
-            stage.process(samples, sounds, wanted, output, self.blocks)
-        if self._shared_tail is not None:
-            now, then = self.tail_gain[:, :, np.newaxis]
-            tail = np.sum((now + (then - now) * self._fade_in) * samples, axis=0, keepdims=True)
-            self.tail_gain[0, sounds] = self.tail_gain[1, sounds]
-            tail_sounds = np.array([self._tail_wanted[0] is not None]) & (self._tail_silent < quiet)
-            self._shared_tail.process(tail, tail_sounds, self._tail_wanted, output, self.blocks)
-        self.exchanged[:] = self._stages[0].exchanged
+        for number, stage in self._own.items():
+            own = self._taken_in(samples, sounds, self._own_gain[number]) if number in self._own_gain else samples
+            stage.process(own, sounds, self._wanted, output, self.blocks)
+        is_shared = np.array([self._shared_wanted[0] is not None])
+        for number, stage in self._shared.items():
+            mix = np.sum(self._taken_in(samples, sounds, self._shared_gain[number]), axis=0, keepdims=True)
+            stage.process(mix, is_shared, self._shared_wanted, output, self.blocks)
+        self.exchanged[:] = self._own[0].exchanged
         self.blocks += 1
 
+    def _taken_in(self, samples: FloatArray, sounds: npt.NDArray[np.bool], gain: FloatArray) -> FloatArray:
+        """The inputs at their gains (2, source), which move to what is wanted."""
+        now, then = gain[:, :, np.newaxis]
+        taken = (now + (then - now) * self._fade_in) * samples
+        gain[0, sounds] = gain[1, sounds]
+        return np.asarray(taken, np.float32)
+
     def clear(self, source: int) -> None:
-        self._wanted[source] = self._own_tails_wanted[source] = None
+        self._wanted[source] = None
         self.silent[source] = 0
-        self.tail_gain[:, source] = 0
-        for stage in self._stages:
+        for gain in (*self._own_gain.values(), *self._shared_gain.values()):
+            gain[:, source] = 0
+        for stage in self._own.values():
             stage.clear(source)
 
     def reset(self) -> None:
         for source in range(len(self._wanted)):
             self.clear(source)
-        self._tail_wanted[0] = None
-        self._tail_silent.fill(0)
+        self._shared_wanted[0] = None
         self.exchanged.fill(0)
         self.blocks = 0
-        for stage in (*self._stages, *([self._shared_tail] if self._shared_tail else [])):
+        for stage in (*self._own.values(), *self._shared.values()):
             stage.reset()
 
 

@@ -24,8 +24,8 @@ class CompiledConvolver:
     methods.
 
     `_wanted` (source,) holds the address of each source's filter, 0 for none; `silent` (source,): how many blocks in a
-    row each source has been silent. The last stage, which holds the tail, exists for each source, once for the shared
-    tail, or both.
+    row each source has been silent. The stages with the numbers in `own` exist for each source, those in `shared` once
+    for a mix of all of them.
     """
 
     def __init__(
@@ -34,8 +34,8 @@ class CompiledConvolver:
         sources: int,
         channels: int,
         *,
-        has_shared_tail: bool,
-        has_own_tails: bool,
+        own: range,
+        shared: range,
     ) -> None:
         block_size, history = partitioning.block_size, partitioning.history_blocks
         stages = partitioning.stages
@@ -44,30 +44,27 @@ class CompiledConvolver:
         self.output = zeros_on_lines(channels, block_size)
         self.silent: IntArray = np.zeros(sources, np.int64)
         self.exchanged: IntArray = np.zeros(sources, np.int64)
-        self.tail_gain = zeros_on_lines(2, sources)
         self._history = zeros_on_lines(sources, history * block_size)
         self._wanted: IntArray = np.zeros(sources, np.int64)
-        # The last stage reads these instead of `_wanted` only where both kinds of tail exist.
-        self._own_tails_wanted: IntArray = np.zeros(sources, np.int64)
-        self._tail_history = zeros_on_lines(1, history * block_size)
-        self._tail_wanted: IntArray = np.zeros(1, np.int64)
-        self._tail_silent: IntArray = np.zeros(1, np.int64)
         self._scratch = zeros_on_lines(3, stages[-1].size)
         self._fade_in = raised_cosine(block_size)
-        last = len(stages) - 1
-        kinds = [(number, False) for number in range(len(stages)) if number < last or has_own_tails]
-        kinds += [(last, True)] if has_shared_tail else []
+        samples = history * block_size
+        self._shared_wanted = {number: np.zeros(1, np.int64) for number in shared}
+        self._shared_inputs = {number: _Inputs(1, sources, samples) for number in shared}
+        self._own_inputs = {number: _Inputs(sources, sources, samples) for number in own if number in shared}
+        kinds = [*((number, False) for number in own), *((number, True) for number in shared)]
         self._stages = np.zeros(len(kinds), STAGE)
         self._stage_arrays = [
             _StageArrays(stages[number], 1 if is_shared else sources, channels) for number, is_shared in kinds
         ]
         for place, ((number, is_shared), arrays) in enumerate(zip(kinds, self._stage_arrays, strict=True)):
-            wanted = self._own_tails_wanted if has_shared_tail and number == last else self._wanted
+            inputs = (self._shared_inputs if is_shared else self._own_inputs).get(number)
             record = self._stages[place : place + 1]
-            record["number"] = number
-            record["history"] = address(self._tail_history if is_shared else self._history)
-            record["wanted"] = address(self._tail_wanted if is_shared else wanted)
-            record["silent"] = address(self._tail_silent if is_shared else self.silent)
+            record["number"], record["is_mix"] = number, is_shared
+            record["history"] = address(self._history if inputs is None else inputs.history)
+            record["gain"] = 0 if inputs is None else address(inputs.gain)
+            record["wanted"] = address(self._shared_wanted[number] if is_shared else self._wanted)
+            record["silent"] = address(self.silent if inputs is None else inputs.silent)
             arrays.enter(record)
         self._record = np.zeros(1, CONVOLVER)
         for name, value in {
@@ -77,7 +74,6 @@ class CompiledConvolver:
             "history_blocks": history,
             "quiet_blocks": partitioning.quiet_blocks,
             "stages": len(kinds),
-            "has_shared_tail": has_shared_tail,
         }.items():
             self._record[name] = value
         for name, array in {
@@ -89,9 +85,6 @@ class CompiledConvolver:
             "silent": self.silent,
             "exchanged": self.exchanged,
             "scratch": self._scratch,
-            "tail_history": self._tail_history,
-            "tail_silent": self._tail_silent,
-            "tail_gain": self.tail_gain,
             "fade_in": self._fade_in,
         }.items():
             self._record[name] = address(array)
@@ -105,24 +98,33 @@ class CompiledConvolver:
         return pack(ir, self._partitioning, like, same_from)
 
     def want(self, source: int, filters: PackedFilter) -> None:
-        self._wanted[source] = self._own_tails_wanted[source] = filters.address
+        self._wanted[source] = filters.address
 
-    def want_own_tail(self, source: int, filters: PackedFilter) -> None:
-        """Set a different filter for a source's last stage; call it after `want`, which sets all stages."""
-        self._own_tails_wanted[source] = filters.address
+    def want_shared(self, filters: PackedFilter) -> None:
+        for wanted in self._shared_wanted.values():
+            wanted[0] = filters.address
 
-    def want_tail(self, filters: PackedFilter | None) -> None:
-        self._tail_wanted[0] = 0 if filters is None else filters.address
+    def take_in(self, number: int, own: bool, shared: FloatArray, at_once: npt.NDArray[np.bool]) -> None:
+        """From the next block on, take inputs into the stage of this number of each source if `own`, and into the
+        shared one at the gains `shared` (source,): faded over that block, or suddenly for the sources `at_once`."""
+        for inputs, gains in ((self._own_inputs.get(number), np.float32(own)), (self._shared_inputs[number], shared)):
+            if inputs is not None:
+                inputs.gain[1] = gains
+                inputs.gain[0, at_once] = inputs.gain[1, at_once]
 
     def process(self, blocks: FloatArray, output: FloatArray) -> None:
         if not process_block(self.address, blocks, output):
             raise ValueError(f"expected a block {self.input.shape} and room {self.output.shape} for the mix")
 
     def clear(self, source: int) -> None:
-        self._wanted[source] = self._own_tails_wanted[source] = 0
+        self._wanted[source] = 0
         self._history[source] = 0
         self.silent[source] = 0
-        self.tail_gain[:, source] = 0
+        for inputs in self._own_inputs.values():
+            inputs.history[source] = 0
+            inputs.silent[source] = 0
+        for inputs in (*self._own_inputs.values(), *self._shared_inputs.values()):
+            inputs.gain[:, source] = 0
         for arrays in self._stage_arrays:
             if arrays.sources > source and arrays.sources == len(self._wanted):
                 arrays.clear(source)
@@ -131,14 +133,26 @@ class CompiledConvolver:
         for source in range(len(self._wanted)):
             self.clear(source)
         self.exchanged.fill(0)
-        self._tail_history.fill(0)
-        self._tail_wanted.fill(0)
-        self._tail_silent.fill(0)
+        for inputs in self._shared_inputs.values():
+            inputs.history.fill(0)
+            inputs.silent.fill(0)
+        for wanted in self._shared_wanted.values():
+            wanted.fill(0)
         self._record["blocks"] = 0
         for number, arrays in enumerate(self._stage_arrays):
             arrays.reset()
             for name in PROGRESS:
                 self._stages[name][number] = 0
+
+
+class _Inputs:
+    """What one stage takes in, where it does not simply read all inputs: `history` (row, samples), how many blocks in a
+    row were `silent` (row,), and the `gain` (2, source) in effect and wanted."""
+
+    def __init__(self, rows: int, sources: int, samples: int) -> None:
+        self.history = zeros_on_lines(rows, samples)
+        self.silent: IntArray = np.zeros(rows, np.int64)
+        self.gain = zeros_on_lines(2, sources)
 
 
 class _StageArrays:

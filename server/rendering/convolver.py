@@ -15,9 +15,11 @@ Compiled code (`server.rendering.convolver_kernel`) convolves blocks of a power 
 (`server.rendering.any_size_convolver`) all others; their results agree to -120 dB.
 """
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +36,17 @@ if TYPE_CHECKING:
     from server.rendering.compiled_convolver import CompiledConvolver
 
 
+class Sharing(IntEnum):
+    """What sources share: the greater, the more. Shared parts come from one source, and each source feeds them at the
+    level of its own."""
+
+    NOTHING = 0
+    TAIL = 1
+    """The last stage."""
+    REVERBERATION = 2
+    """All stages but the first."""
+
+
 @dataclass(frozen=True)
 class PartitionedIr:
     """An impulse response transformed for convolvers of one layout. Immutable, so threads may share it."""
@@ -41,8 +54,8 @@ class PartitionedIr:
     layout: tuple[Partitioning, int]
     """The partitioning, and the number of channels."""
     filters: Any
-    tail_energy: float
-    """The sum of squares, over all channels, of the samples that a shared tail can replace."""
+    energies: tuple[float, ...]
+    """For each stage the sum of squares, over all channels, of the samples from its start on."""
 
     @property
     def channels(self) -> int:
@@ -54,17 +67,6 @@ class PartitionedIr:
         return sum(int(part.nbytes) for part in self.filters.spectra)
 
 
-@dataclass(frozen=True)
-class _Tail:
-    """The filter of the shared tail's stage: `filters`, made from `ir`, or silence."""
-
-    ir: PartitionedIr | None
-    filters: Any
-
-
-_NO_TAIL = _Tail(None, None)
-
-
 class Convolver:
     """Convolves `sources` mono inputs, each with its own IR of `channels` channels (one of CHANNELS), and mixes them
     into one output.
@@ -73,8 +75,7 @@ class Convolver:
     does the work. With `shared_tail` the last stage convolves one mix of all sources with one tail. This tail comes
     from the first source that has one, and each source is scaled to the level of its own tail: from twice the longest
     partition on, tails differ in little but level. A shared tail makes many sources cheaper. With `switches_tail` the
-    convolver begins with separate tails, and `share_tail` switches between shared and separate ones with the same
-    crossfades as an IR exchange.
+    convolver begins with nothing shared, and `share` says how much is, with the same crossfades as an IR exchange.
 
     Only one thread at a time may use it, except `prepare`, which any thread may call. Raises ValueError for sizes that
     are not supported.
@@ -95,34 +96,37 @@ class Convolver:
             raise ValueError(f"a convolver has at least 1 source, and {CHANNELS} channels")
         self._partitioning = Partitioning(block_size, ir_samples, any_size)
         stages = self._partitioning.stages
+        self._starts = [stage.start for stage in stages]
         # With one stage the tail would be the whole IR, which cannot be shared.
-        self._has_shared_tail = (shared_tail or switches_tail) and len(stages) > 1
-        self._switches_tail = self._has_shared_tail and not shared_tail
-        self._shares_tail = self._has_shared_tail and shared_tail
-        self._tail_start = stages[-1].start if self._has_shared_tail else ir_samples
+        can_share = len(stages) > 1
+        self._switches = can_share and switches_tail and not shared_tail
+        self._sharing = Sharing.TAIL if can_share and shared_tail else Sharing.NOTHING
+        self._has_shared = self._switches or self._sharing is not Sharing.NOTHING
         self.sources = sources
         self.channels = channels
         self.block_size = block_size
         self.ir_samples = ir_samples
+        last = len(stages) - 1
+        self._shareable = range(1 if self._switches else last, len(stages)) if self._has_shared else range(0)
+        """The numbers of the stages that can be shared."""
         kind = _any_size_convolver() if any_size else _compiled_convolver()
         self._engine: Any = kind(
             self._partitioning,
             sources,
             channels,
-            has_shared_tail=self._has_shared_tail,
-            has_own_tails=self._switches_tail or not self._has_shared_tail,
+            own=range(len(stages) - (self._has_shared and not self._switches)),
+            shared=self._shareable,
         )
-        # The filter of a stage that must stay inaudible: it has no partitions except in the head.
-        self._silence = self._engine.prepare(np.zeros((channels, 1), np.float32)) if self._switches_tail else None
         self._layout = self._partitioning, channels
         self._irs: list[PartitionedIr | None] = [None] * sources
-        self._tail_energy = np.zeros(sources)
+        self._energies = np.zeros((len(stages), sources))
         self._retired: deque[tuple[int, PartitionedIr]] = deque()
         # Compiled code uses addresses, so a replaced IR must stay in memory until its source's turn, and during the
         # window that is computed from it then.
         self._retires_after = (TURNS + 2) * stages[-1].ticks
-        self._tail = self._tail_before = _NO_TAIL
-        self._tail_chosen_at = -1
+        self._shared: PartitionedIr | None = None
+        self._shared_before: PartitionedIr | None = None
+        self._shared_chosen_at = -1
         self._came_at = np.full(sources, -1)
         """The number of the block in which each source got its first IR; -1 before."""
 
@@ -132,8 +136,8 @@ class Convolver:
         """Cut an IR (channels, 1..ir_samples) into partitions and transform them for `set_ir`. This is most of the cost
         of an exchange, and any thread may do it.
 
-        If the IR equals another one of the same length from sample `same_from` on, pass the other one as `like`: stages
-        that begin there or later are reused, and exchanging the two IRs does not touch these stages.
+        If the IR equals another one from sample `same_from` on, pass the other one as `like`: stages that begin there
+        or later are reused, and exchanging the two IRs does not touch these stages. Then `ir` may end at `same_from`.
 
         Raises ValueError for another shape, and for samples that are not finite or so large that a product could
         overflow: either would corrupt all later output.
@@ -141,22 +145,34 @@ class Convolver:
         # guard: a response has samples
         if ir.ndim != 2 or ir.shape[0] != self.channels or not 1 <= ir.shape[1] <= self.ir_samples:
             raise ValueError(f"expected an IR ({self.channels}, 1..{self.ir_samples}), got shape {ir.shape}")
-        with np.errstate(over="ignore"):  # an overflow is found below
-            samples = ir.astype(np.float32, copy=False)
-        head_energy, tail_energy = _energy(samples[:, : self._tail_start]), _energy(samples[:, self._tail_start :])
-        # Energy says it at once of nearly all; neither is true of what is no number.
-        # guard: a response is sound
-        if not (head_energy + tail_energy <= LOUDEST or -LOUDEST <= ir.min() <= ir.max() <= LOUDEST):
-            raise ValueError(f"impulse response has samples that are not finite, or beyond {LOUDEST:g}")
         if like is not None and like.layout != self._layout:
             raise ValueError("the IR that it is like was prepared for another convolver")
+        with np.errstate(over="ignore"):  # an overflow is found below
+            samples = ir.astype(np.float32, copy=False)
+        energies = self._energies_of(samples, like, same_from)
+        # Energy says it at once of nearly all; neither is true of what is no number.
+        # guard: a response is sound
+        if not (energies[0] <= LOUDEST or -LOUDEST <= ir.min() <= ir.max() <= LOUDEST):
+            raise ValueError(f"impulse response has samples that are not finite, or beyond {LOUDEST:g}")
         prepared = self._engine.prepare(samples, None if like is None else like.filters, same_from)
-        return PartitionedIr(self._layout, prepared, tail_energy)
+        return PartitionedIr(self._layout, prepared, energies)
+
+    def _energies_of(self, samples: FloatArray, like: PartitionedIr | None, same_from: int) -> tuple[float, ...]:
+        """The energies from the start of each stage on, of which `like` has those of the stages that are reused."""
+        starts = self._starts
+        own = len(starts) if like is None else bisect_left(starts, same_from)
+        energies = [] if like is None else list(like.energies[own:])
+        after = energies[0] if energies else 0.0
+        ends = [*starts, samples.shape[1]]
+        for number in reversed(range(own)):
+            after += _energy(samples[:, starts[number] : ends[number + 1]])
+            energies.insert(0, after)
+        return tuple(energies)
 
     @property
     def preparation(self) -> Hashable:
         """A key that is equal for convolvers which prepare IRs in the same way and may share them."""
-        return self._layout, self._tail_start
+        return self._layout
 
     def set_ir(self, source: int, ir: npt.NDArray[np.floating] | PartitionedIr) -> None:
         """Set the IR of a source: at once before the source's first block, by a crossfade from the next block on after
@@ -175,50 +191,57 @@ class Convolver:
         else:
             self._retire(previous)
         self._irs[source] = prepared
-        self._tail_energy[source] = prepared.tail_energy
+        self._energies[:, source] = prepared.energies
         self._engine.want(source, prepared.filters)
-        if self._shares_tail and self._switches_tail:
-            self._engine.want_own_tail(source, self._silence)
-        if self._has_shared_tail:
-            self._choose_tail()
+        if self._has_shared:
+            self._choose_shared()
 
-    def share_tail(self, is_shared: bool) -> None:
-        """Make all sources share one tail, or give each its own. Only for a convolver made with `switches_tail`;
-        without effect if its IRs are too short for a tail."""
-        if not self._switches_tail or is_shared == self._shares_tail:
-            return
-        self._shares_tail = is_shared
-        for source, ir in enumerate(self._irs):
-            if ir is not None:
-                self._engine.want_own_tail(source, self._silence if is_shared else ir.filters)
-        self._choose_tail()
+    def share(self, sharing: Sharing) -> None:
+        """Make all sources share as much as `sharing` says. From the next block on, inputs go to other stages; what
+        they have taken in before rings out. Only for a convolver made with `switches_tail`; without effect if its IRs
+        are too short."""
+        if self._switches and sharing is not self._sharing:
+            self._sharing = sharing
+            self._choose_shared()
+
+    @property
+    def early_samples(self) -> int:
+        """The samples of an IR that no sources share, however much is shared: those of the first stage."""
+        return self._partitioning.stages[0].end
+
+    @property
+    def _first_shared(self) -> int:
+        """The number of the first stage that is shared now; the number of stages if none is."""
+        stages = len(self._starts)
+        return {Sharing.NOTHING: stages, Sharing.TAIL: stages - 1, Sharing.REVERBERATION: 1}[self._sharing]
 
     def _retire(self, ir: PartitionedIr) -> None:
         self._retired.append((self._engine.blocks + self._retires_after, ir))
 
-    def _choose_tail(self) -> None:
-        """Choose the shared tail and the level at which each source feeds it; the level of a new source applies at
-        once.
+    def _choose_shared(self) -> None:
+        """Choose whose response is shared, and the level at which each source feeds it; the level of a new source
+        applies at once.
 
-        The choice depends on the IRs of the next block and on the tail of the last block, but not on IRs that were set
-        and replaced in between, because an offline render never sees those.
+        The choice depends on the IRs of the next block and on what was shared in the last block, but not on IRs that
+        were set and replaced in between, because an offline render never sees those.
         """
-        if self._tail_chosen_at != self._engine.blocks:
-            self._tail_chosen_at, self._tail_before = self._engine.blocks, self._tail
-        ir = next((ir for ir in self._irs if ir is not None and ir.tail_energy > 0), None)
-        if ir is not None:
-            tail = _Tail(ir, ir.filters if self._shares_tail else self._silence)
-        elif self._shares_tail or self._tail_before is _NO_TAIL:
-            tail = self._tail_before  # no source feeds this tail any more: it rings out
-        else:
-            tail = _Tail(self._tail_before.ir, self._silence)
-        if self._tail.ir is not None and self._tail.ir is not tail.ir:
-            self._retire(self._tail.ir)
-        self._tail = tail
-        self._engine.want_tail(tail.filters)
-        self._engine.tail_gain[1] = 0.0 if ir is None else np.sqrt(self._tail_energy / ir.tail_energy)
+        if self._shared_chosen_at != self._engine.blocks:
+            self._shared_chosen_at, self._shared_before = self._engine.blocks, self._shared
+        first = self._first_shared
+        energies = self._energies[min(first, len(self._starts) - 1)]
+        at = int(np.argmax(energies > 0))
+        # Where no source feeds it any more, it rings out.
+        shared = self._irs[at] if energies[at] > 0 else self._shared_before
+        if self._shared is not None and self._shared is not shared:
+            self._retire(self._shared)
+        self._shared = shared
+        if shared is not None:
+            self._engine.want_shared(shared.filters)
+        gains = np.sqrt(energies / energies[at]) if energies[at] > 0 else np.zeros(self.sources)
         newcomers = self._came_at == self._engine.blocks
-        self._engine.tail_gain[0, newcomers] = self._engine.tail_gain[1, newcomers]
+        for number in self._shareable:
+            is_shared = number >= first
+            self._engine.take_in(number, not is_shared, gains if is_shared else 0 * gains, newcomers)
 
     def process(self, blocks: FloatArray, out: FloatArray | None = None) -> FloatArray:
         """Convolve one block (sources, b) and return the mix (channels, b) of the same time span, in `out` or a new
@@ -259,19 +282,19 @@ class Convolver:
             return
         self._retire(ir)
         self._irs[source] = None
-        self._tail_energy[source] = 0
+        self._energies[:, source] = 0
         self._engine.clear(source)
-        if self._has_shared_tail:
-            self._choose_tail()
+        if self._has_shared:
+            self._choose_shared()
 
     def reset(self) -> None:
         """Forget everything, as if newly constructed."""
         self._engine.reset()
         self._irs = [None] * self.sources
-        self._tail_energy.fill(0)
+        self._energies.fill(0)
         self._retired.clear()
-        self._tail = self._tail_before = _NO_TAIL
-        self._tail_chosen_at = -1
+        self._shared = self._shared_before = None
+        self._shared_chosen_at = -1
         self._came_at.fill(-1)
 
 

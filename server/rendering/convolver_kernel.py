@@ -65,6 +65,9 @@ def process_convolver(address: int) -> None:
     convolver = carray(pointer(address), (1,), CONVOLVER)[0]
     stages = carray(pointer(convolver.stage), (convolver.stages,), STAGE)
     _write_input(convolver)
+    for number in range(1, convolver.stages):
+        if stages[number].gain != 0:
+            _take_in(convolver, stages[number])
     _head(convolver, stages[0])
     for number in range(1, convolver.stages):
         _tick(convolver, stages[number])
@@ -108,7 +111,6 @@ def _write_input(convolver) -> None:
     place = (convolver.blocks % convolver.history_blocks) * size
     silent = _ints(convolver.silent, convolver.sources)
     wanted = _ints(convolver.wanted, convolver.sources)
-    any_sounds = False
     for source in range(convolver.sources):
         samples = _floats(convolver.input + 4 * source * size, size)
         is_fed = False
@@ -117,36 +119,50 @@ def _write_input(convolver) -> None:
         silent[source] = 0 if is_fed else silent[source] + 1
         if wanted[source] == 0 or silent[source] >= convolver.quiet_blocks:
             continue
-        any_sounds = True
         history = convolver.history + 4 * (source * convolver.history_blocks * size + place)
         for n in range(0, size, 8):
             store(history, n, load(convolver.input, source * size + n))
-    if convolver.has_shared_tail:
-        _take_in_tail(convolver, place, any_sounds)
 
 
 @compiled
-def _take_in_tail(convolver, place, any_sounds) -> None:
-    size = convolver.block_size
-    tail_silent = _ints(convolver.tail_silent, 1)
-    tail_silent[0] = 0 if any_sounds else tail_silent[0] + 1
-    if tail_silent[0] >= convolver.quiet_blocks:
-        return
-    silent = _ints(convolver.silent, convolver.sources)
-    wanted = _ints(convolver.wanted, convolver.sources)
-    gains = _floats(convolver.tail_gain, 2 * convolver.sources)
-    history = convolver.tail_history + 4 * place
-    for n in range(0, size, 8):
-        store(history, n, broadcast(np.float32(0)))
+def _take_in(convolver, stage) -> None:
+    """Write the inputs of a stage with a history of its own, at their gains. What a stage no longer takes in rings out
+    in it; then it costs nothing."""
+    size, span = convolver.block_size, convolver.history_blocks * convolver.block_size
+    place = (convolver.blocks % convolver.history_blocks) * size
+    heard, wanted = _ints(convolver.silent, convolver.sources), _ints(convolver.wanted, convolver.sources)
+    silent = _ints(stage.silent, stage.sources)
+    gains = _floats(stage.gain, 2 * convolver.sources)
+    is_fed = False
     for source in range(convolver.sources):
-        if wanted[source] == 0 or silent[source] >= convolver.quiet_blocks:
-            continue
-        start = broadcast(gains[source])
-        change = broadcast(gains[convolver.sources + source] - gains[source])
-        for n in range(0, size, 8):
-            gain = multiply_add(change, load(convolver.fade_in, n), start)
-            store(history, n, multiply_add(gain, load(convolver.input, source * size + n), load(history, n)))
-        gains[source] = gains[convolver.sources + source]
+        before, after = gains[source], gains[convolver.sources + source]
+        is_heard = wanted[source] != 0 and heard[source] < convolver.quiet_blocks and (before != 0 or after != 0)
+        history = stage.history + 4 * place
+        if stage.is_mix:
+            if is_heard and not is_fed:
+                _clear_block(history, size)
+            is_fed |= is_heard
+        else:
+            history += 4 * source * span
+            silent[source] = 0 if is_heard and heard[source] == 0 else silent[source] + 1
+            if silent[source] < convolver.quiet_blocks:
+                _clear_block(history, size)
+        if is_heard:
+            start, change = broadcast(before), broadcast(after - before)
+            for n in range(0, size, 8):
+                gain = multiply_add(change, load(convolver.fade_in, n), start)
+                store(history, n, multiply_add(gain, load(convolver.input, source * size + n), load(history, n)))
+            gains[source] = after
+    if stage.is_mix:
+        silent[0] = 0 if is_fed else silent[0] + 1
+        if not is_fed and silent[0] < convolver.quiet_blocks:
+            _clear_block(stage.history + 4 * place, size)
+
+
+@compiled
+def _clear_block(address, size) -> None:
+    for n in range(0, size, 8):
+        store(address, n, broadcast(np.float32(0)))
 
 
 @compiled

@@ -13,6 +13,10 @@ STAGE = np.dtype(
             "partitions",
             "sources",
             "history",  # (source, history_blocks * block_size) float32
+            # (2, source of the convolver) float32: gains in effect, and wanted gains, at which inputs are taken into a
+            # history of the stage's own; 0 if it reads the history of the convolver
+            "gain",
+            "is_mix",  # whether that history is one mix of all inputs
             "twist",
             "passes",
             "lanes",
@@ -74,10 +78,6 @@ CONVOLVER = np.dtype(
             "silent",
             "exchanged",  # (source,) int64: whether the head exchanged the source's IR in this block
             "scratch",  # (3, size of the largest stage) float32
-            "has_shared_tail",
-            "tail_history",
-            "tail_silent",
-            "tail_gain",  # (2, source) float32: gains in effect, and wanted gains
             "fade_in",  # (block_size,) float32
         )
     ]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import Quaternion
 from server.rendering.bus import Bus
-from server.rendering.convolver import Convolver, PartitionedIr
+from server.rendering.convolver import Convolver, PartitionedIr, Sharing
 from server.rendering.direct_path import DirectPath
 from server.rendering.mixing import Mixer
 
@@ -52,7 +52,7 @@ class MixerSet:
     def clear(self) -> None:
         """Drop all mixers and all sound in them."""
         self._mixers: dict[int, Mixer] = {}
-        self._shares_tail = False
+        self._sharing = Sharing.NOTHING
         self._orientation: Quaternion | None = None
         self._leaving: list[Slot] = []  # they ramp down in the next block
         self._ringing: list[Slot] = []  # they have ramped down and ring out
@@ -103,16 +103,16 @@ class MixerSet:
         """The convolver of a mixer; made and connected now if there is none yet."""
         if mixer.convolver is None:
             convolver = self._spare_convolvers.pop(mixer.channels, None) or self._new_convolver(mixer.channels)
-            convolver.share_tail(self._shares_tail)
+            convolver.share(self._sharing)
             mixer.connect(convolver)
             return convolver
         return mixer.convolver
 
-    def share_tail(self, is_shared: bool) -> None:
-        self._shares_tail = is_shared
+    def share(self, sharing: Sharing) -> None:
+        self._sharing = sharing
         for mixer in self:
             if mixer.convolver is not None:
-                mixer.convolver.share_tail(is_shared)
+                mixer.convolver.share(sharing)
 
     def set_orientation(self, orientation: Quaternion) -> None:
         if orientation != self._orientation:

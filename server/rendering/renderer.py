@@ -34,7 +34,7 @@ from server.acoustics.geometry import Quaternion
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.errors import NafirError
 from server.rendering.bus import Bus
-from server.rendering.convolver import Convolver, FloatArray, PartitionedIr
+from server.rendering.convolver import Convolver, FloatArray, PartitionedIr, Sharing
 from server.rendering.direct_path import DirectPath, PathTarget
 from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import HeadFilters
@@ -84,8 +84,8 @@ class Renderer:
     output exceeds it (`server.rendering.limiter`). `has_head` says whether to begin with a head. Raises ValueError for
     a `block_size` that is not one of `BLOCK_SIZES`.
 
-    Only one thread at a time may use it, except `prepare` and `prepare_hearing`, which one other thread may call
-    meanwhile.
+    Only one thread at a time may use it, except `prepare`, `early_samples` and `prepare_hearing`, which one other
+    thread may call meanwhile.
     """
 
     def __init__(
@@ -216,6 +216,12 @@ class Renderer:
             same_from = max(0, same_from - decoder.delay)
         return self._mixers.prepare(ir, like=like, same_from=same_from)
 
+    def early_samples(self, channels: int) -> int:
+        """The samples of an IR of so many channels that emitters never share. The rest of an IR may be kept when they
+        are exchanged: prepare them with the whole IR as `like`, and this as `same_from`."""
+        decoder = self._decoders.get(channels)
+        return self._mixers.preparer(channels).early_samples + (0 if decoder is None else decoder.delay)
+
     @property
     def preparation(self) -> Hashable:
         """A key that is equal for renderers which prepare IRs of two ears in the same way and may share them."""
@@ -320,9 +326,10 @@ class Renderer:
             self._mixers.hush(emitter.mixer, emitter.slot)
         self._changed.append(emitter)
 
-    def share_tail(self, is_shared: bool) -> None:
-        """Make all emitters share one late tail, or give each its own. Only for a renderer that switches tails."""
-        self._mixers.share_tail(is_shared)
+    def share(self, sharing: Sharing) -> None:
+        """Make all emitters share as much of their responses as `sharing` says. Only for a renderer that switches
+        tails."""
+        self._mixers.share(sharing)
 
     def set_path(self, emitter_id: str, target: PathTarget) -> None:
         """Set the path of an emitter's direct sound from the next block on. Raises UnknownEmitterError."""

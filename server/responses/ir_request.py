@@ -21,11 +21,13 @@ from server.responses.node_reflections import add_first_reflections
 @dataclass(frozen=True)
 class AskedIr:
     """A requested response for one emitter, in the `state` that it had then. `serial` tells the emitter from others
-    with the same id, and `identity` the response from others where poses share responses."""
+    with the same id, and `identity` the response from others where poses share responses. If `like` is given, only the
+    early part is computed, and the rest is that of `like`."""
 
     serial: int
     state: EmitterState
     identity: Hashable | None = None
+    like: PartitionedIr | None = None
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,20 @@ def compute_irs(levels: FieldsByLevel, request: IrRequest, renderer: Renderer) -
         early = direct.early_reflections
         kept = prepared_irs(field, levels.node_cache, early, renderer, request.listener, emitters)
         return IrResponse(request, kept)
-    irs = composed_irs(field, direct, request.listener, emitters, request.channels, remember=True)
-    return IrResponse(request, tuple(renderer.prepare(ir if is_whole else _without_end(ir)) for ir in irs))
+    prepared: dict[int, PartitionedIr] = {}
+    for is_early in (False, True):
+        rows = [row for row, asked in enumerate(request.asked) if (asked.like is not None) == is_early]
+        if not rows:
+            continue
+        samples = renderer.early_samples(request.channels) if is_early else None
+        some = [emitters[row] for row in rows]
+        irs = composed_irs(field, direct, request.listener, some, request.channels, remember=True, samples=samples)
+        for row, ir in zip(rows, irs, strict=True):
+            if samples is not None:
+                prepared[row] = renderer.prepare(ir, like=request.asked[row].like, same_from=samples)
+            else:
+                prepared[row] = renderer.prepare(ir if is_whole else _without_end(ir))
+    return IrResponse(request, tuple(prepared[row] for row in range(len(emitters))))
 
 
 def composed_irs(
@@ -76,12 +90,14 @@ def composed_irs(
     channels: int = 2,
     *,
     remember: bool = False,
+    samples: int | None = None,
 ) -> npt.NDArray[np.float32]:
     """Return responses (B, channel, sample) with the parts that the emitters' effects call for. The field computes only
-    those of emitters with `late` on. `remember` is as in `AcousticField.impulse_responses`."""
+    those of emitters with `late` on. `remember` is as in `AcousticField.impulse_responses`. With `samples`, only so
+    many of each response are computed."""
     count = len(emitters)
     field, listener = direct.heard(field, channels), direct.axes_for(listener, channels)
-    held = _held(field, direct, listener, emitters, remember=remember)
+    held = _held(field, direct, listener, emitters, remember=remember, samples=samples)
     if direct.binauralization is not None:
         places = [emitter.pose.position for emitter in emitters]
         return direct.binauralization.binauralize(held, listener, places) if channels == 2 else held
@@ -103,23 +119,32 @@ def composed_irs(
 
 
 def _held(
-    field: AcousticField, direct: DirectSound, listener: Pose, emitters: Sequence[EmitterState], *, remember: bool
+    field: AcousticField,
+    direct: DirectSound,
+    listener: Pose,
+    emitters: Sequence[EmitterState],
+    *,
+    remember: bool,
+    samples: int | None,
 ) -> npt.NDArray[np.float32]:
     """Return the field's responses (B, channel, sample) in an array of their own; zeros for emitters with `late`
     off."""
     late = [row for row, emitter in enumerate(emitters) if emitter.effects.late]
-    channels = field.channels
+    shape = len(emitters), field.channels, field.ir_samples if samples is None else samples
     if not late:
-        return np.zeros((len(emitters), channels, field.ir_samples), np.float32)
+        return np.zeros(shape, np.float32)
     ears = np.tile(np.asarray(listener.position), (len(late), 1))
     places = np.array([emitters[row].pose.position for row in late])
     heads = np.tile(np.asarray(listener.orientation), (len(late), 1))
-    answer = field.impulse_responses(ears, places, heads, remember=remember)
+    if samples is None:
+        answer = field.impulse_responses(ears, places, heads, remember=remember)
+    else:
+        answer = field.first_samples(ears, places, heads, samples)
     if direct.field_gain != 1.0:
         answer *= np.float32(direct.field_gain)
     if len(late) == len(emitters):
         return answer
-    held = np.zeros((len(emitters), channels, field.ir_samples), np.float32)
+    held = np.zeros(shape, np.float32)
     held[late] = answer
     return held
 

@@ -12,7 +12,7 @@ from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.planning.catalogue import ENERGY_EFFECTS, emitter_effects
 from server.planning.planned_effects import PlannedEffects
-from server.rendering.convolver import PartitionedIr
+from server.rendering.convolver import PartitionedIr, Sharing
 from server.rendering.renderer import Renderer
 from server.responses.effect_flags import EmitterEffects, SharedEffects
 from server.responses.emitter_state import EmitterState
@@ -118,10 +118,12 @@ class ActiveEffects:
         whole = emitter_effects(told | {EffectName.PROPAGATION_DELAY})
         return whole, self.planned.output == "headphones" and EffectName.HRTF not in off
 
-    def share_tail(self, is_shared: bool, emitters: Mapping[str, StreamedEmitter]) -> None:
-        """Make emitters share one late tail, if the quality level does or the plan finds no audible difference."""
+    def share(self, sharing: Sharing, emitters: Mapping[str, StreamedEmitter]) -> None:
+        """Make emitters share what the quality calls for, and at least a late tail if the plan finds no audible
+        difference."""
         several = sum(emitter.effects.late for emitter in emitters.values()) > 1
-        self._renderer.share_tail(is_shared or (several and not self.shared.own_tails))
+        planned = Sharing.TAIL if several and not self.shared.own_tails else Sharing.NOTHING
+        self._renderer.share(max(sharing, planned))
 
     def as_asked(self, emitter: StreamedEmitter) -> EmitterState:
         """Return the state to request an IR for. The direct sound is baked only once there is an IR of the pose without

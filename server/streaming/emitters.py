@@ -1,12 +1,13 @@
 """A session's data of one emitter: its state, its source, the response that is playing, and which of them are out of
 date."""
 
+import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 
 from server.acoustics.directivity import OMNIDIRECTIONAL
-from server.acoustics.geometry import Pose
+from server.acoustics.geometry import Pose, Vector3
 from server.core.errors import RequestError
 from server.field.lattice import Neighbourhood
 from server.planning.catalogue import EVERYTHING
@@ -46,6 +47,25 @@ class HeardResponse:
     bakes_direct: bool = False
     """Whether the IR includes the direct sound."""
     validity: "Validity | None" = None
+    whole: "WholeResponse | None" = None
+    """The newest IR of which all parts were computed for one pose."""
+
+
+@dataclass(frozen=True)
+class WholeResponse:
+    """An IR computed for poses of listener and emitter, with the `circumstances` on which its later part depends."""
+
+    ir: PartitionedIr
+    listener: Pose
+    emitter: Vector3
+    circumstances: Hashable
+
+    def lasts(self, circumstances: Hashable, listener: Pose, emitter: Vector3, reach_m: float, turn_rad: float) -> bool:
+        """Whether its later part still serves these poses: they are at most `reach_m` away, listener and emitter
+        together, and the head is turned by at most `turn_rad`."""
+        moved_m = math.dist(self.listener.position, listener.position) + math.dist(self.emitter, emitter)
+        same = abs(sum(a * b for a, b in zip(self.listener.orientation, listener.orientation, strict=True)))
+        return self.circumstances == circumstances and moved_m <= reach_m and same >= math.cos(turn_rad / 2)
 
 
 @dataclass(frozen=True)
@@ -122,7 +142,7 @@ class StreamedEmitter:
 
     def discard_response(self) -> None:
         """Mark the IR as wrong for every position of the emitter."""
-        self.is_outdated, self.heard.identity = True, None
+        self.is_outdated, self.heard.identity, self.heard.whole = True, None, None
 
 
 @dataclass

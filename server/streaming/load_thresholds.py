@@ -22,6 +22,15 @@ class Thresholds:
     least_ir_rate_hz: float = 2.0
     """Responses per second and emitter on the lowest step: a walk is still followed."""
 
+    late_reach_m: float = 0.5
+    """Metres that listener and emitter may move, together, before the later part of a response is computed anew, on the
+    steps below the top: late sound in one room hardly differs within that."""
+    shared_reach_m: float = 1.0
+    """The same on the lowest step, where only the level of an emitter's late sound and one response for all of them
+    are used."""
+    late_turn_deg: float = 60.0
+    """Degrees that the head may turn before that: late sound comes from nearly everywhere."""
+
     full_busy: float = 0.85
     """Busy share from which on a thread has no time to spare, unless it can make some by rendering more blocks at once.
     The rest is what the event loop and the system take."""

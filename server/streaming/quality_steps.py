@@ -1,16 +1,19 @@
 """The quality steps that a stream can have under load, best first.
 
 A step is a quality level and a rate of impulse responses (IRs) per second. From the top there are first fewer IRs, then
-cheaper levels, then levels whose emitters share a tail. Costs are milliseconds per IR.
+cheaper levels, then levels whose emitters share a tail. Last, all emitters share their reverberation: what comes after
+the first stage of the convolver. Below the top, the later part of an IR is computed anew only when its emitter or the
+listener has moved some way. Costs are milliseconds per IR.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 from server.core.errors import RequestError
 from server.field.kinds.catalogue import kind_of
 from server.protocol.client_messages import AUTO
+from server.rendering.convolver import Sharing
 from server.scene.manifest import QualityLevel
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 
@@ -18,17 +21,19 @@ from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 @dataclass(frozen=True)
 class QualityStep:
     """IRs of `level`, which cost `cost_ms` each: at most `ir_rate_hz` per second for each emitter; if None, one per
-    pose."""
+    pose. Their later parts are kept while listener and emitter stay within `late_reach_m` metres; with 0 they are
+    always computed."""
 
     level: str
     ir_rate_hz: float | None
-    shared_tail: bool
+    sharing: Sharing
     cost_ms: float
+    late_reach_m: float = 0.0
 
     @classmethod
     def full(cls, level: QualityLevel, cost_ms: float) -> Self:
         """Return the step of a level at the full rate."""
-        return cls(level.name, level.ir_rate_hz, level.shared_tail, cost_ms)
+        return cls(level.name, level.ir_rate_hz, kind_of(level).sharing, cost_ms)
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,7 @@ class Offer:
             if level is None:
                 known = ", ".join(sorted(level.name for level in self.levels))
                 raise RequestError("unknown_level", f"{choice!r} is none of {AUTO}, {known}", field="level")
-            return (*self._slower(level), self._step(level, least_hz))
+            return (*self._slower(level), self._step(level, least_hz), self._least(level))
         levels = [level for level in self.levels if level.bus is None] or self.levels
         fitting = [level for level in levels if self.ms_here[level.name] <= 1000 * block_s] or levels[:1]
         # The most expensive level is the best, but levels that share a tail come last.
@@ -59,7 +64,8 @@ class Offer:
         # A level that reuses responses has fewer of them to compute, however often they are requested.
         often_hz, *_, seldom_hz = self.thresholds.ir_rates_hz
         down = [self._step(level, often_hz if kind_of(level).reuses_responses else seldom_hz) for level in cheaper]
-        return (*self._slower(best), *down, self._step((best, *cheaper)[-1], least_hz))
+        last = (best, *cheaper)[-1]
+        return (*self._slower(best), *down, self._step(last, least_hz), self._least(last))
 
     def _slower(self, level: QualityLevel) -> tuple[QualityStep, ...]:
         own = level.ir_rate_hz
@@ -68,4 +74,11 @@ class Offer:
 
     def _step(self, level: QualityLevel, most_hz: float) -> QualityStep:
         rate_hz = most_hz if level.ir_rate_hz is None else min(most_hz, level.ir_rate_hz)
-        return QualityStep(level.name, rate_hz, level.shared_tail, self.ms_here[level.name])
+        reach_m = self.thresholds.late_reach_m
+        return QualityStep(level.name, rate_hz, kind_of(level).sharing, self.ms_here[level.name], reach_m)
+
+    def _least(self, level: QualityLevel) -> QualityStep:
+        """Return the cheapest step. With shared reverberation, little of an IR is computed, and so it may be asked for
+        more often again."""
+        step = self._step(level, min(self.thresholds.ir_rates_hz))
+        return replace(step, sharing=Sharing.REVERBERATION, late_reach_m=self.thresholds.shared_reach_m)

@@ -6,6 +6,7 @@ the newest poses. They come back through `accept`, or through `give_up` if the c
 another level takes effect when its IRs have arrived. Clocks are in samples.
 """
 
+import math
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -14,12 +15,15 @@ from server.acoustics.geometry import Pose
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.server_messages import EmitterAdded, Error, LevelChanged, LevelReason, ServerMessage
+from server.rendering.convolver import PartitionedIr, Sharing
 from server.rendering.renderer import Renderer
 from server.responses.direct_sound import DirectSound
+from server.responses.emitter_state import EmitterState
 from server.responses.ir_cache import Shared, shared_response
 from server.responses.ir_request import AskedIr, IrRequest, IrResponse
 from server.streaming.active_effects import ActiveEffects
-from server.streaming.emitters import StreamedEmitter, Validity
+from server.streaming.emitters import StreamedEmitter, Validity, WholeResponse
+from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.quality_steps import QualityStep
 
 
@@ -85,7 +89,7 @@ class ResponseScheduler:
         self._interval_s = 0.0
         self._next_request_clock = 0
         effects.bus = levels[quality.level].level.bus
-        renderer.share_tail(quality.shared_tail)
+        renderer.share(quality.sharing)
 
     @property
     def are_awaited(self) -> bool:
@@ -118,13 +122,13 @@ class ResponseScheduler:
         if self._wanted == self.heard:
             return []
         self.heard = self._wanted
-        self._effects.share_tail(self.heard.shared_tail, self._emitters)
+        self._effects.share(self.heard.sharing, self._emitters)
         return [
             LevelChanged(
                 level=self.heard.level,
                 reason=self._reason,
                 ir_rate_hz=self.heard.ir_rate_hz,
-                shared_tail=self.heard.shared_tail,
+                shared_tail=self.heard.sharing is not Sharing.NOTHING,
                 sample_clock=self._renderer.sample_clock,
             )
         ]
@@ -160,7 +164,7 @@ class ResponseScheduler:
     def enforce_plan(self) -> list[ServerMessage]:
         """Put the plan of effects into effect, from the next block on."""
         events = self._announce(self._effects.enforce(self._emitters))
-        self._effects.share_tail(self.heard.shared_tail, self._emitters)
+        self._effects.share(self.heard.sharing, self._emitters)
         self._look_again()
         return events + self.change_quality_unheard()
 
@@ -198,7 +202,7 @@ class ResponseScheduler:
         for emitter in emitters:
             emitter.is_outdated = False
         asked = tuple(
-            AskedIr(emitter.serial, state, self._identity(emitter, listener))
+            AskedIr(emitter.serial, state, self._identity(emitter, listener), self._like(emitter, state, listener))
             for emitter, state in zip(emitters, states, strict=True)
         )
         return IrRequest(
@@ -210,6 +214,23 @@ class ResponseScheduler:
             self._effects.channels,
             is_first=is_first,
         )
+
+    def _like(self, emitter: StreamedEmitter, state: EmitterState, listener: Pose) -> PartitionedIr | None:
+        """The IR whose later part an emitter's next one keeps; None if all of it has to be computed."""
+        whole, reach_m = emitter.heard.whole, self._wanted.late_reach_m
+        can_keep = reach_m > 0 and not (
+            state.effects.bakes_direct or self._levels[self._wanted.level].kind.reuses_responses
+        )
+        if whole is None or not can_keep:
+            return None
+        circumstances = self._circumstances(self._wanted.level, state, self._effects.channels)
+        turn_rad = math.radians(THRESHOLDS.late_turn_deg)
+        return whole.ir if whole.lasts(circumstances, listener, state.position, reach_m, turn_rad) else None
+
+    @staticmethod
+    def _circumstances(level: str, state: EmitterState, channels: int) -> Hashable:
+        """On what else but poses the later part of an IR depends."""
+        return level, state.effects, state.directivity, channels
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer to the last request into effect, from the next block on."""
@@ -227,6 +248,10 @@ class ResponseScheduler:
             if emitter.serial not in arrived:
                 continue
             ir, asked = arrived[emitter.serial]
+            if asked.like is None:
+                circumstances = self._circumstances(response.request.level, asked.state, response.request.channels)
+                where = response.request.listener, asked.state.position
+                emitter.heard.whole = WholeResponse(ir, *where, circumstances)
             if self._effects.accept_ir(identifier, emitter, ir, asked.state.effects, pose_id):
                 emitter.heard.identity = asked.identity
                 events += self._announce([identifier])

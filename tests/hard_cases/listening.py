@@ -11,6 +11,7 @@ from scipy.signal import fftconvolve
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
 from server.protocol.server_messages import Error
+from server.rendering.convolver import Sharing
 from server.rendering.direct_path import PathTarget
 from server.rendering.ingest import DryAudio
 from server.rendering.renderer import Renderer
@@ -100,7 +101,7 @@ def not_finite(samples):
     return int(samples.size - np.count_nonzero(np.isfinite(samples)))
 
 
-FULL = QualityStep("standard", None, False, 1.0)
+FULL = QualityStep("standard", None, Sharing.NOTHING, 1.0)
 CLIP = 0.005 * noise(3, 3_000)
 
 

@@ -20,6 +20,7 @@ from server.protocol.client_messages import (
     SetEffects,
     parse_client_message,
 )
+from server.rendering.convolver import Sharing
 from server.rendering.limiter import CEILING
 from server.responses.ambisonic_response import AmbisonicResponse
 from server.responses.direct_sound import DirectSound
@@ -34,7 +35,7 @@ from tests.signals import error_db
 HERE, THERE = (2.0, 2.5, 1.5), (6.0, 3.0, 1.4)
 CLIP = 0.005 * np.random.default_rng(3).standard_normal(2_000).astype(np.float32)  # no limiter acts
 UP = Quaternion(0.0, -0.5, 0.0, np.sqrt(0.75))
-QUALITY = QualityStep("standard", None, False, 1.0)
+QUALITY = QualityStep("standard", None, Sharing.NOTHING, 1.0)
 ORDERS = pytest.mark.parametrize("order", [1, 2, 3])
 
 

@@ -10,6 +10,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, planned_effects, render
 from server.planning.places import place_of_field
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, SetEffects
+from server.rendering.convolver import Sharing
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle
@@ -24,7 +25,7 @@ HERE, THERE = (2.0, 2.5, 1.5), (6.0, 3.0, 1.4)
 RATE = 24_000
 NOISE = 0.005 * np.random.default_rng(3).standard_normal(6 * RATE).astype(np.float32)  # no limiter acts
 ON_ITS_SIDE = Quaternion(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
-EARS, BUS = (QualityStep(name, None, False, 1.0) for name in ("standard", "by-bus"))
+EARS, BUS = (QualityStep(name, None, Sharing.NOTHING, 1.0) for name in ("standard", "by-bus"))
 ALL_OFF = {"direct_path": False}
 
 

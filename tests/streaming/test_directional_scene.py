@@ -8,6 +8,7 @@ from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, render
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose
+from server.rendering.convolver import Sharing
 from server.responses.direct_sound import DirectSound
 from server.responses.emitter_state import EmitterState
 from server.responses.ir_request import composed_irs, compute_irs
@@ -30,7 +31,7 @@ def field(request, tmp_path) -> AcousticField:
 @pytest.fixture
 def session(field, filters) -> Session:
     hello = Hello(protocol=PROTOCOL, scene="flat")
-    quality = QualityStep("standard", None, False, 1.0)
+    quality = QualityStep("standard", None, Sharing.NOTHING, 1.0)
     return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, quality=quality, window=1_000)
 
 

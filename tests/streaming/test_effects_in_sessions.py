@@ -23,7 +23,7 @@ from server.protocol.client_messages import (
     SetEffects,
 )
 from server.protocol.server_messages import EmitterAdded, Error, PlanChanged
-from server.rendering.convolver import Convolver
+from server.rendering.convolver import Convolver, Sharing
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import composed_irs, compute_irs
 from server.scene.bundle import Bundle, find_bundle
@@ -61,7 +61,7 @@ class Stage:
             self.levels,
             filters,
             lambda _: self.clip,
-            quality=QualityStep(field.level.name, None, False, 1.0),
+            quality=QualityStep(field.level.name, None, Sharing.NOTHING, 1.0),
             window=1_000_000,
             place=place,
         )

@@ -9,6 +9,7 @@ from server.field.kinds.catalogue import kind_of
 from server.planning.places import place_of_field
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, RemoveEmitter, SetEffects
 from server.protocol.server_messages import EmitterAdded, LevelChanged
+from server.rendering.convolver import Sharing
 from server.responses.ir_request import compute_irs
 from server.scene.manifest import QualityLevel
 from server.streaming.quality_steps import QualityStep
@@ -18,7 +19,7 @@ RATE, BLOCK = 24_000, 256
 HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 HELLO = Hello(protocol=PROTOCOL, scene="flat")
 CLIP = 0.005 * np.random.default_rng(3).standard_normal(3_000).astype(np.float32)  # no limiter acts
-GOOD, FAST = QualityStep("good", None, False, 2.0), QualityStep("fast", None, False, 1.0)
+GOOD, FAST = QualityStep("good", None, Sharing.NOTHING, 2.0), QualityStep("fast", None, Sharing.NOTHING, 1.0)
 
 
 class Room:
@@ -106,7 +107,7 @@ def test_levels_that_switch_while_a_tone_sounds_do_not_splatter(open_session, le
     hear(session, 60)
     heard, events = [], []
     for number in range(16):
-        to = QualityStep("fast", None, True, 1.0) if number % 2 == 0 else GOOD
+        to = QualityStep("fast", None, Sharing.TAIL, 1.0) if number % 2 == 0 else GOOD
         events += session.set_quality(to, "chosen")
         heard.append(hear(session, 2))  # the IRs take a while
         events += answer(session, levels)
@@ -122,7 +123,7 @@ def test_a_rate_alone_changes_at_once(open_session, levels):
     session = open_session()
     add(session)
     answer(session, levels)
-    slower = QualityStep("good", 5.0, False, 2.0)
+    slower = QualityStep("good", 5.0, Sharing.NOTHING, 2.0)
     (event,) = session.set_quality(slower, "load")
     assert (event.level, event.reason, event.ir_rate_hz) == ("good", "load", 5.0)
     assert session.take_request() is None  # nothing it has is out of date

@@ -17,6 +17,7 @@ from server.planning.places import place_of_field
 from server.planning.planner import make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Situation
 from server.protocol.client_messages import PROTOCOL, AddEmitter, DirectivityPattern, Hello, ListenerPose
+from server.rendering.convolver import Sharing
 from server.rendering.hrtf import HeadFilters
 from server.rendering.sphere import fill_gaps, triangulate
 from server.responses.binaural import DIRECT_S, Binauralization
@@ -137,7 +138,7 @@ def test_sound_from_everywhere_keeps_its_energy(filters):
 @pytest.fixture
 def session(field, filters):
     hello = Hello(protocol=PROTOCOL, scene="measured")
-    quality = QualityStep("standard", None, False, 1.0)
+    quality = QualityStep("standard", None, Sharing.NOTHING, 1.0)
     return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, quality=quality, window=1_000)
 
 

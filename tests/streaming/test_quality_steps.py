@@ -6,6 +6,7 @@ import pytest
 
 from server.core.errors import RequestError
 from server.protocol.client_messages import AUTO
+from server.rendering.convolver import Sharing
 from server.scene.manifest import QualityLevel, Reuse
 from server.streaming.quality_steps import Offer, QualityStep
 
@@ -19,7 +20,7 @@ def offer(**ms_here):
 
 def test_auto_begins_with_the_best_level_whose_response_fits_into_a_block():
     steps = offer(fast=0.5, good=4.0, best=9.0, exact=700.0).steps(AUTO, block_s=BLOCK_S)
-    assert steps[0] == QualityStep("best", None, False, 9.0)
+    assert steps[0] == QualityStep("best", None, Sharing.NOTHING, 9.0)
     assert [level for level, _ in itertools.groupby(step.level for step in steps)] == ["best", "good", "fast"]
     assert offer(fast=0.5, good=4.0).steps(AUTO, block_s=0.003)[0].level == "fast"
     assert {step.level for step in offer(slow=50.0, slower=60.0).steps(AUTO, block_s=BLOCK_S)} == {"slow"}
@@ -32,7 +33,7 @@ def test_down_a_ladder_come_fewer_responses_then_cheaper_levels_then_a_shared_ta
         QualityLevel(name="good", field="any", ir_rate_hz=20.0),
     )
     steps = Offer(levels, {"shared": 0.3, "fast": 0.4, "good": 4.0}).steps(AUTO, block_s=BLOCK_S)
-    assert [(step.level, step.ir_rate_hz, step.shared_tail) for step in steps] == [
+    assert [(step.level, step.ir_rate_hz, step.sharing) for step in steps] == [
         ("good", 20.0, False),
         ("good", 12.0, False),
         ("good", 5.0, False),

@@ -6,6 +6,7 @@ import pytest
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, MoveEmitter, RemoveEmitter
 from server.protocol.server_messages import EmitterAdded, EmitterRemoved, Error
+from server.rendering.convolver import Sharing
 from server.responses.ir_request import compute_irs
 from server.streaming.quality_steps import QualityStep
 from server.streaming.response_scheduler import Scope
@@ -17,7 +18,7 @@ HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 
 @pytest.fixture
 def session(field, filters):
-    hello, quality = Hello(protocol=PROTOCOL, scene="flat"), QualityStep("standard", None, False, 1.0)
+    hello, quality = Hello(protocol=PROTOCOL, scene="flat"), QualityStep("standard", None, Sharing.NOTHING, 1.0)
     return Session(hello, FieldsByLevel([field]), filters, lambda _: CLIP, quality=quality, window=1_000)
 
 

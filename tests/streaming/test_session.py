@@ -25,6 +25,7 @@ from server.protocol.client_messages import (
     SetGain,
 )
 from server.protocol.server_messages import EmitterAdded, Error
+from server.rendering.convolver import Sharing
 from server.responses.full_response import FullResponse
 from server.responses.ir_request import compute_irs
 from server.streaming.quality_steps import QualityStep
@@ -33,7 +34,7 @@ from server.streaming.session import Session
 # Quiet enough that no limiter acts.
 CLIP = 0.005 * np.random.default_rng(3).standard_normal(3_000).astype(np.float32)
 HELLO = Hello(protocol=PROTOCOL, scene="flat")
-FULL = QualityStep("standard", None, False, 1.0)
+FULL = QualityStep("standard", None, Sharing.NOTHING, 1.0)
 HERE, THERE = (2.0, 2.0, 1.5), (6.0, 3.0, 1.5)
 
 
@@ -381,4 +382,4 @@ def test_a_shared_tail_is_the_operators_choice(field, filters):
     hello = Hello(protocol=PROTOCOL, scene="flat")
     for wanted in (False, True):
         session = Session(hello, FieldsByLevel([field]), filters, load_clip, quality=FULL, shared_tail=wanted)
-        assert session.renderer._mixers.preparer(2)._has_shared_tail is wanted
+        assert session.renderer._mixers.preparer(2)._sharing is (Sharing.TAIL if wanted else Sharing.NOTHING)

@@ -156,7 +156,7 @@ def _at_rest(field: AcousticField, filters: HeadFilters) -> Renderer:
         buses=[] if bus is None else [bus],
     )
     renderer.set_channels(channels)
-    renderer.share_tail(field.kind.shares_tail)
+    renderer.share(field.kind.sharing)
     emitter, listener = EmitterState(Pose(start.emitter)), Pose(start.listener)
     (response,) = composed_irs(field, direct_sound, listener, [emitter], channels)
     clip = np.random.default_rng(0).standard_normal(field.sample_rate).astype(np.float32)

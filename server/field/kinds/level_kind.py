@@ -7,6 +7,7 @@ from typing import ClassVar
 from server.acoustics.sound_path import SoundPathFinder
 from server.field.node_responses import NodeCache
 from server.field.response_source import Compute, ResponseSource
+from server.rendering.convolver import Sharing
 from server.scene.bundle import Bundle
 from server.scene.manifest import QualityLevel
 
@@ -38,6 +39,11 @@ class LevelKind(ABC):
     def shares_tail(self) -> bool:
         """Whether all emitters of a listener share one late tail. Under load, such levels are used last."""
         return self.level.shared_tail
+
+    @property
+    def sharing(self) -> Sharing:
+        """What the emitters of a listener share."""
+        return Sharing.TAIL if self.shares_tail else Sharing.NOTHING
 
     def shares_whole_responses(self, *, has_reflections: bool) -> bool:
         """Whether poses share everything after the direct sound, in a scene that `has_reflections` from geometry."""
