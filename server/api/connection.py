@@ -448,9 +448,9 @@ class Connection:
         return None
 
     def _serialize(self, timed: TimedBlock, now_s: float) -> bytes:
-        block = timed.block
-        if not block.is_late and now_s > timed.deadline_s and self._stream is not None:
-            self._stream.blocks_late += 1
+        block, stream = timed.block, self._stream
+        if stream is not None and stream.note_sent(timed.deadline_s, now_s) and not block.is_late:
+            stream.blocks_late += 1
             block.is_late = True
         return block.serialize(self._encoding)
 

@@ -49,6 +49,8 @@ class HeardResponse:
     validity: "Validity | None" = None
     whole: "WholeResponse | None" = None
     """The newest IR of which all parts were computed for one pose."""
+    keeps_late: bool = False
+    """Whether only the early part of the IR was computed for its pose, and the rest is that of `whole`."""
 
 
 @dataclass(frozen=True)

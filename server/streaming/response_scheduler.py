@@ -108,6 +108,10 @@ class ResponseScheduler:
                 emitter.is_outdated = True
             self._look_again()
             self._next_request_clock = 0
+        if quality.late_reach_m < self._wanted.late_reach_m:
+            for emitter in self._emitters.values():
+                emitter.is_outdated |= emitter.heard.keeps_late
+            self._look_again()
         self._wanted, self._reason = quality, reason
         self._effects.bus = self._levels[quality.level].level.bus
         return self.change_quality() if quality.level == self.heard.level else self.change_quality_unheard()
@@ -230,7 +234,7 @@ class ResponseScheduler:
     @staticmethod
     def _circumstances(level: str, state: EmitterState, channels: int) -> Hashable:
         """On what else but poses the later part of an IR depends."""
-        return level, state.effects, state.directivity, channels
+        return level, state.effects.early, state.effects.late, state.directivity, channels
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer to the last request into effect, from the next block on."""
@@ -253,7 +257,7 @@ class ResponseScheduler:
                 where = response.request.listener, asked.state.position
                 emitter.heard.whole = WholeResponse(ir, *where, circumstances)
             if self._effects.accept_ir(identifier, emitter, ir, asked.state.effects, pose_id):
-                emitter.heard.identity = asked.identity
+                emitter.heard.identity, emitter.heard.keeps_late = asked.identity, asked.like is not None
                 events += self._announce([identifier])
         if not is_partial:
             self._accepted_pose_id = pose_id

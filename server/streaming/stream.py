@@ -123,6 +123,9 @@ class Stream:
         self.company = 1
         """The number of streams on the audio thread, including this one."""
         self._worst_lateness_s = 0.0
+        self._worst_sent_s = 0.0
+        """The longest time from a block's due time until it was sent, since the last measurement; the sender writes
+        it."""
         self._next_check_s: float | None = FIRST_S
         """Seconds of sound at which the next check of a plan is due; None during a check."""
         self._next_status_s = 1.0
@@ -245,8 +248,16 @@ class Stream:
 
     def sample_load(self, now_s: float) -> LoadSample:
         """Return the load of this stream since the last call."""
-        lateness, self._worst_lateness_s = self._worst_lateness_s / (self._lead * self.block_s), 0.0
+        lateness_s = max(self._worst_lateness_s, self._worst_sent_s)
+        self._worst_lateness_s = self._worst_sent_s = 0.0
+        lateness = lateness_s / (self._lead * self.block_s)
         return LoadSample(lateness, self._wait.take_longest_s(now_s), self._costs.request_s, self._costs.plan_s)
+
+    def note_sent(self, deadline_s: float, now_s: float) -> bool:
+        """Note that a block is sent now; return whether it is late. The sender calls this: a block that is ready in
+        time is of no use while the sender has no time."""
+        self._worst_sent_s = max(self._worst_sent_s, now_s - deadline_s + self._lead * self.block_s)
+        return now_s > deadline_s
 
     def follow_ladder(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
         """Set the session to the present step of the ladder, which has been moved."""
