@@ -13,9 +13,10 @@ its `.ctypes.data`.
 import math
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
@@ -44,6 +45,11 @@ _ROOT_HALF_BITS = 0x3F3504F3
 """The bits of the square root of 1/2."""
 _SMALLEST_NORMAL = 2.0**-126
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
+
+
+HAS_WIDE_REGISTERS: Final = bool(get_host_cpu_features().get("avx512f"))
+"""Whether a register holds sixteen float32, and there are 32 of them (AVX-512). Elsewhere there are sixteen of eight
+(AVX), or 32 of four (NEON)."""
 
 
 class Vector(types.Type):

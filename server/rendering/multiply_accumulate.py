@@ -8,8 +8,10 @@ and sums stay in registers.
 
 Eight complex numbers are one vector of sixteen lanes, the real parts in its first half and the imaginary parts in the
 second. A product then takes two steps: multiply by the real parts of one factor, repeated in both halves, and by its
-imaginary parts, crosswise and with opposed signs. Such a vector is one register with AVX-512 and two elsewhere.
-Therefore it is used only in loops that load more than they keep in registers.
+imaginary parts, crosswise and with opposed signs. Such a vector is one register with AVX-512 and two elsewhere, where
+registers are also fewer. There it is used only in loops that load more than they keep in registers, and the loop that
+keeps the most, a source's turn, works on one channel at a time with real and imaginary parts apart. Both ways round
+alike, to the last bit.
 """
 
 import numpy as np
@@ -18,11 +20,13 @@ from numba import carray
 from server.kernels.cache_lines import LINE_BYTES
 from server.kernels.compiled import compiled
 from server.kernels.simd import (
+    HAS_WIDE_REGISTERS,
     add,
     lanes,
     load_int,
     multiply,
     multiply_add,
+    multiply_subtract,
     pointer,
     prefetch,
     store,
@@ -30,7 +34,8 @@ from server.kernels.simd import (
 )
 from server.rendering.partitions import NEAR, TURNS
 
-_wide = lanes(16)
+_wide, _narrow = lanes(16), lanes(8)
+_load_narrow, _broadcast_narrow = _narrow.load, _narrow.broadcast
 load, broadcast, load_twice, load_opposed = _wide.load, _wide.broadcast, _wide.load_twice, _wide.load_opposed
 
 COLUMNS = TURNS + 1
@@ -169,8 +174,64 @@ def add_turn(stage, channels, members, newest, first, last) -> None:
     """Multiply all partitions of a group's filters by the spectra in their rings, from slot `newest` on, and add the
     products to the mix of the current window. Also add the products that are known by now to the mixes of the next
     three windows: from the first, second and third partition on."""
-    for channel in range(0, channels, 2):
-        _add_turn_of_pair(stage, channels, channel, members, newest, first, last)
+    if HAS_WIDE_REGISTERS:
+        for channel in range(0, channels, 2):
+            _add_turn_of_pair(stage, channels, channel, members, newest, first, last)
+    else:
+        for channel in range(channels):
+            _add_turn_of_channel(stage, channels, channel, members, newest, first, last)
+
+
+@compiled
+def _add_turn_of_channel(stage, channels, channel, members, newest, first, last) -> None:
+    """Do the work of `add_turn` for one channel, in registers of eight lanes."""
+    mix, tiles, slots = stage.mix, stage.size // 8, stage.slots
+    spectrum = spectrum_stride(stage.size)
+    zero = _broadcast_narrow(np.float32(0))
+    for tile in range(first, last):
+        a, b, c, d = zero, zero, zero, zero
+        a_i, b_i, c_i, d_i = zero, zero, zero, zero
+        for member in range(members):
+            filters, count, ring = member_of(stage, member)
+            near = min(NEAR, count)
+            slot = newest
+            h = 16 * (channels * tile + channel)
+            # Where the spectra of the partition's own window are, and of the one, two and three windows after it.
+            x, x_b, x_c, x_d = 0, 0, 0, 0
+            for partition in range(count):
+                x, x_b, x_c, x_d = spectrum * slot + 16 * tile, x, x_b, x_c
+                prefetch(ring + 4 * x + _SPECTRUM_AHEAD)
+                _fetch_filter(filters, h)
+                real, imaginary = _load_narrow(filters, h), _load_narrow(filters, h + 8)
+                a, a_i = _plus_product(a, a_i, ring, x, real, imaginary)
+                if partition >= 1:
+                    b, b_i = _plus_product(b, b_i, ring, x_b, real, imaginary)
+                if partition >= 2:
+                    c, c_i = _plus_product(c, c_i, ring, x_c, real, imaginary)
+                if partition >= 3:
+                    d, d_i = _plus_product(d, d_i, ring, x_d, real, imaginary)
+                h += _step(near, tiles, channels, count, tile, partition)
+                slot = slot + 1 if slot + 1 < slots else 0
+        _add_parts(mix, mix_offset(channels, tile, channel, stage.window % TURNS), a, a_i)
+        _add_parts(mix, mix_offset(channels, tile, channel, (stage.window + 1) % TURNS), b, b_i)
+        _add_parts(mix, mix_offset(channels, tile, channel, (stage.window + 2) % TURNS), c, c_i)
+        _add_parts(mix, mix_offset(channels, tile, channel, (stage.window + 3) % TURNS), d, d_i)
+
+
+@compiled
+def _plus_product(total, total_i, ring, x, real, imaginary):
+    """Return the real and imaginary parts of a sum plus the product of a filter's values with eight bins at index
+    `x`."""
+    x_r, x_i = _load_narrow(ring, x), _load_narrow(ring, x + 8)
+    total = multiply_subtract(x_i, imaginary, multiply_add(x_r, real, total))
+    total_i = multiply_add(x_i, real, multiply_add(x_r, imaginary, total_i))
+    return total, total_i
+
+
+@compiled
+def _add_parts(mix, at, real, imaginary) -> None:
+    store(mix, at, add(_load_narrow(mix, at), real))
+    store(mix, at + 8, add(_load_narrow(mix, at + 8), imaginary))
 
 
 @compiled
