@@ -147,8 +147,7 @@ class Convolver:
             raise ValueError(f"expected an IR ({self.channels}, 1..{self.ir_samples}), got shape {ir.shape}")
         if like is not None and like.layout != self._layout:
             raise ValueError("the IR that it is like was prepared for another convolver")
-        with np.errstate(over="ignore"):  # an overflow is found below
-            samples = ir.astype(np.float32, copy=False)
+        samples = _single(ir)
         energies = self._energies_of(samples, like, same_from)
         # Energy says it at once of nearly all; neither is true of what is no number.
         # guard: a response is sound
@@ -191,9 +190,12 @@ class Convolver:
         else:
             self._retire(previous)
         self._irs[source] = prepared
-        self._energies[:, source] = prepared.energies
         self._engine.want(source, prepared.filters)
-        if self._has_shared:
+        if not self._has_shared:
+            return
+        is_early = previous is not None and prepared.energies[1:] == previous.energies[1:]
+        self._energies[:, source] = prepared.energies
+        if not is_early or self._shared is previous:
             self._choose_shared()
 
     def share(self, sharing: Sharing) -> None:
@@ -296,6 +298,14 @@ class Convolver:
         self._shared = self._shared_before = None
         self._shared_chosen_at = -1
         self._came_at.fill(-1)
+
+
+def _single(samples: npt.NDArray[np.floating]) -> FloatArray:
+    """The samples in single precision, infinite where they are too large."""
+    if samples.dtype == np.float32:
+        return samples  # as most are; setting and resetting the error state would take longer than the rest
+    with np.errstate(over="ignore"):
+        return samples.astype(np.float32)
 
 
 def _energy(samples: FloatArray) -> float:
