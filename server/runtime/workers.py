@@ -1,19 +1,23 @@
 """Worker threads, which compute impulse responses and plans for the audio threads. Urgent work comes first. After that
-the kinds of work take turns, so that no kind delays another; within a kind the oldest request comes first."""
+each kind of work has its share of the workers' time, so that no kind delays another for long; within a kind the oldest
+request comes first."""
 
 import threading
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import Any, Final, Literal, Self, TypeVar, get_args
 
 from server.runtime.thread_pool import ThreadPool
 
 T = TypeVar("T")
 Kind = Literal["response", "plan"]
 """Impulse responses, or plans of effects with their audits."""
-
+_SHARES: Final[Mapping[Kind, float]] = {"response": 0.75, "plan": 0.25}
+"""The share of the workers' CPU time that each kind has while both wait. A reverberation that lags is heard; a plan
+looks seconds ahead."""
 
 _PATIENCE_S = 10.0
 """Impulse responses and plans take milliseconds, audits of plans up to a second."""
@@ -30,7 +34,8 @@ class Workers:
         """One entry for each unfinished piece of work."""
         self._urgent: deque[Callable[[], None]] = deque()
         self._usual: dict[Kind, deque[Callable[[], None]]] = {kind: deque() for kind in get_args(Kind)}
-        self._turns = deque(self._usual)
+        self._used_s = dict.fromkeys(self._usual, 0.0)
+        """CPU time that each kind has taken, divided by its share."""
         self._choosing = threading.Lock()
 
     def __enter__(self) -> Self:
@@ -56,19 +61,23 @@ class Workers:
 
     def _run_next(self) -> None:
         try:
-            self._next()()  # not in a variable, which the traceback of a failure would keep alive
+            began_s = time.thread_time()
+            with self._choosing:
+                kind = None if self._urgent else self._choose()
+                taken = [(self._urgent if kind is None else self._usual[kind]).popleft()]
+            taken.pop()()  # in no variable, which the traceback of a failure would keep alive
+            if kind is not None:
+                self._used_s[kind] += (time.thread_time() - began_s) / _SHARES[kind]
         finally:
             self._unfinished.pop()
 
-    def _next(self) -> Callable[[], None]:
-        with self._choosing:
-            return self._urgent.popleft() if self._urgent else self._next_usual()
-
-    def _next_usual(self) -> Callable[[], None]:
-        kind = next(kind for kind in self._turns if self._usual[kind])
-        self._turns.remove(kind)
-        self._turns.append(kind)
-        return self._usual[kind].popleft()
+    def _choose(self) -> Kind:
+        """The kind that has used least of its share, of those that wait. A kind that did not wait saves nothing up."""
+        waiting = [kind for kind, queue in self._usual.items() if queue]
+        chosen = min(waiting, key=self._used_s.__getitem__)
+        for kind in self._usual:
+            self._used_s[kind] = max(self._used_s[kind], self._used_s[chosen])
+        return chosen
 
 
 def _settle(future: Future[T], work: Callable[..., T], args: tuple[Any, ...]) -> None:

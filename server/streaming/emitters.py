@@ -62,12 +62,13 @@ class WholeResponse:
     emitter: Vector3
     circumstances: Hashable
 
-    def lasts(self, circumstances: Hashable, listener: Pose, emitter: Vector3, reach_m: float, turn_rad: float) -> bool:
-        """Whether its later part still serves these poses: they are at most `reach_m` away, listener and emitter
-        together, and the head is turned by at most `turn_rad`."""
+    def age(self, listener: Pose, emitter: Vector3, reach_m: float, turn_deg: float) -> float:
+        """How far its poses are from these, as a share of how far they may be: `reach_m` for listener and emitter
+        together, or a turn of the head by `turn_deg`."""
         moved_m = math.dist(self.listener.position, listener.position) + math.dist(self.emitter, emitter)
         same = abs(sum(a * b for a, b in zip(self.listener.orientation, listener.orientation, strict=True)))
-        return self.circumstances == circumstances and moved_m <= reach_m and same >= math.cos(turn_rad / 2)
+        turned_deg = 2 * math.degrees(math.acos(min(1.0, same)))
+        return max(moved_m / reach_m, turned_deg / turn_deg)
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,12 @@ class Thresholds:
     late_reach_m: float = 0.5
     """Metres that listener and emitter may move, together, before the later part of a response is computed anew, on the
     steps below the top: late sound in one room hardly differs within that."""
-    shared_reach_m: float = 1.0
-    """The same on the lowest step, where only the level of an emitter's late sound and one response for all of them
-    are used."""
     late_turn_deg: float = 60.0
     """Degrees that the head may turn before that: late sound comes from nearly everywhere."""
+
+    whole_at_once: int = 2
+    """Responses of a request whose later parts are computed anew because poses have moved on: with all of them at once,
+    requests took so long that all had to be computed anew each time."""
 
     full_busy: float = 0.85
     """Busy share from which on a thread has no time to spare, unless it can make some by rendering more blocks at once.

@@ -81,4 +81,4 @@ class Offer:
         """Return the cheapest step. With shared reverberation, little of an IR is computed, and so it may be asked for
         more often again."""
         step = self._step(level, min(self.thresholds.ir_rates_hz))
-        return replace(step, sharing=Sharing.REVERBERATION, late_reach_m=self.thresholds.shared_reach_m)
+        return replace(step, sharing=Sharing.REVERBERATION)

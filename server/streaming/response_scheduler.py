@@ -6,7 +6,6 @@ the newest poses. They come back through `accept`, or through `give_up` if the c
 another level takes effect when its IRs have arrived. Clocks are in samples.
 """
 
-import math
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -203,10 +202,11 @@ class ResponseScheduler:
 
     def _request(self, listener: Pose, emitters: list[StreamedEmitter], *, is_first: bool) -> IrRequest:
         states = [self._effects.as_asked(emitter) for emitter in emitters]
+        kept = self._kept(emitters, states, listener)
         for emitter in emitters:
             emitter.is_outdated = False
         asked = tuple(
-            AskedIr(emitter.serial, state, self._identity(emitter, listener), self._like(emitter, state, listener))
+            AskedIr(emitter.serial, state, self._identity(emitter, listener), kept.get(emitter.serial))
             for emitter, state in zip(emitters, states, strict=True)
         )
         return IrRequest(
@@ -219,17 +219,27 @@ class ResponseScheduler:
             is_first=is_first,
         )
 
-    def _like(self, emitter: StreamedEmitter, state: EmitterState, listener: Pose) -> PartitionedIr | None:
-        """The IR whose later part an emitter's next one keeps; None if all of it has to be computed."""
-        whole, reach_m = emitter.heard.whole, self._wanted.late_reach_m
-        can_keep = reach_m > 0 and not (
-            state.effects.bakes_direct or self._levels[self._wanted.level].kind.reuses_responses
-        )
-        if whole is None or not can_keep:
-            return None
-        circumstances = self._circumstances(self._wanted.level, state, self._effects.channels)
-        turn_rad = math.radians(THRESHOLDS.late_turn_deg)
-        return whole.ir if whole.lasts(circumstances, listener, state.position, reach_m, turn_rad) else None
+    def _kept(
+        self, emitters: Iterable[StreamedEmitter], states: Iterable[EmitterState], listener: Pose
+    ) -> dict[int, PartitionedIr]:
+        """The IRs, by serial, whose later parts the next ones keep. Of those that have become too old, a few are left
+        out at a time, the oldest first: if a request were to compute all of them anew, it would take so long that the
+        next had to do so, too."""
+        reach_m, kind = self._wanted.late_reach_m, self._levels[self._wanted.level].kind
+        if reach_m == 0 or kind.reuses_responses:
+            return {}
+        ages: dict[int, float] = {}
+        kept = {}
+        for emitter, state in zip(emitters, states, strict=True):
+            whole = emitter.heard.whole
+            circumstances = self._circumstances(self._wanted.level, state, self._effects.channels)
+            if whole is not None and whole.circumstances == circumstances and not state.effects.bakes_direct:
+                kept[emitter.serial] = whole.ir
+                ages[emitter.serial] = whole.age(listener, state.position, reach_m, THRESHOLDS.late_turn_deg)
+        oldest = sorted((serial for serial, age in ages.items() if age > 1), key=ages.__getitem__, reverse=True)
+        for serial in oldest[: THRESHOLDS.whole_at_once]:
+            del kept[serial]
+        return kept
 
     @staticmethod
     def _circumstances(level: str, state: EmitterState, channels: int) -> Hashable:
