@@ -209,7 +209,7 @@ class Convolver:
     @property
     def early_samples(self) -> int:
         """The samples of an IR that no sources share, however much is shared: those of the first stage."""
-        return self._partitioning.stages[0].end
+        return min(self.ir_samples, self._partitioning.stages[0].end)
 
     @property
     def _first_shared(self) -> int:

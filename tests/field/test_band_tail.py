@@ -150,3 +150,14 @@ def test_it_is_that_of_double_precision(towards):
         for part in (slice(None, 1600), slice(1600, None)):
             error = np.sum((found - exact)[:, part] ** 2) / np.sum(exact[:, part] ** 2)
             assert 10 * np.log10(error) < -120
+
+
+@pytest.mark.parametrize("samples", [1_000, 2_048, 14_400])
+def test_first_samples_are_those_of_the_whole_response(samples):
+    """At the least those by which the gate makes up for what it takes away."""
+    for field in fields(towards=(0.0, 1.0, 0.0), share=0.3):
+        (whole,) = field.impulse_responses([LISTENER], [EMITTER], [0.3])
+        (first,) = field.first_samples([LISTENER], [EMITTER], [0.3], samples)
+        np.testing.assert_allclose(first, whole[:, :samples], rtol=1e-5, atol=1e-8)
+        with pytest.raises(ValueError, match="finite"):
+            field.first_samples([(np.nan, 0.0, 0.0)], [EMITTER], [0.3], samples)

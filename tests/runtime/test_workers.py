@@ -1,6 +1,7 @@
 """What is urgent is done first, and nothing is lost."""
 
 import gc
+import itertools
 import threading
 import time
 import weakref
@@ -37,14 +38,23 @@ def test_urgent_work_is_done_before_what_waits_longer_and_all_else_in_order(work
     assert done == ["a", "b", 0, 1, 2]
 
 
-def test_kinds_take_turns_however_many_wait_of_either(workers, hold):
+def test_each_kind_has_its_share_of_the_time_however_many_wait_of_either(workers, hold, monkeypatch):
+    """Three quarters for responses, of equal pieces of work; what has not waited saves nothing up."""
+    clock_s = itertools.count()
+    monkeypatch.setattr("server.runtime.workers.time.thread_time", lambda: next(clock_s))
     done = []
-    plans = [workers.submit(done.append, number, kind="plan") for number in range(5)]
-    responses = [workers.submit(done.append, name, kind="response") for name in "abc"]
     hold()
-    for future in (*plans, *responses):
+    for future in [workers.submit(done.append, "early", kind="response") for _ in range(20)]:
         future.result(timeout=10)
-    assert done == ["a", 0, "b", 1, "c", 2, 3, 4]
+    is_released = threading.Event()
+    workers.submit(is_released.wait, kind="response", is_urgent=True)
+    works = [workers.submit(done.append, kind, kind=kind) for kind in ("plan", "response") for _ in range(12)]
+    is_released.set()
+    for future in works:
+        future.result(timeout=10)
+    both = done[20:32]
+    assert both.count("response") == pytest.approx(9, abs=1)
+    assert both.index("plan") <= 3
 
 
 def test_results_and_exceptions_come_back(workers):

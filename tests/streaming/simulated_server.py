@@ -22,6 +22,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from server.field.kinds.catalogue import kind_of
 from server.protocol.client_messages import AUTO, ListenerPose
 from server.rendering.output import Rendered
 from server.scene.manifest import QualityLevel, Reuse
@@ -54,8 +55,10 @@ class Costs:
 
     tick_s: float = 60e-6
     block_s: float = 0.92e-3
-    shared_tail: float = 0.6
-    """Share of that, for emitters that share a tail."""
+    shared: tuple[float, ...] = (1.0, 0.6, 0.45)
+    """Share of that, for emitters that share nothing, a tail, or their reverberation."""
+    early: float = 0.3
+    """Share of the cost of a response of which only the early part is computed."""
     saved_by_doubling: float = 1 / 8
     exchange_s: float = 0.32e-3
     """More of a block that fades to other responses: the convolver runs twice."""
@@ -434,7 +437,7 @@ class SimulatedServer:
         costs, numbers = self._costs, self._thresholds.blocks_at_once
         quality = self._offer.steps(AUTO, block_s=BLOCK_S)[step]
         count = blocks_at_once or numbers[-1]
-        block_s = costs.block_s * emitters / 16 * (costs.shared_tail if quality.shared_tail else 1)
+        block_s = costs.block_s * emitters / 16 * costs.shared[quality.sharing]
         saved = (1 - costs.saved_by_doubling) ** numbers.index(count)
         exchange_s = costs.exchange_s * emitters / 16 * min(quality.ir_rate_hz or self._poses_hz, self._poses_hz)
         ticks_s = costs.tick_s * audio_engine.PHASES / BLOCK_S / (2 if count == numbers[-1] else 1)
@@ -476,7 +479,11 @@ class SimulatedServer:
         client, level = self._by_session[session], self._levels[request.level]
         # The first response of each emitter finds nothing kept.
         each_ms = level.miss_ms if request.is_first else level.walk_ms
-        cost_s = client.emitters * each_ms / 1000 * self._chance()
+        whole = client.emitters
+        if session.quality.late_reach_m and not (request.is_first or kind_of(level.level).reuses_responses):
+            whole = min(whole, THRESHOLDS.whole_at_once)
+        responses = whole + (client.emitters - whole) * self._costs.early
+        cost_s = responses * each_ms / 1000 * self._chance()
         self._compute(
             future,
             cost_s,
@@ -513,7 +520,7 @@ class SimulatedServer:
         cost_s = costs.tick_s
         for session, count in Counter(sessions).items():
             emitters = self._by_session[session].emitters
-            share = (costs.shared_tail if session.quality.shared_tail else 1.0) * emitters / 16
+            share = costs.shared[session.quality.sharing] * emitters / 16
             saved = (1 - costs.saved_by_doubling) ** (math.log2(count))
             cost_s += count * costs.block_s * share * saved + session.is_exchange * costs.exchange_s * emitters / 16
             blocks += [Rendered(_SILENCE, session.is_exchange and number == 0, False) for number in range(count)]

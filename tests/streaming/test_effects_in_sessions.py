@@ -337,7 +337,7 @@ def test_emitters_whose_tails_nobody_tells_apart_share_one(open_stage):
         stage.add(str(number), position=(5.0 + 0.2 * number, 3.0, 1.5))
     stage.hear(0.5)
     convolver = next(iter(stage.session.renderer._mixers)).convolver
-    assert convolver._shares_tail is not stage.is_on(EffectName.PER_SOURCE_TAIL)
+    assert (convolver._sharing is Sharing.TAIL) is not stage.is_on(EffectName.PER_SOURCE_TAIL)
 
 
 @pytest.mark.parametrize("effects", [{"echo": True}, {"hrtff": False}])

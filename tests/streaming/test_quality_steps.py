@@ -26,7 +26,7 @@ def test_auto_begins_with_the_best_level_whose_response_fits_into_a_block():
     assert {step.level for step in offer(slow=50.0, slower=60.0).steps(AUTO, block_s=BLOCK_S)} == {"slow"}
 
 
-def test_down_a_ladder_come_fewer_responses_then_cheaper_levels_then_a_shared_tail():
+def test_down_a_ladder_come_fewer_responses_then_cheaper_levels_then_what_emitters_share():
     levels = (
         QualityLevel(name="shared", field="any", shared_tail=True),
         QualityLevel(name="fast", field="any"),
@@ -34,13 +34,16 @@ def test_down_a_ladder_come_fewer_responses_then_cheaper_levels_then_a_shared_ta
     )
     steps = Offer(levels, {"shared": 0.3, "fast": 0.4, "good": 4.0}).steps(AUTO, block_s=BLOCK_S)
     assert [(step.level, step.ir_rate_hz, step.sharing) for step in steps] == [
-        ("good", 20.0, False),
-        ("good", 12.0, False),
-        ("good", 5.0, False),
-        ("fast", 5.0, False),
-        ("shared", 5.0, True),
-        ("shared", 2.0, True),
+        ("good", 20.0, Sharing.NOTHING),
+        ("good", 12.0, Sharing.NOTHING),
+        ("good", 5.0, Sharing.NOTHING),
+        ("fast", 5.0, Sharing.NOTHING),
+        ("shared", 5.0, Sharing.TAIL),
+        ("shared", 2.0, Sharing.TAIL),
+        ("shared", 5.0, Sharing.REVERBERATION),
     ]
+    # At the top every response is computed whole.
+    assert [step.late_reach_m > 0 for step in steps] == [False] + 6 * [True]
 
 
 def test_levels_that_reuse_responses_may_ask_more_often():
@@ -53,6 +56,7 @@ def test_levels_that_reuse_responses_may_ask_more_often():
         ("good", 5.0),
         ("whole", 12.0),
         ("whole", 2.0),
+        ("whole", 5.0),
     ]
 
 
@@ -72,6 +76,6 @@ def test_auto_leaves_a_bus_to_whoever_asks_for_it():
 def test_a_level_that_was_chosen_is_kept_and_only_its_rate_falls():
     steps = offer(fast=0.5, exact=700.0).steps("exact", block_s=BLOCK_S)
     assert {step.level for step in steps} == {"exact"}
-    assert [step.ir_rate_hz for step in steps] == [None, 12.0, 5.0, 2.0]
+    assert [step.ir_rate_hz for step in steps] == [None, 12.0, 5.0, 2.0, 5.0]
     with pytest.raises(RequestError, match="none of auto, fast"):
         offer(fast=0.5).steps("other", block_s=BLOCK_S)

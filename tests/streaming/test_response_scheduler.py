@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from server.acoustics.geometry import Pose
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, MoveEmitter, RemoveEmitter
 from server.protocol.server_messages import EmitterAdded, EmitterRemoved, Error
 from server.rendering.convolver import Sharing
-from server.responses.ir_request import compute_irs
+from server.responses.ir_request import composed_irs, compute_irs
 from server.streaming.quality_steps import QualityStep
 from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
@@ -185,3 +186,76 @@ def test_a_field_that_is_not_finite_is_not_an_answer(session, field):
     add(session)
     with pytest.raises(ValueError):
         compute_irs(FieldsByLevel([field]), session.take_request(), session.renderer)
+
+
+def walk(session, field, positions, first_pose_id):
+    """Whether each response that was asked for at these places was whole: one list per request."""
+    wholes = []
+    for number, position in enumerate(positions):
+        session.receive(ListenerPose(pose_id=first_pose_id + number, position=position))
+        request = session.take_request()
+        wholes.append([asked.like is None for asked in request.asked])
+        session.accept(compute_irs(FieldsByLevel([field]), request, session.renderer))
+        session.render_block()
+    return wholes
+
+
+EASED = QualityStep("standard", None, Sharing.NOTHING, 1.0, late_reach_m=0.5)
+
+
+def test_below_the_top_late_parts_are_kept_while_listener_and_emitters_stay_near(session, field):
+    for name in "abc":
+        add(session, name)
+    session.receive(ListenerPose(pose_id=1, position=HERE))
+    answer(session, field)
+    near = [(2.0 + 0.1 * step, 2.0, 1.5) for step in range(1, 5)]
+    assert walk(session, field, near, 2) == [[True] * 3] * 4
+    session.set_quality(EASED, "load")
+    assert walk(session, field, [(2.8, 2.0, 1.5)], 10) == [[False] * 3]
+    # Too far away for all three: two are computed anew at a time.
+    first, second, third = walk(session, field, [(3.0, 2.0, 1.5), (3.1, 2.0, 1.5), (3.2, 2.0, 1.5)], 20)
+    assert (sum(first), sum(second), sum(third)) == (2, 1, 0)
+    assert not any(both[0] and both[1] for both in zip(first, second, strict=True))
+
+
+def test_a_turn_of_the_head_makes_late_parts_old_too(session, field):
+    add(session)
+    session.receive(ListenerPose(pose_id=1, position=HERE))
+    answer(session, field)
+    session.set_quality(EASED, "load")
+    for pose_id, (yaw, is_whole) in enumerate([(0.5, False), (1.2, True)], 2):
+        session.receive(ListenerPose(pose_id=pose_id, position=HERE, yaw=yaw))
+        request = session.take_request()
+        assert [asked.like is None for asked in request.asked] == [is_whole]
+        session.accept(compute_irs(FieldsByLevel([field]), request, session.renderer))
+
+
+def test_back_at_the_top_everything_is_computed_for_the_pose_that_is_heard(session, field):
+    add(session, "a")
+    add(session, "b")
+    answer(session, field)
+    top = session.quality
+    session.set_quality(EASED, "load")
+    session.receive(MoveEmitter(id="b", position=(6.1, 3.0, 1.5), pose_id=1))
+    answer(session, field)
+    assert session.take_request() is None
+    session.set_quality(top, "recovered")
+    assert [(each.state.position, each.like) for each in session.take_request().asked] == [((6.1, 3.0, 1.5), None)]
+
+
+def test_a_response_with_a_kept_late_part_is_that_of_both_poses(session, field):
+    add(session)
+    session.receive(ListenerPose(pose_id=1, position=HERE))
+    answer(session, field)
+    session.set_quality(EASED, "load")
+    session.receive(ListenerPose(pose_id=2, position=(2.2, 2.0, 1.5)))
+    request = session.take_request()
+    (kept,) = compute_irs(FieldsByLevel([field]), request, session.renderer).irs
+    (asked,) = request.asked
+    early = session.renderer.early_samples(2)
+    (there,) = composed_irs(field, request.direct_sound, request.listener, [asked.state])
+    (before,) = composed_irs(field, request.direct_sound, Pose(HERE), [asked.state])
+    both = session.renderer.prepare(np.concatenate([there[:, :early], before[:, early:]], axis=1))
+    for own, other in zip(kept.filters.spectra, both.filters.spectra, strict=True):
+        np.testing.assert_array_equal(own, other)
+    assert kept.energies == pytest.approx(both.energies)
